@@ -1,0 +1,133 @@
+"""The rest scene: 3D Gaussians with the masks that say what moves, what is held and what is shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gausim.core.errors import SceneError
+
+SH_COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianScene:
+    """K Gaussians exactly as a 3DGS file stores them (raw parameters: nothing is activated or normalised).
+
+    Attributes:
+        means: rest positions X [scene units].
+        log_scales: natural logarithm of the standard deviations along the principal axes [log scene units].
+        quats: orientation, w x y z, any non-zero length.
+        opacity_logits: opacity before the sigmoid.
+        sh: spherical-harmonics colour coefficients, ((d+1)^2, RGB) per kernel, d = 0..3.
+        simulated: kernels that the dynamics may move; the others are rendered where they are.
+        pinned: simulated kernels that are held at their rest position (the roots).
+        foreground: kernels that are compared with segmented video.
+        volume_scale: c of V = prod(c s_i) (METHOD section 1), so that the mean kernel mass is of order 1.
+        name: what the scene is called in messages, tables and checkpoints.
+    """
+
+    means: Float[Tensor, "K 3"]
+    log_scales: Float[Tensor, "K 3"]
+    quats: Float[Tensor, "K 4"]
+    opacity_logits: Float[Tensor, " K"]
+    sh: Float[Tensor, "K B 3"]
+    simulated: Bool[Tensor, " K"]
+    pinned: Bool[Tensor, " K"]
+    foreground: Bool[Tensor, " K"]
+    volume_scale: float = 1.0
+    name: str = "scene"
+
+    @staticmethod
+    def create(
+        *,
+        means: Tensor,
+        log_scales: Tensor,
+        quats: Tensor,
+        opacity_logits: Tensor,
+        sh: Tensor,
+        simulated: Tensor | None = None,
+        pinned: Tensor | None = None,
+        foreground: Tensor | None = None,
+        volume_scale: float | None = None,
+        name: str = "scene",
+    ) -> GaussianScene:
+        """Builds a scene; masks default to all simulated, none pinned, all foreground.
+
+        Without ``volume_scale`` it is chosen so that the mean kernel volume, and with unit density the mean
+        mass, is 1.
+        """
+        count = means.shape[0]
+        every = torch.ones(count, dtype=torch.bool, device=means.device)
+        if volume_scale is None:
+            volume_scale = float(torch.exp(log_scales.double().sum(-1)).mean()) ** (-1 / 3) if count else 1.0
+        scene = GaussianScene(
+            means=means,
+            log_scales=log_scales,
+            quats=quats,
+            opacity_logits=opacity_logits,
+            sh=sh,
+            simulated=every if simulated is None else simulated,
+            pinned=~every if pinned is None else pinned,
+            foreground=every if foreground is None else foreground,
+            volume_scale=volume_scale,
+            name=name,
+        )
+        return scene.validated()
+
+    @property
+    def count(self) -> int:
+        """Number of kernels K."""
+        return self.means.shape[0]
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree d of the spherical harmonics, 0..3."""
+        return {n: d for d, n in SH_COEFFICIENTS.items()}[self.sh.shape[1]]
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the simulated kernels' bounding-box diagonal [scene units]; all radii are fractions of it."""
+        x = self.means[self.simulated]
+        return float((x.amax(0) - x.amin(0)).norm())
+
+    def validated(self) -> GaussianScene:
+        """Returns itself, or raises :class:`SceneError` naming the field that is wrong."""
+        if self.count == 0:
+            raise SceneError(f"{self.name}: expected at least one Gaussian, got none.")
+        if self.sh.shape[1] not in SH_COEFFICIENTS.values():
+            raise SceneError(
+                f"{self.name}: field 'sh' has {self.sh.shape[1]} coefficients per channel; expected 1, 4, 9 or 16."
+            )
+        for name in ("means", "log_scales", "quats", "opacity_logits", "sh"):
+            value = getattr(self, name)
+            bad = ~torch.isfinite(value).reshape(self.count, -1).all(-1)
+            if bad.any():
+                raise SceneError(
+                    f"{self.name}: field '{name}' is NaN or infinite for {int(bad.sum())} of {self.count} Gaussians "
+                    f"(first: number {int(bad.nonzero()[0])}). Remove them or repair the reconstruction."
+                )
+        zero = self.quats.norm(dim=-1) == 0
+        if zero.any():
+            raise SceneError(
+                f"{self.name}: field 'quats' is zero for {int(zero.sum())} of {self.count} Gaussians "
+                f"(first: number {int(zero.nonzero()[0])}); a rotation needs a non-zero quaternion."
+            )
+        if (self.pinned & ~self.simulated).any():
+            raise SceneError(f"{self.name}: mask 'pinned' marks kernels that mask 'simulated' leaves out.")
+        return self
+
+    def select(self, mask: Bool[Tensor, " K"]) -> GaussianScene:
+        """The sub-scene of the kernels where ``mask`` holds, in the same order."""
+        return replace(self, **{n: getattr(self, n)[mask] for n in self._tensor_names()})
+
+    def to(self, device: torch.device | str) -> GaussianScene:
+        """The same scene on another device."""
+        return replace(self, **{n: getattr(self, n).to(device) for n in self._tensor_names()})
+
+    @classmethod
+    def _tensor_names(cls) -> list[str]:
+        return [f.name for f in fields(cls) if f.name not in ("volume_scale", "name")]

@@ -1,0 +1,63 @@
+"""State and trajectory: what goes into a step and what comes out of a rollout."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class SimState:
+    """The state of the dynamics is exactly the kernels' two latest positions.
+
+    Attributes:
+        positions: x_t of all K kernels of the scene [scene units].
+        previous: x_{t-1}, one frame earlier.
+    """
+
+    positions: Float[Tensor, "K 3"]
+    previous: Float[Tensor, "K 3"]
+
+    def detach(self) -> SimState:
+        """The same numbers without history (gradients stop here)."""
+        return SimState(self.positions.detach(), self.previous.detach())
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """F frames of one scene, frame 0 being the initial state.
+
+    Kernel k of frame f has mean ``positions[f, k]``, covariance G S_k G^T with G =
+    ``gradients[f, unit_of_kernel[k]]`` and its colour is looked up at Q^T d with Q the rotation of the same unit.
+
+    Attributes:
+        positions: kernel means [scene units].
+        gradients: accumulated deformation gradients of the N units that carry kernels.
+        rotations: their accumulated rotations.
+        unit_of_kernel: the unit of each kernel; pinned and never-simulated kernels point to an identity unit.
+        fps: frames per second.
+    """
+
+    positions: Float[Tensor, "F K 3"]
+    gradients: Float[Tensor, "F N 3 3"]
+    rotations: Float[Tensor, "F N 3 3"]
+    unit_of_kernel: Int[Tensor, " K"]
+    fps: float
+
+    @property
+    def frames(self) -> int:
+        """Number of frames F, the initial state included."""
+        return self.positions.shape[0]
+
+    def carry(self, points: Float[Tensor, "P 3"], kernel: Int[Tensor, " P"], rest: Float[Tensor, "K 3"]) -> Tensor:
+        """Moves rest-space points with the unit of the kernel they are attached to, (F, P, 3).
+
+        A point s attached to kernel k goes to x_k + G (X_s - X_k), which for a kernel of unit c is
+        x_c + G_c (X_s - X_c) (METHOD section 5, the 3D error).
+        """
+        gradient = self.gradients[:, self.unit_of_kernel[kernel]]
+        offset = (points - rest[kernel]).to(gradient)
+        return self.positions[:, kernel] + torch.einsum("fpij,pj->fpi", gradient, offset)
