@@ -1,0 +1,257 @@
+"""3DGS PLY files: what is written is read back bit by bit, and every malformed file is refused by name."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gausim.core.errors import SceneError
+from gausim.core.scene import GaussianScene
+from gausim.io.ply import load_masks, load_scene, masks_path, save_masks, save_scene
+
+FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh", "simulated", "pinned", "foreground")
+
+
+def make_scene(degree: int = 1, count: int = 7) -> GaussianScene:
+    g = torch.Generator().manual_seed(degree)
+    pinned = torch.zeros(count, dtype=torch.bool)
+    pinned[:2] = True
+    simulated = torch.ones(count, dtype=torch.bool)
+    simulated[-1] = False
+    return GaussianScene.create(
+        means=torch.randn(count, 3, generator=g),
+        log_scales=torch.randn(count, 3, generator=g) - 3,
+        quats=torch.randn(count, 4, generator=g),
+        opacity_logits=torch.randn(count, generator=g),
+        sh=torch.randn(count, (degree + 1) ** 2, 3, generator=g),
+        simulated=simulated,
+        pinned=pinned,
+        foreground=~pinned,
+        volume_scale=37.5,
+        name="scene",
+    )
+
+
+def columns_of(scene: GaussianScene) -> dict[str, np.ndarray]:
+    """An independent statement of the INRIA layout."""
+    columns = {n: scene.means[:, i].numpy() for i, n in enumerate("xyz")}
+    columns |= {f"f_dc_{i}": scene.sh[:, 0, i].numpy() for i in range(3)}
+    per_channel = scene.sh.shape[1] - 1
+    for channel in range(3):
+        for b in range(per_channel):
+            columns[f"f_rest_{channel * per_channel + b}"] = scene.sh[:, 1 + b, channel].numpy()
+    columns["opacity"] = scene.opacity_logits.numpy()
+    columns |= {f"scale_{i}": scene.log_scales[:, i].numpy() for i in range(3)}
+    return columns | {f"rot_{i}": scene.quats[:, i].numpy() for i in range(4)}
+
+
+def write_ply(
+    path: Path, columns: dict[str, np.ndarray], *, kind: str = "float", order: str = "<", cut: int = 0, extra: str = ""
+) -> None:
+    code = {"float": "f4", "double": "f8"}[kind]
+    table = np.empty(len(columns["x"]), dtype=[(n, order + code) for n in columns])
+    for n, value in columns.items():
+        table[n] = value
+    name = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    header = f"ply\nformat {name} 1.0\ncomment by hand\nelement vertex {len(table)}\n"
+    header += "".join(f"property {kind} {n}\n" for n in columns) + extra + "end_header\n"
+    body = table.tobytes()
+    path.write_bytes(header.encode() + body[: len(body) - cut])
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_round_trip_is_bitwise(tmp_path: Path, degree: int) -> None:
+    scene = make_scene(degree)
+    save_scene(scene, tmp_path / "scene.ply")
+    back = load_scene(tmp_path / "scene.ply")
+    assert back.sh_degree == degree
+    for field in FIELDS:
+        assert torch.equal(getattr(back, field), getattr(scene, field)), field
+    assert back.volume_scale == 37.5
+    assert back.name == "scene"
+    save_scene(back, tmp_path / "again.ply")
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "scene.ply").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "again.masks.npz", "again.ply", "scene.masks.npz", "scene.ply",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_plyfile_reads_what_is_written(tmp_path: Path, degree: int) -> None:
+    plyfile = pytest.importorskip("plyfile")
+    scene = make_scene(degree)
+    save_scene(scene, tmp_path / "scene.ply")
+    vertex = plyfile.PlyData.read(str(tmp_path / "scene.ply"))["vertex"]
+    expected = columns_of(scene)
+    names = [p.name for p in vertex.properties]
+    assert names[:6] == ["x", "y", "z", "nx", "ny", "nz"]
+    assert set(names) == set(expected) | {"nx", "ny", "nz"}
+    for name, value in expected.items():
+        assert np.array_equal(vertex[name], value), name
+
+
+@pytest.mark.parametrize(("kind", "order"), [("float", "<"), ("double", "<"), ("float", ">")])
+def test_other_layouts_are_read(tmp_path: Path, kind: str, order: str) -> None:
+    scene = make_scene(2)
+    columns = columns_of(scene)
+    shuffled = {n: columns[n] for n in sorted(columns, reverse=True)} | {"confidence": np.ones(scene.count)}
+    extra = "element camera 1\nproperty list uchar int view\n"
+    write_ply(tmp_path / "other.ply", shuffled, kind=kind, order=order, extra=extra)
+    back = load_scene(tmp_path / "other.ply", name="other name")
+    assert back.name == "other name"
+    for field in ("means", "log_scales", "quats", "opacity_logits", "sh"):
+        assert torch.equal(getattr(back, field), getattr(scene, field)), field
+    assert back.simulated.all() and back.foreground.all() and not back.pinned.any()
+
+
+def test_text_is_read(tmp_path: Path) -> None:
+    scene = make_scene(1)
+    columns = columns_of(scene)
+    header = f"ply\nformat ascii 1.0\nelement vertex {scene.count}\n"
+    header += "".join(f"property float {n}\n" for n in columns) + "end_header\n"
+    rows = [" ".join(repr(float(c[i])) for c in columns.values()) for i in range(scene.count)]
+    (tmp_path / "text.ply").write_text(header + "\n".join(rows) + "\n")
+    assert torch.equal(load_scene(tmp_path / "text.ply").sh, scene.sh)
+    (tmp_path / "short.ply").write_text(header + "\n".join(rows[:-1]) + "\n")
+    with pytest.raises(SceneError, match=r"short\.ply.*'vertex' declares 7 .* 6 lines"):
+        load_scene(tmp_path / "short.ply")
+
+
+def refuse(path: Path, *needles: str) -> None:
+    with pytest.raises(SceneError) as caught:
+        load_scene(path)
+    for needle in (path.name, *needles):
+        assert needle in str(caught.value)
+
+
+def test_truncated_file_is_refused(tmp_path: Path) -> None:
+    write_ply(tmp_path / "cut.ply", columns_of(make_scene()), cut=1)
+    refuse(tmp_path / "cut.ply", "truncated", "7 vertices")
+    (tmp_path / "header.ply").write_bytes((tmp_path / "cut.ply").read_bytes()[:60])
+    refuse(tmp_path / "header.ply", "end_header")
+
+
+def test_count_below_the_data_is_refused(tmp_path: Path) -> None:
+    write_ply(tmp_path / "long.ply", columns_of(make_scene()))
+    with (tmp_path / "long.ply").open("ab") as file:
+        file.write(b"\0" * 400)
+    refuse(tmp_path / "long.ply", "not what its header says")
+
+
+@pytest.mark.parametrize("name", ["x", "f_dc_1", "f_rest_4", "opacity", "scale_2", "rot_3"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_values_that_are_not_finite_are_refused(tmp_path: Path, name: str, value: float) -> None:
+    columns = columns_of(make_scene())
+    columns[name] = columns[name].copy()
+    columns[name][3] = value
+    write_ply(tmp_path / "bad.ply", columns)
+    refuse(tmp_path / "bad.ply", f"property '{name}'", "vertex 3")
+
+
+def test_double_beyond_float_is_refused(tmp_path: Path) -> None:
+    columns = columns_of(make_scene())
+    columns["y"] = np.full(7, 1e300)
+    write_ply(tmp_path / "huge.ply", columns, kind="double")
+    refuse(tmp_path / "huge.ply", "property 'y'")
+
+
+def test_zero_quaternion_is_refused(tmp_path: Path) -> None:
+    columns = columns_of(make_scene())
+    for i in range(4):
+        columns[f"rot_{i}"] = columns[f"rot_{i}"].copy()
+        columns[f"rot_{i}"][5] = 0
+    write_ply(tmp_path / "zero.ply", columns)
+    refuse(tmp_path / "zero.ply", "rot_0", "vertex 5", "quaternion")
+
+
+@pytest.mark.parametrize("name", ["z", "f_dc_0", "opacity", "scale_1", "rot_0"])
+def test_missing_property_is_refused(tmp_path: Path, name: str) -> None:
+    columns = columns_of(make_scene())
+    del columns[name]
+    write_ply(tmp_path / "part.ply", columns)
+    refuse(tmp_path / "part.ply", f"property '{name}' is missing")
+
+
+def test_odd_number_of_coefficients_is_refused(tmp_path: Path) -> None:
+    columns = columns_of(make_scene())
+    del columns["f_rest_8"]
+    write_ply(tmp_path / "odd.ply", columns)
+    refuse(tmp_path / "odd.ply", "8 properties 'f_rest_*'")
+
+
+@pytest.mark.parametrize(
+    ("content", "needle"),
+    [
+        (b"solid cube\n", "first line 'ply'"),
+        (b"ply\nelement vertex 1\nproperty float x\nend_header\n0000", "'format'"),
+        (b"ply\nformat binary_little_endian 1.0\nelement face 1\nproperty float x\nend_header\n0000", "'vertex'"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n", "empty"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n0", "'x'"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex one\nproperty float x\nend_header\n0", "vertex one"),
+    ],
+)
+def test_malformed_headers_are_refused(tmp_path: Path, content: bytes, needle: str) -> None:
+    (tmp_path / "odd.ply").write_bytes(content)
+    refuse(tmp_path / "odd.ply", needle)
+
+
+def test_missing_file_is_refused(tmp_path: Path) -> None:
+    refuse(tmp_path / "absent.ply", "no such file")
+
+
+def test_masks_of_another_scene_are_refused(tmp_path: Path) -> None:
+    scene = make_scene()
+    save_scene(scene, tmp_path / "scene.ply")
+    save_masks(make_scene(count=9), masks_path(tmp_path / "scene.ply"))
+    refuse_masks = pytest.raises(SceneError, match=r"scene\.masks\.npz: mask 'simulated': expected bool \(7,\).*\(9,\)")
+    with refuse_masks:
+        load_scene(tmp_path / "scene.ply")
+
+
+def test_malformed_masks_are_refused(tmp_path: Path) -> None:
+    scene, path = make_scene(), tmp_path / "m.masks.npz"
+    every = np.ones(scene.count, dtype=bool)
+    good = {"simulated": every, "pinned": ~every, "foreground": every, "volume_scale": np.float64(2.0)}
+    for change, needle in [
+        ({"pinned": every.astype(np.int64)}, "'pinned'"),
+        ({"volume_scale": np.float64(-1)}, "'volume_scale'"),
+        ({"volume_scale": np.ones(2)}, "'volume_scale'"),
+        ({"foreground": np.array([None] * 7, dtype=object)}, "plain arrays"),
+    ]:
+        np.savez(path, **(good | change))
+        with pytest.raises(SceneError, match=needle):
+            load_masks(scene, path)
+    path.write_bytes(b"no archive")
+    with pytest.raises(SceneError, match=r"m\.masks\.npz"):
+        load_masks(scene, path)
+    with pytest.raises(SceneError, match="no such file"):
+        load_scene_with_absent_masks(tmp_path, scene)
+
+
+def load_scene_with_absent_masks(folder: Path, scene: GaussianScene) -> None:
+    save_scene(scene, folder / "scene.ply")
+    load_scene(folder / "scene.ply", masks=folder / "elsewhere.masks.npz")
+
+
+def test_masks_given_by_path_are_used(tmp_path: Path) -> None:
+    scene = make_scene()
+    write_ply(tmp_path / "scene.ply", columns_of(scene))
+    save_masks(scene, tmp_path / "mine.npz")
+    assert not load_scene(tmp_path / "scene.ply").pinned.any()
+    assert torch.equal(load_scene(tmp_path / "scene.ply", masks=tmp_path / "mine.npz").pinned, scene.pinned)
+
+
+def test_real_scene_is_written_back_equal_in_every_stored_field(tmp_path: Path) -> None:
+    plyfile = pytest.importorskip("plyfile")
+    root = os.environ.get("GAUSIM_TEST_DATA")
+    if not root:
+        pytest.skip("GAUSIM_TEST_DATA is not set: no external data")
+    source = Path(root) / "splats" / "playbot_lod3.ply"
+    save_scene(load_scene(source), tmp_path / "back.ply")
+    before, after = (plyfile.PlyData.read(str(p))["vertex"] for p in (source, tmp_path / "back.ply"))
+    for p in before.properties:
+        assert before[p.name].tobytes() == after[p.name].tobytes(), p.name
