@@ -1,0 +1,166 @@
+"""Selections of kernels by place or colour, to be combined with ``&``, ``|`` and ``~`` and stored as masks."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gausim.core.errors import SceneError
+from gausim.core.scene import GaussianScene
+from gausim.ops.spherical_harmonics import C0
+
+AXES = {"x": 0, "y": 1, "z": 2}
+# Distances of this many pairs are held at once (float32: 64 MiB).
+_PAIRS_AT_ONCE = 1 << 24
+
+
+class Selection(ABC):
+    """What is selected in a scene; calling it gives one bool per kernel."""
+
+    @abstractmethod
+    def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
+        """True for the kernels that are selected."""
+
+    def __and__(self, other: Selection) -> Selection:
+        """Selected by both."""
+        return _Both(self, other)
+
+    def __or__(self, other: Selection) -> Selection:
+        """Selected by either."""
+        return ~(~self & ~other)
+
+    def __invert__(self) -> Selection:
+        """Selected exactly where this one does not select."""
+        return _Not(self)
+
+
+@dataclass(frozen=True)
+class _Both(Selection):
+    first: Selection
+    second: Selection
+
+    def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
+        return self.first(scene) & self.second(scene)
+
+
+@dataclass(frozen=True)
+class _Not(Selection):
+    selection: Selection
+
+    def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
+        return ~self.selection(scene)
+
+
+@dataclass(frozen=True)
+class HalfSpace(Selection):
+    """Kernels whose mean lies strictly below (or above) a value on one axis.
+
+    Attributes:
+        axis: 0, 1 or 2 for x, y or z.
+        below: select coordinates less than this [scene units].
+        above: select coordinates greater than this [scene units].
+    """
+
+    axis: int
+    below: float | None = None
+    above: float | None = None
+
+    def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
+        """True for the kernels on the selected side."""
+        x = scene.means[:, self.axis]
+        selected = torch.ones_like(x, dtype=torch.bool)
+        if self.below is not None:
+            selected = selected & (x < self.below)
+        if self.above is not None:
+            selected = selected & (x > self.above)
+        return selected
+
+
+@dataclass(frozen=True)
+class Box(Selection):
+    """Kernels whose mean lies in an axis-aligned box, borders included [scene units]."""
+
+    minimum: tuple[float, float, float]
+    maximum: tuple[float, float, float]
+
+    def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
+        """True for the kernels inside."""
+        low, high = scene.means.new_tensor(self.minimum), scene.means.new_tensor(self.maximum)
+        return ((scene.means >= low) & (scene.means <= high)).all(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class NearPoints(Selection):
+    """Kernels within a distance of any point of a cloud [scene units] (METHOD section 7: 0.01 for READY)."""
+
+    points: Float[Tensor, "P 3"]
+    distance: float
+
+    def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
+        """True for the kernels near a point."""
+        points = self.points.to(scene.means)
+        chunks = scene.means.split(max(1, _PAIRS_AT_ONCE // max(1, len(points))))
+        exact = "donot_use_mm_for_euclid_dist"  # the product form loses digits where distances are small
+        near = [(torch.cdist(x, points, compute_mode=exact) <= self.distance).any(-1) for x in chunks]
+        return torch.cat(near)
+
+
+@dataclass(frozen=True)
+class ColorBall(Selection):
+    """Kernels whose view-independent colour lies within a distance of an RGB colour in [0, 1]."""
+
+    color: tuple[float, float, float]
+    distance: float
+
+    def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
+        """True for the kernels of about that colour."""
+        color = scene.sh[:, 0] * C0 + 0.5
+        return (color - color.new_tensor(self.color)).norm(dim=-1) <= self.distance
+
+
+def parse_half_space(text: str, *, above: bool = False) -> HalfSpace:
+    """Reads ``AXIS=VALUE``, e.g. ``z=0.33``, as the half-space below (or above) that value.
+
+    Raises:
+        SceneError: if the text is of another form.
+    """
+    match = re.fullmatch(r"\s*([xyz])\s*=\s*([-+0-9.eE]+)\s*", text)
+    try:
+        axis, value = AXES[match[1]], float(match[2])  # type: ignore[index]
+    except (TypeError, ValueError) as error:
+        raise SceneError(f"half-space '{text}': expected AXIS=VALUE with axis x, y or z, e.g. z=0.33.") from error
+    return HalfSpace(axis, above=value) if above else HalfSpace(axis, below=value)
+
+
+def apply_masks(
+    scene: GaussianScene,
+    *,
+    simulated: Selection | Bool[Tensor, " K"] | None = None,
+    pinned: Selection | Bool[Tensor, " K"] | None = None,
+    foreground: Selection | Bool[Tensor, " K"] | None = None,
+) -> GaussianScene:
+    """The scene with these masks replaced; what is left out stays. Kernels not simulated cannot be pinned.
+
+    Raises:
+        SceneError: if a selection given here selects no kernel at all.
+    """
+    given = {"simulated": simulated, "pinned": pinned, "foreground": foreground}
+    masks = {n: v(scene) if isinstance(v, Selection) else v for n, v in given.items() if v is not None}
+    for name, mask in masks.items():
+        if not mask.any():
+            low, high = scene.means.amin(0).tolist(), scene.means.amax(0).tolist()
+            raise SceneError(
+                f"{scene.name}: mask '{name}': the selection holds none of {scene.count} kernels. The scene spans "
+                + ", ".join(f"{a} {low[i]:.3g}..{high[i]:.3g}" for a, i in AXES.items())
+                + "; choose the axis and the value within."
+            )
+    if "pinned" in masks:
+        masks["pinned"] = masks["pinned"] & masks.get("simulated", scene.simulated)
+    elif "simulated" in masks:
+        masks["pinned"] = scene.pinned & masks["simulated"]
+    return replace(scene, **masks).validated()
