@@ -1,0 +1,156 @@
+"""The LightningDataModule over READY-like object directories."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch import LightningDataModule
+from torch.utils.data import DataLoader
+
+from gausim.core import ConfigError
+from gausim.data.curriculum import Curriculum
+from gausim.data.dataset import SequenceIndex, TrainingDataset, WholeSequenceDataset, collate
+from gausim.data.objects import ObjectData, find_objects
+from gausim.data.sampler import SequenceBatchSampler
+
+
+class ReadyDataModule(LightningDataModule):
+    """Streams multi-view sequences of one or several objects, their length set by the curriculum.
+
+    Training batches are lists of :class:`SequenceSample` (frames 0..T of the training views only); test batches
+    hold one whole sequence in all views.
+    """
+
+    def __init__(
+        self,
+        root: str | Path | Sequence[str | Path | Mapping[str, Any]] | None,
+        *,
+        scene: str | Path | None = None,
+        masks: str | Path | None = None,
+        selections: Mapping[str, Any] | None = None,
+        batch_size: int = 1,
+        repeats: int = 1,
+        curriculum: Curriculum | None = None,
+        seed: int = 0,
+        names: Sequence[str] | None = None,
+        sequences: int | Sequence[str] | None = None,
+        free_root: bool = False,
+    ) -> None:
+        """Keeps the settings; the disk is first touched by :attr:`objects` or :meth:`setup`.
+
+        Args:
+            root: an object directory, a folder of such, or a list of either; an entry of the list may be a mapping
+                with ``root`` and its own ``scene``, ``masks`` and ``selections``.
+            scene: PLY of the rest scene of a single object; ``scene.ply`` in its directory when None.
+            masks: npz of its masks; beside the PLY when None.
+            selections: boxes that replace masks, see :func:`gausim.data.selection.apply_selections`.
+            batch_size: sequences per optimiser step and rank.
+            repeats: how many times each sequence is shown per epoch.
+            curriculum: predicted steps per epoch; METHOD's when None.
+            seed: of the order.
+            names: keep only the objects of these names.
+            sequences: keep only so many sequences per object, or those of these names.
+            free_root: accept scenes that pin no kernel.
+        """
+        super().__init__()
+        self._root, self._names, self._sequences = root, names, sequences
+        self._options = {"scene": scene, "masks": masks, "selections": selections}
+        self._batch_size, self._repeats, self._seed = batch_size, repeats, seed
+        self._free_root = free_root
+        self.curriculum = curriculum if curriculum is not None else Curriculum()
+        self._sampler: SequenceBatchSampler | None = None
+
+    @cached_property
+    def objects(self) -> list[ObjectData]:
+        """The objects; their index is the ``scene_id`` of samples.
+
+        Raises:
+            ConfigError: a root is not set, or ``names`` asks for an object that is not there.
+            DataError: a root holds no data set.
+        """
+        single = self._root is None or isinstance(self._root, (str, Path))
+        found = [item for source in ([self._root] if single else self._root or []) for item in self._open(source)]
+        have = [item.name for item in found]
+        if not found or len(set(have)) != len(have):
+            raise ConfigError(f"data.root: expected at least one object, each name once, got {have}.")
+        if self._names is None:
+            return found
+        absent = [name for name in self._names if name not in have]
+        if absent or not self._names:
+            raise ConfigError(f"data.names: {list(self._names)} asked for, the roots hold {have}.")
+        return [item for item in found if item.name in self._names]
+
+    @cached_property
+    def index(self) -> SequenceIndex:
+        """All sequences of all objects, numbered; the number is the ``sequence_id`` of samples."""
+        return SequenceIndex(self.objects)
+
+    def setup(self, stage: str | None = None) -> None:
+        """Opens the objects and fixes the order of training (before a checkpoint's position is loaded)."""
+        if stage in (None, "fit"):
+            self._check_curriculum()
+            self._sampler = SequenceBatchSampler(
+                len(self.index),
+                batch_size=self._batch_size,
+                repeats=self._repeats,
+                curriculum=self.curriculum,
+                seed=self._seed,
+                rank=self.trainer.global_rank if self.trainer else 0,
+                world_size=self.trainer.world_size if self.trainer else 1,
+            )
+
+    def steps(self, epoch: int) -> int:
+        """Predicted steps T in an epoch."""
+        return self.curriculum.steps(epoch)
+
+    def train_dataloader(self) -> DataLoader:
+        """Batches of training samples; frames are decoded once and stay in memory, so no worker is needed."""
+        return DataLoader(
+            TrainingDataset(self.index), batch_sampler=self._ready_sampler(), collate_fn=collate, num_workers=0
+        )
+
+    def test_dataloader(self) -> DataLoader:
+        """Whole sequences in order, one per batch, in all views."""
+        return DataLoader(WholeSequenceDataset(self.index), batch_size=1, collate_fn=collate, num_workers=0)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Epoch and position of the order of training, for an exact resume."""
+        return self._sampler.state_dict() if self._sampler is not None else {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continues the order of training where a checkpoint left it."""
+        if state_dict:
+            self._ready_sampler().load_state_dict(state_dict)
+
+    def _ready_sampler(self) -> SequenceBatchSampler:
+        if self._sampler is None:
+            self.setup("fit")
+        assert self._sampler is not None
+        return self._sampler
+
+    def _open(self, source: str | Path | Mapping[str, Any] | None) -> list[ObjectData]:
+        own = dict(source) if isinstance(source, Mapping) else {"root": source}
+        root, options = own.pop("root", None), {**self._options, **own}
+        if root is None:
+            raise ConfigError(
+                "data.root: no directory of a data set is given. Set data.root=PATH on the command line, or the "
+                "environment variable that the data config names."
+            )
+        if set(options) - set(self._options):
+            raise ConfigError(f"data.root: unknown key in {own}; expected root and {sorted(self._options)}.")
+        roots = find_objects(root)
+        if len(roots) > 1 and any(options[key] is not None for key in ("scene", "masks")):
+            raise ConfigError(f"data.root: 'scene' and 'masks' are of one object, but {root} holds {len(roots)}.")
+        return [ObjectData(r, sequences=self._sequences, free_root=self._free_root, **options) for r in roots]
+
+    def _check_curriculum(self) -> None:
+        for item in self.objects:
+            if self.curriculum.t_max >= len(item.train_frames):
+                raise ConfigError(
+                    f"data.curriculum.t_max: {self.curriculum.t_max} steps would see frame {self.curriculum.t_max}, "
+                    f"but '{item.name}' trains on frames 0..{item.train_frames.stop - 1}; "
+                    f"at most {len(item.train_frames) - 1} steps."
+                )

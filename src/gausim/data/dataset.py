@@ -1,0 +1,153 @@
+"""Samples for training and for measuring: whole stretches of one sequence, as 8-bit frames with their cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from gausim.core import Cameras, ConfigError, DataError
+from gausim.data.objects import ObjectData
+from gausim.data.records import SequenceRecord
+
+
+class SampleKey(NamedTuple):
+    """What the batch sampler asks the training dataset for.
+
+    Attributes:
+        sequence: global sequence id.
+        steps: predicted steps T; frames 0..T are handed out.
+    """
+
+    sequence: int
+    steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceSample:
+    """One stretch of one sequence, from frame 0 on.
+
+    Attributes:
+        scene_id: index of the object.
+        object_name: its name.
+        sequence_id: running index of the sequence over all objects.
+        sequence_name: its name within the object.
+        frames: straight-alpha RGBA of T + 1 frames in V views.
+        cameras: the V cameras.
+        fps: frames per second.
+    """
+
+    scene_id: int
+    object_name: str
+    sequence_id: int
+    sequence_name: str
+    frames: UInt8[Tensor, "F V H W 4"]
+    cameras: Cameras
+    fps: float
+
+    @property
+    def steps(self) -> int:
+        """Predicted steps T: frames after the first."""
+        return self.frames.shape[0] - 1
+
+    def to(self, device: torch.device | str) -> SequenceSample:
+        """The same sample on another device (Lightning moves batches through this)."""
+        return SequenceSample(
+            self.scene_id,
+            self.object_name,
+            self.sequence_id,
+            self.sequence_name,
+            self.frames.to(device, non_blocking=True),
+            self.cameras.to(device),
+            self.fps,
+        )
+
+
+class SequenceIndex:
+    """Numbers the sequences of several objects: 0.. over the first object, on over the next."""
+
+    def __init__(self, objects: Sequence[ObjectData]) -> None:
+        """Lists all sequences of these objects (their transforms are read, no image is)."""
+        self.objects = list(objects)
+        self.entries: list[tuple[int, SequenceRecord]] = [
+            (scene_id, record) for scene_id, item in enumerate(self.objects) for record in item.sequences
+        ]
+
+    def __len__(self) -> int:
+        """Number of sequences over all objects."""
+        return len(self.entries)
+
+    def sample(self, sequence: int, frames: range, views: Sequence[str]) -> SequenceSample:
+        """The sample of these frames and views of a sequence."""
+        scene_id, record = self.entries[sequence]
+        return SequenceSample(
+            scene_id=scene_id,
+            object_name=self.objects[scene_id].name,
+            sequence_id=sequence,
+            sequence_name=record.name,
+            frames=record.frames(frames, views),
+            cameras=record.cameras_of(views),
+            fps=record.fps,
+        )
+
+
+class TrainingDataset(Dataset):
+    """Frames 0..T of the training views; nothing else can be had from it, whatever is asked."""
+
+    def __init__(self, index: SequenceIndex) -> None:
+        """Serves the sequences of ``index``, keyed by :class:`SampleKey`."""
+        self._index = index
+
+    def __len__(self) -> int:
+        """Number of sequences."""
+        return len(self._index)
+
+    def __getitem__(self, key: SampleKey) -> SequenceSample:
+        """Frames 0..steps of one sequence in the training views.
+
+        Raises:
+            DataError: the steps reach beyond the training frames.
+        """
+        sequence, steps = key
+        item = self._index.objects[self._index.entries[sequence][0]]
+        if not 1 <= steps < len(item.train_frames):
+            raise DataError(
+                f"{item.name}: {steps} predicted steps asked for, the training frames "
+                f"{item.train_frames.start}..{item.train_frames.stop - 1} allow 1..{len(item.train_frames) - 1}. "
+                "Lower the curriculum's t_max."
+            )
+        return self._index.sample(sequence, range(steps + 1), item.train_views)
+
+
+class WholeSequenceDataset(Dataset):
+    """All frames of every sequence, in order, for measuring: training views first, then the held-out ones."""
+
+    def __init__(self, index: SequenceIndex) -> None:
+        """Serves the sequences of ``index`` by their id."""
+        self._index = index
+
+    def __len__(self) -> int:
+        """Number of sequences."""
+        return len(self._index)
+
+    def __getitem__(self, sequence: int) -> SequenceSample:
+        """Every frame of one sequence."""
+        scene_id, record = self._index.entries[sequence]
+        item = self._index.objects[scene_id]
+        return self._index.sample(sequence, range(record.count), (*item.train_views, *item.heldout_views))
+
+
+def collate(samples: list[SequenceSample]) -> list[SequenceSample]:
+    """A batch is the list itself: scenes differ in kernels, views and image size, so nothing is stacked.
+
+    Raises:
+        ConfigError: the batch mixes lengths (all rollouts of a batch advance together).
+    """
+    if len({sample.steps for sample in samples}) > 1:
+        raise ConfigError(f"a batch needs one number of steps, got {[s.steps for s in samples]}.")
+    return samples

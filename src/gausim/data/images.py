@@ -1,0 +1,78 @@
+"""Image files to tensors: decoding and checking RGBA frames, compositing straight alpha."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from gausim.core import DataError
+
+# Decoding releases the interpreter lock; more threads than this only queue for the disk.
+DECODER_THREADS = 4
+
+
+def composite(
+    frames: UInt8[Tensor, "*B H W 4"], background: Float[Tensor, " 3"] | None = None
+) -> tuple[Float[Tensor, "*B H W 3"], Float[Tensor, "*B H W"]]:
+    """Straight-alpha RGBA over a constant background, in the file's own (sRGB) values.
+
+    Args:
+        frames: straight-alpha 8-bit RGBA.
+        background: colour in [0, 1]; None is black.
+
+    Returns:
+        RGB in [0, 1] and alpha in [0, 1] (the foreground mask is alpha > 0).
+    """
+    values = frames.float() / 255
+    alpha = values[..., 3]
+    rgb = values[..., :3] * alpha[..., None]
+    if background is not None:
+        rgb = rgb + (1 - alpha[..., None]) * background.to(rgb)
+    return rgb, alpha
+
+
+def read_rgba(path: Path, size: tuple[int, int]) -> np.ndarray:
+    """Decodes one 8-bit RGBA image of ``size`` = (width, height) to (H, W, 4).
+
+    Raises:
+        DataError: the file is missing, no image, of another size or depth, or has no alpha.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: no such image, though its transforms.json names it. Restore or re-export it.")
+    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise DataError(f"{path}: cannot be decoded as an image. Re-export the frame as PNG.")
+    expected = (size[1], size[0], 4)
+    if pixels.shape != expected or pixels.dtype != np.uint8:
+        channels = {2: "gray"}.get(pixels.ndim) or {3: "RGB", 4: "RGBA"}.get(pixels.shape[-1], "?")
+        found = f"{pixels.shape[1]}x{pixels.shape[0]} {channels} ({pixels.dtype.itemsize * 8} bit)"
+        remedy = "with alpha (the foreground mask)" if channels != "RGBA" else "as 8-bit RGBA of the camera's size"
+        raise DataError(
+            f"{path}: expected {size[0]}x{size[1]} RGBA (8 bit), got {found}. Re-export the frame {remedy}."
+        )
+    return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA)
+
+
+def read_rgba_into(paths: Sequence[Path], targets: Sequence[np.ndarray], size: tuple[int, int]) -> None:
+    """Decodes each path into the (H, W, 4) array of the same index, several at a time."""
+
+    def decode(item: tuple[Path, np.ndarray]) -> None:
+        item[1][...] = read_rgba(item[0], size)
+
+    with ThreadPoolExecutor(DECODER_THREADS) as pool:
+        for _ in pool.map(decode, zip(paths, targets, strict=True)):
+            pass
+
+
+def write_rgba(path: Path, pixels: UInt8[Tensor, "H W 4"] | np.ndarray) -> None:
+    """Writes 8-bit straight-alpha RGBA as PNG."""
+    array = np.ascontiguousarray(np.asarray(torch.as_tensor(pixels)))
+    if not cv2.imwrite(str(path), cv2.cvtColor(array, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_PNG_COMPRESSION, 4]):
+        raise DataError(f"{path}: cannot be written. Check the folder and the free space.")

@@ -1,0 +1,191 @@
+"""One object of a data set: its facts, sequences, stills, true points and rest scene, from one directory."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import DataError, GaussianScene
+from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_array, read_stills
+from gausim.data.selection import Bound, apply_selections, require_pinned
+from gausim.io.ply import load_scene
+from gausim.io.transforms import read_json
+
+
+class ObjectData:
+    """A READY-like object directory (``dataset.json``, ``static/``, ``sequences/``, ``scene.ply``).
+
+    Attributes:
+        root: the directory.
+        name: the object's name.
+        fps: frames per second of its sequences.
+        views: names of all cameras.
+        train_views: cameras to train on.
+        heldout_views: cameras never trained on.
+        train_frames: the frames that training may see, e.g. range(0, 16).
+        facts: everything else ``dataset.json`` says.
+        scene_path: the rest scene's PLY file.
+        masks_path: its masks; None means beside the PLY.
+    """
+
+    def __init__(
+        self,
+        root: Path | str,
+        *,
+        sequences: int | Sequence[str] | None = None,
+        scene: Path | str | None = None,
+        masks: Path | str | None = None,
+        selections: Mapping[str, Mapping[str, Bound | None]] | None = None,
+        free_root: bool = False,
+    ) -> None:
+        """Reads ``dataset.json``; everything else is read when first asked for.
+
+        Args:
+            root: the object's directory.
+            sequences: only so many sequences, or only those of these names; all when None.
+            scene: PLY of the rest scene; ``root/scene.ply`` when None.
+            masks: npz of its masks; beside the PLY when None.
+            selections: boxes that replace masks, see :func:`gausim.data.selection.apply_selections`.
+            free_root: accept a scene without a pinned kernel.
+
+        Raises:
+            DataError: ``dataset.json`` is missing or a field of it is wrong.
+        """
+        self.root = Path(root)
+        path = self.root / "dataset.json"
+        self.facts = read_json(path)
+        self.name = str(self.facts.get("name", self.root.name))
+        self.fps = _positive(self.facts, "fps", path)
+        self.views = _names(self.facts, "views", path)
+        self.train_views = _names(self.facts, "train_views", path)
+        self.heldout_views = _names(self.facts, "heldout_views", path)
+        self.train_frames = _frame_range(self.facts, path)
+        self._check_views(path)
+        self.scene_path = Path(scene) if scene is not None else self.root / "scene.ply"
+        self.masks_path = Path(masks) if masks is not None else None
+        self._chosen, self._selections, self._free_root = sequences, dict(selections or {}), free_root
+
+    @cached_property
+    def sequences(self) -> list[SequenceRecord]:
+        """The object's sequences in the order of their names."""
+        folder = self.root / "sequences"
+        found = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
+        chosen = found
+        if isinstance(self._chosen, int):
+            chosen = found[: self._chosen]
+        elif self._chosen is not None:
+            chosen = list(self._chosen)
+        absent = [name for name in chosen if name not in found]
+        short = isinstance(self._chosen, int) and not 0 < self._chosen <= len(found)
+        if not chosen or absent or short:
+            raise DataError(
+                f"{folder}: sequences {self._chosen if self._chosen is not None else 'of any name'} "
+                f"asked for, it has {len(found)}: {found}."
+            )
+        records = [SequenceRecord(folder / name, views=self.views, fps=self.fps) for name in chosen]
+        for record in records:
+            if record.count < self.train_frames.stop:
+                raise DataError(
+                    f"{record.root}: has {record.count} frames, dataset.json trains on {self.train_frames}. "
+                    "Complete the sequence or leave it out."
+                )
+        return records
+
+    @cached_property
+    def rest_points(self) -> Float[Tensor, "P 3"] | None:
+        """Rest positions of the points whose true motion is known [scene units]; None where it is not."""
+        points, mesh = self.root / "rest_points.npz", self.root / "rest_mesh.npz"
+        if points.is_file():
+            return torch.from_numpy(read_array(points, "points")).float()
+        if mesh.is_file():
+            return torch.from_numpy(read_array(mesh, "vertices")[read_array(mesh, "gt_ids")]).float()
+        return None
+
+    def ground_truth(self, sequence: SequenceRecord) -> GroundTruth | None:
+        """True motion of a sequence of this object, or None where it is unknown."""
+        return sequence.ground_truth(self.rest_points)
+
+    @cached_property
+    def _stills(self) -> Stills:
+        return read_stills(self.root / "static" / "transforms.json")
+
+    def stills(self) -> Stills:
+        """Posed images of the rest state, decoded once, with the split that reconstruction is measured by."""
+        return self._stills
+
+    @property
+    def diagonal(self) -> float | None:
+        """Bounding-box diagonal of the true object [scene units], where ``dataset.json`` states it."""
+        value = self.facts.get("object_diagonal")
+        return float(value) if isinstance(value, (int, float)) and math.isfinite(value) and value > 0 else None
+
+    def scene(self) -> GaussianScene:
+        """The rest scene with its masks and the config's selections, named after the object.
+
+        Raises:
+            DataError: there is no scene file yet.
+            SceneError: the scene is unusable, or pins nothing and ``free_root`` is off.
+        """
+        if not self.scene_path.is_file():
+            raise DataError(
+                f"{self.scene_path}: no rest scene. Make one with `gausim reconstruct {self.root}`, "
+                "or name one in the data config (scene: path/to/scene.ply)."
+            )
+        scene = apply_selections(load_scene(self.scene_path, masks=self.masks_path, name=self.name), self._selections)
+        return scene if self._free_root else require_pinned(scene)
+
+    def _check_views(self, path: Path) -> None:
+        both = set(self.train_views) & set(self.heldout_views)
+        unknown = (set(self.train_views) | set(self.heldout_views)) - set(self.views)
+        if both or unknown or not self.train_views or len(set(self.views)) != len(self.views):
+            raise DataError(
+                f"{path}: fields 'train_views' {list(self.train_views)} and 'heldout_views' "
+                f"{list(self.heldout_views)} must be disjoint parts of 'views' {list(self.views)}, the first not empty."
+            )
+
+
+def find_objects(root: Path | str) -> list[Path]:
+    """Object directories at ``root``: itself if it has a ``dataset.json``, else its children that have one.
+
+    Raises:
+        DataError: there is none.
+    """
+    root = Path(root)
+    if (root / "dataset.json").is_file():
+        return [root]
+    found = sorted(p.parent for p in root.glob("*/dataset.json"))
+    if not found:
+        raise DataError(
+            f"{root}: no data set here (no dataset.json in it or in a folder of it). "
+            "Make the embedded one with `python -m data_prep.synthesize`, or point the data config at yours."
+        )
+    return found
+
+
+def _names(facts: dict[str, Any], key: str, path: Path) -> tuple[str, ...]:
+    value = facts.get(key)
+    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+        raise DataError(f"{path}: field '{key}' must be a list of camera names, got {value!r}.")
+    return tuple(value)
+
+
+def _positive(facts: dict[str, Any], key: str, path: Path) -> float:
+    value = facts.get(key)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
+        raise DataError(f"{path}: field '{key}' must be a positive number, got {value!r}.")
+    return float(value)
+
+
+def _frame_range(facts: dict[str, Any], path: Path) -> range:
+    value = facts.get("train_frames")
+    good = isinstance(value, list) and len(value) == 2 and all(type(v) is int for v in value)
+    if not good or value[0] != 0 or value[1] < 2:
+        raise DataError(f"{path}: field 'train_frames' must be [0, first unseen frame], e.g. [0, 16], got {value!r}.")
+    return range(*value)

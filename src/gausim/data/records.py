@@ -1,0 +1,185 @@
+"""Records of a data set on disk: one sequence, its true motion, the stills. Frames are decoded when first asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from gausim.core import Cameras, DataError
+from gausim.data.images import read_rgba_into
+from gausim.io.transforms import PosedFrame, read_transforms
+
+# Every tenth still is left out of the reconstruction, to measure it on.
+STILLS_PER_HELDOUT = 10
+# A camera stands still through a sequence: its poses may differ by rounding only.
+POSE_TOLERANCE = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class GroundTruth:
+    """True motion of P points of one sequence.
+
+    Attributes:
+        rest: positions in the rest state [scene units].
+        positions: positions in every frame, frame 0 first [scene units].
+    """
+
+    rest: Float[Tensor, "P 3"]
+    positions: Float[Tensor, "F P 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Stills:
+    """Posed images of the rest state.
+
+    Attributes:
+        images: straight-alpha RGBA.
+        cameras: one per image.
+        train: indices to reconstruct from.
+        heldout: indices of every tenth image, left out to measure the reconstruction on.
+    """
+
+    images: UInt8[Tensor, "N H W 4"]
+    cameras: Cameras
+    train: tuple[int, ...]
+    heldout: tuple[int, ...]
+
+
+def read_stills(path: Path) -> Stills:
+    """Reads all images named by a ``transforms.json`` of the rest scene, and splits them."""
+    posed = read_transforms(path)
+    cameras = posed.cameras
+    images = np.empty((len(posed.frames), cameras.height, cameras.width, 4), np.uint8)
+    read_rgba_into([f.path for f in posed.frames], list(images), (cameras.width, cameras.height))
+    heldout = tuple(range(STILLS_PER_HELDOUT - 1, len(images), STILLS_PER_HELDOUT))
+    train = tuple(sorted(set(range(len(images))) - set(heldout)))
+    return Stills(torch.from_numpy(images), cameras, train, heldout)
+
+
+class SequenceRecord:
+    """One recorded motion: F frames seen by V static cameras.
+
+    Attributes:
+        name: folder name, e.g. ``seq_003``.
+        root: the sequence's folder.
+        views: names of its cameras, in the data set's order.
+        cameras: their calibration, in the same order.
+        count: number of frames F.
+        fps: frames per second.
+    """
+
+    def __init__(self, root: Path, *, views: Sequence[str], fps: float) -> None:
+        """Reads and checks ``transforms.json``; no image is decoded yet.
+
+        Raises:
+            DataError: a view of the data set or a frame of a view is not listed, or a camera moves.
+        """
+        posed = read_transforms(root / "transforms.json")
+        if posed.fps is not None and posed.fps != fps:
+            raise DataError(f"{posed.path}: field 'fps' is {posed.fps:g}, dataset.json says {fps:g}. Make them agree.")
+        self.root, self.name, self.views, self.fps = root, root.name, tuple(views), fps
+        self._frames, index = _frames_of_views(posed.path, posed.frames, self.views)
+        self.count = len(self._frames[0])
+        _check_static(posed.path, posed.cameras, index, self.views)
+        chosen = posed.cameras.select([row[0] for row in index])
+        self.cameras = Cameras(chosen.viewmats, chosen.Ks, chosen.width, chosen.height, self.views)
+        # np.empty takes no memory before a frame is decoded into it.
+        self._pixels = np.empty((self.count, len(self.views), chosen.height, chosen.width, 4), np.uint8)
+        self._decoded = np.zeros((self.count, len(self.views)), bool)
+
+    def camera_indices(self, views: Sequence[str] | None = None) -> list[int]:
+        """Positions of these views in :attr:`views` (all when None), or :class:`DataError`."""
+        unknown = [v for v in views or () if v not in self.views]
+        if unknown:
+            raise DataError(f"{self.root}: has no view {unknown}; it has {list(self.views)}.")
+        return [self.views.index(v) for v in (self.views if views is None else views)]
+
+    def cameras_of(self, views: Sequence[str] | None = None) -> Cameras:
+        """The cameras of these views, in that order."""
+        return self.cameras.select(self.camera_indices(views))
+
+    def frames(self, frames: range, views: Sequence[str] | None = None) -> UInt8[Tensor, "F V H W 4"]:
+        """Straight-alpha RGBA of these frames and views; each image is decoded once and kept in memory.
+
+        Raises:
+            DataError: a frame or view does not exist, or an image is missing or malformed.
+        """
+        if len(frames) == 0 or frames[0] < 0 or frames[-1] >= self.count:
+            raise DataError(f"{self.root}: frames {frames} asked for, it has frames 0..{self.count - 1}.")
+        columns = self.camera_indices(views)
+        missing = [(f, v) for f in frames for v in columns if not self._decoded[f, v]]
+        paths = [self._frames[v][f].path for f, v in missing]
+        size = self.cameras.width, self.cameras.height
+        read_rgba_into(paths, [self._pixels[f, v] for f, v in missing], size)
+        for f, v in missing:
+            self._decoded[f, v] = True
+        return torch.from_numpy(self._pixels[np.ix_(list(frames), columns)])
+
+    def ground_truth(self, rest: Float[Tensor, "P 3"] | None) -> GroundTruth | None:
+        """True motion of the object's points, or None where the data set has none (real captures).
+
+        Args:
+            rest: rest positions of the same points, from :meth:`ObjectData.rest_points`.
+        """
+        path = self.root / "ground_truth.npz"
+        if rest is None or not path.is_file():
+            return None
+        displacement = torch.from_numpy(read_array(path, "displacement").astype(np.float32))
+        if displacement.shape != (self.count, *rest.shape) or not torch.isfinite(displacement).all():
+            raise DataError(
+                f"{path}: field 'displacement' must be finite and of shape {(self.count, *rest.shape)}, "
+                f"got {tuple(displacement.shape)}. Re-export the true motion."
+            )
+        return GroundTruth(rest, rest + displacement)
+
+
+def read_array(path: Path, field: str) -> np.ndarray:
+    """One array of an npz file without pickles, or :class:`DataError` that names file and field."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return arrays[field]
+    except KeyError:
+        raise DataError(f"{path}: array '{field}' is missing.") from None
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as npz ({error}).") from error
+
+
+def _frames_of_views(
+    path: Path, frames: Sequence[PosedFrame], views: Sequence[str]
+) -> tuple[list[list[PosedFrame]], list[list[int]]]:
+    """Entries and their indices, sorted into [view][frame]."""
+    table: dict[str, dict[int, int]] = {view: {} for view in views}
+    for i, frame in enumerate(frames):
+        if frame.camera not in table:
+            raise DataError(f"{path}: frames[{i}] is of camera '{frame.camera}', dataset.json has {list(views)}.")
+        number = frame.frame if frame.frame is not None else len(table[frame.camera])
+        if number in table[frame.camera]:
+            raise DataError(f"{path}: frame {number} of camera '{frame.camera}' is listed twice.")
+        table[frame.camera][number] = i
+    count = max(max(row, default=-1) for row in table.values()) + 1
+    for view, row in table.items():
+        absent = [f for f in range(count) if f not in row]
+        if absent:
+            raise DataError(
+                f"{path}: view '{view}' lacks {len(absent)} of {count} frames (first: {absent[0]}). "
+                "Restore them, or take the view out of dataset.json."
+            )
+    index = [[table[view][f] for f in range(count)] for view in views]
+    return [[frames[i] for i in row] for row in index], index
+
+
+def _check_static(path: Path, cameras: Cameras, index: list[list[int]], views: Sequence[str]) -> None:
+    for view, row in zip(views, index, strict=True):
+        pose = (cameras.viewmats[row] - cameras.viewmats[row[0]]).abs().amax((1, 2))
+        lens = (cameras.Ks[row] - cameras.Ks[row[0]]).abs().amax((1, 2))
+        moved = ((pose > POSE_TOLERANCE * (1 + cameras.viewmats[row[0]].abs().max())) | (lens > 1e-3)).nonzero()
+        if len(moved):
+            raise DataError(
+                f"{path}: camera '{view}' moves at frame {int(moved[0])}; sequences need cameras that stand still."
+            )

@@ -1,0 +1,98 @@
+"""The order of training: a pure function of seed and epoch, with a position that a resumed run continues from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch.utils.data import Sampler
+
+from gausim.core import ConfigError
+from gausim.data.curriculum import Curriculum
+from gausim.data.dataset import SampleKey
+
+
+class SequenceBatchSampler(Sampler[list[SampleKey]]):
+    """Shows every sequence ``repeats`` times per epoch, in batches without a repeated sequence where possible.
+
+    Lightning announces the epoch only to ``loader.sampler`` and ``loader.batch_sampler.sampler``; this object is its
+    own ``sampler`` so that it hears of it. Under several ranks it deals out equal shares by itself, so the trainer
+    needs ``use_distributed_sampler=False``.
+    """
+
+    def __init__(
+        self,
+        count: int,
+        *,
+        batch_size: int,
+        repeats: int,
+        curriculum: Curriculum,
+        seed: int,
+        rank: int = 0,
+        world_size: int = 1,
+    ) -> None:
+        """Deals ``count`` sequences into batches of ``batch_size`` per rank."""
+        if min(count, batch_size, repeats) < 1:
+            raise ConfigError(
+                f"data: sequences ({count}), batch_size ({batch_size}) and repeats ({repeats}) must be at least 1."
+            )
+        self._count, self._batch_size, self._repeats = count, batch_size, repeats
+        self._curriculum, self._seed = curriculum, seed
+        self._rank, self._world_size = rank, world_size
+        self.epoch, self.position = 0, 0
+
+    @property
+    def sampler(self) -> SequenceBatchSampler:
+        """Itself: where Lightning looks for ``set_epoch``."""
+        return self
+
+    def set_epoch(self, epoch: int) -> None:
+        """Starts an epoch; naming the epoch that is under way (after a resume) keeps the position."""
+        if epoch != self.epoch:
+            self.epoch, self.position = epoch, 0
+
+    def __len__(self) -> int:
+        """Batches per rank in a whole epoch."""
+        share = self._batch_size * self._world_size
+        return -(-self._count * self._repeats // share)
+
+    def order(self, epoch: int) -> list[int]:
+        """Sequence ids of an epoch over all ranks, before they are dealt out.
+
+        Permutations follow each other; the head of each avoids what the open batch holds already.
+        """
+        generator = torch.Generator().manual_seed(hash_seed(self._seed, epoch))
+        share, order = self._batch_size * self._world_size, []
+        for _ in range(self._repeats):
+            permutation = torch.randperm(self._count, generator=generator).tolist()
+            open_batch = set(order[len(order) - len(order) % share :])
+            order += [i for i in permutation if i not in open_batch] + [i for i in permutation if i in open_batch]
+        # Ranks must take equally many steps: the last batch is filled up from the epoch's beginning.
+        short = -len(order) % share if self._world_size > 1 else 0
+        return order + (order * (short // len(order) + 1))[:short]
+
+    def __iter__(self) -> Iterator[list[SampleKey]]:
+        """Yields this rank's batches from the current position on."""
+        steps, order = self._curriculum.steps(self.epoch), self.order(self.epoch)
+        share = self._batch_size * self._world_size
+        batches = [order[i : i + share][self._rank :: self._world_size] for i in range(0, len(order), share)]
+        if self.position >= len(batches):
+            self.position = 0
+        while self.position < len(batches):
+            batch = batches[self.position]
+            self.position += 1
+            yield [SampleKey(sequence, steps) for sequence in batch]
+        self.position = 0
+
+    def state_dict(self) -> dict[str, int]:
+        """Epoch and number of batches already dealt in it."""
+        return {"epoch": self.epoch, "position": self.position}
+
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Continues where ``state`` was taken."""
+        self.epoch, self.position = int(state["epoch"]), int(state["position"])
+
+
+def hash_seed(seed: int, epoch: int) -> int:
+    """One 63-bit seed from two numbers, without the overlap that ``seed + epoch`` has between neighbouring seeds."""
+    return (seed * 0x9E3779B97F4A7C15 + epoch * 0xBF58476D1CE4E5B9 + 0x94D049BB133111EB) % (1 << 63)

@@ -1,0 +1,203 @@
+"""Reader and writer of nerfstudio/Blender ``transforms.json``: posed images, camera to world in OpenGL axes."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import Cameras, DataError
+
+# Camera models without distortion, or whose distortion is checked to be zero.
+PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+# OpenGL looks along -z with y up, OpenCV along +z with y down.
+OPENGL_TO_OPENCV = (1.0, -1.0, -1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class PosedFrame:
+    """One entry of ``frames``.
+
+    Attributes:
+        path: image file.
+        camera: name of the camera; the image's folder where the entry names none.
+        frame: frame number within its sequence; None for a still.
+        heldout: the entry is marked as never to be trained on.
+    """
+
+    path: Path
+    camera: str
+    frame: int | None
+    heldout: bool
+
+
+@dataclass(frozen=True, eq=False)
+class PosedImages:
+    """A whole ``transforms.json``.
+
+    Attributes:
+        path: the file it was read from.
+        frames: its N entries.
+        cameras: their N cameras, in the same order.
+        fps: frames per second, where the file says so.
+    """
+
+    path: Path
+    frames: tuple[PosedFrame, ...]
+    cameras: Cameras
+    fps: float | None
+
+
+def read_transforms(path: Path) -> PosedImages:
+    """Reads a ``transforms.json`` of undistorted pinhole images of one size.
+
+    Intrinsics may be global or per frame, as ``fl_x`` (``fl_y``, ``cx``, ``cy``) or ``camera_angle_x`` [radian];
+    without ``w`` and ``h`` the first image's size counts (Blender's own layout).
+
+    Raises:
+        DataError: the file is missing or no JSON, a field is missing, malformed or of another size, the lens is
+            distorted, or a pose is not a rotation plus a translation.
+    """
+    data = read_json(path)
+    entries = data.get("frames")
+    if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
+        raise DataError(f"{path}: field 'frames' must be a non-empty list of objects.")
+    size: tuple[int, int] | None = None
+    frames, viewmats, intrinsics = [], [], []
+    for i, entry in enumerate(entries):
+        fields, field = {**data, **entry}, f"{path}: frames[{i}]"
+        frames.append(_frame(path.parent, entry, field))
+        here = _size(fields, frames[-1].path, field, fallback=size)
+        size = size or here
+        if here != size:
+            raise DataError(f"{field}: is {here[0]}x{here[1]}, frames[0] is {size[0]}x{size[1]}; use one image size.")
+        viewmats.append(_viewmat(entry, field))
+        intrinsics.append(_intrinsics(fields, here, field))
+    assert size is not None
+    names = tuple(_name(f) for f in frames)
+    cameras = Cameras(torch.stack(viewmats), torch.stack(intrinsics), size[0], size[1], names).validated(str(path))
+    fps = _number(data, "fps", str(path)) if "fps" in data else None
+    return PosedImages(path, tuple(frames), cameras, fps)
+
+
+def write_transforms(path: Path, cameras: Cameras, entries: list[dict[str, Any]], *, fps: float | None = None) -> None:
+    """Writes entries (``file_path`` and further keys) with the pose of the camera of the same index.
+
+    All cameras must share one K, which becomes the file's global intrinsics.
+    """
+    k = cameras.Ks[0]
+    if len(entries) != len(cameras.names) or not torch.equal(cameras.Ks, k.expand_as(cameras.Ks)):
+        raise DataError(f"{path}: expected one camera per entry and one K for all, got {len(entries)} entries.")
+    fl_x, fl_y, cx, cy = (float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
+    data: dict[str, Any] = {
+        "camera_model": "OPENCV",
+        "camera_angle_x": 2 * math.atan(cameras.width / (2 * fl_x)),
+        **{"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy, "w": cameras.width, "h": cameras.height},
+    }
+    if fps is not None:
+        data["fps"] = fps
+    poses = torch.linalg.inv(cameras.viewmats.double()) * torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
+    data["frames"] = [{**entry, "transform_matrix": pose.tolist()} for entry, pose in zip(entries, poses, strict=True)]
+    path.write_text(json.dumps(data, indent=1))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Reads a JSON object, or raises :class:`DataError` that names the file."""
+    try:
+        data = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file. Check the data set's root.") from None
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as JSON ({error}).") from error
+    if not isinstance(data, dict):
+        raise DataError(f"{path}: expected a JSON object, got a {type(data).__name__}.")
+    return data
+
+
+def _number(fields: dict[str, Any], key: str, where: str) -> float:
+    value = fields.get(key)
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        raise DataError(f"{where}: field '{key}' must be a finite number, got {value!r}.")
+    return float(value)
+
+
+def _frame(folder: Path, entry: dict[str, Any], field: str) -> PosedFrame:
+    name = entry.get("file_path")
+    if not isinstance(name, str) or not name:
+        raise DataError(f"{field}: field 'file_path' must name an image, got {name!r}.")
+    path = folder / name
+    if not path.suffix:
+        path = path.with_suffix(".png")  # Blender's own files leave the extension out
+    number = entry.get("frame")
+    if number is not None and (not isinstance(number, int) or number < 0):
+        raise DataError(f"{field}: field 'frame' must be a frame number from 0 on, got {number!r}.")
+    return PosedFrame(path, str(entry.get("camera", path.parent.name)), number, bool(entry.get("heldout", False)))
+
+
+def _name(frame: PosedFrame) -> str:
+    return f"{frame.path.parent.name}/{frame.path.name}"
+
+
+def _size(fields: dict[str, Any], image: Path, field: str, *, fallback: tuple[int, int] | None) -> tuple[int, int]:
+    if "w" in fields or "h" in fields:
+        size = int(_number(fields, "w", field)), int(_number(fields, "h", field))
+        if min(size) < 1:
+            raise DataError(f"{field}: fields 'w', 'h' must be positive, got {size}.")
+        return size
+    if fallback is not None:
+        return fallback
+    pixels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise DataError(f"{field}: has no 'w' and 'h', and {image} cannot be read to find them.")
+    return pixels.shape[1], pixels.shape[0]
+
+
+def _viewmat(entry: dict[str, Any], field: str) -> Float[Tensor, "4 4"]:
+    if "transform_matrix" not in entry:
+        raise DataError(f"{field}: field 'transform_matrix' is missing (camera to world, 4 x 4, OpenGL axes).")
+    try:
+        pose = torch.tensor(entry["transform_matrix"], dtype=torch.float64)
+    except (TypeError, ValueError):
+        pose = torch.empty(0)
+    last_row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
+    if pose.shape != (4, 4) or not torch.isfinite(pose).all() or not torch.allclose(pose[3], last_row, atol=1e-6):
+        raise DataError(f"{field}: field 'transform_matrix' must be a finite 4 x 4 matrix that ends in 0 0 0 1.")
+    pose = pose * torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
+    # The transpose is the inverse of a rotation, and unlike a general inverse it keeps whatever is wrong with the
+    # matrix visible to Cameras.validated (a singular pose must reach that message, not a linear-algebra error).
+    rotation = pose[:3, :3].T
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ pose[:3, 3]
+    return viewmat.float()
+
+
+def _intrinsics(fields: dict[str, Any], size: tuple[int, int], field: str) -> Float[Tensor, "3 3"]:
+    model = fields.get("camera_model", "PINHOLE")
+    if model not in PINHOLE_MODELS:
+        raise DataError(f"{field}: camera_model {model!r} is not supported, expected one of {PINHOLE_MODELS}.")
+    bent = {key: fields[key] for key in DISTORTION if key in fields and _number(fields, key, field) != 0}
+    if bent:
+        raise DataError(f"{field}: the lens is distorted ({bent}); undistort the images and set these fields to 0.")
+    if "fl_x" in fields:
+        fl_x = _number(fields, "fl_x", field)
+    elif "camera_angle_x" in fields:
+        angle = _number(fields, "camera_angle_x", field)
+        if not 0 < angle < math.pi:
+            raise DataError(f"{field}: field 'camera_angle_x' must be between 0 and pi [radian], got {angle:g}.")
+        fl_x = size[0] / (2 * math.tan(angle / 2))
+    else:
+        raise DataError(f"{field}: neither field 'fl_x' [pixels] nor 'camera_angle_x' [radian] is there.")
+    fl_y = _number(fields, "fl_y", field) if "fl_y" in fields else fl_x
+    if fl_x <= 0 or fl_y <= 0:
+        raise DataError(f"{field}: focal lengths must be positive, got fl_x {fl_x:g}, fl_y {fl_y:g}.")
+    cx = _number(fields, "cx", field) if "cx" in fields else size[0] / 2
+    cy = _number(fields, "cy", field) if "cy" in fields else size[1] / 2
+    return torch.tensor([[fl_x, 0.0, cx], [0.0, fl_y, cy], [0.0, 0.0, 1.0]])
