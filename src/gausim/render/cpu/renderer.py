@@ -1,0 +1,127 @@
+"""The CPU renderer as a torch operation."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import ConfigError, Rendered
+from gausim.render.cpu.batch import Batch
+from gausim.render.cpu.pool import WorkerPool
+
+logger = logging.getLogger(__name__)
+
+ANNOUNCE_AFTER = 1.0  # [s]; loading the compiled kernels from numba's cache takes about 0.2 s
+
+
+class _Render(torch.autograd.Function):
+    """The batch as one node of the autograd graph."""
+
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, covars: Tensor, colors: Tensor, opacities: Tensor, *rest: Any) -> Any:
+        pool, keep, viewmats, Ks, background, size, near, alpha_max = rest
+        arrays = [x.detach().contiguous().numpy() for x in (means, covars, colors, opacities, viewmats, Ks)]
+        batch = Batch(*arrays, background, *size, near, np.float32(alpha_max))
+        rgb, alpha = batch.forward(pool, keep)
+        ctx.batch, ctx.pool = batch if keep else None, pool
+        return torch.from_numpy(rgb), torch.from_numpy(alpha)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad_rgb: Tensor, grad_alpha: Tensor) -> Any:
+        grads = ctx.batch.backward(ctx.pool, grad_rgb.contiguous().numpy(), grad_alpha.contiguous().numpy())
+        needed = ctx.needs_input_grad[:4]
+        return (*(torch.from_numpy(g) if n else None for g, n in zip(grads, needed, strict=True)), *[None] * 8)
+
+
+class CpuRenderer:
+    """Gaussian splatting compiled by numba for the processor at hand (core.Renderer, float32).
+
+    Tile-based EWA splatting with analytic gradients. Results do not depend on the number of threads, bit for bit.
+    The first call compiles for some seconds; the result is kept in numba's cache.
+    """
+
+    def __init__(self, *, threads: int | None = None, near: float = 0.01, alpha_max: float = 0.999) -> None:
+        """Sets the options.
+
+        Args:
+            threads: worker threads; None means torch.get_num_threads() at the time of each call.
+            near: kernels closer than this to the camera plane are dropped [scene units].
+            alpha_max: ceiling of a kernel's opacity at a pixel (gsplat 1.5.3: 0.999).
+
+        Raises:
+            ConfigError: an option is out of range.
+        """
+        if threads is not None and threads < 1:
+            raise ConfigError(f"render.threads: expected at least 1, got {threads}.")
+        if not near > 0:
+            raise ConfigError(f"render.near: expected more than 0, got {near}.")
+        if not 0 < alpha_max < 1:
+            raise ConfigError(f"render.alpha_max: expected a value between 0 and 1, got {alpha_max}.")
+        self.threads, self.near, self.alpha_max = threads, near, alpha_max
+        self._pool = WorkerPool(threads or torch.get_num_threads())
+
+    def __call__(
+        self,
+        means: Float[Tensor, "B K 3"],
+        covars: Float[Tensor, "B K 3 3"],
+        colors: Float[Tensor, "B V K 3"],
+        opacities: Float[Tensor, "B K"],
+        viewmats: Float[Tensor, "B V 4 4"],
+        Ks: Float[Tensor, "B V 3 3"],
+        size: tuple[int, int],
+        *,
+        background: Float[Tensor, " 3"] | None = None,
+    ) -> Rendered:
+        """Draws B states in V views each (see core.Renderer). Tensors must be float32 on the CPU.
+
+        Raises:
+            ConfigError: a tensor is not float32 or not on the CPU.
+            DivergenceError: a Gaussian is not finite or its opacity lies outside 0..1.
+        """
+        inputs = {"means": means, "covars": covars, "colors": colors, "opacities": opacities}
+        for name, value in {**inputs, "viewmats": viewmats, "Ks": Ks}.items():
+            if value.dtype != torch.float32 or value.device.type != "cpu":
+                raise ConfigError(
+                    f"CpuRenderer: expected {name} as float32 on the CPU, got {value.dtype} on {value.device}. "
+                    "Convert it, or use ReferenceRenderer for float64."
+                )
+        keep = torch.is_grad_enabled() and any(value.requires_grad for value in inputs.values())
+        behind = np.zeros(3, np.float32) if background is None else background.detach().to(torch.float32).numpy()
+        with _announced():
+            rgb, alpha = _Render.apply(
+                means, covars, colors, opacities, self._workers(), keep, viewmats, Ks, np.ascontiguousarray(behind),
+                size, self.near, self.alpha_max,
+            )  # fmt: skip
+        return Rendered(rgb, alpha)
+
+    def _workers(self) -> WorkerPool:
+        threads = self.threads or torch.get_num_threads()
+        if self._pool.threads != threads:
+            self._pool = WorkerPool(threads)
+        return self._pool
+
+
+class _announced:
+    """Says once per process that kernels are being compiled, if the first call takes long."""
+
+    done = False
+
+    def __enter__(self) -> None:
+        self.timer = None
+        if not _announced.done:
+            _announced.done = True
+            text = "Compiling the CPU renderer (once, some seconds; numba keeps the result for later runs)."
+            self.timer = threading.Timer(ANNOUNCE_AFTER, logger.warning, (text,))
+            self.timer.daemon = True
+            self.timer.start()
+
+    def __exit__(self, *_: object) -> None:
+        if self.timer is not None:
+            self.timer.cancel()
