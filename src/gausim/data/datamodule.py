@@ -15,6 +15,7 @@ from gausim.data.curriculum import Curriculum
 from gausim.data.dataset import SequenceIndex, TrainingDataset, WholeSequenceDataset, collate
 from gausim.data.objects import ObjectData, find_objects
 from gausim.data.sampler import SequenceBatchSampler
+from gausim.ops.selection import Selection
 
 
 class ReadyDataModule(LightningDataModule):
@@ -30,7 +31,7 @@ class ReadyDataModule(LightningDataModule):
         *,
         scene: str | Path | None = None,
         masks: str | Path | None = None,
-        selections: Mapping[str, Any] | None = None,
+        selections: Mapping[str, Selection | str] | None = None,
         batch_size: int = 1,
         repeats: int = 1,
         curriculum: Curriculum | None = None,
@@ -46,7 +47,7 @@ class ReadyDataModule(LightningDataModule):
                 with ``root`` and its own ``scene``, ``masks`` and ``selections``.
             scene: PLY of the rest scene of a single object; ``scene.ply`` in its directory when None.
             masks: npz of its masks; beside the PLY when None.
-            selections: boxes that replace masks, see :func:`gausim.data.selection.apply_selections`.
+            selections: what replaces its masks, see :func:`gausim.data.scenes.select_masks`.
             batch_size: sequences per optimiser step and rank.
             repeats: how many times each sequence is shown per epoch.
             curriculum: predicted steps per epoch; METHOD's when None.
@@ -57,7 +58,7 @@ class ReadyDataModule(LightningDataModule):
         """
         super().__init__()
         self._root, self._names, self._sequences = root, names, sequences
-        self._options = {"scene": scene, "masks": masks, "selections": selections}
+        self._options: dict[str, Any] = {"scene": scene, "masks": masks, "selections": selections}
         self._batch_size, self._repeats, self._seed = batch_size, repeats, seed
         self._free_root = free_root
         self.curriculum = curriculum if curriculum is not None else Curriculum()
@@ -71,8 +72,8 @@ class ReadyDataModule(LightningDataModule):
             ConfigError: a root is not set, or ``names`` asks for an object that is not there.
             DataError: a root holds no data set.
         """
-        single = self._root is None or isinstance(self._root, (str, Path))
-        found = [item for source in ([self._root] if single else self._root or []) for item in self._open(source)]
+        sources = [self._root] if self._root is None or isinstance(self._root, (str, Path)) else self._root
+        found = [item for source in sources for item in self._open(source)]
         have = [item.name for item in found]
         if not found or len(set(have)) != len(have):
             raise ConfigError(f"data.root: expected at least one object, each name once, got {have}.")

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from gausim.core import DataError, GaussianScene
 from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_array, read_stills
-from gausim.data.selection import Bound, apply_selections, require_pinned
+from gausim.data.scenes import require_pinned, select_masks
 from gausim.io.ply import load_scene
 from gausim.io.transforms import read_json
+from gausim.ops.selection import Selection
 
 
 class ObjectData:
@@ -42,7 +43,7 @@ class ObjectData:
         sequences: int | Sequence[str] | None = None,
         scene: Path | str | None = None,
         masks: Path | str | None = None,
-        selections: Mapping[str, Mapping[str, Bound | None]] | None = None,
+        selections: Mapping[str, Selection | str] | None = None,
         free_root: bool = False,
     ) -> None:
         """Reads ``dataset.json``; everything else is read when first asked for.
@@ -52,7 +53,7 @@ class ObjectData:
             sequences: only so many sequences, or only those of these names; all when None.
             scene: PLY of the rest scene; ``root/scene.ply`` when None.
             masks: npz of its masks; beside the PLY when None.
-            selections: boxes that replace masks, see :func:`gausim.data.selection.apply_selections`.
+            selections: what replaces its masks, see :func:`gausim.data.scenes.select_masks`.
             free_root: accept a scene without a pinned kernel.
 
         Raises:
@@ -138,7 +139,7 @@ class ObjectData:
                 f"{self.scene_path}: no rest scene. Make one with `gausim reconstruct {self.root}`, "
                 "or name one in the data config (scene: path/to/scene.ply)."
             )
-        scene = apply_selections(load_scene(self.scene_path, masks=self.masks_path, name=self.name), self._selections)
+        scene = select_masks(load_scene(self.scene_path, masks=self.masks_path, name=self.name), self._selections)
         return scene if self._free_root else require_pinned(scene)
 
     def _check_views(self, path: Path) -> None:
@@ -185,7 +186,12 @@ def _positive(facts: dict[str, Any], key: str, path: Path) -> float:
 
 def _frame_range(facts: dict[str, Any], path: Path) -> range:
     value = facts.get("train_frames")
-    good = isinstance(value, list) and len(value) == 2 and all(type(v) is int for v in value)
-    if not good or value[0] != 0 or value[1] < 2:
+    if (
+        not isinstance(value, list)
+        or len(value) != 2
+        or not all(type(v) is int for v in value)
+        or value[0] != 0
+        or value[1] < 2
+    ):
         raise DataError(f"{path}: field 'train_frames' must be [0, first unseen frame], e.g. [0, 16], got {value!r}.")
     return range(*value)

@@ -62,7 +62,8 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         Permutations follow each other; the head of each avoids what the open batch holds already.
         """
         generator = torch.Generator().manual_seed(hash_seed(self._seed, epoch))
-        share, order = self._batch_size * self._world_size, []
+        share = self._batch_size * self._world_size
+        order: list[int] = []
         for _ in range(self._repeats):
             permutation = torch.randperm(self._count, generator=generator).tolist()
             open_batch = set(order[len(order) - len(order) % share :])
