@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+from torchmetrics.functional.image import peak_signal_noise_ratio
+
+from gausim.metrics import L2, PSNR, SSIM, ForegroundL2, ForegroundPSNR, ImageMetric
+
+
+def images(seed: int = 0, count: int = 3, size: int = 24) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    first, second = torch.rand(2, count, size, size + 4, 3, generator=generator)
+    mask = torch.rand(count, size, size + 4, generator=generator) > 0.6
+    return first, second, mask
+
+
+def test_l2_of_one_changed_pixel_by_hand():
+    target = torch.zeros(2, 4, 5, 3)
+    prediction = target.clone()
+    prediction[0, 1, 2] = torch.tensor([0.3, 0.0, 0.4])  # norm 0.5 in one of 20 pixels
+    mask = torch.zeros(2, 4, 5, dtype=torch.bool)
+    mask[:, 1, 2:4] = True  # two foreground pixels
+    assert L2().per_image(prediction, target, mask).tolist() == pytest.approx([0.5 / 20, 0.0])
+    assert ForegroundL2().per_image(prediction, target, mask).tolist() == pytest.approx([0.25, 0.0])
+
+
+def test_l2_is_the_norm_and_not_the_squared_error():
+    prediction, target, mask = images()
+    expected = np.sqrt(((prediction - target).numpy() ** 2).sum(-1)).mean((1, 2))
+    assert L2().per_image(prediction, target, mask).numpy() == pytest.approx(expected, rel=1e-6)
+
+
+def test_psnr_agrees_with_torchmetrics_per_image():
+    prediction, target, mask = images()
+    values = PSNR().per_image(prediction, target, mask)
+    for i in range(len(values)):
+        expected = peak_signal_noise_ratio(prediction[i], target[i], data_range=1.0)
+        assert float(values[i]) == pytest.approx(float(expected), rel=1e-5)
+
+
+def test_foreground_psnr_looks_at_the_masked_pixels_only():
+    prediction, target, mask = images()
+    each = zip(prediction, target, mask, strict=True)
+    expected = [-10 * math.log10(float((p[m] - t[m]).square().mean())) for p, t, m in each]
+    values = ForegroundPSNR().per_image(prediction, target, mask)
+    assert values.tolist() == pytest.approx(expected, rel=1e-5)
+    changed = torch.where(mask[..., None], prediction, torch.rand_like(prediction))
+    assert torch.equal(ForegroundPSNR().per_image(changed, target, mask), values)
+
+
+def test_psnr_of_identical_images_is_finite():
+    prediction, _, mask = images()
+    assert PSNR().per_image(prediction, prediction, mask).tolist() == pytest.approx([100.0] * 3)
+
+
+def scipy_ssim(a: np.ndarray, b: np.ndarray) -> float:
+    """Wang et al. by hand for one channel: Gaussian window 11, sigma 1.5."""
+
+    def blur(x: np.ndarray) -> np.ndarray:
+        return gaussian_filter(x, 1.5, truncate=5 / 1.5, mode="mirror")
+
+    mu_a, mu_b = blur(a), blur(b)
+    var_a, var_b, cov = blur(a * a) - mu_a**2, blur(b * b) - mu_b**2, blur(a * b) - mu_a * mu_b
+    numerator = (2 * mu_a * mu_b + 0.01**2) * (2 * cov + 0.03**2)
+    return float((numerator / ((mu_a**2 + mu_b**2 + 0.01**2) * (var_a + var_b + 0.03**2))).mean())
+
+
+def test_ssim_agrees_with_the_definition():
+    prediction, target, mask = images()
+    target = 0.7 * prediction + 0.3 * target
+    values = SSIM().per_image(prediction, target, mask)
+    for i in range(len(values)):
+        channels = [scipy_ssim(prediction[i, ..., c].double().numpy(), target[i, ..., c].double().numpy())
+                    for c in range(3)]  # fmt: skip
+        assert float(values[i]) == pytest.approx(np.mean(channels), abs=1e-5)
+
+
+@pytest.mark.parametrize("metric", [L2(), ForegroundL2(), PSNR(), ForegroundPSNR(), SSIM()], ids=lambda m: m.key)
+def test_batches_in_any_split_give_the_mean_over_images(metric: ImageMetric):
+    prediction, target, mask = images(count=5)
+    expected = metric.per_image(prediction, target, mask).double().mean()
+    metric.reset()
+    metric.update(prediction[:2], target[:2], mask[:2])
+    metric.update(prediction[2:], target[2:], mask[2:])
+    assert float(metric.compute()) == pytest.approx(float(expected), rel=1e-6)
+    metric.reset()
+
+
+def test_images_without_foreground_do_not_count():
+    prediction, target, mask = images()
+    mask[1] = False
+    metric = ForegroundL2()
+    metric.update(prediction, target, mask)
+    expected = metric.per_image(prediction, target, mask)[[0, 2]].mean()
+    assert float(metric.compute()) == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_states_are_sums_over_ranks():
+    assert set(L2()._reductions) == {"total", "count"}
+    assert all(r is not None and r.__name__ == "dim_zero_sum" for r in L2()._reductions.values())
