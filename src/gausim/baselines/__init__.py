@@ -1,0 +1,1 @@
+"""Methods to compare with; each offers the same contract of dynamics."""
