@@ -1,0 +1,77 @@
+"""Trajectories as safetensors: every number comes back bit for bit, and nothing in the file can run."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from gausim.core import DataError, Trajectory
+
+FORMAT = "gausim.trajectory/1"
+_TENSORS = ("positions", "gradients", "rotations", "unit_of_kernel", "fps")
+
+
+def save_trajectory(path: Path | str, trajectory: Trajectory, *, facts: Mapping[str, str] | None = None) -> None:
+    """Writes a trajectory; replaces the file atomically.
+
+    Args:
+        path: the safetensors file.
+        trajectory: what to write.
+        facts: texts for the header, e.g. object and sequence.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tensors = {name: getattr(trajectory, name).detach().cpu().contiguous() for name in _TENSORS[:-1]}
+    tensors["fps"] = torch.tensor(trajectory.fps, dtype=torch.float64)
+    temporary = path.with_name(path.name + ".tmp")
+    save_file(tensors, str(temporary), metadata={**(facts or {}), "format": FORMAT})
+    os.replace(temporary, path)
+
+
+def load_trajectory(path: Path | str) -> Trajectory:
+    """Reads a trajectory.
+
+    Raises:
+        DataError: the file is missing, not safetensors, of another format, or a tensor is missing or malformed.
+    """
+    path = Path(path)
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            found, metadata = set(file.keys()), file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in _TENSORS if name in found}
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file. Write one with `gausim simulate RUN`.") from None
+    except (OSError, SafetensorError) as error:
+        raise DataError(f"{path}: cannot be read as safetensors ({error}). Copy or export it again.") from error
+    if metadata.get("format") != FORMAT:
+        raise DataError(f"{path}: header 'format' is {metadata.get('format')!r}, expected {FORMAT!r}.")
+    missing = [name for name in _TENSORS if name not in found]
+    if missing:
+        raise DataError(f"{path}: tensor '{missing[0]}' is missing; it has {sorted(found)}. Export it again.")
+    _check(path, tensors)
+    return Trajectory(**{n: tensors[n] for n in _TENSORS[:-1]}, fps=float(tensors["fps"]))
+
+
+def _check(path: Path, tensors: dict[str, Tensor]) -> None:
+    frames, kernels = tensors["positions"].shape[:1], tensors["unit_of_kernel"].shape
+    units = tensors["gradients"].shape[1:2]
+    expected = {
+        "positions": (*frames, *kernels, 3),
+        "gradients": (*frames, *units, 3, 3),
+        "rotations": (*frames, *units, 3, 3),
+        "unit_of_kernel": kernels[:1],
+        "fps": (),
+    }
+    for name, shape in expected.items():
+        actual = tuple(tensors[name].shape)
+        if actual != tuple(shape):
+            raise DataError(f"{path}: tensor '{name}' has shape {actual}, expected {tuple(shape)}. Export it again.")
+    index = tensors["unit_of_kernel"]
+    if index.is_floating_point() or (len(index) and not 0 <= int(index.min()) <= int(index.max()) < units[0]):
+        raise DataError(f"{path}: tensor 'unit_of_kernel' must hold indices of {units[0]} units. Export it again.")

@@ -1,0 +1,141 @@
+"""Video files through PyAV (no system ffmpeg needed): MP4 for people, GIF for pages; nothing to train from."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+
+import av
+import numpy as np
+from av.error import FFmpegError
+
+from gausim.core import DataError
+
+H264 = "libx264"
+# Built into every FFmpeg; larger files, played by nearly everything.
+FALLBACK = "mpeg4"
+# Visually lossless for H.264; frames are figures, not archives.
+_OPTIONS = {H264: {"crf": "16", "preset": "medium"}, FALLBACK: {"qscale": "2", "b": "12000000"}}
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What was written: the file, its codec, number of frames and size [pixels]."""
+
+    path: Path
+    codec: str
+    frames: int
+    width: int
+    height: int
+
+
+def video_codec() -> str:
+    """H.264 where this PyAV can encode it, else MPEG-4 with a warning that says so."""
+    if H264 in av.codecs_available:
+        return H264
+    warnings.warn(
+        f"this PyAV has no encoder '{H264}': writing MPEG-4 part 2 instead (larger; browsers may not play it). "
+        "The wheels of `pip install av` have it.",
+        stacklevel=2,
+    )
+    return FALLBACK
+
+
+def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float, *, codec: str | None = None) -> VideoInfo:
+    """Writes (H, W, 3) uint8 RGB frames as MP4, one at a time as they come.
+
+    Odd sizes grow by one repeated row or column, because the chroma planes have half the size.
+
+    Args:
+        path: the file, with suffix .mp4.
+        frames: at least one frame, all of one size.
+        fps: frames per second.
+        codec: encoder name; :func:`video_codec` chooses when None.
+
+    Raises:
+        DataError: no frames, frames of different size or type, or the encoder fails.
+    """
+    path, codec = Path(path), codec or video_codec()
+    first, frames = _peek(path, frames)
+    height, width = (n + n % 2 for n in first.shape[:2])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    count = 0
+    try:
+        with av.open(str(path), "w") as container:
+            stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            stream.options = _OPTIONS.get(codec, {})
+            for pixels in frames:
+                _check(path, pixels, first.shape)
+                padded = np.pad(pixels, ((0, height - len(pixels)), (0, width - pixels.shape[1]), (0, 0)), mode="edge")
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(padded), format="rgb24")
+                container.mux(stream.encode(frame))
+                count += 1
+            container.mux(stream.encode())
+    except (FFmpegError, ValueError) as error:
+        raise DataError(f"{path}: encoder '{codec}' failed ({error}). Check the folder and the free space.") from error
+    return VideoInfo(path, codec, count, width, height)
+
+
+def read_video(path: Path | str) -> Iterator[np.ndarray]:
+    """Decodes the first video stream, one (H, W, 3) uint8 RGB frame at a time.
+
+    Raises:
+        DataError: the file is missing, holds no video or cannot be decoded.
+    """
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise DataError(f"{path}: holds no video stream.")
+            for frame in container.decode(video=0):
+                yield frame.to_ndarray(format="rgb24")
+    except (FFmpegError, OSError) as error:
+        raise DataError(f"{path}: cannot be decoded as video ({error}). Check the file.") from error
+
+
+def write_gif(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> int:
+    """Writes (H, W, 3) uint8 RGB frames as an endless GIF with one palette for all; returns their number.
+
+    GIF times are whole hundredths of a second and most programs slow down below 0.02 s, so at more than 50 fps
+    it plays at 50.
+
+    Raises:
+        DataError: no frames, or frames of different size or type.
+    """
+    from PIL import Image
+
+    path = Path(path)
+    first, frames = _peek(path, frames)
+    images = []
+    for pixels in frames:
+        _check(path, pixels, first.shape)
+        images.append(Image.fromarray(pixels))
+    # The palette of a picture of all frames serves the whole animation: no flicker between palettes.
+    step = max(1, len(images) // 8)
+    overview = Image.fromarray(np.concatenate([np.asarray(i) for i in images[::step]], axis=1))
+    palette = overview.quantize(colors=256)
+    indexed = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    duration = max(20, round(1000 / fps / 10) * 10)
+    indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=duration, loop=0)
+    return len(indexed)
+
+
+def _peek(path: Path, frames: Iterable[np.ndarray]) -> tuple[np.ndarray, Iterator[np.ndarray]]:
+    iterator = iter(frames)
+    first = next(iterator, None)
+    if first is None:
+        raise DataError(f"{path}: no frames to write; a video needs at least one.")
+    _check(path, first, first.shape)
+    return first, chain([first], iterator)
+
+
+def _check(path: Path, pixels: np.ndarray, shape: tuple[int, ...]) -> None:
+    if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.shape != shape:
+        raise DataError(
+            f"{path}: expected uint8 RGB frames of one size (first {shape}), got {pixels.dtype} {pixels.shape}."
+        )

@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from gausim.core import DataError, Trajectory
+from gausim.io.trajectory import FORMAT, load_trajectory, save_trajectory
+
+
+def trajectory(frames: int = 4, kernels: int = 7, units: int = 3) -> Trajectory:
+    generator = torch.Generator().manual_seed(0)
+    return Trajectory(
+        positions=torch.randn(frames, kernels, 3, generator=generator),
+        gradients=torch.randn(frames, units, 3, 3, generator=generator),
+        rotations=torch.randn(frames, units, 3, 3, generator=generator),
+        unit_of_kernel=torch.randint(0, units, (kernels,), generator=generator),
+        fps=30000 / 1001,
+    )
+
+
+def test_round_trip_is_bitwise(tmp_path):
+    original = trajectory()
+    save_trajectory(tmp_path / "a" / "t.safetensors", original, facts={"object": "bunny"})
+    loaded = load_trajectory(tmp_path / "a" / "t.safetensors")
+    for name in ("positions", "gradients", "rotations", "unit_of_kernel"):
+        first, second = getattr(original, name), getattr(loaded, name)
+        assert first.dtype == second.dtype and torch.equal(first, second)
+    assert loaded.fps == original.fps
+    assert [p.name for p in (tmp_path / "a").iterdir()] == ["t.safetensors"]
+
+
+def test_views_of_one_frame_are_written_out(tmp_path):
+    one = trajectory()
+    still = Trajectory(one.positions[0].expand(5, -1, -1), one.gradients[:1].expand(5, -1, -1, -1),
+                       one.rotations[:1].expand(5, -1, -1, -1), one.unit_of_kernel, 24.0)  # fmt: skip
+    save_trajectory(tmp_path / "t.safetensors", still)
+    assert torch.equal(load_trajectory(tmp_path / "t.safetensors").positions, still.positions)
+
+
+def test_missing_file_names_the_path(tmp_path):
+    with pytest.raises(DataError, match=r"none\.safetensors: no such file"):
+        load_trajectory(tmp_path / "none.safetensors")
+
+
+def test_broken_files_name_what_is_wrong(tmp_path):
+    path = tmp_path / "t.safetensors"
+    save_trajectory(path, trajectory())
+    tensors = load_file(str(path))
+    path.write_bytes(path.read_bytes()[:50])
+    with pytest.raises(DataError, match="cannot be read as safetensors"):
+        load_trajectory(path)
+    save_file(tensors, str(path))
+    with pytest.raises(DataError, match="header 'format' is None"):
+        load_trajectory(path)
+    save_file({k: v for k, v in tensors.items() if k != "rotations"}, str(path), metadata={"format": FORMAT})
+    with pytest.raises(DataError, match="'rotations' is missing"):
+        load_trajectory(path)
+    save_file({**tensors, "gradients": tensors["gradients"][:-1]}, str(path), metadata={"format": FORMAT})
+    with pytest.raises(DataError, match=r"'gradients' has shape \(3, 3, 3, 3\), expected \(4, 3, 3, 3\)"):
+        load_trajectory(path)
+    save_file({**tensors, "unit_of_kernel": tensors["unit_of_kernel"] + 3}, str(path), metadata={"format": FORMAT})
+    with pytest.raises(DataError, match="indices of 3 units"):
+        load_trajectory(path)

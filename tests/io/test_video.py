@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from gausim.core import DataError
+from gausim.io import video
+from gausim.io.video import read_video, write_gif, write_video
+
+
+def ramp(count: int = 9, height: int = 50, width: int = 71) -> list[np.ndarray]:
+    """Grey frames that brighten, with a bright left half."""
+    frames = []
+    for i in range(count):
+        frame = np.full((height, width, 3), 20 + 20 * i, np.uint8)
+        frame[:, : width // 2, 0] = 230
+        frames.append(frame)
+    return frames
+
+
+@pytest.mark.parametrize("codec", [None, "mpeg4"])
+def test_video_decodes_to_the_same_frames(tmp_path, codec):
+    frames = ramp()
+    info = write_video(tmp_path / "new" / "v.mp4", iter(frames), 29.97, codec=codec)
+    decoded = list(read_video(info.path))
+    assert info.frames == len(decoded) == len(frames)
+    assert decoded[0].shape == (50, 72, 3)  # the odd width grew by one
+    for before, after in zip(frames, decoded, strict=True):
+        error = np.abs(before.astype(int) - after[:, :71].astype(int))[:, 40:]
+        assert error.mean() < 6
+    with av.open(str(info.path)) as container:
+        assert float(container.streams.video[0].average_rate) == pytest.approx(29.97, abs=0.01)
+
+
+def test_h264_is_preferred_and_the_fallback_says_so(monkeypatch):
+    if "libx264" in av.codecs_available:
+        assert video.video_codec() == "libx264"
+    monkeypatch.setattr(video.av, "codecs_available", {"mpeg4"})
+    with pytest.warns(UserWarning, match="no encoder 'libx264'"):
+        assert video.video_codec() == "mpeg4"
+
+
+def test_unusable_frames_are_refused(tmp_path):
+    with pytest.raises(DataError, match="no frames"):
+        write_video(tmp_path / "v.mp4", [], 24.0)
+    frames = ramp(3)
+    with pytest.raises(DataError, match="of one size"):
+        write_video(tmp_path / "v.mp4", [*frames, frames[0][:-2]], 24.0)
+    with pytest.raises(DataError, match="got float64"):
+        write_video(tmp_path / "v.mp4", [frames[0] / 255], 24.0)
+    with pytest.raises(DataError, match="cannot be decoded"):
+        next(read_video(tmp_path / "none.mp4"))
+
+
+def test_gif_keeps_frames_time_and_colours(tmp_path):
+    frames = ramp(6)
+    assert write_gif(tmp_path / "v.gif", frames, 24.0) == 6
+    with Image.open(tmp_path / "v.gif") as image:
+        assert image.n_frames == 6 and image.info["duration"] == 40
+        image.seek(3)
+        shown = np.asarray(image.convert("RGB")).astype(int)
+    assert np.abs(shown - frames[3].astype(int)).mean() < 8
