@@ -1,0 +1,73 @@
+# Everything starts here: `make` lists the targets.
+.DEFAULT_GOAL := help
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.ONESHELL:
+.DELETE_ON_ERROR:
+
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+# Two test processes with one thread each suit a small machine; more cores: make test WORKERS=8.
+WORKERS ?= 2
+DATA ?= data/synthetic
+RUN ?= outputs/demo
+ARGS ?=
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
+
+.PHONY: help install test test-slow lint format data demo train evaluate simulate clean
+
+help: ## Show this text
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+install: $(STAMP) ## Create .venv with the tested versions (again only after a change of pyproject.toml or constraints.txt)
+
+$(STAMP): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "error: no python3.11 or python3 found. Install Python 3.11 to 3.13, or: make install PYTHON=/path/to/python" >&2; exit 1; }
+	"$(PYTHON)" -c 'import sys; assert (3, 11) <= sys.version_info < (3, 14), f"expected Python 3.11 to 3.13, got {sys.version.split()[0]}. Use make install PYTHON=/path/to/python3.11"'
+	test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV)
+	$(BIN)/python -m pip install -q -c constraints.txt -e ".[dev]"
+	touch $@
+
+test: install ## Run the default tests (without the slow ones)
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) -m "not slow" $(ARGS)
+
+test-slow: install ## Run the slow tests
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) -m slow $(ARGS)
+
+lint: install ## Check style, formatting, types and import directions
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: install ## Format the code and fix what can be fixed
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+data: $(DATA)/.made ## Make the synthetic data set
+
+$(DATA)/.made: | install
+	$(BIN)/python -m data_prep.synthesize --out $(DATA)
+	touch $@
+
+train: install ## Train: make train ARGS="experiment=demo seed=1"
+	$(BIN)/gausim train $(ARGS)
+
+evaluate: install ## Evaluate a run: make evaluate RUN=outputs/demo
+	$(BIN)/gausim evaluate $(RUN) $(ARGS)
+
+simulate: install ## Write the videos and figures of a run: make simulate RUN=outputs/demo
+	$(BIN)/gausim simulate $(RUN) $(ARGS)
+
+demo: data ## From nothing to a simulator that foresees: install, make data, train, evaluate, simulate
+	$(BIN)/gausim train experiment=demo
+	$(BIN)/gausim evaluate outputs/demo
+	$(BIN)/gausim simulate outputs/demo
+	echo "Numbers and pictures of the demo:"
+	find outputs/demo -type f \( -name '*.json' -o -name '*.md' -o -name '*.png' -o -name '*.mp4' \) | sort | sed 's/^/  /'
+
+clean: ## Remove caches and builds (not .venv, data or outputs)
+	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	find src tests data_prep -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,300 @@
+"""Hydra at one place: where the configurations lie, how they are composed, run and turned into objects."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, InstantiationException
+from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+import gausim
+from gausim.core.errors import ConfigError, GausSimError
+
+HYDRA_VERSION_BASE = "1.3"
+# What a configuration may name in `_target_`. A configuration comes with data and runs from other people, so it must
+# not be able to call whatever the interpreter can import.
+ALLOWED_PACKAGES = ("gausim", "torch", "lightning", "torchmetrics", "kornia")
+ALLOWED_TARGETS = ("builtins.dict", "builtins.list")
+# Inside the allowed packages these load code, read pickles or start programs.
+REFUSED_MODULES = (
+    "gausim.cli",
+    "torch.hub",
+    "torch.jit",
+    "torch.package",
+    "torch.serialization",
+    "torch.utils.collect_env",
+    "torch.utils.cpp_extension",
+)
+
+
+@dataclass
+class RootConfig:
+    """Schema of the root keys of a training configuration: a misspelt root key fails instead of being ignored.
+
+    Attributes:
+        data: the data module: which set, views, frames and batches.
+        model: the dynamics.
+        loss: the terms and their weights.
+        optimizer: the optimiser (partial, it awaits the parameters) and its schedule.
+        render: the renderer.
+        trainer: arguments of the Lightning trainer.
+        logger: loggers by name.
+        callbacks: callbacks by name.
+        paths: where data is read and runs are written.
+        ablation: what the chosen ablation records about itself.
+        experiment: what the chosen experiment records about itself.
+        seed: of every random generator.
+        name: of the run; its directory is `${paths.output_root}/${name}`.
+        task_name: what is being done, for logs and dashboards.
+    """
+
+    data: Any = MISSING
+    model: Any = MISSING
+    loss: Any = MISSING
+    optimizer: Any = MISSING
+    render: Any = MISSING
+    trainer: Any = MISSING
+    logger: Any = None
+    callbacks: Any = None
+    paths: Any = MISSING
+    ablation: Any = None
+    experiment: Any = None
+    seed: int = 0
+    name: str = MISSING
+    task_name: str = "train"
+
+
+ConfigStore.instance().store(name="base_schema", node=RootConfig, provider="gausim")
+
+
+def conf_dir() -> Path:
+    """Returns the directory of the configurations: the wheel's own copy, or conf/ of the checkout.
+
+    Raises:
+        ConfigError: neither is there.
+    """
+    package = Path(gausim.__file__).resolve().parent
+    candidates = (package / "conf", package.parents[1] / "conf")
+    for candidate in candidates:
+        if candidate.is_dir():
+            return candidate
+    raise ConfigError(
+        f"expected the configurations in {candidates[0]} or {candidates[1]}, found neither. Reinstall gausim, or run "
+        "from a complete checkout."
+    )
+
+
+def compose(config_name: str, overrides: Sequence[str] = ()) -> DictConfig:
+    """Composes a configuration without running anything.
+
+    Args:
+        config_name: file in conf/, without its suffix.
+        overrides: as on the command line, e.g. `("model=gausim_paper", "seed=3")`.
+
+    Returns:
+        The composed configuration; unknown keys cannot be set on it.
+
+    Raises:
+        ConfigError: an unknown key, group or option.
+    """
+    with _readable_errors(config_name):
+        return _compose(config_name, overrides)
+
+
+def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    with hydra.initialize_config_dir(str(conf_dir()), version_base=HYDRA_VERSION_BASE):
+        return hydra.compose(config_name, overrides=list(overrides))
+
+
+def run_hydra(config_name: str, task: Callable[[DictConfig], float | None], argv: Sequence[str]) -> int:
+    """Runs a task under Hydra: overrides, `-m`, `--cfg job`, `--help` and the rest of Hydra's own options.
+
+    Args:
+        config_name: file in conf/, without its suffix.
+        task: what to do with the composed configuration; its return value is a sweeper's objective.
+        argv: the arguments after the command's name.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        ConfigError: an unknown key, group or option, or a value missing.
+        GausSimError: whatever the task raises on purpose.
+    """
+    runner = hydra.main(version_base=HYDRA_VERSION_BASE, config_path=str(conf_dir()), config_name=config_name)(task)
+    saved_argv, saved_flag = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    # Hydra reads sys.argv; with its full errors on it raises them, which are then told in our way, instead of exiting.
+    sys.argv = [saved_argv[0], *argv]
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        with _readable_errors(config_name):
+            runner()
+    finally:
+        sys.argv = saved_argv
+        if saved_flag is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = saved_flag
+    return 0
+
+
+def run_dir() -> Path:
+    """Returns the directory of the running job (inside `run_hydra` only; of a sweep, the job's own)."""
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+@contextmanager
+def _readable_errors(config_name: str) -> Iterator[None]:
+    """Turns Hydra's and OmegaConf's complaints into ConfigError, with the keys that were perhaps meant."""
+    try:
+        yield
+    except InstantiationException:
+        raise  # `instantiate` has already told those that are the configuration's fault
+    except (HydraException, OmegaConfBaseException) as error:
+        message = str(error).strip()
+        cause = str(error.__cause__).strip() if error.__cause__ else ""
+        if cause and cause not in message:
+            message = f"{message}\n{cause}"
+        raise ConfigError(f"{config_name}.yaml: {message}{_close_keys(config_name, message)}") from error
+
+
+def _close_keys(config_name: str, message: str) -> str:
+    found = re.search(r"Could not override '([^']+)'|Key '([^']+)' (?:is )?not in", message)
+    if found is None:
+        return ""
+    key = str(found.group(1) or found.group(2)).split("@")[0]
+    try:
+        known = list(_keys(_compose(config_name, ())))
+    except (HydraException, OmegaConfBaseException):
+        return ""  # the configuration is broken without the override as well; the message at hand says how
+    matches = difflib.get_close_matches(key, known, n=3, cutoff=0.6)
+    return f"\nDid you mean {' or '.join(matches)}?" if matches else f"\n`--cfg job` shows every key of {config_name}."
+
+
+def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
+    for key in node:
+        yield f"{prefix}{key}"
+        if not OmegaConf.is_missing(node, key) and not OmegaConf.is_interpolation(node, key):
+            child = node[key]
+            if isinstance(child, DictConfig):
+                yield from _keys(child, f"{prefix}{key}.")
+
+
+def instantiate(node: DictConfig | ListConfig | Mapping[str, Any], **kwargs: Any) -> Any:
+    """Builds the objects that a configuration names in `_target_`; nothing else in gausim does.
+
+    Objects in `kwargs` reach the constructor as they are (Hydra itself would copy them).
+
+    Args:
+        node: a node with `_target_`, or a dict or list of such nodes (then without `kwargs`).
+        **kwargs: further constructor arguments; they win over the node's.
+
+    Returns:
+        The object; a `functools.partial` where the node says `_partial_: true`; a dict or list for a dict or list.
+
+    Raises:
+        ConfigError: a target outside the allow-list, one that does not exist, or arguments it does not take.
+        GausSimError: whatever the constructor raises on purpose.
+    """
+    config = node if isinstance(node, DictConfig | ListConfig) else OmegaConf.create(dict(node))
+    has_target = isinstance(config, DictConfig) and "_target_" in config
+    if kwargs and not has_target:
+        raise ConfigError(f"expected a node with `_target_` for the arguments {sorted(kwargs)}, got {config!r}.")
+    check_targets(config)
+    where = str(config._get_full_key(None) or "configuration")
+    try:
+        if not has_target:
+            return hydra.utils.instantiate(config, _convert_="all")
+        wants_partial = bool(config.get("_partial_", False))
+        factory = hydra.utils.instantiate(config, _convert_="all", _partial_=True)
+        return partial(factory, **kwargs) if wants_partial else factory(**kwargs)
+    except InstantiationException as error:
+        raise _blame(error, where) from error
+    except TypeError as error:
+        if not _is_wrong_call(error):
+            raise  # from inside the constructor: a defect there, not a wrong configuration
+        raise ConfigError(f"{where}: {error}. Compare the keys with {config.get('_target_')}.") from error
+
+
+def _is_wrong_call(error: TypeError) -> bool:
+    """Tells arguments that the target does not take from a TypeError inside its body, by where it was raised."""
+    frame = error.__traceback__
+    while frame is not None and frame.tb_next is not None:
+        frame = frame.tb_next
+    raised_in = Path(frame.tb_frame.f_code.co_filename).resolve() if frame else Path()
+    hydra_home = Path(hydra.__file__).resolve().parent
+    return "argument" in str(error) and (raised_in == Path(__file__).resolve() or hydra_home in raised_in.parents)
+
+
+def _blame(error: InstantiationException, where: str) -> Exception:
+    """Finds what Hydra wrapped: our own error, a wrong argument or name (the configuration's fault), or a defect."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, GausSimError):
+            return cause
+        last, cause = cause, cause.__cause__
+    if isinstance(last, InstantiationException) or (isinstance(last, TypeError) and _is_wrong_call(last)):
+        return ConfigError(f"{where}: {str(error).strip()}")
+    return error
+
+
+def check_targets(node: DictConfig | ListConfig) -> None:
+    """Refuses every `_target_` outside the allow-list, however deep, before anything is built.
+
+    A name is judged by where its object really lives: `torch.os.system` begins well, but is not torch's.
+
+    Args:
+        node: the configuration to look through.
+
+    Raises:
+        ConfigError: naming the key and the target.
+    """
+    root = str(node._get_full_key(None) or "")
+    for key, target in _targets(OmegaConf.to_container(node, resolve=True), root):
+        if not _is_allowed(target):
+            raise ConfigError(
+                f"{key}._target_: expected something from {', '.join(ALLOWED_PACKAGES)} or one of "
+                f"{', '.join(ALLOWED_TARGETS)}, got {target!r}. Only these may be built from a configuration."
+            )
+
+
+def _targets(value: Any, key: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        if "_target_" in value:
+            yield key or "configuration", value["_target_"]
+        for name, child in value.items():
+            yield from _targets(child, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, list):
+        for index, child in enumerate(value):
+            yield from _targets(child, f"{key}[{index}]")
+
+
+def _within(name: str, packages: Sequence[str]) -> bool:
+    return any(name == package or name.startswith(f"{package}.") for package in packages)
+
+
+def _is_allowed(target: Any) -> bool:
+    if not isinstance(target, str):
+        return False
+    if target in ALLOWED_TARGETS:
+        return True
+    if not _within(target, ALLOWED_PACKAGES) or _within(target, REFUSED_MODULES):
+        return False
+    try:
+        home = getattr(hydra.utils.get_object(target), "__module__", None)
+    except Exception as error:  # importing the target may fail in any way; the name is what the reader can mend
+        raise ConfigError(f"_target_ {target!r} cannot be found: {error}. Check its spelling.") from error
+    return isinstance(home, str) and _within(home, ALLOWED_PACKAGES) and not _within(home, REFUSED_MODULES)

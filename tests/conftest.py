@@ -1,0 +1,45 @@
+"""What every test shares: run-time checks of shapes and types, one thread, and the external data set."""
+
+from __future__ import annotations
+
+import ast
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from jaxtyping import _import_hook, install_import_hook
+
+torch.set_num_threads(1)
+
+
+def _left_unchecked(decorator: ast.AST, *, marked=_import_hook._is_no_type_check) -> bool:
+    """numba cannot compile a function that the checker has wrapped, so its kernels go unchecked."""
+    names = {node.id for node in ast.walk(decorator) if isinstance(node, ast.Name)}
+    names |= {node.attr for node in ast.walk(decorator) if isinstance(node, ast.Attribute)}
+    return marked(decorator) or bool(names & {"njit", "jit", "vectorize", "guvectorize"} and "torch" not in names)
+
+
+_import_hook._is_no_type_check = _left_unchecked
+# Before anything imports gausim: every annotated signature, shapes included, is checked in every test.
+install_import_hook("gausim", "beartype.beartype")
+
+
+@pytest.fixture(scope="session")
+def data_root() -> Path:
+    """Directory that holds external data sets, one folder each (e.g. bunny)."""
+    value = os.environ.get("GAUSIM_TEST_DATA")
+    if not value:
+        pytest.skip("GAUSIM_TEST_DATA is not set: it names the directory of the external data sets")
+    path = Path(value)
+    if not path.is_dir():
+        pytest.fail(f"GAUSIM_TEST_DATA: expected a directory, got {path}. Correct or unset it.")
+    return path
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    if torch.cuda.is_available():
+        return
+    for item in items:
+        if item.get_closest_marker("gpu"):
+            item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))

@@ -1,0 +1,236 @@
+"""Every file in conf/ composes, names only what may be built, fits the signatures it names, and builds where it can."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pytest
+import torch
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from gausim.cli import _config
+from gausim.cli._config import check_targets, compose, conf_dir, instantiate, run_hydra
+from gausim.core.errors import ConfigError, SceneError
+
+# Values for what a file leaves to the user (`???`), by "group/option".
+MANDATORY: dict[str, list[str]] = {}
+FILES = sorted(path.relative_to(conf_dir()).with_suffix("") for path in conf_dir().rglob("*.yaml"))
+ROOTS = [path.as_posix() for path in FILES if len(path.parts) == 1]
+OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1]
+# They set keys of other groups or of Hydra, and so build nothing of their own under their name.
+NOT_BUILT = ("hydra", "paths")
+SPECIAL = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
+
+
+def compose_option(option: str) -> DictConfig:
+    group, _, name = option.rpartition("/")
+    return compose("train", [f"{group}={name}", *MANDATORY.get(option, [])])
+
+
+def targets(node: Any) -> Iterator[DictConfig]:
+    """Every node below that has a `_target_`, the node itself included."""
+    if isinstance(node, DictConfig):
+        if node.get("_target_") is not None:
+            yield node
+        for key in node:
+            yield from targets(node[key])
+    elif isinstance(node, ListConfig):
+        for child in node:
+            yield from targets(child)
+
+
+def signature_of(node: DictConfig) -> tuple[inspect.Signature, dict[str, Any]]:
+    target = hydra.utils.get_object(node._target_)
+    return inspect.signature(target), {str(key): None for key in node if key not in SPECIAL}
+
+
+def is_complete(node: DictConfig) -> bool:
+    """Whether the file alone can build the object; otherwise code injects the missing arguments."""
+    signature, arguments = signature_of(node)
+    try:
+        signature.bind(*node.get("_args_", []), **arguments)
+    except TypeError:
+        return False
+    return True
+
+
+def needs_other_hardware(config: DictConfig) -> bool:
+    accelerator = str(OmegaConf.select(config, "trainer.accelerator", default="cpu"))
+    return accelerator not in ("cpu", "auto") and not torch.cuda.is_available()
+
+
+@pytest.mark.parametrize("name", ROOTS)
+def test_root_composes(name: str) -> None:
+    config = compose(name, MANDATORY.get(name, []))
+    check_targets(config)
+    assert config
+
+
+@pytest.mark.parametrize("option", OPTIONS)
+def test_option_composes_and_fits_the_signatures(option: str) -> None:
+    config = compose_option(option)
+    check_targets(config)
+    for node in targets(config):
+        signature, arguments = signature_of(node)
+        signature.bind_partial(*node.get("_args_", []), **arguments)  # TypeError: a key that the target does not take
+
+
+@pytest.mark.parametrize("option", [option for option in OPTIONS if option.split("/")[0] not in NOT_BUILT])
+def test_option_builds(option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    config = compose_option(option)
+    if needs_other_hardware(config):
+        pytest.skip(f"{option} asks for trainer.accelerator={config.trainer.accelerator}, which this machine lacks")
+    group = option.split("/")[0]
+    built = config if group in ("experiment", "ablation") else {group: config[group]}
+    for node in (built[key] for key in built):
+        build(node)
+
+
+def build(node: Any) -> None:
+    """Builds the topmost complete nodes; below an incomplete one, its complete parts."""
+    if isinstance(node, DictConfig) and node.get("_target_") is not None:
+        if is_complete(node) or node.get("_partial_"):
+            made = instantiate(node)
+            assert made is not None
+            assert isinstance(made, functools.partial) == bool(node.get("_partial_"))
+            return
+    for child in node if isinstance(node, ListConfig) else node.values() if isinstance(node, DictConfig) else ():
+        build(child)
+
+
+def test_every_kind_of_file_is_covered() -> None:
+    assert "train" in ROOTS
+    assert {"data", "model", "loss", "optimizer", "render", "trainer", "paths", "hydra"} <= {
+        option.split("/")[0] for option in OPTIONS
+    }
+
+
+def test_runs_have_a_directory_of_their_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    seen: list[Path] = []
+    assert run_hydra("train", lambda config: seen.append(_config.run_dir()), ["name=rose", "paths.output_root=o"]) == 0
+    assert seen == [tmp_path / "o" / "rose"]
+
+
+def test_a_sweep_gives_every_seed_its_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    seen: list[tuple[int, Path]] = []
+    run_hydra("train", lambda c: seen.append((c.seed, _config.run_dir())), ["-m", "seed=3,4", "name=rose"])
+    assert [seed for seed, _ in seen] == [3, 4]
+    assert [path.name for _, path in seen] == ["seed_3", "seed_4"]
+    assert sys.argv[1:] != ["-m", "seed=3,4", "name=rose"]
+
+
+def test_an_experiment_wins_over_the_root_file() -> None:
+    experiments = [option for option in OPTIONS if option.startswith("experiment/")]
+    for option in experiments:
+        written = OmegaConf.load(conf_dir() / f"{option}.yaml")
+        for key in {"name", "seed"} & set(written):
+            assert compose_option(option)[key] == written[key]
+
+
+@pytest.mark.parametrize(
+    ("override", "key", "meant"),
+    [("modle=gausim", "modle", "model"), ("sed=1", "sed", "seed"), ("trainer.max_epoch=3", "trainer.max_epoch", None)],
+)
+def test_unknown_keys_are_named_with_what_was_meant(override: str, key: str, meant: str | None) -> None:
+    with pytest.raises(ConfigError, match=key) as caught:
+        compose("train", [override])
+    assert meant is None or f"Did you mean {meant}" in str(caught.value)
+
+
+def test_unknown_keys_fail_on_the_command_line_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="Did you mean seed"):
+        run_hydra("train", lambda config: None, ["sed=1"])
+
+
+def test_unknown_options_list_the_known() -> None:
+    with pytest.raises(ConfigError, match=r"render/nope(.|\n)*cpu"):
+        compose("train", ["render=nope"])
+
+
+def test_errors_of_the_task_pass_through(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(config: DictConfig) -> None:
+        raise SceneError("no pinned kernel")
+
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SceneError, match="no pinned kernel"):
+        run_hydra("train", fail, [])
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "builtins.eval",
+        "subprocess.run",
+        "hydra.utils.get_method",
+        "gausimulator.Evil",
+        "torch.os.system",
+        "torch.load",
+        "torch.hub.load",
+        "torch.utils.collect_env.run",
+        "gausim.cli.main.main",
+        "lightning",
+    ],
+)
+def test_allow_list_refuses_and_names_key_and_target(target: str) -> None:
+    config = OmegaConf.create({"callbacks": [{"_target_": "torch.nn.ReLU", "inner": {"_target_": target}}]})
+    with pytest.raises(ConfigError) as caught:
+        instantiate(config)
+    assert "callbacks[0].inner" in str(caught.value)
+    assert repr(target) in str(caught.value)
+
+
+def test_refused_targets_are_not_reached_through_interpolation() -> None:
+    config = OmegaConf.create({"a": {"_target_": "${b}"}, "b": "os.getcwd"})
+    with pytest.raises(ConfigError, match=r"os\.getcwd"):
+        instantiate(config.a)
+
+
+def test_a_target_that_does_not_exist_is_named() -> None:
+    with pytest.raises(ConfigError, match=r"torch\.nn\.Linearr"):
+        instantiate({"_target_": "torch.nn.Linearr"})
+
+
+def test_arguments_the_target_does_not_take_are_named() -> None:
+    config = OmegaConf.create({"model": {"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 3, "foo": 1}})
+    with pytest.raises(ConfigError, match=r"model(.|\n)*foo"):
+        instantiate(config.model)
+    with pytest.raises(ConfigError, match="foo"):
+        instantiate(config)
+
+
+def test_defects_inside_a_constructor_stay_what_they_are() -> None:
+    with pytest.raises(TypeError):
+        instantiate({"_target_": "torch.nn.Linear", "in_features": "two", "out_features": 3})
+
+
+def test_injected_objects_are_not_copied() -> None:
+    layer = torch.nn.Linear(2, 3)
+    made = instantiate({"_target_": "torch.nn.Sequential", "_args_": []})
+    assert isinstance(made, torch.nn.Sequential)
+    optimizer = instantiate({"_target_": "torch.optim.SGD", "lr": 0.5}, params=layer.parameters())
+    assert optimizer.param_groups[0]["params"][0] is layer.weight
+
+
+def test_partials_await_their_arguments() -> None:
+    factory = instantiate({"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.5})
+    optimizer = factory(torch.nn.Linear(2, 3).parameters())
+    assert optimizer.param_groups[0]["lr"] == 0.5
+
+
+def test_dicts_and_lists_of_nodes_become_plain_containers() -> None:
+    node = {"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 3}
+    made = instantiate(OmegaConf.create({"first": node, "rest": [node]}))
+    assert type(made) is dict and type(made["rest"]) is list
+    assert isinstance(made["rest"][0], torch.nn.Linear)

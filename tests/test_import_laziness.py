@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("torch", "lightning", "pytorch_lightning", "wandb", "viser", "hydra", "omegaconf", "numpy", "kornia", "numba")
+LIST_MODULES = "\nimport sys\nprint('MODULES', *sorted({name.split('.')[0] for name in sys.modules}))"
+
+
+def imported_by(code: str) -> set[str]:
+    run = subprocess.run([sys.executable, "-c", code + LIST_MODULES], capture_output=True, text=True, check=True)
+    return set(run.stdout.splitlines()[-1].split()[1:])
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import gausim",
+        "from gausim.cli.main import main; assert main(['--help']) == 0",
+        "from gausim.cli.main import main; assert main(['--version']) == 0",
+        "from gausim.cli.main import main; assert main(['no-such-command']) == 2",
+    ],
+)
+def test_loads_nothing_heavy(code: str) -> None:
+    modules = imported_by(code)
+    assert "gausim" in modules
+    assert not modules & set(HEAVY)
+
+
+def test_the_list_of_modules_would_show_a_heavy_import() -> None:
+    assert "numpy" in imported_by("import gausim, numpy")
+
+
+def test_core_needs_no_gpu_dashboard_or_viewer() -> None:
+    assert not imported_by("import gausim.core") & {
+        "lightning",
+        "pytorch_lightning",
+        "wandb",
+        "viser",
+        "hydra",
+        "kornia",
+    }
