@@ -1,0 +1,5 @@
+"""Rendering: Gaussians to images, differentiably. Renderers are interchangeable (core.Renderer)."""
+
+from gausim.render.draw import SceneAppearance, draw, draw_trajectory, film, to_bytes
+
+__all__ = ["SceneAppearance", "draw", "draw_trajectory", "film", "to_bytes"]

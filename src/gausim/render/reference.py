@@ -84,9 +84,7 @@ class ReferenceRenderer:
         width, height = size
         columns, rows = -(-width // TILE), -(-height // TILE)
         hits = _tile_hits(mean2d.detach(), reach, columns, rows)
-        tiles = [
-            self._tile(kernels, hit, TILE * (i % columns), TILE * (i // columns)) for i, hit in enumerate(hits)
-        ]
+        tiles = [self._tile(kernels, hit, TILE * (i % columns), TILE * (i // columns)) for i, hit in enumerate(hits)]
         image = torch.stack(tiles).reshape(rows, columns, TILE, TILE, 4).transpose(1, 2)
         image = image.reshape(rows * TILE, columns * TILE, 4)[:height, :width]
         return image[..., :3], image[..., 3]

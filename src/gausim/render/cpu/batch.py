@@ -15,6 +15,7 @@ from gausim.render.cpu.projection import add_band_sums, depth_order, project_adj
 from gausim.render.cpu.raster import PIXELS, SUMS, backward_band, forward_band
 
 Array = NDArray[Any]
+Gradients = tuple[Array, Array, Array, Array]  # of means, covars, colors, opacities
 
 # A call is cut into at least about this many tasks. A constant, not the number of threads, because the cut decides
 # the order of summation and gradients must not depend on the number of threads.
@@ -98,7 +99,7 @@ class Batch:
                 self._forget(item)
         return rgb, alpha
 
-    def backward(self, pool: WorkerPool, grad_rgb: Array, grad_alpha: Array) -> tuple[Array, Array, Array, Array]:
+    def backward(self, pool: WorkerPool, grad_rgb: Array, grad_alpha: Array) -> Gradients:
         """Gradients of means, covars, colors and opacities."""
         states, views = self.viewmats.shape[:2]
         count = self.means.shape[1]
@@ -123,7 +124,7 @@ class Batch:
         parts = max(1, TASKS // states)
         cuts = [i * count // parts for i in range(parts + 1)]
         pool.run(
-            lambda item: self._finish(*item, *grads),
+            lambda part: self._finish(part, grads),
             [(b, low, high) for b in range(states) for low, high in zip(cuts, cuts[1:], strict=False) if high > low],
         )
         return grads
@@ -147,18 +148,15 @@ class Batch:
         entries, start = fill_tiles(extents, bound, *rows, strips)
         final = np.empty((start.shape[0] - 1, PIXELS), np.float32)
         last = np.empty((start.shape[0] - 1, PIXELS), np.float32)
-        forward_band(
-            records, entries, start, rows[0], self.background, self.alpha_max, rgb, alpha, final, last
-        )
+        forward_band(records, entries, start, rows[0], self.background, self.alpha_max, rgb, alpha, final, last)
         return Band(rows[0], records, entries, start, row_of, final, last)
 
     def _forget(self, item: tuple[int, int]) -> None:
         view = self.views[item]
         view.records = view.extents = view.order = None
 
-    def _finish(
-        self, b: int, low: int, high: int, means: Array, covars: Array, colors: Array, opacities: Array
-    ) -> None:
+    def _finish(self, part: tuple[int, int, int], grads: Gradients) -> None:
+        (b, low, high), (means, covars, colors, opacities) = part, grads
         means[b, low:high], covars[b, low:high], opacities[b, low:high] = 0, 0, 0
         colors[b, :, low:high] = 0
         for v in range(self.viewmats.shape[1]):

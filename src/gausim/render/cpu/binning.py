@@ -1,5 +1,7 @@
 """Assignment of projected Gaussians to the tiles of one band, in depth order."""
 
+# Annotations would be checked by beartype in the tests, around functions that numba has to compile.
+# mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
 import math

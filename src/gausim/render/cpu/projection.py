@@ -1,5 +1,7 @@
 """Projection of Gaussians into one view, and their order by depth."""
 
+# Annotations would be checked by beartype in the tests, around functions that numba has to compile.
+# mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
 import math
@@ -10,8 +12,9 @@ import numpy as np
 # Without nnan and ninf: this is the gate that finds non-finite input, so it must be able to see it.
 FINITE_MATH_OFF = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
-# Raster record, float32: integer and fractional part of the mean (so that offsets inside a tile stay exact far from
-# the image's origin), -A/16, -B/8, -C/16 of the inverse covariance, opacity, colour, exponent below which alpha < 1/255.
+# Raster record, float32: integer and fractional part of the mean, x then y (so that offsets inside a tile stay exact
+# far from the image's origin), -A/16, -B/8, -C/16 of the inverse covariance, opacity, colour, and the exponent below
+# which alpha < 1/255, over 8.
 RECORD = 12
 # Extent record, float64: mean x y, half width X, half height Y, B/C, -(B/A) Y, t/C, det Q / C^2.
 EXTENT = 8
@@ -185,13 +188,21 @@ def project_adjoint(
         for j in range(3):
             p, q = g00 * frame[3 + j] + g01 * frame[6 + j], g01 * frame[3 + j] + g11 * frame[6 + j]
             grad_row0[j], grad_row1[j] = p, q
-            for l in range(3):
-                grad_covars[k, l, j] += frame[3 + l] * p + frame[6 + l] * q
+            for h in range(3):
+                grad_covars[k, h, j] += frame[3 + h] * p + frame[6 + h] * q
         p0, p1, p2 = grad_row0[0], grad_row0[1], grad_row0[2]
         q0, q1, q2 = grad_row1[0], grad_row1[1], grad_row1[2]
         # dL/dM = 2 G_S M Sigma; of dL/dJ = dL/dM R^T only the four entries that J has are needed.
-        n0, n1, n2 = 2 * (p0 * xx + p1 * xy + p2 * xz), 2 * (p0 * xy + p1 * yy + p2 * yz), 2 * (p0 * xz + p1 * yz + p2 * zz)
-        o0, o1, o2 = 2 * (q0 * xx + q1 * xy + q2 * xz), 2 * (q0 * xy + q1 * yy + q2 * yz), 2 * (q0 * xz + q1 * yz + q2 * zz)
+        n0, n1, n2 = (
+            2 * (p0 * xx + p1 * xy + p2 * xz),
+            2 * (p0 * xy + p1 * yy + p2 * yz),
+            2 * (p0 * xz + p1 * yz + p2 * zz),
+        )
+        o0, o1, o2 = (
+            2 * (q0 * xx + q1 * xy + q2 * xz),
+            2 * (q0 * xy + q1 * yy + q2 * yz),
+            2 * (q0 * xz + q1 * yz + q2 * zz),
+        )
         j00 = n0 * viewmat[0, 0] + n1 * viewmat[0, 1] + n2 * viewmat[0, 2]
         j02 = n0 * viewmat[2, 0] + n1 * viewmat[2, 1] + n2 * viewmat[2, 2]
         j11 = o0 * viewmat[1, 0] + o1 * viewmat[1, 1] + o2 * viewmat[1, 2]

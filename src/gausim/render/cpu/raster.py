@@ -5,6 +5,8 @@ vector instructions (a test looks for them). Validity is decided on the exponent
 outside its range.
 """
 
+# Annotations would be checked by beartype in the tests, around functions that numba has to compile.
+# mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
 import numba
@@ -150,9 +152,7 @@ def forward_band(records, entries, start, row_low, background, alpha_max, rgb, a
     write_grid(buf, 5 * PIXELS)
     for tile in range(start.shape[0] - 1):
         top, left = row_low + tile // strips * TILE_HEIGHT, tile % strips * TILE_WIDTH
-        forward_tile(
-            records, entries, start[tile], start[tile + 1], np.float32(left), np.float32(top), alpha_max, buf
-        )
+        forward_tile(records, entries, start[tile], start[tile + 1], np.float32(left), np.float32(top), alpha_max, buf)
         for i in range(PIXELS):
             final[tile, i] = abs(buf[i])
             last[tile, i] = buf[4 * PIXELS + i]
@@ -186,9 +186,7 @@ def backward_band(records, entries, start, row_low, background, alpha_max, grad_
             for x in range(left, min(left + TILE_WIDTH, width)):
                 i = (y - top) * TILE_WIDTH + x - left
                 red, green, blue = grad_rgb[y, x, 0], grad_rgb[y, x, 1], grad_rgb[y, x, 2]
-                buf[PIXELS + i] = (
-                    red * background[0] + green * background[1] + blue * background[2] - grad_alpha[y, x]
-                )
+                buf[PIXELS + i] = red * background[0] + green * background[1] + blue * background[2] - grad_alpha[y, x]
                 buf[2 * PIXELS + i] = red
                 buf[3 * PIXELS + i] = green
                 buf[4 * PIXELS + i] = blue

@@ -12,12 +12,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import ConfigError, Rendered
-from gausim.render.cpu.batch import Batch
+from gausim.render.cpu.batch import Array, Batch
 from gausim.render.cpu.pool import WorkerPool
 
 logger = logging.getLogger(__name__)
 
 ANNOUNCE_AFTER = 1.0  # [s]; loading the compiled kernels from numba's cache takes about 0.2 s
+
+
+def _array(tensor: Tensor) -> Array:
+    return tensor.detach().contiguous().numpy()
 
 
 class _Render(torch.autograd.Function):
@@ -26,16 +30,30 @@ class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, covars: Tensor, colors: Tensor, opacities: Tensor, *rest: Any) -> Any:
         pool, keep, viewmats, Ks, background, size, near, alpha_max = rest
-        arrays = [x.detach().contiguous().numpy() for x in (means, covars, colors, opacities, viewmats, Ks)]
-        batch = Batch(*arrays, background, *size, near, np.float32(alpha_max))
+        batch = Batch(
+            means=_array(means),
+            covars=_array(covars),
+            colors=_array(colors),
+            opacities=_array(opacities),
+            viewmats=_array(viewmats),
+            Ks=_array(Ks),
+            background=background,
+            width=size[0],
+            height=size[1],
+            near=near,
+            alpha_max=np.float32(alpha_max),
+        )
         rgb, alpha = batch.forward(pool, keep)
-        ctx.batch, ctx.pool = batch if keep else None, pool
+        if keep:
+            ctx.save_for_backward(means, covars, colors, opacities)
+            ctx.batch, ctx.pool = batch, pool
         return torch.from_numpy(rgb), torch.from_numpy(alpha)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_rgb: Tensor, grad_alpha: Tensor) -> Any:
-        grads = ctx.batch.backward(ctx.pool, grad_rgb.contiguous().numpy(), grad_alpha.contiguous().numpy())
+        _ = ctx.saved_tensors  # raises if an input was changed in place since: the batch shares their memory
+        grads = ctx.batch.backward(ctx.pool, _array(grad_rgb), _array(grad_alpha))
         needed = ctx.needs_input_grad[:4]
         return (*(torch.from_numpy(g) if n else None for g, n in zip(grads, needed, strict=True)), *[None] * 8)
 

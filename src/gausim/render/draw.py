@@ -1,0 +1,182 @@
+"""From a deformed scene to images: covariances, view-dependent colours and the call of a renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gausim.core import Cameras, ConfigError, GaussianScene, Rendered, Renderer, Trajectory
+from gausim.ops.covariance import covariance_from_scales, transport_covariance
+from gausim.ops.spherical_harmonics import spherical_harmonics_basis
+
+
+@dataclass(frozen=True, eq=False)
+class SceneAppearance:
+    """What of a scene stays the same in every frame; made once, drawn thousands of times.
+
+    Attributes:
+        covars: rest covariances [scene units^2] of the n kernels that are drawn.
+        opacities: after the sigmoid.
+        sh: colour coefficients.
+        sh_degree: their degree, 0..3.
+        index: which of the scene's kernels are drawn; None means all.
+    """
+
+    covars: Float[Tensor, "n 3 3"]
+    opacities: Float[Tensor, " n"]
+    sh: Float[Tensor, "n basis 3"]
+    sh_degree: int
+    index: Int[Tensor, " n"] | None
+
+    @staticmethod
+    def of(scene: GaussianScene, mask: Bool[Tensor, " K"] | None = None) -> SceneAppearance:
+        """The appearance of a scene, or of its kernels where ``mask`` holds (e.g. ``scene.foreground``)."""
+        index = None
+        if mask is not None and not bool(mask.all()):
+            index = mask.nonzero()[:, 0]
+            scene = scene.select(mask)
+        return SceneAppearance(
+            covars=covariance_from_scales(scene.log_scales, scene.quats),
+            opacities=torch.sigmoid(scene.opacity_logits),
+            sh=scene.sh,
+            sh_degree=scene.sh_degree,
+            index=index,
+        )
+
+    def to(self, like: Tensor) -> SceneAppearance:
+        """The same in the type and on the device of ``like``."""
+        if self.covars.dtype == like.dtype and self.covars.device == like.device:
+            return self
+        index = None if self.index is None else self.index.to(like.device)
+        return SceneAppearance(
+            self.covars.to(like), self.opacities.to(like), self.sh.to(like), self.sh_degree, index
+        )  # fmt: skip
+
+
+def draw(
+    renderer: Renderer,
+    scene: GaussianScene | SceneAppearance,
+    positions: Float[Tensor, "B K 3"],
+    gradients: Float[Tensor, "B N 3 3"],
+    rotations: Float[Tensor, "B N 3 3"],
+    unit_of_kernel: Int[Tensor, " K"],
+    cameras: Cameras,
+    *,
+    background: Float[Tensor, " 3"] | None = None,
+    mask: Bool[Tensor, " K"] | None = None,
+) -> Rendered:
+    """Draws B deformed states of one scene in every camera (METHOD section 2).
+
+    Kernel k of unit c has covariance G_c S_k G_c^T and the colour of its spherical harmonics at Q_c^T d, d the unit
+    vector from the camera to the kernel. Differentiable in ``positions``, ``gradients`` and ``rotations``.
+
+    Args:
+        renderer: what draws.
+        scene: the rest scene; training passes a SceneAppearance made once.
+        positions: kernel means of each state [scene units].
+        gradients: accumulated deformation gradients G of the N units.
+        rotations: their accumulated rotations Q.
+        unit_of_kernel: the unit of each kernel.
+        cameras: V views.
+        background: colour behind the kernels; black when absent.
+        mask: draw only these kernels; goes with a GaussianScene (a SceneAppearance has chosen its own).
+
+    Raises:
+        ConfigError: a mask beside a SceneAppearance.
+    """
+    if isinstance(scene, GaussianScene):
+        scene = SceneAppearance.of(scene, mask)
+    elif mask is not None:
+        raise ConfigError("draw: expected a mask only beside a GaussianScene. Give it to SceneAppearance.of instead.")
+    look = scene.to(positions)
+    if look.index is not None:
+        positions, unit_of_kernel = positions.index_select(1, look.index), unit_of_kernel[look.index]
+    covars = transport_covariance(look.covars, gradients.index_select(1, unit_of_kernel))
+    states, views = positions.shape[0], cameras.viewmats.shape[0]
+    return renderer(
+        positions,
+        covars,
+        view_colors(look, positions, rotations, unit_of_kernel, cameras.centers.to(positions)),
+        look.opacities.expand(states, -1),
+        cameras.viewmats.to(positions).expand(states, views, 4, 4),
+        cameras.Ks.to(positions).expand(states, views, 3, 3),
+        (cameras.width, cameras.height),
+        background=background,
+    )
+
+
+def view_colors(
+    look: SceneAppearance,
+    positions: Float[Tensor, "B n 3"],
+    rotations: Float[Tensor, "B N 3 3"],
+    unit_of_kernel: Int[Tensor, " n"],
+    centers: Float[Tensor, "V 3"],
+) -> Float[Tensor, "B V n 3"]:
+    """Colours of the kernels as each camera sees them, max(0, 0.5 + sum_b sh_b Y_b(Q^T d))."""
+    if look.sh_degree == 0:
+        basis = spherical_harmonics_basis(0, centers.new_zeros(3))
+        colors = (0.5 + basis * look.sh[:, 0]).clamp_min(0.0)
+        return colors.expand(positions.shape[0], centers.shape[0], -1, 3)
+    away = torch.nn.functional.normalize(positions[:, None] - centers[:, None], dim=-1)
+    turned = away.transpose(1, 2) @ rotations.index_select(1, unit_of_kernel)  # rows d^T Q, (B, n, V, 3)
+    basis = spherical_harmonics_basis(look.sh_degree, turned)
+    return (torch.einsum("bnvs,nsc->bvnc", basis, look.sh) + 0.5).clamp_min(0.0)
+
+
+def draw_trajectory(
+    renderer: Renderer,
+    scene: GaussianScene | SceneAppearance,
+    trajectory: Trajectory,
+    cameras: Cameras,
+    *,
+    background: Float[Tensor, " 3"] | None = None,
+    mask: Bool[Tensor, " K"] | None = None,
+    chunk: int = 16,
+) -> Iterator[Rendered]:
+    """Draws a trajectory for evaluation, ``chunk`` frames at a time, without gradients.
+
+    Yields:
+        The images of the next frames, (frames, V, ...), in order.
+    """
+    if isinstance(scene, GaussianScene):
+        scene, mask = SceneAppearance.of(scene, mask), None
+    for start in range(0, trajectory.frames, chunk):
+        frames = slice(start, start + chunk)
+        with torch.no_grad():
+            images = draw(
+                renderer,
+                scene,
+                trajectory.positions[frames],
+                trajectory.gradients[frames],
+                trajectory.rotations[frames],
+                trajectory.unit_of_kernel,
+                cameras,
+                background=background,
+                mask=mask,
+            )
+        yield images
+
+
+def film(
+    renderer: Renderer,
+    scene: GaussianScene | SceneAppearance,
+    trajectory: Trajectory,
+    cameras: Cameras,
+    *,
+    background: Float[Tensor, " 3"] | None = None,
+    mask: Bool[Tensor, " K"] | None = None,
+    chunk: int = 16,
+    as_bytes: bool = True,
+) -> Tensor:
+    """All frames of a trajectory, (F, V, H, W, 3): uint8, or float in linear input colours (not clamped)."""
+    parts = draw_trajectory(renderer, scene, trajectory, cameras, background=background, mask=mask, chunk=chunk)
+    return torch.cat([to_bytes(part.rgb) if as_bytes else part.rgb for part in parts])
+
+
+def to_bytes(image: Float[Tensor, "*shape"]) -> Tensor:
+    """Rounds colours in 0..1 to uint8, clamping what lies outside."""
+    return (image.clamp(0.0, 1.0) * 255 + 0.5).to(torch.uint8)
