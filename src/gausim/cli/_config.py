@@ -185,7 +185,7 @@ def _close_keys(config_name: str, message: str) -> str:
 
 
 def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
-    for key in node:
+    for key in map(str, node):
         yield f"{prefix}{key}"
         if not OmegaConf.is_missing(node, key) and not OmegaConf.is_interpolation(node, key):
             child = node[key]
@@ -210,13 +210,13 @@ def instantiate(node: DictConfig | ListConfig | Mapping[str, Any], **kwargs: Any
         GausSimError: whatever the constructor raises on purpose.
     """
     config = node if isinstance(node, DictConfig | ListConfig) else OmegaConf.create(dict(node))
-    has_target = isinstance(config, DictConfig) and "_target_" in config
-    if kwargs and not has_target:
+    target = config.get("_target_") if isinstance(config, DictConfig) else None
+    if kwargs and target is None:
         raise ConfigError(f"expected a node with `_target_` for the arguments {sorted(kwargs)}, got {config!r}.")
     check_targets(config)
     where = str(config._get_full_key(None) or "configuration")
     try:
-        if not has_target:
+        if not isinstance(config, DictConfig) or target is None:
             return hydra.utils.instantiate(config, _convert_="all")
         wants_partial = bool(config.get("_partial_", False))
         factory = hydra.utils.instantiate(config, _convert_="all", _partial_=True)
@@ -226,7 +226,7 @@ def instantiate(node: DictConfig | ListConfig | Mapping[str, Any], **kwargs: Any
     except TypeError as error:
         if not _is_wrong_call(error):
             raise  # from inside the constructor: a defect there, not a wrong configuration
-        raise ConfigError(f"{where}: {error}. Compare the keys with {config.get('_target_')}.") from error
+        raise ConfigError(f"{where}: {error}. Compare the keys with {target}.") from error
 
 
 def _is_wrong_call(error: TypeError) -> bool:
