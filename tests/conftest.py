@@ -21,8 +21,8 @@ def _left_unchecked(decorator: ast.AST, *, marked=_import_hook._is_no_type_check
 
 
 _import_hook._is_no_type_check = _left_unchecked
-# Before anything imports gausim: every annotated signature, shapes included, is checked in every test. An int is a float
-# as it is to mypy (PEP 484), or `lr: 1` in a configuration would fail under test and nowhere else.
+# Before anything imports gausim: every annotated signature, shapes included, is checked in every test. An int is a
+# float as it is to mypy (PEP 484), or `lr: 1` in a configuration would fail under test and nowhere else.
 install_import_hook("gausim", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
 
