@@ -1,0 +1,161 @@
+"""Figures from result arrays: errors over time, space-time slices, contact sheets. Never touches a model."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from gausim.report.curves import ERROR_3D, STATIC, ObjectCurves
+from gausim.report.frames import error_colors, moving_line, space_time_slice
+
+_DPI = 110
+_SEEN_SHADE = "#dde6ee"
+_METHOD_COLORS = ("#c2410c", "#1d4ed8", "#15803d", "#7e22ce")
+_REFERENCE_COLORS = ("#555555", "#999999", "#bbbbbb")
+
+
+def error_figure(curves: ObjectCurves, path: Path, *, sequence: str | None = None) -> None:
+    """Errors over time of every row: 3D where truth exists, then l2 in the training and held-out views.
+
+    Args:
+        curves: the evaluated object.
+        path: PNG to write.
+        sequence: one sequence; mean over all, with a band of one standard deviation for the methods, when None.
+    """
+    facts = curves.facts
+    panels = [("l2", group) for group in ("train", "heldout") if curves.view_indices(group)]
+    if any(ERROR_3D in metrics for metrics in curves.values.values()):
+        panels.insert(0, (ERROR_3D, "points"))
+    figure = Figure(figsize=(5.2 * len(panels), 3.6), dpi=_DPI, layout="constrained")
+    for axes, (metric, group) in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
+        _error_panel(axes, curves, metric, group, sequence)
+    figure.suptitle(f"{facts.name}, {sequence or f'mean over {len(facts.sequences)} sequences'}", fontsize=10)
+    _save(figure, path)
+
+
+def _error_panel(axes: Axes, curves: ObjectCurves, metric: str, group: str, sequence: str | None) -> None:
+    titles = {"points": "3D error [% of diagonal]", "train": "l2 x 1000, training views",
+              "heldout": "l2 x 1000, views never trained on"}  # fmt: skip
+    scale = 1.0 if metric == ERROR_3D else 1e3
+    references = [row for row in curves.rows if row not in curves.facts.methods]
+    for row in curves.rows:
+        if metric not in curves.values[row]:
+            continue
+        lines = _lines(curves, row, metric, group, sequence) * scale
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # frames that no sequence has
+            mean, std = np.nanmean(lines, 0), np.nanstd(lines, 0)
+        is_method = row in curves.facts.methods
+        palette, place = (_METHOD_COLORS, curves.facts.methods) if is_method else (_REFERENCE_COLORS, references)
+        color = palette[list(place).index(row) % len(palette)]
+        style = "-" if is_method else "--" if row == STATIC else ":"
+        axes.plot(mean, style, color=color, label=row, linewidth=1.8 if is_method else 1.2)
+        if is_method and len(lines) > 1:
+            axes.fill_between(np.arange(len(mean)), mean - std, mean + std, color=color, alpha=0.15, linewidth=0)
+    _shade_seen(axes, curves.facts.first_unseen)
+    axes.set(title=titles[group], xlabel="frame", ylim=(0, None), xlim=(0, max(curves.facts.frames) - 1))
+    axes.title.set_fontsize(9)
+    axes.legend(fontsize=7, loc="upper left")
+
+
+def _lines(curves: ObjectCurves, row: str, metric: str, group: str, sequence: str | None) -> np.ndarray:
+    """(S, F) values, averaged over the group's views."""
+    values = curves.values[row][metric]
+    if group != "points":
+        values = values[:, :, curves.view_indices(group)].mean(-1)
+    return values if sequence is None else values[[curves.facts.sequences.index(sequence)]]
+
+
+def _shade_seen(axes: Axes, first_unseen: int) -> None:
+    axes.axvspan(-0.5, first_unseen - 0.5, color=_SEEN_SHADE, zorder=0, label="seen in training")
+
+
+def slice_figure(
+    truth: np.ndarray | None, prediction: np.ndarray, path: Path, *, title: str, first_unseen: int
+) -> tuple[str, int]:
+    """Space-time slices of truth above prediction, through the line that moves most in the truth.
+
+    Args:
+        truth: (F, H, W, 3) uint8, of any length; without it the prediction chooses the line.
+        prediction: (F, H, W, 3) uint8.
+        path: PNG to write.
+        title: sequence and view.
+        first_unseen: first frame that training did not see; a line marks it.
+
+    Returns:
+        The line: ("column" | "row", index).
+    """
+    line = moving_line(prediction if truth is None else truth)
+    images = {"prediction": prediction} if truth is None else {"ground truth": truth, "prediction": prediction}
+    figure = Figure(figsize=(7.0, 2.6 * len(images)), dpi=_DPI, layout="constrained")
+    for axes, (name, frames) in zip(np.ravel(figure.subplots(len(images), 1)), images.items(), strict=True):
+        axes.imshow(space_time_slice(frames, line), aspect="auto", interpolation="nearest")
+        if first_unseen < len(frames):
+            axes.axvline(first_unseen - 0.5, color="#f0962a", linewidth=1.4)
+        axes.set(ylabel=name, xlim=(-0.5, len(prediction) - 0.5), yticks=[])
+    axes.set_xlabel("frame (foreseen right of the line)")
+    figure.suptitle(f"{title}: {line[0]} {line[1]} over time", fontsize=10)
+    _save(figure, path)
+    return line
+
+
+def contact_frames(frames: int, first_unseen: int, count: int = 8) -> list[int]:
+    """Frames worth a place on a contact sheet: first, last seen, first unseen, last, and evenly between."""
+    edges = {0, min(first_unseen - 1, frames - 1), min(first_unseen, frames - 1), frames - 1}
+    even = np.linspace(0, frames - 1, count).round().astype(int).tolist()
+    return sorted(edges | set(even))
+
+
+def contact_sheet(
+    truth: np.ndarray | None, prediction: np.ndarray, path: Path, *, title: str, first_unseen: int
+) -> None:
+    """Chosen frames of truth, prediction and error under one another; foreseen frames carry an orange number.
+
+    Args:
+        truth: (F, H, W, 3) uint8, or None; frames beyond its end stay empty.
+        prediction: (F, H, W, 3) uint8.
+        path: PNG to write.
+        title: sequence and view.
+        first_unseen: first frame that training did not see.
+    """
+    chosen = contact_frames(len(prediction), first_unseen)
+    names = ["prediction"] if truth is None else ["ground truth", "prediction", "error"]
+    height = 1.25 * prediction.shape[1] / prediction.shape[2]
+    figure = Figure(figsize=(1.25 * len(chosen), height * len(names) + 0.6), dpi=_DPI, layout="constrained")
+    grid = figure.subplots(len(names), len(chosen), squeeze=False)
+    for column, frame in enumerate(chosen):
+        images: dict[str, np.ndarray] = {"prediction": prediction[frame]}
+        if truth is not None and frame < len(truth):
+            images |= {"ground truth": truth[frame], "error": error_colors(truth[frame], prediction[frame])}
+        for axes, name in zip(grid[:, column], names, strict=True):
+            axes.set(xticks=[], yticks=[])
+            if name in images:
+                axes.imshow(images[name])
+            if column == 0:
+                axes.set_ylabel(name, fontsize=8)
+        foreseen = frame >= first_unseen
+        grid[0, column].set_title(str(frame), fontsize=8, color="#c2410c" if foreseen else "black")
+    figure.suptitle(title, fontsize=10)
+    _save(figure, path)
+
+
+def picture_grid(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, *, title: str) -> None:
+    """Labelled (H, W, 3) uint8 pictures in one row, as PNG."""
+    ratio = images[0].shape[0] / images[0].shape[1]
+    figure = Figure(figsize=(3.2 * len(images), 3.2 * ratio + 0.7), dpi=_DPI, layout="constrained")
+    for axes, image, label in zip(np.ravel(figure.subplots(1, len(images))), images, labels, strict=True):
+        axes.imshow(image)
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(label, fontsize=8)
+    figure.suptitle(title, fontsize=10)
+    _save(figure, path)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)

@@ -1,0 +1,94 @@
+"""Pictures for people from images of truth and prediction: side-by-side frames, error colours, space-time lines."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+# Colour distance that the error panel shows as white-hot; the largest possible one is sqrt(3).
+ERROR_RANGE = 0.5
+PANEL_HEIGHT = 320
+_BAR = 24
+_SEEN, _FORESEEN, _INK, _PAPER = (120, 160, 200), (240, 150, 40), (235, 235, 235), (24, 24, 24)
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Where a video stands: how many frames there are, and the first that training did not see."""
+
+    frames: int
+    first_unseen: int
+
+
+def error_colors(truth: np.ndarray, prediction: np.ndarray) -> np.ndarray:
+    """Per-pixel colour distance of (H, W, 3) uint8 images as a heat map, black = 0, brightest = ERROR_RANGE."""
+    distance = np.linalg.norm(truth.astype(np.float32) - prediction.astype(np.float32), axis=-1) / 255
+    level = np.clip(distance / ERROR_RANGE * 255 + 0.5, 0, 255).astype(np.uint8)
+    return cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+
+
+def video_frame(
+    truth: np.ndarray | None, prediction: np.ndarray, frame: int, timeline: Timeline, title: str
+) -> np.ndarray:
+    """One frame of a comparison: ground truth | prediction | error, labels above, the time line below.
+
+    Args:
+        truth: (H, W, 3) uint8; None beyond the recorded frames, where its panels stay empty.
+        prediction: (H, W, 3) uint8.
+        frame: its number.
+        timeline: of the whole video.
+        title: what is shown (sequence and view).
+    """
+    missing = np.full_like(prediction, _PAPER[0])
+    error = missing if truth is None else error_colors(truth, prediction)
+    zoom = max(1.0, PANEL_HEIGHT / prediction.shape[0])
+    panels = [_enlarge(p, zoom) for p in (missing if truth is None else truth, prediction, error)]
+    labels = ["ground truth" if truth is not None else "no ground truth", "prediction", f"error 0..{ERROR_RANGE:g}"]
+    labelled = [np.concatenate((_label(text, p.shape[1]), p)) for text, p in zip(labels, panels, strict=True)]
+    picture = np.concatenate(labelled, axis=1)
+    return np.concatenate((picture, _footer(frame, timeline, title, picture.shape[1])))
+
+
+def _enlarge(image: np.ndarray, zoom: float) -> np.ndarray:
+    if zoom == 1:
+        return image
+    return cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
+
+
+def _label(text: str, width: int) -> np.ndarray:
+    bar = np.full((_BAR, width, 3), _PAPER, np.uint8)
+    return cv2.putText(bar, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.48, _INK, 1, cv2.LINE_AA)
+
+
+def _footer(frame: int, timeline: Timeline, title: str, width: int) -> np.ndarray:
+    foreseen = frame >= timeline.first_unseen
+    state = "FORESEEN" if foreseen else "seen in training"
+    bar = _label(f"{title}   frame {frame}/{timeline.frames - 1}   {state}", width)
+    line = np.full((8, width, 3), _PAPER, np.uint8)
+    begin, now = (round(width * f / timeline.frames) for f in (timeline.first_unseen, frame + 1))
+    line[:, : min(begin, now)] = _SEEN
+    line[:, begin:now] = _FORESEEN
+    line[:, min(begin, width - 1) :][:, :2] = _INK
+    if foreseen:
+        bar[:, -_BAR:] = _FORESEEN
+    return np.concatenate((bar, line))
+
+
+def moving_line(frames: np.ndarray) -> tuple[str, int]:
+    """The image line with the most motion per pixel in (F, H, W, 3) frames: ("column" | "row", index)."""
+    moved = np.zeros(frames.shape[1:3])
+    for before, after in zip(frames[:-1], frames[1:], strict=True):
+        moved += np.square(after.astype(np.float32) - before.astype(np.float32)).sum(-1)
+    columns, rows = moved.mean(0), moved.mean(1)
+    if columns.max() >= rows.max():
+        return "column", int(columns.argmax())
+    return "row", int(rows.argmax())
+
+
+def space_time_slice(frames: np.ndarray, line: tuple[str, int]) -> np.ndarray:
+    """That line of every (F, H, W, 3) frame side by side: (pixels of the line, F, 3), time to the right."""
+    kind, index = line
+    picked = frames[:, :, index] if kind == "column" else frames[:, index]
+    return picked.swapaxes(0, 1)

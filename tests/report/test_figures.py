@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gausim.report.figures import contact_frames, contact_sheet, error_figure, picture_grid, slice_figure
+from gausim.report.frames import Timeline, error_colors, moving_line, space_time_slice, video_frame
+
+CURVES = runpy.run_path(str(Path(__file__).with_name("test_summary.py")))["curves"]
+
+
+def swinging(frames: int = 12, height: int = 20, width: int = 30) -> np.ndarray:
+    """A bright spot that goes up and down in column 17."""
+    images = np.zeros((frames, height, width, 3), np.uint8)
+    for f in range(frames):
+        images[f, 4 + f % 7, 17] = 250
+    return images
+
+
+def read(path: Path) -> np.ndarray:
+    image = cv2.imread(str(path))
+    assert image is not None
+    return image
+
+
+def test_the_moving_line_is_found_and_cut():
+    images = swinging()
+    assert moving_line(images) == ("column", 17)
+    assert moving_line(images.swapaxes(1, 2)) == ("row", 17)
+    cut = space_time_slice(images, ("column", 17))
+    assert cut.shape == (20, 12, 3)
+    assert [int(cut[:, f, 0].argmax()) for f in range(12)] == [4 + f % 7 for f in range(12)]
+    assert np.array_equal(space_time_slice(images.swapaxes(1, 2), ("row", 17)), cut)
+
+
+def test_error_colours_grow_with_the_error():
+    truth = np.zeros((2, 3, 3), np.uint8)
+    prediction = truth.copy()
+    prediction[0, 1], prediction[0, 2] = 20, 70
+    shown = error_colors(truth, prediction).astype(int).sum(-1)
+    assert shown[0, 0] < shown[0, 1] < shown[0, 2]
+    assert np.array_equal(error_colors(prediction, prediction)[0, 2], error_colors(truth, truth)[0, 0])
+
+
+def test_video_frames_have_one_size_and_mark_what_is_foreseen():
+    images, timeline = swinging(), Timeline(12, 5)
+    seen = video_frame(images[4], images[4], 4, timeline, "seq")
+    foreseen = video_frame(images[5], images[5], 5, timeline, "seq")
+    beyond = video_frame(None, images[5], 11, timeline, "seq")
+    assert seen.shape == foreseen.shape == beyond.shape and seen.dtype == np.uint8
+    orange = (240, 150, 40)
+    assert not (seen == orange).all(-1).any()
+    assert (foreseen == orange).all(-1).sum() < (beyond == orange).all(-1).sum()
+
+
+def test_prediction_stands_in_the_middle_panel():
+    truth = np.zeros((20, 30, 3), np.uint8)
+    prediction = np.full_like(truth, 200)
+    picture = video_frame(truth, prediction, 0, Timeline(12, 5), "seq")
+    third = picture.shape[1] // 3
+    middle = picture[picture.shape[0] // 2]
+    assert (middle[: third - 2] == 0).all() and (middle[third + 2 : 2 * third - 2] == 200).all()
+
+
+def test_contact_frames_hold_the_turning_points():
+    assert {0, 15, 16, 59} <= set(contact_frames(60, 16)) and len(contact_frames(60, 16)) <= 12
+    assert contact_frames(10, 16)[-1] == 9
+
+
+@pytest.mark.parametrize("sequence", [None, "b"])
+def test_error_figure_is_written(tmp_path, sequence):
+    error_figure(CURVES(), tmp_path / "new" / "errors.png", sequence=sequence)
+    image = read(tmp_path / "new" / "errors.png")
+    assert image.shape[1] > 1200  # three panels: 3D, training views, held-out views
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50
+
+
+def test_slices_and_sheets_show_truth_and_prediction(tmp_path):
+    truth = swinging()
+    late = np.roll(truth, 2, axis=0)
+    assert slice_figure(truth, late, tmp_path / "both.png", title="t", first_unseen=5) == ("column", 17)
+    assert slice_figure(None, truth, tmp_path / "one.png", title="t", first_unseen=5) == ("column", 17)
+    assert read(tmp_path / "both.png").shape[0] > 1.5 * read(tmp_path / "one.png").shape[0]
+    contact_sheet(truth[:8], late, tmp_path / "sheet.png", title="t", first_unseen=5)
+    contact_sheet(None, late, tmp_path / "alone.png", title="t", first_unseen=5)
+    assert read(tmp_path / "sheet.png").shape[0] > 1.5 * read(tmp_path / "alone.png").shape[0]
+    picture_grid(list(truth[:3]), ["a", "b", "c"], tmp_path / "grid.png", title="t")
+    assert read(tmp_path / "grid.png").max() == 255
