@@ -1,0 +1,104 @@
+"""A tiny object on disk whose motion is known by formula: a block of kernels that sways about its pinned foot."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gausim.core import Cameras, GaussianScene, Trajectory
+from gausim.data.images import write_rgba
+from gausim.io.ply import save_scene
+from gausim.io.transforms import write_transforms
+from gausim.render.draw import draw
+from gausim.render.reference import ReferenceRenderer
+
+AMPLITUDES = {"seq_000": 0.4, "seq_001": -0.25}
+OMEGA, SIZE, VIEWS = 0.45, 32, ("cam_0", "cam_1", "cam_2")
+
+
+@dataclass
+class ToyObject:
+    root: Path
+    scene: GaussianScene
+    frames: int = 20
+    first_unseen: int = 8
+    fps: float = 24.0
+    amplitudes: dict[str, float] = field(default_factory=lambda: dict(AMPLITUDES))
+
+    def truth(self, sequence: str, frames: int | None = None) -> Trajectory:
+        count = frames or self.frames
+        wave = torch.sin(OMEGA * torch.arange(count)) * self.amplitudes[sequence]
+        shift = torch.zeros(count, self.scene.count, 3)
+        shift[:, :, 0] = wave[:, None] * self.scene.means[:, 2] ** 2
+        identity = torch.eye(3).expand(count, 1, 3, 3)
+        return Trajectory(self.scene.means + shift, identity, identity,
+                          torch.zeros(self.scene.count, dtype=torch.long), self.fps)  # fmt: skip
+
+
+def toy_scene() -> GaussianScene:
+    axis = torch.tensor([-0.3, 0.0, 0.3])
+    means = torch.cartesian_prod(axis, axis, torch.tensor([0.0, 0.35, 0.7, 1.05]))
+    generator = torch.Generator().manual_seed(0)
+    return GaussianScene.create(
+        means=means,
+        log_scales=torch.full((len(means), 3), math.log(0.12)),
+        quats=torch.tensor([1.0, 0, 0, 0]).expand(len(means), 4).clone(),
+        opacity_logits=torch.full((len(means),), 2.0),
+        sh=torch.rand(len(means), 1, 3, generator=generator),
+        pinned=means[:, 2] < 0.1,
+        name="toy",
+    )
+
+
+def cameras() -> Cameras:
+    viewmats = []
+    for angle in (0.0, 1.2, -0.9):
+        eye = torch.tensor([4 * math.sin(angle), -4 * math.cos(angle), 0.9])
+        forward = torch.nn.functional.normalize(torch.tensor([0.0, 0.0, 0.5]) - eye, dim=0)
+        right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
+        rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
+        viewmat = torch.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+        viewmats.append(viewmat)
+    k = torch.tensor([[56.0, 0, SIZE / 2], [0, 56.0, SIZE / 2], [0, 0, 1]])
+    return Cameras(torch.stack(viewmats), k.expand(3, 3, 3), SIZE, SIZE, VIEWS)
+
+
+def write_toy_object(root: Path, *, frames: int = 20) -> ToyObject:
+    toy = ToyObject(root, toy_scene(), frames=frames)
+    root.mkdir(parents=True)
+    facts = {"name": "toy", "fps": 24, "views": VIEWS, "train_views": VIEWS[:2], "heldout_views": VIEWS[2:],
+             "train_frames": [0, toy.first_unseen]}  # fmt: skip
+    (root / "dataset.json").write_text(json.dumps(facts))
+    save_scene(toy.scene, root / "scene.ply")
+    np.savez(root / "rest_points.npz", points=toy.scene.means.numpy())
+    for name in toy.amplitudes:
+        _write_sequence(toy, name)
+    return toy
+
+
+def _write_sequence(toy: ToyObject, name: str) -> None:
+    folder, trajectory = toy.root / "sequences" / name, toy.truth(name)
+    images = rgba(toy.scene, trajectory)
+    entries = []
+    for v, view in enumerate(VIEWS):
+        (folder / view).mkdir(parents=True)
+        for f in range(toy.frames):
+            write_rgba(folder / view / f"{f:04d}.png", images[f, v])
+            entries.append({"file_path": f"{view}/{f:04d}.png", "camera": view, "frame": f})
+    every = cameras().select([v for v in range(len(VIEWS)) for _ in range(toy.frames)])
+    write_transforms(folder / "transforms.json", every, entries, fps=toy.fps)
+    np.savez(folder / "ground_truth.npz", displacement=(trajectory.positions - toy.scene.means).numpy())
+
+
+def rgba(scene: GaussianScene, trajectory: Trajectory) -> Tensor:
+    drawn = draw(ReferenceRenderer(), scene, trajectory.positions, trajectory.gradients, trajectory.rotations,
+                 trajectory.unit_of_kernel, cameras())  # fmt: skip
+    straight = drawn.rgb / drawn.alpha.clamp_min(1e-6)[..., None]
+    return (torch.cat((straight, drawn.alpha[..., None]), -1).clamp(0, 1) * 255).round().to(torch.uint8)
