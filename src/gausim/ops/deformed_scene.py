@@ -1,0 +1,90 @@
+"""One frame of a trajectory as a scene of its own, so that any 3DGS viewer can show it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gausim.core import GaussianScene
+from gausim.ops.covariance import covariance_from_scales
+from gausim.ops.spherical_harmonics import spherical_harmonics_basis
+
+# Directions in which rotated colours are sampled; twice the 16 unknowns of degree 3.
+_DIRECTIONS = 32
+# Matrices this close to the identity leave a kernel's stored fields as they are.
+_UNMOVED = 1e-7
+_KERNELS_AT_ONCE = 8192
+
+
+def deformed_scene(
+    scene: GaussianScene,
+    positions: Float[Tensor, "K 3"],
+    gradients: Float[Tensor, "N 3 3"],
+    rotations: Float[Tensor, "N 3 3"],
+    unit_of_kernel: Int[Tensor, " K"],
+) -> GaussianScene:
+    """The scene whose Gaussians are those of a deformed state.
+
+    Covariances G S G^T are taken apart into axes and lengths, and the spherical harmonics are rotated by Q, so that the
+    result looks in every viewer as the trajectory does here. Kernels of units that did not deform keep their fields
+    bit for bit.
+    """
+    identity = torch.eye(3, dtype=gradients.dtype, device=gradients.device)
+    change = torch.maximum((gradients - identity).abs().amax((1, 2)), (rotations - identity).abs().amax((1, 2)))
+    moved = (change > _UNMOVED)[unit_of_kernel]
+    log_scales, quats, sh = scene.log_scales.clone(), scene.quats.clone(), scene.sh.clone()
+    for index in moved.nonzero()[:, 0].split(_KERNELS_AT_ONCE):
+        gradient = gradients[unit_of_kernel[index]].double()
+        covars = covariance_from_scales(scene.log_scales[index].double(), scene.quats[index].double())
+        lengths, axes = torch.linalg.eigh(gradient @ covars @ gradient.mT)
+        # A reflection is no rotation; turning one axis round leaves the covariance as it is.
+        axes = torch.cat((axes[..., :2], axes[..., 2:] * torch.det(axes)[:, None, None]), -1)
+        log_scales[index] = (0.5 * lengths.clamp_min(1e-30).log()).to(log_scales)
+        quats[index] = matrix_to_quaternion(axes).to(quats)
+        sh[index] = rotate_sh(scene.sh[index], rotations[unit_of_kernel[index]])
+    return replace(scene, means=positions.to(scene.means), log_scales=log_scales, quats=quats, sh=sh)
+
+
+def matrix_to_quaternion(rotation: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
+    """Unit quaternions w x y z with w >= 0 of rotation matrices.
+
+    The eigenvector of the largest eigenvalue of Bar-Itzhack's symmetric 4 x 4 matrix (2000): no case is special.
+    """
+    r = rotation
+    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
+    rows = (
+        (xx + yy + zz, r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]),
+        (r[:, 2, 1] - r[:, 1, 2], xx - yy - zz, r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0]),
+        (r[:, 0, 2] - r[:, 2, 0], r[:, 0, 1] + r[:, 1, 0], yy - xx - zz, r[:, 1, 2] + r[:, 2, 1]),
+        (r[:, 1, 0] - r[:, 0, 1], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1], zz - xx - yy),
+    )
+    matrix = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    quats = torch.linalg.eigh(matrix)[1][..., 3]
+    return torch.where(quats[:, :1] < 0, -quats, quats)
+
+
+def rotate_sh(sh: Float[Tensor, "n B 3"], rotation: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n B 3"]:
+    """Coefficients c' with sum c'_b Y_b(d) = sum c_b Y_b(Q^T d) for every direction d.
+
+    Rotations map each degree to itself, so the least-squares fit on enough directions is exact.
+    """
+    degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
+    if degree == 0:
+        return sh.clone()
+    directions = _spread_directions().to(sh.device)
+    turned = directions @ rotation.double()  # rows d^T Q, (n, directions, 3)
+    colors = spherical_harmonics_basis(degree, turned) @ sh.double()
+    inverse = torch.linalg.pinv(spherical_harmonics_basis(degree, directions))
+    return (inverse @ colors).to(sh)
+
+
+def _spread_directions() -> Float[Tensor, "directions 3"]:
+    """Unit vectors on a Fibonacci spiral, evenly over the sphere."""
+    number = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
+    z = 1 - 2 * number / _DIRECTIONS
+    angle = number * torch.pi * (3 - 5**0.5)
+    radius = (1 - z * z).sqrt()
+    return torch.stack((radius * angle.cos(), radius * angle.sin(), z), -1)
