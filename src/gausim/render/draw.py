@@ -95,8 +95,9 @@ def draw(
     look = scene.to(positions)
     if look.index is not None:
         positions, unit_of_kernel = positions.index_select(1, look.index), unit_of_kernel[look.index]
-    covars = transport_covariance(look.covars, gradients.index_select(1, unit_of_kernel))
     states, views = positions.shape[0], cameras.viewmats.shape[0]
+    rest = look.covars.expand(states, -1, -1, -1)
+    covars = transport_covariance(rest, gradients.index_select(1, unit_of_kernel))
     return renderer(
         positions,
         covars,

@@ -92,7 +92,8 @@ class ReferenceRenderer:
     def _tile(self, kernels: Float[Tensor, "n 9"], hit: Int[Tensor, " m"], left: int, top: int) -> Tensor:
         """Colour and remaining transmittance of one tile's pixels, (TILE * TILE, 4)."""
         if hit.numel() == 0:
-            return kernels.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(TILE * TILE, 4)
+            # The empty sum keeps an image without any kernel differentiable (its gradients are zero).
+            return kernels.new_tensor((0.0, 0.0, 0.0, 1.0)).expand(TILE * TILE, 4) + kernels[:0].sum()
         k = kernels[hit]
         axis = torch.arange(TILE, dtype=k.dtype, device=k.device) + 0.5
         dx = (axis + left)[None, :, None] - k[:, 0]  # (1, x, m)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gausim.core.errors import DivergenceError
 from gausim.render.cpu.binning import TILE_HEIGHT, TILE_WIDTH, collect_band, fill_tiles
 from gausim.render.cpu.pool import WorkerPool
-from gausim.render.cpu.projection import add_band_sums, depth_order, project_adjoint, project_view
+from gausim.render.cpu.projection import add_band_sums, count_unusable, depth_order, project_adjoint, project_view
 from gausim.render.cpu.raster import PIXELS, SUMS, backward_band, forward_band
 
 Array = NDArray[Any]
@@ -130,15 +130,16 @@ class Batch:
         return grads
 
     def _project(self, b: int, v: int, bands: int) -> View:
-        records, extents, ids, depth, unusable = project_view(
-            self.means[b], self.covars[b], self.colors[b, v], self.opacities[b], self.viewmats[b, v], self.Ks[b, v],
-            self.width, self.height, self.near,
-        )  # fmt: skip
+        inputs = self.means[b], self.covars[b], self.colors[b, v], self.opacities[b]
+        unusable = count_unusable(*inputs)
         if unusable:
             raise DivergenceError(
                 f"render: {unusable} of {self.means.shape[1]} Gaussians of state {b}, view {v} have a mean, covariance "
                 "or colour that is not finite, or an opacity outside 0..1. Look for the step that made them so."
             )
+        records, extents, ids, depth = project_view(
+            *inputs, self.viewmats[b, v], self.Ks[b, v], self.width, self.height, self.near
+        )
         return View(ids, records, extents, depth_order(depth), [None] * bands)
 
     def _draw_band(self, view: View, rows: tuple[int, int], index: int, rgb: Array, alpha: Array) -> Band:

@@ -9,7 +9,7 @@ import math
 import numba
 import numpy as np
 
-# Without nnan and ninf: this is the gate that finds non-finite input, so it must be able to see it.
+# All of fastmath but nnan and ninf: what overflows here must not turn into an undefined index later.
 FINITE_MATH_OFF = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
 # Raster record, float32: integer and fractional part of the mean, x then y (so that offsets inside a tile stay exact
@@ -22,6 +22,19 @@ EXTENT = 8
 DILATION = 0.3  # [pixels^2], gsplat's and 3DGS's low-pass filter
 ALPHA_MIN = 1.0 / 255.0
 CLAMP_MARGIN = 0.3  # gsplat clamps x/z and y/z to the field of view widened by this fraction
+
+
+@numba.njit(nogil=True, error_model="numpy", cache=True)
+def count_unusable(means, covars, colors, opacities):
+    """Number of kernels that are not finite or whose opacity lies outside 0..1 (no fastmath: it would see no NaN)."""
+    unusable = 0
+    for k in range(means.shape[0]):
+        total = np.float64(0)
+        for i in range(3):
+            total += np.float64(means[k, i]) + colors[k, i] + covars[k, i, 0] + covars[k, i, 1] + covars[k, i, 2]
+        if not (math.isfinite(total) and 0.0 <= opacities[k] <= 1.0):
+            unusable += 1
+    return unusable
 
 
 @numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True, inline="always")
@@ -75,7 +88,7 @@ def project_view(means, covars, colors, opacities, viewmat, K, width, height, ne
 
     Returns:
         records (n, RECORD), extents (n, EXTENT), kernel index (n,) and depth (n,) of the n kernels left, in kernel
-        order, and the number of kernels whose input is unusable (not finite, or opacity outside 0..1).
+        order.
     """
     count = means.shape[0]
     records = np.empty((count, RECORD), np.float32)
@@ -83,15 +96,9 @@ def project_view(means, covars, colors, opacities, viewmat, K, width, height, ne
     ids = np.empty(count, np.int32)
     depth = np.empty(count, np.float32)
     frame = np.empty(22, np.float64)
-    n, unusable = 0, 0
+    n = 0
     for k in range(count):
         o = opacities[k]
-        total = o + means[k, 0] + means[k, 1] + means[k, 2] + colors[k, 0] + colors[k, 1] + colors[k, 2]
-        for i in range(3):
-            total += covars[k, i, 0] + covars[k, i, 1] + covars[k, i, 2]
-        if not (math.isfinite(total) and 0.0 <= o <= 1.0):
-            unusable += 1
-            continue
         z = (
             np.float64(viewmat[2, 0]) * means[k, 0]
             + np.float64(viewmat[2, 1]) * means[k, 1]
@@ -123,7 +130,7 @@ def project_view(means, covars, colors, opacities, viewmat, K, width, height, ne
         extents[n, 6], extents[n, 7] = t / c, 1.0 / (det * c * c)
         ids[n], depth[n] = k, z
         n += 1
-    return records, extents, ids[:n], depth[:n], unusable
+    return records, extents, ids[:n], depth[:n]
 
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)

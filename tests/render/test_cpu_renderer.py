@@ -1,0 +1,153 @@
+"""The compiled renderer against the oracle in float64, and its own promises."""
+
+from __future__ import annotations
+
+import itertools
+import pickle
+import platform
+import re
+from collections.abc import Callable
+
+import numba
+import pytest
+import torch
+
+from gausim.core import ConfigError, DivergenceError
+from gausim.render.cpu import CpuRenderer
+from gausim.render.cpu.raster import backward_tile, forward_tile
+from gausim.render.reference import ReferenceRenderer
+
+CASES = {
+    "usual": dict(states=2, views=3, count=300, size=(66, 50)),
+    "two_bands": dict(states=2, views=2, count=200, size=(45, 70)),
+    "dense": dict(states=2, views=2, count=1500, size=(40, 36), scale=0.05),
+    "big": dict(states=2, views=2, count=60, size=(50, 41), scale=0.8),
+    "tiny": dict(states=2, views=2, count=400, size=(50, 41), scale=1e-4),
+    "around_the_camera": dict(states=2, views=3, count=400, size=(48, 48), spread=2.0),
+    "off_screen": dict(states=2, views=2, count=200, size=(30, 30), spread=4.0, scale=0.5),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_image_and_gradients_equal_the_reference(inputs: Callable, case: str) -> None:
+    given = inputs(**CASES[case])
+    given.opacities[:, 1::9] = 1e-3  # below 1/255
+    images, gradients = given.to(torch.float32).draw_with_gradients(CpuRenderer(threads=2))
+    expected, expected_gradients = given.to(torch.float64).draw_with_gradients(ReferenceRenderer())
+    assert float(expected.alpha.detach().max()) > 0.1
+    torch.testing.assert_close(images.rgb.double(), expected.rgb, atol=1e-5, rtol=0)
+    torch.testing.assert_close(images.alpha.double(), expected.alpha, atol=1e-5, rtol=0)
+    for name, value, truth in zip(
+        ("means", "covars", "colors", "opacities"), gradients, expected_gradients, strict=True
+    ):
+        assert float((value - truth).norm() / truth.norm()) < 1e-4, name
+
+
+def test_one_view_alone_is_cut_into_more_bands_and_stays_the_same(inputs: Callable) -> None:
+    """A single view has eight bands, six views have two each: images agree bit for bit, gradients to rounding."""
+    given = inputs(2, 3, 300, (40, 130)).to(torch.float32)
+    together, gradients = given.draw_with_gradients(CpuRenderer(threads=2))
+    sums = [torch.zeros_like(x) for x in gradients]
+    g = torch.Generator().manual_seed(5)
+    weights = torch.randn(together.rgb.shape, generator=g), torch.randn(together.alpha.shape, generator=g)
+    for b, v in itertools.product(range(2), range(3)):
+        state, view = slice(b, b + 1), slice(v, v + 1)
+        parts = (given.means[state], given.covars[state], given.colors[state, view], given.opacities[state])
+        leaves = [x.detach().requires_grad_() for x in parts]
+        cameras = given.viewmats[state, view], given.Ks[state, view]
+        alone = CpuRenderer(threads=2)(*leaves, *cameras, given.size, background=given.background)
+        assert torch.equal(alone.rgb[0, 0], together.rgb[b, v])
+        loss = (alone.rgb * weights[0][state, view]).sum() + (alone.alpha * weights[1][state, view]).sum()
+        for i, grad in enumerate(torch.autograd.grad(loss, leaves)):
+            sums[i][(state, view) if i == 2 else state] += grad
+    for value, expected in zip(sums, gradients, strict=True):
+        assert float((value - expected).norm() / expected.norm()) < 1e-5
+
+
+@pytest.mark.parametrize("size", [(66, 50), (40, 130)])
+def test_threads_change_no_bit(inputs: Callable, size: tuple[int, int]) -> None:
+    given = inputs(2, 2, 400, size)
+    images, gradients = given.to(torch.float32).draw_with_gradients(CpuRenderer(threads=1))
+    for threads in (2, 5):
+        again, again_gradients = given.to(torch.float32).draw_with_gradients(CpuRenderer(threads=threads))
+        assert torch.equal(again.rgb, images.rgb) and torch.equal(again.alpha, images.alpha)
+        assert all(torch.equal(a, b) for a, b in zip(again_gradients, gradients, strict=True))
+
+
+def test_view_that_sees_nothing(inputs: Callable) -> None:
+    """One of the two views looks away; it is background and adds nothing to the gradients."""
+    given = inputs(2, 2, 50, (20, 20))
+    given.viewmats[:, 1, 2, 3] = -50.0
+    given = given.to(torch.float32)
+    given.means.requires_grad_()
+    images = given.draw(CpuRenderer(threads=2))
+    assert torch.equal(images.rgb[:, 1].detach(), given.background.expand(2, 20, 20, 3))
+    (grad,) = torch.autograd.grad(images.rgb[:, 1].square().sum(), given.means, retain_graph=True)
+    assert float(grad.abs().max()) == 0
+    (grad,) = torch.autograd.grad(images.rgb[:, 0].square().sum(), given.means)
+    assert float(grad.abs().max()) > 0
+
+
+def test_only_the_gradients_asked_for_are_given(inputs: Callable) -> None:
+    given = inputs(2, 2, 30, (20, 20)).to(torch.float32)
+    given.covars.requires_grad_()
+    images = given.draw(CpuRenderer(threads=1))
+    images.rgb.sum().backward()
+    assert given.covars.grad is not None and given.means.grad is None
+    with torch.no_grad():
+        assert not given.draw(CpuRenderer(threads=1)).rgb.requires_grad
+
+
+def test_input_changed_in_place_before_backward_is_refused(inputs: Callable) -> None:
+    given = inputs(2, 2, 30, (20, 20)).to(torch.float32)
+    given.colors.requires_grad_()
+    images = given.draw(CpuRenderer(threads=1))
+    given.means += 1
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        images.rgb.sum().backward()
+
+
+@pytest.mark.parametrize("name", ["means", "covars", "colors", "opacities"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_numbers_that_are_not_finite_are_refused(inputs: Callable, name: str, value: float) -> None:
+    given = inputs(2, 2, 30, (20, 20)).to(torch.float32)
+    getattr(given, name).reshape(-1)[40] = value
+    with pytest.raises(DivergenceError, match="1 of 30 Gaussians of state"):
+        given.draw(CpuRenderer(threads=2))
+
+
+def test_wrong_type_and_options_are_refused(inputs: Callable) -> None:
+    with pytest.raises(ConfigError, match="means as float32"):
+        inputs(2, 2, 5, (8, 8)).to(torch.float64).draw(CpuRenderer())
+    for options in ({"threads": 0}, {"near": 0.0}, {"alpha_max": 1.0}):
+        with pytest.raises(ConfigError, match=next(iter(options))):
+            CpuRenderer(**options)
+
+
+def test_renderer_can_be_pickled_after_use(inputs: Callable) -> None:
+    given = inputs(2, 2, 30, (20, 20)).to(torch.float32)
+    renderer = CpuRenderer(threads=2)
+    first = given.draw(renderer)
+    assert torch.equal(given.draw(pickle.loads(pickle.dumps(renderer))).rgb, first.rgb)
+
+
+PACKED = {
+    "x86_64": r"v?(mulps|fmadd\d+ps)\s[^\n]*%[xyz]mm",
+    "AMD64": r"v?(mulps|fmadd\d+ps)\s[^\n]*%[xyz]mm",
+    "arm64": r"fml?[aul]+\S*\s[^\n]*\.4s|fm(la|ul)\.4s",
+    "aarch64": r"fml?[aul]+\S*\s[^\n]*\.4s|fm(la|ul)\.4s",
+}
+
+
+@pytest.mark.skipif(platform.machine() not in PACKED, reason="vector instructions of this processor are not known here")
+@pytest.mark.parametrize("kernel", [forward_tile, backward_tile])
+def test_hot_loops_are_vectorised(kernel: numba.core.registry.CPUDispatcher) -> None:
+    records, entries = numba.float32[:, ::1], numba.int32[::1]
+    args = (records, entries, numba.int64, numba.int64, numba.float32, numba.float32, numba.float32, numba.float32[::1])
+    if kernel is backward_tile:
+        args += (records,)
+    # A fresh compilation: numba does not show the code of functions that it loads from its cache.
+    fresh = numba.njit(nogil=True, fastmath=True, error_model="numpy")(kernel.py_func)
+    fresh.compile(args)
+    (code,) = fresh.inspect_asm().values()
+    assert len(re.findall(PACKED[platform.machine()], code)) >= 20  # the exponential alone is eight per vector

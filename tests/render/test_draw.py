@@ -1,0 +1,128 @@
+"""Deformed scenes: covariances, colours by direction, masks, trajectories."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from gausim.core import Cameras, ConfigError, GaussianScene, Trajectory
+from gausim.ops.quaternion import quaternion_to_matrix
+from gausim.ops.spherical_harmonics import evaluate_sh
+from gausim.render import SceneAppearance, draw, draw_trajectory, film
+from gausim.render.cpu import CpuRenderer
+from gausim.render.draw import view_colors
+from gausim.render.reference import ReferenceRenderer
+
+COUNT, UNITS = 12, 3
+
+
+@pytest.fixture
+def units() -> Tensor:
+    return torch.arange(COUNT) % UNITS
+
+
+def deformation(states: int) -> tuple[Tensor, Tensor]:
+    """Random gradients near a rotation and these rotations, (B, N, 3, 3)."""
+    g = torch.Generator().manual_seed(1)
+    rotations = quaternion_to_matrix(torch.randn(states, UNITS, 4, generator=g, dtype=torch.float64))
+    stretch = torch.eye(3).double() + 0.2 * torch.randn(states, UNITS, 3, 3, generator=g, dtype=torch.float64)
+    return rotations @ stretch, rotations
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_rotating_scene_and_cameras_together_changes_nothing(
+    scene: Callable, cameras: Cameras, units: Tensor, degree: int
+) -> None:
+    still: GaussianScene = scene(COUNT, degree)
+    rest = still.means.expand(2, -1, -1)
+    identity = torch.eye(3).double().expand(2, UNITS, 3, 3)
+    expected = draw(ReferenceRenderer(), still, rest, identity, identity, units, cameras)
+    turn = quaternion_to_matrix(torch.tensor([0.3, -0.5, 0.7, 0.2]).double())
+    shift = torch.tensor([0.4, -0.2, 0.9]).double()
+    turned = turn.expand(2, UNITS, 3, 3)
+    undo = torch.eye(4).double()
+    undo[:3, :3], undo[:3, 3] = turn.T, -turn.T @ shift
+    moved = replace(cameras, viewmats=cameras.viewmats @ undo)
+    images = draw(ReferenceRenderer(), still, rest @ turn.T + shift, turned, turned, units, moved)
+    torch.testing.assert_close(images.rgb, expected.rgb, atol=1e-10, rtol=0)
+    assert float(expected.alpha.max()) > 0.5
+    if degree:  # colours that stayed behind would show
+        behind = draw(ReferenceRenderer(), still, rest @ turn.T + shift, turned, identity, units, moved)
+        assert float((behind.rgb - expected.rgb).abs().max()) > 1e-2
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_colours_are_looked_up_along_the_unrotated_direction(
+    scene: Callable, cameras: Cameras, units: Tensor, degree: int
+) -> None:
+    still = scene(COUNT, degree)
+    positions = torch.randn(2, COUNT, 3, dtype=torch.float64)
+    _, rotations = deformation(2)
+    colors = view_colors(SceneAppearance.of(still), positions, rotations, units, cameras.centers)
+    for b, v, k in ((0, 0, 0), (1, 0, 7), (1, 1, 5)):
+        away = torch.nn.functional.normalize(positions[b, k] - cameras.centers[v], dim=-1)
+        expected = evaluate_sh(still.sh[k], rotations[b, units[k]].T @ away)
+        torch.testing.assert_close(colors[b, v, k], expected, atol=1e-12, rtol=0)
+
+
+def test_gradients_reach_positions_gradients_and_rotations(scene: Callable, cameras: Cameras, units: Tensor) -> None:
+    look = SceneAppearance.of(scene(COUNT, 1))
+    small = replace(cameras, width=8, height=6, Ks=cameras.Ks * torch.tensor([0.25, 0.25, 1]).double()[:, None])
+    gradients, rotations = deformation(2)
+    positions = 0.3 * torch.randn(2, COUNT, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+
+    def image(positions: Tensor, gradients: Tensor, rotations: Tensor) -> Tensor:
+        return draw(ReferenceRenderer(), look, positions, gradients, rotations, units, small).rgb
+
+    given = tuple(x.clone().requires_grad_() for x in (positions, gradients, rotations))
+    assert torch.autograd.gradcheck(image, given, atol=1e-6, fast_mode=True)
+    assert all(float(g.abs().max()) > 0 for g in torch.autograd.grad(image(*given).sum(), given))
+
+
+def test_mask_draws_the_kernels_it_names(scene: Callable, cameras: Cameras, units: Tensor) -> None:
+    still = scene(COUNT, 2)
+    (gradients, rotations), positions = deformation(2), still.means.expand(2, -1, -1)
+    part = still.select(still.foreground)
+    expected = draw(
+        ReferenceRenderer(),
+        part,
+        positions[:, still.foreground],
+        gradients,
+        rotations,
+        units[still.foreground],
+        cameras,
+    )
+    images = draw(ReferenceRenderer(), still, positions, gradients, rotations, units, cameras, mask=still.foreground)
+    assert torch.equal(images.rgb, expected.rgb)
+    whole = draw(ReferenceRenderer(), still, positions, gradients, rotations, units, cameras)
+    assert float((whole.rgb - expected.rgb).abs().max()) > 1e-2
+    with pytest.raises(ConfigError, match="SceneAppearance.of"):
+        draw(
+            ReferenceRenderer(), SceneAppearance.of(still), positions, gradients, rotations, units, cameras,
+            mask=still.foreground,
+        )  # fmt: skip
+
+
+def test_trajectory_is_drawn_chunk_by_chunk(scene: Callable, cameras: Cameras, units: Tensor) -> None:
+    still = scene(COUNT, 1)
+    gradients, rotations = (x.float() for x in deformation(5))
+    positions = (still.means + torch.linspace(0, 0.2, 5)[:, None, None]).float()
+    trajectory = Trajectory(positions, gradients, rotations, units, 24.0)
+    renderer = CpuRenderer(threads=1)
+    behind = torch.tensor([1.0, 1.0, 1.0])
+    expected = draw(renderer, still, positions, gradients, rotations, units, cameras, background=behind).rgb
+    parts = []
+    for part in draw_trajectory(renderer, still, trajectory, cameras, background=behind, chunk=2):
+        assert torch.is_grad_enabled()
+        parts.append(part.rgb)
+    assert [p.shape[0] for p in parts] == [2, 2, 1]
+    assert torch.equal(torch.cat(parts), expected)
+    frames = film(renderer, still, trajectory, cameras, background=behind, chunk=3)
+    assert frames.dtype == torch.uint8 and frames.shape == (5, 2, cameras.height, cameras.width, 3)
+    assert float((frames.float() / 255 - expected.clamp(0, 1)).abs().max()) <= 0.5 / 255 + 1e-6
+    assert math.isclose(float(frames.max()), 255)

@@ -1,0 +1,35 @@
+"""The oracle's gradients against finite differences."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from gausim.render import reference
+from gausim.render.reference import ReferenceRenderer
+
+
+def test_gradcheck_with_respect_to_all_four_inputs(inputs: Callable) -> None:
+    """Kernels wide enough that some means lie where the projection is clamped, two states, two views."""
+    given = inputs(2, 2, 3, (5, 4), scale=0.25, spread=0.6, seed=3).to(torch.float64)
+    given.opacities[:, 0] = 0.97  # below the ceiling: at it the derivative is one-sided
+
+    def images(*tensors: Tensor) -> tuple[Tensor, Tensor]:
+        drawn = replace(given, **dict(zip(("means", "covars", "colors", "opacities"), tensors, strict=True))).draw(
+            ReferenceRenderer()
+        )
+        return drawn.rgb, drawn.alpha
+
+    assert torch.autograd.gradcheck(images, tuple(x.requires_grad_() for x in given.tensors), atol=1e-6)
+
+
+def test_tiles_do_not_change_the_image(inputs: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One tile as large as the image holds every kernel: culling per tile loses nothing."""
+    given = inputs(2, 2, 60, (70, 50), scale=0.08).to(torch.float64)
+    tiled = given.draw(ReferenceRenderer()).rgb
+    monkeypatch.setattr(reference, "TILE", 70)
+    torch.testing.assert_close(given.draw(ReferenceRenderer()).rgb, tiled, atol=1e-12, rtol=0)
