@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -245,12 +244,9 @@ def test_masks_given_by_path_are_used(tmp_path: Path) -> None:
     assert torch.equal(load_scene(tmp_path / "scene.ply", masks=tmp_path / "mine.npz").pinned, scene.pinned)
 
 
-def test_real_scene_is_written_back_equal_in_every_stored_field(tmp_path: Path) -> None:
+def test_real_scene_is_written_back_equal_in_every_stored_field(tmp_path: Path, data_root: Path) -> None:
     plyfile = pytest.importorskip("plyfile")
-    root = os.environ.get("GAUSIM_TEST_DATA")
-    if not root:
-        pytest.skip("GAUSIM_TEST_DATA is not set: no external data")
-    source = Path(root) / "splats" / "playbot_lod3.ply"
+    source = data_root / "splats" / "playbot_lod3.ply"
     save_scene(load_scene(source), tmp_path / "back.ply")
     before, after = (plyfile.PlyData.read(str(p))["vertex"] for p in (source, tmp_path / "back.ply"))
     for p in before.properties:

@@ -268,7 +268,8 @@ def _read_header(path: Path) -> _Header:
 
 
 def _parse_header(path: Path, lines: list[list[str]], offset: int) -> _Header:
-    encoding, elements = "", []
+    encoding = ""
+    elements: list[tuple[str, int, list[list[str]]]] = []
     for words in lines:
         if words[0] == "format" and len(words) == 3 and words[1] in _BYTE_ORDER:
             encoding = words[1]

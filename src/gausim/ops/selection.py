@@ -163,4 +163,9 @@ def apply_masks(
         masks["pinned"] = masks["pinned"] & masks.get("simulated", scene.simulated)
     elif "simulated" in masks:
         masks["pinned"] = scene.pinned & masks["simulated"]
-    return replace(scene, **masks).validated()
+    return replace(
+        scene,
+        simulated=masks.get("simulated", scene.simulated),
+        pinned=masks.get("pinned", scene.pinned),
+        foreground=masks.get("foreground", scene.foreground),
+    ).validated()

@@ -1,0 +1,162 @@
+"""`gausim inspect`: what a scene holds and what hierarchy it gets."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gausim.core.scene import GaussianScene
+    from gausim.models.hierarchy import Hierarchy
+
+HELP = "Print a scene's kernels and hierarchy and draw its clusters."
+
+# Cluster diameters as fractions of the bounding-box diagonal (METHOD section 1, the range of the paper's objects).
+DEFAULT_RADII = (0.04, 0.3)
+
+
+def main(argv: list[str]) -> int:
+    """Runs the command.
+
+    Args:
+        argv: the arguments after the command's name.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        SceneError: the scene is unusable, or no kernel is pinned.
+    """
+    arguments = _parser().parse_args(argv)
+    from gausim.core.errors import SceneError
+    from gausim.io.ply import load_scene, masks_path, save_masks
+    from gausim.models.hierarchy import build_hierarchy
+
+    if any(not 0 < r <= 1 for r in arguments.radii):
+        raise SceneError(f"--radii {arguments.radii}: expected fractions of the diagonal in (0, 1], fine to coarse.")
+    scene = _marked(load_scene(arguments.scene, masks=arguments.masks), arguments)
+    _print_scene(scene)
+    if not scene.pinned.any():
+        raise SceneError(_no_pins(scene))
+    hierarchy = build_hierarchy(scene, radii=arguments.radii, clustering=arguments.clustering)
+    _print_hierarchy(hierarchy, arguments.radii)
+    out = Path(arguments.out) if arguments.out else Path(f"{Path(arguments.scene).stem}.clusters.png")
+    _draw(scene, hierarchy, arguments, out)
+    print(f"picture    {out}")
+    if arguments.save_masks:
+        side = Path(arguments.masks) if arguments.masks else masks_path(arguments.scene)
+        save_masks(scene, side)
+        print(f"masks      {side}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="gausim inspect", description=HELP)
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="3DGS scene (PLY)")
+    add("--masks", metavar="FILE", help="masks (npz); default <stem>.masks.npz next to the scene, if there")
+    add_pin_options(parser)
+    add("--simulate-below", metavar="AXIS=VALUE", help="simulate only kernels below (others are drawn, never moved)")
+    add("--simulate-above", metavar="AXIS=VALUE", help="simulate only kernels above")
+    add("--save-masks", action="store_true", help="store the masks so that every command uses them")
+    add("--radii", type=float, nargs="+", default=list(DEFAULT_RADII), metavar="R",
+        help="largest cluster diameter per level, fine to coarse [fraction of the bounding-box diagonal]")  # fmt: skip
+    add("--clustering", default="ball", choices=("ball", "complete_linkage"), help="clustering method")
+    add("--up", choices=("x", "y", "z", "-x", "-y", "-z"),
+        help="axis drawn upwards (write --up=-y); default away from the pins, else z")  # fmt: skip
+    add("--out", metavar="PICTURE.png", help="picture of the clusters; default <stem>.clusters.png")
+    return parser
+
+
+def add_pin_options(parser: argparse.ArgumentParser) -> None:
+    """Adds --pin-below and --pin-above, which mark roots by height."""
+    add = parser.add_argument
+    add("--pin-below", metavar="AXIS=VALUE", help="pin kernels whose coordinate is below, e.g. z=0.33")
+    add("--pin-above", metavar="AXIS=VALUE", help="pin kernels whose coordinate is above (scenes with up = -y)")
+
+
+def pinned_by(scene: GaussianScene, below: str | None, above: str | None) -> GaussianScene:
+    """The scene with its pins replaced by --pin-below and --pin-above (either side counts); as it is without them."""
+    from gausim.ops.selection import apply_masks, parse_half_space
+
+    low = parse_half_space(below) if below else None
+    high = parse_half_space(above, above=True) if above else None
+    if low is None and high is None:
+        return scene
+    both = low | high if low is not None and high is not None else low or high
+    return apply_masks(scene, pinned=both)
+
+
+def _marked(scene: GaussianScene, arguments: argparse.Namespace) -> GaussianScene:
+    from gausim.ops.selection import apply_masks, parse_half_space
+
+    for text, above in ((arguments.simulate_below, False), (arguments.simulate_above, True)):
+        if text:
+            mask = scene.simulated & parse_half_space(text, above=above)(scene)
+            scene = apply_masks(scene, simulated=mask)
+    return pinned_by(scene, arguments.pin_below, arguments.pin_above)
+
+
+def _no_pins(scene: GaussianScene) -> str:
+    low, high = scene.means.amin(0).tolist(), scene.means.amax(0).tolist()
+    example = low[2] + 0.1 * (high[2] - low[2])
+    return (
+        f"{scene.name}: no kernel is pinned; expected at least one, the root that holds the object. Mark some, e.g. "
+        f"--pin-below z={example:.3g} (or --pin-above where up is negative), and keep them with --save-masks."
+    )
+
+
+def _print_scene(scene: GaussianScene) -> None:
+    low, high = scene.means.amin(0).tolist(), scene.means.amax(0).tolist()
+    print(f"scene      {scene.name}")
+    print(f"kernels    {scene.count}")
+    print(f"SH degree  {scene.sh_degree}")
+    print("box        " + "  ".join(f"{a} {low[i]:.4g} .. {high[i]:.4g}" for i, a in enumerate("xyz")))
+    if scene.simulated.any():
+        print(f"diagonal   {scene.diagonal:.4g} scene units (simulated kernels)")
+    masks = [(n, int(getattr(scene, n).sum())) for n in ("simulated", "pinned", "foreground")]
+    print("masks      " + "  ".join(f"{n} {count}" for n, count in masks))
+    print(f"volume     c = {scene.volume_scale:.6g} (V = prod of c s_i)")
+
+
+def _print_hierarchy(hierarchy: Hierarchy, radii: list[float]) -> None:
+    levels = hierarchy.levels
+    print("level      units   free  pinned  max diameter    volume sum      mass sum at density 1")
+    for number, level in enumerate(levels):
+        pinned, total = int(level.pinned.sum()), math.fsum(level.volume.double().tolist())
+        bound = f"{radii[number - 1]:.3g} of diagonal" if number else "-"
+        units = f"{level.count:>10} {level.count - pinned:>6} {pinned:>7}"
+        print(f"{number:<5} {units}  {bound:<15} {total:<15.8g} {total:.8g}")
+    predicted = list(range(len(levels) - 1, 0, -1))
+    kernels, count = levels[0].count, hierarchy.predictions(predicted)
+    share = f"{count} / {kernels} = {100 * count / kernels:.2f} %"
+    print(f"N_F / N_K  {share} (units predicted per step, levels {predicted})")
+    print("levels     " + " -> ".join(str(level.count) for level in levels))
+
+
+def _draw(scene: GaussianScene, hierarchy: Hierarchy, arguments: argparse.Namespace, out: Path) -> None:
+    from gausim.report.clusters import draw_clusters
+
+    count = len(hierarchy.levels)
+    labels = [hierarchy.ancestor(0, level).numpy() for level in range(1, count)]
+    upward = arguments.up or _away_from_pins(arguments)
+    up = "xyz".index(upward[-1])
+    first, second = (axis for axis in range(3) if axis != up)
+    draw_clusters(
+        out,
+        scene.means[hierarchy.kernels].cpu().numpy(),
+        labels,
+        scene.pinned[hierarchy.kernels].cpu().numpy(),
+        title=f"{scene.name}: {hierarchy.levels[0].count} simulated kernels (pinned grey)",
+        names=[f"level {level}: {hierarchy.levels[level].count} units" for level in range(1, count)],
+        sides=((first, up), (second, up)),
+        flip=upward.startswith("-"),
+    )
+
+
+def _away_from_pins(arguments: argparse.Namespace) -> str:
+    if arguments.pin_below:
+        return arguments.pin_below.strip()[0]
+    return "-" + arguments.pin_above.strip()[0] if arguments.pin_above else "z"

@@ -1,0 +1,162 @@
+"""Visual hull on a voxel grid: the largest body that projects into every foreground mask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+# Corners of the search cube that few cameras see say nothing; the body must be in the image of this share of views.
+_MINIMUM_SEEN = 0.5
+_COARSE_RESOLUTION = 48
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelHull:
+    """A body on a grid of cubic voxels.
+
+    Attributes:
+        occupied: voxels of the body.
+        origin: centre of voxel (0, 0, 0) [scene units].
+        spacing: edge length of a voxel [scene units].
+    """
+
+    occupied: Bool[Tensor, "X Y Z"]
+    origin: Float[Tensor, " 3"]
+    spacing: float
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the body's bounding-box diagonal [scene units]."""
+        x = self.occupied.nonzero()
+        return float((x.amax(0) - x.amin(0) + 1).float().norm()) * self.spacing
+
+    def surface(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N 3"]]:
+        """Centres of the voxels with a free face, and outward unit normals there (zero where undefined)."""
+        body = self.occupied.float()[None, None]
+        padded = functional.pad(body, (1,) * 6)
+        cross = torch.zeros(1, 1, 3, 3, 3)
+        cross[..., 1, 1, :] = cross[..., 1, :, 1] = cross[..., :, 1, 1] = 1.0
+        filled = functional.conv3d(padded, cross)[0, 0]
+        index = (self.occupied & (filled < 7)).nonzero()
+        smooth = functional.avg_pool3d(functional.pad(body, (3,) * 6), 5, stride=1)[0, 0]
+        i, j, k = (index + 1).unbind(-1)  # smooth has a border of one voxel
+        slope = (
+            smooth[i + 1, j, k] - smooth[i - 1, j, k],
+            smooth[i, j + 1, k] - smooth[i, j - 1, k],
+            smooth[i, j, k + 1] - smooth[i, j, k - 1],
+        )
+        return self.origin + index * self.spacing, functional.normalize(-torch.stack(slope, -1), dim=-1)
+
+    def dilated(self, voxels: int) -> VoxelHull:
+        """The body grown by this many voxels in every direction."""
+        width = 2 * voxels + 1
+        body = functional.pad(self.occupied.float()[None, None], (2 * voxels,) * 6)
+        grown = functional.max_pool3d(body, width, stride=1)[0, 0] > 0
+        return VoxelHull(grown, self.origin - voxels * self.spacing, self.spacing)
+
+    def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+        """True for the points in an occupied voxel."""
+        index = ((points - self.origin) / self.spacing).round().long()
+        size = torch.tensor(self.occupied.shape, device=points.device)
+        inside = ((index >= 0) & (index < size)).all(-1)
+        i, j, k = torch.minimum(index.clamp_min(0), size - 1).unbind(-1)
+        return inside & self.occupied[i, j, k]
+
+
+def project(
+    points: Float[Tensor, "N 3"], viewmats: Float[Tensor, "V 4 4"], Ks: Float[Tensor, "V 3 3"]
+) -> tuple[Float[Tensor, "V N 2"], Float[Tensor, "V N"]]:
+    """Pixel coordinates and depths of points in V pinhole views (OpenCV axes)."""
+    local = points @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
+    depth = local[..., 2]
+    pixels = (local @ Ks.mT)[..., :2] / depth.clamp_min(1e-6)[..., None]
+    return pixels, depth
+
+
+def search_cube(
+    viewmats: Float[Tensor, "V 4 4"], Ks: Float[Tensor, "V 3 3"], size: tuple[int, int]
+) -> tuple[Float[Tensor, " 3"], float]:
+    """Centre and half edge of a cube that holds what all cameras look at.
+
+    The centre is the point nearest to all optical axes in the least-squares sense; the half edge covers what the
+    widest view sees at its distance.
+    """
+    forward = viewmats[:, 2, :3].double()
+    centers = -(viewmats[:, :3, :3].double().mT @ viewmats[:, :3, 3, None].double())[..., 0]
+    across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
+    # A touch of damping keeps parallel axes (one camera, or a row of them) solvable.
+    normal = across.sum(0) + 1e-6 * torch.eye(3, dtype=torch.float64)
+    middle = torch.linalg.solve(normal, (across @ centers[..., None]).sum(0)[:, 0])
+    focal = torch.stack((Ks[:, 0, 0] / size[0], Ks[:, 1, 1] / size[1]), -1).amin(-1).double()
+    half = ((middle - centers).norm(dim=-1) / (2 * focal)).max()
+    return middle.float(), float(half)
+
+
+def carve(
+    masks: Bool[Tensor, "V H W"], viewmats: Float[Tensor, "V 4 4"], Ks: Float[Tensor, "V 3 3"], resolution: int
+) -> VoxelHull | None:
+    """Visual hull with about ``resolution`` voxels along its longest side; None if nothing is left.
+
+    Views are unanimous: one mask that misses a part removes it. Pixels outside an image veto nothing, so an object
+    that leaves some images survives.
+    """
+    middle, half = search_cube(viewmats, Ks, (masks.shape[2], masks.shape[1]))
+    coarse = _carve_box(masks, viewmats, Ks, middle - half, middle + half, 2 * half / _COARSE_RESOLUTION)
+    if not coarse.occupied.any():
+        return None
+    index = coarse.occupied.nonzero()
+    low = coarse.origin + (index.amin(0) - 1) * coarse.spacing
+    high = coarse.origin + (index.amax(0) + 1) * coarse.spacing
+    return _carve_box(masks, viewmats, Ks, low, high, float((high - low).max()) / resolution)
+
+
+def _carve_box(
+    masks: Bool[Tensor, "V H W"],
+    viewmats: Float[Tensor, "V 4 4"],
+    Ks: Float[Tensor, "V 3 3"],
+    low: Float[Tensor, " 3"],
+    high: Float[Tensor, " 3"],
+    spacing: float,
+) -> VoxelHull:
+    axes = [torch.arange(float(low[i]), float(high[i]) + spacing / 2, spacing) for i in range(3)]
+    points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
+    occupied = _inside_masks(points.reshape(-1, 3), masks, viewmats, Ks)
+    return VoxelHull(occupied.reshape(points.shape[:3]), points[0, 0, 0], spacing)
+
+
+def _inside_masks(
+    points: Float[Tensor, "N 3"],
+    masks: Bool[Tensor, "V H W"],
+    viewmats: Float[Tensor, "V 4 4"],
+    Ks: Float[Tensor, "V 3 3"],
+) -> Bool[Tensor, " N"]:
+    height, width = masks.shape[1:]
+    alive, seen = torch.arange(points.shape[0]), torch.zeros(points.shape[0])
+    # View by view, each on what the earlier ones left over: ten times less work than all points in all views.
+    for view in range(masks.shape[0]):
+        pixels, depth = project(points[alive], viewmats[view : view + 1], Ks[view : view + 1])
+        x, y = pixels[0].floor().long().unbind(-1)  # the centre of pixel i is at i + 0.5
+        visible = (depth[0] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        covered = masks[view, y.clamp(0, height - 1), x.clamp(0, width - 1)]
+        seen[alive[visible]] += 1
+        alive = alive[covered | ~visible]
+    inside = torch.zeros(points.shape[0], dtype=torch.bool)
+    inside[alive] = seen[alive] >= _MINIMUM_SEEN * masks.shape[0]
+    return inside
+
+
+def farthest_points(points: Float[Tensor, "N 3"], count: int, *, start: int = 0) -> Tensor:
+    """Indices of ``count`` points, each the farthest from those before it: an even cover of the cloud."""
+    count = min(count, points.shape[0])
+    chosen = torch.zeros(count, dtype=torch.long)
+    distance = torch.full((points.shape[0],), float("inf"))
+    current = start
+    for i in range(count):
+        chosen[i] = current
+        distance = torch.minimum(distance, (points - points[current]).square().sum(-1))
+        current = int(distance.argmax())
+    return chosen

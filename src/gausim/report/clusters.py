@@ -1,0 +1,74 @@
+"""Picture of a hierarchy: every level's units in their own colours, seen from two sides."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+# Neighbouring units get hues this far apart on the colour circle: the golden ratio never repeats.
+GOLDEN = 0.6180339887498949
+# Point area [points^2] for a thousand kernels; more kernels get smaller points.
+POINT_AREA = 30.0
+PINNED_COLOR = (0.25, 0.25, 0.25)
+
+
+def draw_clusters(
+    path: Path,
+    means: Float[np.ndarray, "K 3"],
+    labels: Sequence[Int[np.ndarray, " K"]],
+    pinned: Bool[np.ndarray, " K"],
+    *,
+    title: str,
+    names: Sequence[str],
+    sides: tuple[tuple[int, int], tuple[int, int]],
+    flip: bool = False,
+) -> None:
+    """Writes a picture with one column per level and one row per side.
+
+    Args:
+        path: PNG to write.
+        means: rest positions of the kernels [scene units].
+        labels: for each level the unit of every kernel.
+        pinned: kernels that are drawn dark grey.
+        title: what stands above.
+        names: heading of each level.
+        sides: for each row the horizontal and the vertical axis (0, 1, 2 for x, y, z).
+        flip: draw the vertical axis downwards (scenes whose up is negative).
+    """
+    figure = Figure(figsize=(4.2 * len(labels), 8.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title)
+    panels = figure.subplots(2, len(labels), squeeze=False)
+    area = min(POINT_AREA, max(0.3, POINT_AREA * 1e3 / len(means)))
+    for column, (unit, name) in enumerate(zip(labels, names, strict=True)):
+        colors = unit_colors(unit)
+        colors[pinned] = PINNED_COLOR
+        for row, (across, up) in enumerate(sides):
+            panel = panels[row, column]
+            # Nearest to the eye last: the third axis is depth.
+            order = np.argsort(means[:, 3 - across - up] * (1 if row else -1), kind="stable")
+            panel.scatter(means[order, across], means[order, up], s=area, c=colors[order], linewidths=0)
+            panel.set_aspect("equal")
+            panel.set_xlabel("xyz"[across])
+            panel.set_ylabel("xyz"[up])
+            if flip:
+                panel.invert_yaxis()
+            if row == 0:
+                panel.set_title(name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    figure.savefig(temporary, format="png", dpi=110)
+    temporary.replace(path)
+
+
+def unit_colors(unit: Int[np.ndarray, " K"]) -> Float[np.ndarray, "K 3"]:
+    """One RGB colour per unit: hues by the golden ratio, three brightnesses."""
+    hue = (unit * GOLDEN) % 1.0
+    value = np.array([1.0, 0.8, 0.6])[unit % 3]
+    channels = [np.clip(np.abs((hue * 6 + shift) % 6 - 3) - 1, 0, 1) for shift in (0.0, 4.0, 2.0)]
+    return np.stack([value * (0.25 + 0.75 * c) for c in channels], axis=-1)
