@@ -11,6 +11,8 @@ import numpy as np
 
 from gausim.render.cpu.projection import EXTENT, FINITE_MATH_OFF, RECORD
 
+# numba freezes constants into its cached code and looks only at the file that holds the function: after changing a
+# constant that other files import, delete their cache (__pycache__/*.nb?).
 TILE_WIDTH = 8  # [pixels]: one vector of float32
 TILE_HEIGHT = 16  # [pixels]
 SLACK = 0.002  # [pixels] added to every extent, far above its rounding error
