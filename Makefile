@@ -62,7 +62,7 @@ simulate: install ## Write the videos and figures of a run: make simulate RUN=ou
 	$(BIN)/gausim simulate $(RUN) $(ARGS)
 
 demo: data ## From nothing to a simulator that foresees: install, make data, train, evaluate, simulate
-	$(BIN)/gausim train experiment=demo
+	$(BIN)/gausim train experiment=demo hydra.run.dir=outputs/demo
 	$(BIN)/gausim evaluate outputs/demo
 	$(BIN)/gausim simulate outputs/demo
 	echo "Numbers and pictures of the demo:"

@@ -25,6 +25,8 @@ ROOTS = [path.as_posix() for path in FILES if len(path.parts) == 1]
 OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1]
 # They set keys of other groups or of Hydra, and so build nothing of their own under their name.
 NOT_BUILT = ("hydra", "paths")
+# They change other groups under `@package _global_`: everything is built with them.
+GLOBAL = ("experiment", "ablation", "debug")
 SPECIAL = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
 
 
@@ -89,7 +91,7 @@ def test_option_builds(option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     if needs_other_hardware(config):
         pytest.skip(f"{option} asks for trainer.accelerator={config.trainer.accelerator}, which this machine lacks")
     group = option.split("/")[0]
-    built = config if group in ("experiment", "ablation") else {group: config[group]}
+    built = {group: config[group]} if group in config and group not in GLOBAL else config
     for node in (built[key] for key in built):
         build(node)
 
@@ -113,11 +115,14 @@ def test_every_kind_of_file_is_covered() -> None:
     }
 
 
-def test_runs_have_a_directory_of_their_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_choice_runs_in_the_same_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     seen: list[Path] = []
-    assert run_hydra("train", lambda config: seen.append(_config.run_dir()), ["name=rose", "paths.output_root=o"]) == 0
-    assert seen == [tmp_path / "o" / "rose"]
+    for seed in (3, 3, 4):
+        overrides = ["name=rose", "paths.output_root=o", f"seed={seed}"]
+        assert run_hydra("train", lambda config: seen.append(_config.run_dir()), overrides) == 0
+    assert seen == [tmp_path / "o" / "rose" / f"seed_{seed}" for seed in (3, 3, 4)]
+    assert Path.cwd() == tmp_path
 
 
 def test_a_sweep_gives_every_seed_its_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,7 +57,7 @@ class RootConfig:
         ablation: what the chosen ablation records about itself.
         experiment: what the chosen experiment records about itself.
         seed: of every random generator.
-        name: of the run; its directory is `${paths.output_root}/${name}`.
+        name: of the run; its directory is `${paths.output_root}/${name}/seed_${seed}`.
         task_name: what is being done, for logs and dashboards.
     """
 
