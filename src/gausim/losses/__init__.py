@@ -1,0 +1,7 @@
+"""What training minimises: images, the rest state and the momentum between levels."""
+
+from gausim.losses.image import ImageLoss, structural_similarity
+from gausim.losses.objective import Objective
+from gausim.losses.static import static_loss
+
+__all__ = ["ImageLoss", "Objective", "static_loss", "structural_similarity"]

@@ -1,0 +1,93 @@
+"""From a configuration to a training module, and from a run directory back to its trained module."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from gausim.cli._config import instantiate
+from gausim.core import ConfigError, Renderer
+from gausim.data.datamodule import ReadyDataModule
+from gausim.data.objects import ObjectData
+from gausim.engine.checkpoint import check_scenes, load_weights, read_checkpoint
+from gausim.engine.module import GausSimModule
+from gausim.engine.run import RunDirectory
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedRun:
+    """A trained run, ready to be measured or played.
+
+    Attributes:
+        config: its resolved configuration.
+        module: in evaluation mode with the run's weights (the averaged ones where it averaged).
+        objects: its objects; their index is the ``scene_id`` of the module's scenes.
+        datamodule: its data.
+        renderer: what it was trained with.
+        run_dir: where it lies.
+    """
+
+    config: dict[str, Any]
+    module: GausSimModule
+    objects: list[ObjectData]
+    datamodule: ReadyDataModule
+    renderer: Renderer
+    run_dir: Path
+
+
+def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyDataModule]:
+    """Builds the module and the data of a training configuration.
+
+    Raises:
+        ConfigError: a node is wrong, or the model cannot be trained by `gausim train`.
+        DataError: the data set is missing or broken.
+        SceneError: a rest scene is missing or broken.
+    """
+    config = cfg if isinstance(cfg, DictConfig) else OmegaConf.create(dict(cfg))
+    if "simulator" not in config.model or "initial_states" not in config.model:
+        raise ConfigError(
+            "model: expected the entries 'simulator' and 'initial_states' of a model that learns (gausim, "
+            f"gausim_paper), got {sorted(str(k) for k in config.model)}."
+        )
+    datamodule = instantiate(config.data)
+    objects = datamodule.objects
+    scenes = [item.scene() for item in objects]
+    model = instantiate(config.model.simulator, scenes=scenes, fps=[item.fps for item in objects])()
+    scene_of_sequence = [scene_id for scene_id, _ in datamodule.index.entries]
+    states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
+    module = GausSimModule(
+        model=model,
+        initial_states=states,
+        scene_of_sequence=scene_of_sequence,
+        renderer=instantiate(config.render),
+        objective=instantiate(config.loss),
+        optimizer=instantiate(config.optimizer),
+        seed=int(config.seed),
+    )
+    return module, datamodule
+
+
+def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mapping[str, Any] | None = None) -> LoadedRun:
+    """Loads a run.
+
+    Args:
+        run_dir: its directory.
+        checkpoint: file in it.
+        data: keys of the data configuration to replace, e.g. ``{"root": "/elsewhere"}``.
+
+    Raises:
+        RunError: there is no run or checkpoint, or the data holds another scene than it was trained on.
+    """
+    directory = RunDirectory(run_dir)
+    config = directory.config()
+    config["data"] = {**config.get("data", {}), **(data or {})}
+    loaded = read_checkpoint(directory.path / checkpoint)
+    module, datamodule = build(config)
+    check_scenes(loaded, module.simulator.scenes, str(directory.path / checkpoint))
+    load_weights(module, loaded)
+    module.eval()
+    return LoadedRun(config, module, datamodule.objects, datamodule, module.renderer, directory.path)

@@ -1,0 +1,117 @@
+"""`gausim train`: learn an object's dynamics from multi-view videos."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lightning.pytorch import Trainer
+    from omegaconf import DictConfig
+
+    from gausim.data.datamodule import ReadyDataModule
+    from gausim.engine.module import GausSimModule
+    from gausim.engine.run import RunDirectory
+
+HELP = "Learn an object's dynamics from multi-view videos."
+
+USAGE = """usage: gausim train [KEY=VALUE ...] [-m] [--cfg job] [--info] [--resolve]
+
+Learns an object's dynamics from multi-view videos. Every setting is a key of conf/train.yaml and its groups:
+
+  gausim train                                  the embedded synthetic set, the default model
+  gausim train experiment=bunny seed=1          a prepared experiment
+  gausim train data=object data.root=PATH       an object of your own
+  gausim train ablation=momentum_off            without the momentum loss
+  gausim train -m ablation=none,mass_off seed=0,1,2
+  gausim train trainer.max_minutes=30 trainer.threads=2
+  gausim train --cfg job                        print the whole configuration, run nothing
+
+A run goes to OUTPUT_ROOT/NAME/seed_SEED (paths.output_root, name, seed). Started again, it resumes from its last
+checkpoint; once finished it is refused, unless trainer.overwrite=true."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs the command.
+
+    Args:
+        argv: Hydra overrides and options.
+
+    Returns:
+        The exit status.
+    """
+    if any(a in ("-h", "--help") for a in argv):
+        print(USAGE)
+        return 0
+    from gausim.cli._config import run_hydra
+
+    return run_hydra("train", train, argv)
+
+
+def train(cfg: DictConfig) -> float | None:
+    """Trains one run; returns its last loss above the floor as a fraction of the static prediction's.
+
+    Raises:
+        RunError: the run is finished already, or was started with another configuration.
+        DivergenceError: a number is no longer finite.
+    """
+    from lightning.pytorch import seed_everything
+    from omegaconf import OmegaConf
+
+    from gausim.cli import _config
+    from gausim.cli._run import build
+    from gausim.engine.run import RunDirectory
+
+    # Hydra's directory of a single job has the run's name only, a sweep's jobs have the seed in it already.
+    folder = _config.run_dir()
+    run = RunDirectory(folder if folder.name == f"seed_{cfg.seed}" else folder / f"seed_{cfg.seed}")
+    resume = run.prepare(OmegaConf.to_container(cfg, resolve=True), overwrite=cfg.trainer.overwrite)
+    seed_everything(cfg.seed, workers=True, verbose=False)
+    module, datamodule = build(cfg)
+    trainer = make(cfg, run)
+    _introduce(trainer, module, datamodule, run, resumed=resume is not None)
+    trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
+    if trainer.interrupted:
+        raise KeyboardInterrupt
+    run.finish(
+        {"epochs": trainer.current_epoch, "steps": module.global_step, **{k: v for k, v in module.summary.items()}}
+    )
+    print(f"\nrun: {run.path}\nnext: gausim evaluate {run.path}\n      gausim simulate {run.path}", flush=True)
+    return module.summary.get("excess_static")
+
+
+def make(cfg: DictConfig, run: RunDirectory) -> Trainer:
+    """The trainer of a configuration, with its callbacks and with loggers that write into the run."""
+    from gausim.cli._config import instantiate
+
+    callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node]
+    loggers = [instantiate(node, save_dir=str(run.path)) for node in (cfg.logger or {}).values() if node]
+    return instantiate(cfg.trainer, run_dir=run.path, callbacks=callbacks, loggers=loggers)
+
+
+def _introduce(
+    trainer: Trainer, module: GausSimModule, datamodule: ReadyDataModule, run: RunDirectory, *, resumed: bool
+) -> None:
+    import torch
+
+    datamodule.setup("fit")
+    batches = len(datamodule.train_dataloader().batch_sampler or [])
+    epochs = trainer.max_epochs or 0
+    device = trainer.strategy.root_device
+    lines = [f"{'resuming' if resumed else 'training'} on {device} ({torch.get_num_threads()} threads): {run.path}"]
+    for item, scene in zip(datamodule.objects, module.simulator.scenes, strict=True):
+        record = item.sequences[0]
+        lines.append(
+            f"  {item.name}: {scene.count} kernels ({int(scene.pinned.sum())} pinned), {len(item.sequences)} sequences, "
+            f"{len(item.train_views)} views of {record.cameras.width}x{record.cameras.height}, {item.fps:g} fps"
+        )
+    sizes = {name: sum(p.numel() for p in own) for name, own in module.simulator.parameter_groups().items()}
+    sizes["initial states"] = sum(p.numel() for p in module.initial_states.parameters())
+    lines.append("  parameters: " + ", ".join(f"{name} {count}" for name, count in sizes.items()))
+    frames = sum(datamodule.steps(epoch) * batches for epoch in range(epochs))
+    lines.append(
+        f"  {epochs} epochs x {batches} steps; T {datamodule.steps(0)} to {datamodule.curriculum.t_max}, "
+        f"at least {frames} predicted frames"
+    )
+    print("\n".join(lines), file=sys.stdout, flush=True)

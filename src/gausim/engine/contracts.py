@@ -1,0 +1,90 @@
+"""What the engine asks of a simulator that learns: steps over a disjoint graph of several sequences."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
+
+from torch import Tensor
+from torch.nn import Parameter
+
+from gausim.core import GaussianScene, SimState
+
+
+@runtime_checkable
+class Member(Protocol):
+    """One sequence of a batch.
+
+    Attributes:
+        scene_id: index of its scene.
+        kernels: its rows of positions.
+        units: its rows of gradients and rotations.
+        unit_of_kernel: (K,) the unit of each kernel, counted within ``units``.
+    """
+
+    scene_id: int
+    kernels: slice
+    units: slice
+    unit_of_kernel: Tensor
+
+
+@runtime_checkable
+class SceneBatch(Protocol):
+    """Several sequences, also of different scenes, as one disjoint graph.
+
+    Attributes:
+        rest: (K over all members, 3) rest positions [scene units].
+        members: the sequences, in the order that was asked for.
+    """
+
+    rest: Tensor
+    members: tuple[Any, ...]
+
+
+@runtime_checkable
+class Step(Protocol):
+    """One predicted frame of a batch.
+
+    Attributes:
+        positions: (K over all members, 3) kernel means [scene units].
+        gradients: (N over all members, 3, 3) accumulated deformation gradients of the units.
+        rotations: (N over all members, 3, 3) their accumulated rotations.
+        momentum: the momentum loss, summed over members; zero where it is switched off.
+    """
+
+    positions: Tensor
+    gradients: Tensor
+    rotations: Tensor
+    momentum: Tensor
+
+
+@runtime_checkable
+class Simulator(Protocol):
+    """The dynamics as training sees it; a torch module besides.
+
+    Attributes:
+        scenes: the rest scenes; their index is the ``scene_id`` of samples.
+    """
+
+    scenes: Sequence[GaussianScene]
+
+    def batch(self, scene_ids: Sequence[int]) -> Any:
+        """The disjoint graph of one sequence per entry."""
+        ...
+
+    def step(self, batch: Any, state: SimState, force: Tensor | None = None) -> Any:
+        """Predicts the next frame of all members."""
+        ...
+
+    def parameter_groups(self) -> dict[str, list[Parameter]]:
+        """Trainable parameters: ``network`` (shared by all scenes), ``scene`` (densities, attributes), ``template``."""
+        ...
+
+
+@runtime_checkable
+class InitialVelocities(Protocol):
+    """The frame before the first of every training sequence; a torch module with one parameter per sequence."""
+
+    def previous(self, sequence_id: int) -> Tensor:
+        """(K, 3) positions one frame before frame 0 [scene units]."""
+        ...

@@ -1,0 +1,147 @@
+"""The optimiser's settings: groups with learning rates of their own, schedules, clipping."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+from torch.nn import Parameter
+from torch.optim import Adam, Optimizer
+
+from gausim.core import ConfigError
+
+
+@runtime_checkable
+class Schedule(Protocol):
+    """How the learning rates change over a run."""
+
+    def factor(self, epoch: float, epochs: int) -> float:
+        """What the learning rates are multiplied by at ``epoch`` (with its fraction) of ``epochs``."""
+        ...
+
+
+@dataclass(frozen=True)
+class ConstantSchedule:
+    """The learning rates stay as they are."""
+
+    def factor(self, epoch: float, epochs: int) -> float:
+        """Always 1."""
+        return 1.0
+
+
+@dataclass(frozen=True)
+class HalvingSchedule:
+    """Halved after ``first`` epochs and then every ``every`` epochs (METHOD section 4)."""
+
+    first: int = 16
+    every: int = 2
+
+    def factor(self, epoch: float, epochs: int) -> float:
+        """A power of one half."""
+        done = math.floor(epoch)
+        return 1.0 if done < self.first else 0.5 ** (1 + (done - self.first) // self.every)
+
+
+@dataclass(frozen=True)
+class CosineSchedule:
+    """A linear start over ``warmup`` of the run, then half a cosine down to ``final``.
+
+    Attributes:
+        warmup: fraction of the run that the start takes.
+        final: factor at the end of the run.
+    """
+
+    warmup: float = 0.02
+    final: float = 0.05
+
+    def factor(self, epoch: float, epochs: int) -> float:
+        """Between ``final`` and 1 (below that during the start)."""
+        done = min(1.0, epoch / max(1, epochs))
+        if done < self.warmup:
+            return max(0.05, done / self.warmup)
+        fraction = (done - self.warmup) / max(1e-9, 1 - self.warmup)
+        return self.final + (1 - self.final) * 0.5 * (1 + math.cos(math.pi * fraction))
+
+
+@dataclass(frozen=True)
+class OptimizerSettings:
+    """Who learns how fast.
+
+    Attributes:
+        optimizer: makes the optimiser from parameter groups; Adam when None.
+        network_lr: learning rate of the network.
+        scene_lr: of densities and attributes of a scene.
+        template_lr: of what the model's template learns about a scene; ``scene_lr`` when None.
+        initial_lr: of the initial states [diagonals of the scene's bounding box, or modal amplitudes].
+        schedule: how they change; constant when None.
+        clip_norm: gradients are clipped at this norm; 0 does not clip.
+        clip_per_group: clip network, scenes and initial states each by themselves instead of all together.
+        ema_decay: weights of the run are also averaged with this decay per step, and the average is what evaluation
+            loads; 0 does not average.
+    """
+
+    optimizer: Callable[..., Optimizer] | None = None
+    network_lr: float = 8e-4
+    scene_lr: float = 8e-4
+    template_lr: float | None = None
+    initial_lr: float = 8e-4
+    schedule: Schedule | None = None
+    clip_norm: float = 1.0
+    clip_per_group: bool = False
+    ema_decay: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        if (
+            min(self.network_lr, self.scene_lr, self.template_lr or 0.0, self.initial_lr, self.clip_norm) < 0
+            or not 0 <= self.ema_decay < 1
+        ):
+            raise ConfigError(f"optimizer: expected rates and clip_norm >= 0 and ema_decay in [0, 1), got {self}.")
+
+    def build(self, groups: Mapping[str, Sequence[Parameter]]) -> Optimizer:
+        """The optimiser over the named groups ``network``, ``scene``, ``template`` and ``initial``.
+
+        A parameter that is not in a batch has no gradient there, and the optimiser leaves it and its momentum alone.
+
+        Raises:
+            ConfigError: a group for which there is no learning rate.
+        """
+        rates = {
+            "network": self.network_lr,
+            "scene": self.scene_lr,
+            "template": self.scene_lr if self.template_lr is None else self.template_lr,
+            "initial": self.initial_lr,
+        }
+        if set(groups) - set(rates):
+            raise ConfigError(f"optimizer: no learning rate for parameter groups {sorted(set(groups) - set(rates))}.")
+        made = [
+            {"params": list(members), "lr": rates[name], "base_lr": rates[name], "name": name}
+            for name, members in groups.items()
+            if members
+        ]
+        return (self.optimizer or Adam)(made)
+
+    def set_rates(self, optimizer: Optimizer, epoch: float, epochs: int) -> float:
+        """Sets the learning rates of all groups; returns the schedule's factor."""
+        factor = self.schedule.factor(epoch, epochs) if self.schedule is not None else 1.0
+        for group in optimizer.param_groups:
+            group["lr"] = group["base_lr"] * factor
+        return factor
+
+    def clip(self, optimizer: Optimizer) -> dict[str, Tensor]:
+        """Clips the gradients; returns the norm of each named group before clipping."""
+        grads: dict[str, list[Tensor]] = {}
+        for group in optimizer.param_groups:
+            grads.setdefault(group["name"], []).extend(p.grad for p in group["params"] if p.grad is not None)
+        norms = {name: torch.nn.utils.get_total_norm(g) if g else torch.tensor(0.0) for name, g in grads.items()}
+        if self.clip_norm > 0:
+            total = torch.stack([n.to(next(iter(norms.values()))) for n in norms.values()]).norm()
+            for name, own in grads.items():
+                if own:
+                    norm = norms[name] if self.clip_per_group else total
+                    torch._foreach_mul_(own, (self.clip_norm / (norm + 1e-6)).clamp(max=1.0))
+        return norms

@@ -1,0 +1,195 @@
+"""Run directories: what a run was asked, whether it is finished, whether it may be resumed."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from lightning.pytorch import Callback, Trainer
+from lightning.pytorch.callbacks import ProgressBar
+from lightning.pytorch.loggers import Logger
+
+from gausim.core import ConfigError, RunError
+from gausim.engine.callbacks import LAST_CHECKPOINT, TimeBudget
+from gausim.engine.checkpoint import AtomicCheckpointIO
+
+CONFIG, FINISHED = "config.yaml", "FINISHED"
+# What may differ when a run is resumed: where it is kept, how it is shown and what computes it, not what is learned.
+FREE_KEYS = (
+    "paths",
+    "logger",
+    "callbacks",
+    "task_name",
+    "trainer.threads",
+    "trainer.accelerator",
+    "trainer.devices",
+    "trainer.log_every_n_steps",
+    "trainer.progress",
+    "trainer.overwrite",
+)
+# What `overwrite` removes; anything else in the directory is not ours.
+OWN_FILES = (CONFIG, FINISHED, LAST_CHECKPOINT, "epochs.csv")
+OWN_FOLDERS = ("panels", "snapshots", "tensorboard", "csv")
+
+
+class RunDirectory:
+    """A directory that holds exactly one training run.
+
+    Attributes:
+        path: the directory.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        """Names the directory; :meth:`prepare` makes it."""
+        self.path = Path(path)
+
+    @property
+    def checkpoint(self) -> Path:
+        """The last checkpoint."""
+        return self.path / LAST_CHECKPOINT
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the run came to its end."""
+        return (self.path / FINISHED).is_file()
+
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration of the run.
+
+        Raises:
+            RunError: there is no run here, or its configuration is unreadable.
+        """
+        path = self.path / CONFIG
+        if not path.is_file():
+            raise RunError(f"{self.path}: no run here ({CONFIG} is missing). Train first (`gausim train name=NAME`).")
+        try:
+            loaded = yaml.safe_load(path.read_text())
+        except yaml.YAMLError as error:
+            raise RunError(f"{path}: cannot be read as YAML ({error}).") from error
+        if not isinstance(loaded, dict):
+            raise RunError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
+        return loaded
+
+    def prepare(self, config: Mapping[str, Any], *, overwrite: bool = False) -> Path | None:
+        """Makes the directory and writes the configuration; returns the checkpoint to resume from, if there is one.
+
+        Args:
+            config: the resolved configuration, plain containers only.
+            overwrite: remove what an earlier run left here.
+
+        Raises:
+            RunError: the run here is finished, or was started with another configuration.
+        """
+        if overwrite:
+            self._clear()
+        if self.is_finished:
+            raise RunError(
+                f"{self.path}: this run is finished. Give the new one another name (name=NAME) or seed, or remove the "
+                "old one with trainer.overwrite=true."
+            )
+        if (self.path / CONFIG).is_file():
+            changed = changed_keys(self.config(), config)
+            if changed and self.checkpoint.is_file():
+                raise RunError(
+                    f"{self.path}: the run here was started with another configuration; changed: {', '.join(changed)}. "
+                    "Restore these keys to resume it, give the new run another name, or set trainer.overwrite=true."
+                )
+        self.path.mkdir(parents=True, exist_ok=True)
+        temporary = self.path / f".{CONFIG}.tmp"
+        temporary.write_text(yaml.safe_dump(dict(config), sort_keys=False))
+        os.replace(temporary, self.path / CONFIG)
+        return self.checkpoint if self.checkpoint.is_file() else None
+
+    def finish(self, facts: Mapping[str, Any]) -> None:
+        """Marks the run as finished, with a few facts about it."""
+        temporary = self.path / f".{FINISHED}.tmp"
+        temporary.write_text(json.dumps(dict(facts), indent=1) + "\n")
+        os.replace(temporary, self.path / FINISHED)
+
+    def _clear(self) -> None:
+        for name in OWN_FILES:
+            (self.path / name).unlink(missing_ok=True)
+        for name in OWN_FOLDERS:
+            if (self.path / name).is_dir():
+                shutil.rmtree(self.path / name)
+
+
+def changed_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Dotted keys whose values differ between two configurations, those aside that a resumed run may change."""
+    first, second = dict(_flatten(old)), dict(_flatten(new))
+    keys = sorted(set(first) | set(second))
+    different = [k for k in keys if k not in first or k not in second or first[k] != second[k]]
+    return [k for k in different if not any(k == free or k.startswith(f"{free}.") for free in FREE_KEYS)]
+
+
+def _flatten(value: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    if isinstance(value, Mapping) and value:
+        return [item for k, v in value.items() for item in _flatten(v, f"{prefix}.{k}" if prefix else str(k))]
+    return [(prefix, value)]
+
+
+def make_trainer(
+    *,
+    max_epochs: int,
+    accelerator: str = "auto",
+    devices: int = 1,
+    threads: int | None = None,
+    precision: str = "32-true",
+    max_minutes: float | None = None,
+    clock: str = "wall",
+    log_every_n_steps: int = 20,
+    progress: bool = True,
+    overwrite: bool = False,
+    run_dir: Path | str | None = None,
+    callbacks: Sequence[Callback] = (),
+    loggers: Sequence[Logger] = (),
+) -> Trainer:
+    """The Lightning trainer of a run.
+
+    Args:
+        max_epochs: epochs of the whole run.
+        accelerator: ``auto``, ``cpu`` or ``gpu``.
+        devices: how many; training on several is not offered here.
+        threads: of torch's operators on the CPU; None leaves the process's own number.
+        precision: Lightning's name of it.
+        max_minutes: time budget; None is without.
+        clock: what the budget counts, ``wall`` or ``cpu`` time.
+        log_every_n_steps: optimiser steps between rows of the loggers.
+        progress: whether a progress bar is shown.
+        overwrite: what the run directory is prepared with (:meth:`RunDirectory.prepare`); nothing to the trainer.
+        run_dir: where checkpoints, panels and tables go.
+        callbacks: further ones.
+        loggers: where numbers go.
+
+    Raises:
+        ConfigError: more than one device.
+    """
+    if devices != 1:
+        raise ConfigError(f"trainer.devices: expected 1, got {devices}. Start one run per device instead.")
+    if threads is not None:
+        torch.set_num_threads(threads)
+    own = [c for c in callbacks if progress or not isinstance(c, ProgressBar)]
+    if max_minutes is not None:
+        own.append(TimeBudget(minutes=max_minutes, clock=clock))
+    return Trainer(
+        max_epochs=max_epochs,
+        accelerator=accelerator,
+        devices=devices,
+        precision=precision,  # type: ignore[arg-type]
+        logger=list(loggers) or False,
+        callbacks=own,
+        log_every_n_steps=log_every_n_steps,
+        enable_progress_bar=progress,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        limit_val_batches=0,
+        use_distributed_sampler=False,  # the sampler deals out shares itself
+        default_root_dir=str(run_dir) if run_dir is not None else None,
+        plugins=[AtomicCheckpointIO()],
+    )

@@ -1,0 +1,57 @@
+"""The weights of the terms and how far gradients reach: everything that defines what is minimised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from gausim.core import ConfigError
+from gausim.losses.image import ImageLoss
+
+
+@dataclass(frozen=True)
+class Objective:
+    """What one optimiser step minimises (METHOD section 4).
+
+    Attributes:
+        image: loss between a predicted and a true image.
+        image_weight: of the image loss (mean over views and steps).
+        static_weight: of the static loss.
+        static_probability: how often a batch carries it; None is 1 / T.
+        momentum_weight: of the momentum loss (mean over steps).
+        backprop_steps: gradients stop every so many steps; 0 lets them through the whole rollout.
+        input_noise: standard deviation of the noise added to each unit's position before a step [diagonals of the
+            scene's bounding box]; 0 is off.
+        explosion: a rollout that moves a kernel further than this from its rest position ends there and the rest of
+            it is not learned from [diagonals of the scene's bounding box]; each such end is counted in the log.
+    """
+
+    image: ImageLoss = field(default_factory=ImageLoss)
+    image_weight: float = 1.0
+    static_weight: float = 1.0
+    static_probability: float | None = None
+    momentum_weight: float = 1.0
+    backprop_steps: int = 1
+    input_noise: float = 0.0
+    explosion: float = 3.0
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        negative = [
+            name
+            for name in ("image_weight", "static_weight", "momentum_weight", "backprop_steps", "input_noise")
+            if getattr(self, name) < 0
+        ]
+        if negative or self.explosion <= 0:
+            raise ConfigError(f"loss: expected {', '.join(negative) or 'explosion'} not to be negative, got {self}.")
+        if self.static_probability is not None and not 0 <= self.static_probability <= 1:
+            raise ConfigError(f"loss.static_probability: expected null or 0..1, got {self.static_probability}.")
+
+    def static_chance(self, steps: int) -> float:
+        """Probability that a batch of ``steps`` predicted steps also carries the static loss."""
+        if self.static_weight == 0:
+            return 0.0
+        return 1 / steps if self.static_probability is None else self.static_probability
+
+    def window(self, steps: int) -> int:
+        """Length of the stretches through which gradients flow, within a rollout of ``steps``."""
+        return min(steps, self.backprop_steps) if self.backprop_steps else steps

@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import csv
+import runpy
+from pathlib import Path
+
+import pytest
+import torch
+
+from gausim.cli import train as command
+from gausim.cli._run import load_run
+from gausim.core import ConfigError, RunError
+from gausim.engine.checkpoint import read_checkpoint
+
+write_toy_object = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["write_toy_object"]
+
+TINY = (
+    "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
+    "data.curriculum.t_max=2", "data.batch_size=2", "trainer.max_epochs=2", "trainer.accelerator=cpu",
+    "trainer.progress=false", "trainer.threads=1", "render=reference", "callbacks.panels.every_epochs=1", "name=toy",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_toy_object(tmp_path_factory.mktemp("data") / "toy").root
+
+
+@pytest.fixture
+def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    monkeypatch.chdir(tmp_path)
+    return [f"data.root={toy}", *TINY]
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    return read_checkpoint(run / "last.ckpt")["state_dict"]
+
+
+def test_a_run_leaves_everything_and_loads_again(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.main(arguments) == 0
+    run = Path("outputs/toy/seed_0")
+    assert {"config.yaml", "FINISHED", "last.ckpt", "epochs.csv", "panels", "tensorboard", "csv"} <= {
+        p.name for p in run.iterdir()
+    }
+    rows = list(csv.DictReader((run / "epochs.csv").open()))
+    assert [(r["epoch"], float(r["steps"])) for r in rows] == [("1", 1.0), ("2", 2.0)]
+    assert len(list((run / "panels").glob("*.png"))) == 2
+    printed = capsys.readouterr().out
+    assert "36 kernels" in printed and "gausim evaluate" in printed
+    loaded = load_run(run)
+    assert not loaded.module.training and loaded.objects[0].name == "toy"
+    for name, value in loaded.module.state_dict().items():
+        torch.testing.assert_close(value, weights(run)[name])
+
+
+def test_a_finished_run_is_refused_and_can_be_overwritten(arguments: list[str]) -> None:
+    command.main([*arguments, "trainer.max_epochs=1"])
+    with pytest.raises(RunError, match=r"finished.*name=NAME.*overwrite=true"):
+        command.main([*arguments, "trainer.max_epochs=1"])
+    assert command.main([*arguments, "trainer.max_epochs=1", "trainer.overwrite=true"]) == 0
+
+
+def test_resuming_at_an_epochs_end_equals_an_uninterrupted_run(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gausim.engine.callbacks import RunCheckpoint
+
+    command.main([*arguments, "name=whole"])
+    saved = RunCheckpoint.on_train_epoch_end
+
+    def crash(self: RunCheckpoint, trainer: object, pl_module: object) -> None:
+        saved(self, trainer, pl_module)  # type: ignore[arg-type]
+        raise MemoryError("power cut")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunCheckpoint, "on_train_epoch_end", crash)
+        with pytest.raises(MemoryError):
+            command.main([*arguments, "name=cut"])
+    assert not Path("outputs/cut/seed_0/FINISHED").exists()
+    command.main([*arguments, "name=cut", "logger=none"])
+    whole, cut = (weights(Path(f"outputs/{name}/seed_0")) for name in ("whole", "cut"))
+    for name, value in whole.items():
+        torch.testing.assert_close(cut[name], value, rtol=0, atol=0)
+
+
+def test_a_changed_config_is_refused_by_the_name_of_its_keys(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command.main([*arguments, "trainer.max_epochs=1"])
+    Path("outputs/toy/seed_0/FINISHED").unlink()
+    with pytest.raises(RunError, match=r"changed: loss\.static_weight\."):
+        command.main([*arguments, "trainer.max_epochs=1", "loss.static_weight=2"])
+
+
+def test_an_unknown_key_is_refused(arguments: list[str]) -> None:
+    with pytest.raises(ConfigError, match="modle"):
+        command.main([*arguments, "modle=gausim"])
+    assert not Path("outputs").exists()
+
+
+def test_a_checkpoint_of_another_scene_is_refused(arguments: list[str], tmp_path: Path) -> None:
+    command.main([*arguments, "trainer.max_epochs=1"])
+    other = write_toy_object(tmp_path / "other")
+    from dataclasses import replace
+
+    from gausim.io.ply import save_scene
+
+    save_scene(replace(other.scene, means=other.scene.means * 1.01), other.root / "scene.ply")
+    with pytest.raises(RunError, match=r"trained on 'toy' \(36 kernels.*but the data holds 'toy' \(36 kernels"):
+        load_run(Path("outputs/toy/seed_0"), data={"root": str(other.root)})
+
+
+def test_help_needs_no_hydra(capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.main(["--help"]) == 0
+    assert "usage: gausim train" in capsys.readouterr().out
