@@ -1,0 +1,157 @@
+"""What a static reconstruction is made from and measured on: posed RGBA images in sets of one size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from gausim.core import Cameras, DataError, GaussianScene, Renderer
+from gausim.data.images import composite
+from gausim.data.objects import ObjectData
+from gausim.data.records import Stills, read_stills
+from gausim.metrics.psnr import PSNR, ForegroundPSNR
+from gausim.metrics.ssim import SSIM
+from gausim.render.draw import draw
+
+
+@dataclass(frozen=True, eq=False)
+class ImageSet:
+    """N posed images of one size.
+
+    Attributes:
+        name: what they are, for tables.
+        images: straight-alpha RGBA.
+        cameras: one per image.
+        share: weight of the set when training draws images.
+    """
+
+    name: str
+    images: UInt8[Tensor, "N H W 4"]
+    cameras: Cameras
+    share: float = 1.0
+
+    def select(self, index: Sequence[int]) -> ImageSet:
+        """The images at these indices."""
+        return ImageSet(self.name, self.images[list(index)], self.cameras.select(list(index)), self.share)
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """Training sets (the first one is carved for the hull) and the sets that the result is measured on."""
+
+    train: tuple[ImageSet, ...]
+    measure: tuple[ImageSet, ...]
+
+
+def gather_stills(path: Path) -> Material:
+    """The stills of one ``transforms.json``; every tenth is left out and measured.
+
+    Raises:
+        DataError: fewer than two stills, or an image or pose is unusable.
+    """
+    stills = read_stills(path)
+    if len(stills.images) < 2:
+        raise DataError(f"{path}: {len(stills.images)} stills; expected at least two views of the object.")
+    return Material((_part(stills, stills.train, "stills"),), _left_out(stills))
+
+
+def gather_object(data: ObjectData, *, video_share: float = 0.4) -> Material:
+    """The stills of an object and the first frames of its training views, which show the same rest state.
+
+    Training compares renderings with the video frames, which are often smaller than the stills, and splats are not
+    scale-free (their pixel filter is 0.3 pixels^2 at every size). So ``video_share`` of all steps are spent at the
+    size of the video: one quarter of them on the first frames themselves, the rest on the stills reduced to that
+    size. Views that are held out are only measured.
+
+    Args:
+        data: the object.
+        video_share: share of the steps at the video's size, 0 for stills only.
+    """
+    stills = data.stills()
+    train = _part(stills, stills.train, "stills", share=1 - video_share)
+    measured = list(_left_out(stills))
+    if not (data.root / "sequences").is_dir():
+        return Material((train,), tuple(measured))
+    first, heldout = first_frames(data, data.train_views), first_frames(data, data.heldout_views)
+    measured += [s for s in (first, heldout) if s is not None]
+    if first is None or video_share <= 0:
+        return Material((train,), tuple(measured))
+    factor = first.cameras.width / train.cameras.width
+    sets = [train]
+    if factor < 1:
+        size = first.cameras.width, max(1, round(train.cameras.height * factor))
+        sets.append(reduced(train, size, share=0.75 * video_share))
+    sets.append(ImageSet(first.name, first.images, first.cameras, video_share * (0.25 if factor < 1 else 1.0)))
+    return Material(tuple(sets), tuple(measured))
+
+
+def first_frames(data: ObjectData, views: Sequence[str]) -> ImageSet | None:
+    """Frame 0 of these views over all sequences, cameras that stand at the same place taken once."""
+    images, cameras, places = [], [], set()
+    for sequence in data.sequences if views else []:
+        here = sequence.cameras_of(views)
+        for i, name in enumerate(views):
+            place = (name, *here.viewmats[i].flatten().tolist())
+            if place not in places:
+                places.add(place)
+                images.append(sequence.frames(range(1), [name])[0, 0])
+                cameras.append(here.select([i]))
+    if not images:
+        return None
+    kind = "frame 0, views to train on" if tuple(views) == data.train_views else "frame 0, views held out"
+    joined = Cameras(
+        torch.cat([c.viewmats for c in cameras]),
+        torch.cat([c.Ks for c in cameras]),
+        cameras[0].width,
+        cameras[0].height,
+        tuple(c.names[0] for c in cameras),
+    )
+    return ImageSet(kind, torch.stack(images), joined)
+
+
+def reduced(images: ImageSet, size: tuple[int, int], *, share: float) -> ImageSet:
+    """The set at a smaller ``size`` = (width, height): area means of the premultiplied colours, cameras to match."""
+    values = images.images.permute(0, 3, 1, 2).float()
+    premultiplied = torch.cat((values[:, :3] * values[:, 3:] / 255, values[:, 3:]), 1)
+    mean = functional.adaptive_avg_pool2d(premultiplied, (size[1], size[0]))
+    straight = torch.cat((mean[:, :3] * 255 / mean[:, 3:].clamp_min(1e-3), mean[:, 3:]), 1)
+    pixels = straight.round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1).contiguous()
+    factor = torch.tensor([size[0] / images.cameras.width, size[1] / images.cameras.height, 1.0])
+    cameras = Cameras(images.cameras.viewmats, images.cameras.Ks * factor[:, None], *size, images.cameras.names)
+    return ImageSet(f"{images.name} reduced", pixels, cameras, share)
+
+
+@torch.no_grad()
+def draw_rest(scene: GaussianScene, renderer: Renderer, cameras: Cameras) -> Float[Tensor, "V H W 3"]:
+    """The scene at rest in every camera, over black, clamped to [0, 1]."""
+    identity, unit = torch.eye(3)[None, None], torch.zeros(scene.count, dtype=torch.int64)
+    drawn = draw(renderer, scene, scene.means[None], identity, identity, unit, cameras)
+    return drawn.rgb[0].clamp(0, 1)
+
+
+def measure(scene: GaussianScene, renderer: Renderer, images: ImageSet) -> dict[str, float]:
+    """PSNR [dB] of the whole image and of the foreground, and SSIM, over black: means over the images."""
+    truth, alpha = composite(images.images)
+    drawn = draw_rest(scene, renderer, images.cameras)
+    result = {}
+    for metric in (PSNR(), ForegroundPSNR(), SSIM()):
+        metric.update(drawn, truth, alpha > 0)
+        result[metric.key] = float(metric.compute())
+    return result
+
+
+def _part(stills: Stills, index: Sequence[int], name: str, *, share: float = 1.0) -> ImageSet:
+    # Sets below ten stills have none to leave out; then all are used and the measured ones are among them.
+    return ImageSet(name, stills.images, stills.cameras, share).select(index)
+
+
+def _left_out(stills: Stills) -> tuple[ImageSet, ...]:
+    if stills.heldout:
+        return (_part(stills, stills.heldout, "stills left out"),)
+    return (_part(stills, stills.train, "stills (all used, none left out)"),)
