@@ -88,5 +88,5 @@ def test_slices_and_sheets_show_truth_and_prediction(tmp_path):
     contact_sheet(truth[:8], late, tmp_path / "sheet.png", title="t", first_unseen=5)
     contact_sheet(None, late, tmp_path / "alone.png", title="t", first_unseen=5)
     assert read(tmp_path / "sheet.png").shape[0] > 1.5 * read(tmp_path / "alone.png").shape[0]
-    picture_grid(list(truth[:3]), ["a", "b", "c"], tmp_path / "grid.png", title="t")
+    picture_grid(list(truth[:3]), ["a", "b", "c"], tmp_path / "grid.png", title="t", columns=2)
     assert read(tmp_path / "grid.png").max() == 255

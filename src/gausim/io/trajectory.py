@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from gausim.core import DataError, Trajectory
@@ -30,7 +30,7 @@ def save_trajectory(path: Path | str, trajectory: Trajectory, *, facts: Mapping[
     tensors = {name: getattr(trajectory, name).detach().cpu().contiguous() for name in _TENSORS[:-1]}
     tensors["fps"] = torch.tensor(trajectory.fps, dtype=torch.float64)
     temporary = path.with_name(path.name + ".tmp")
-    save_file(tensors, str(temporary), metadata={**(facts or {}), "format": FORMAT})
+    temporary.write_bytes(save(tensors, metadata={**(facts or {}), "format": FORMAT}))
     os.replace(temporary, path)
 
 

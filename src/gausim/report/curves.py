@@ -120,6 +120,7 @@ def load_curves(path: Path) -> list[ObjectCurves]:
 
 
 def _facts(text: str) -> ObjectFacts:
-    data = json.loads(text)
+    data: dict[str, Any] = json.loads(text)
     metrics = tuple(ImageMetricInfo(**m) for m in data.pop("metrics"))
-    return ObjectFacts(**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}, metrics=metrics)
+    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+    return ObjectFacts(**fields, metrics=metrics)

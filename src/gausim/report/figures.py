@@ -34,6 +34,8 @@ def error_figure(curves: ObjectCurves, path: Path, *, sequence: str | None = Non
     figure = Figure(figsize=(5.2 * len(panels), 3.6), dpi=_DPI, layout="constrained")
     for axes, (metric, group) in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
         _error_panel(axes, curves, metric, group, sequence)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=7)
     figure.suptitle(f"{facts.name}, {sequence or f'mean over {len(facts.sequences)} sequences'}", fontsize=10)
     _save(figure, path)
 
@@ -60,7 +62,6 @@ def _error_panel(axes: Axes, curves: ObjectCurves, metric: str, group: str, sequ
     _shade_seen(axes, curves.facts.first_unseen)
     axes.set(title=titles[group], xlabel="frame", ylim=(0, None), xlim=(0, max(curves.facts.frames) - 1))
     axes.title.set_fontsize(9)
-    axes.legend(fontsize=7, loc="upper left")
 
 
 def _lines(curves: ObjectCurves, row: str, metric: str, group: str, sequence: str | None) -> np.ndarray:
@@ -108,7 +109,7 @@ def contact_frames(frames: int, first_unseen: int, count: int = 8) -> list[int]:
     """Frames worth a place on a contact sheet: first, last seen, first unseen, last, and evenly between."""
     edges = {0, min(first_unseen - 1, frames - 1), min(first_unseen, frames - 1), frames - 1}
     even = np.linspace(0, frames - 1, count).round().astype(int).tolist()
-    return sorted(edges | set(even))
+    return sorted(edges | {f for f in even if min(abs(f - e) for e in edges) > 2})
 
 
 def contact_sheet(
@@ -144,13 +145,15 @@ def contact_sheet(
     _save(figure, path)
 
 
-def picture_grid(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, *, title: str) -> None:
-    """Labelled (H, W, 3) uint8 pictures in one row, as PNG."""
-    ratio = images[0].shape[0] / images[0].shape[1]
-    figure = Figure(figsize=(3.2 * len(images), 3.2 * ratio + 0.7), dpi=_DPI, layout="constrained")
-    for axes, image, label in zip(np.ravel(figure.subplots(1, len(images))), images, labels, strict=True):
+def picture_grid(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, *, title: str, columns: int) -> None:
+    """Labelled (H, W, 3) uint8 pictures in rows of ``columns``, as PNG."""
+    ratio, rows = images[0].shape[0] / images[0].shape[1], -(-len(images) // columns)
+    figure = Figure(figsize=(3.2 * columns, (3.2 * ratio + 0.3) * rows + 0.3), dpi=_DPI, layout="constrained")
+    places = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes in places:
+        axes.set_axis_off()
+    for axes, image, label in zip(places, images, labels, strict=False):  # the last row may have places left
         axes.imshow(image)
-        axes.set(xticks=[], yticks=[])
         axes.set_title(label, fontsize=8)
     figure.suptitle(title, fontsize=10)
     _save(figure, path)

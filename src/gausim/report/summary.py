@@ -42,7 +42,7 @@ NEAR_FRAMES = 10
 
 _POINT_METRICS = {
     ERROR_3D: {"label": "3D error", "scale": 1.0, "unit": "% of diagonal", "higher_is_better": False},
-    MOTION_ENERGY: {"label": "motion energy", "scale": 1.0, "unit": "of the truth's", "higher_is_better": None},
+    MOTION_ENERGY: {"label": "motion energy", "scale": 1.0, "unit": "", "higher_is_better": None},
 }
 
 

@@ -11,10 +11,10 @@ SPLIT_TITLES = {"seen": "seen", "unseen": "unseen", "unseen_near": "unseen, firs
 GROUP_TITLES = {"points": "3D, true points", "train": "training views", "heldout": "views never trained on"}
 LEGEND = (
     "Mean ± standard deviation over sequences; `/ static` is the ratio to the static prediction (below 1 is better); "
-    "motion energy is the predicted over the true one, all sequences together (1 is right, 0 stands still). Images are "
-    "foreground on black."
+    "motion energy is the predicted over the true one, all sequences together (1 is right, 0 stands still); floor is "
+    "the reconstruction itself against frame 0. Images are foreground on black."
 )
-FLOOR_ROW = "floor (reconstruction, frame 0)"
+FLOOR_ROW = "floor"
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,130 @@
+"""`gausim evaluate RUN`: figures of a run on seen, unseen and held-out frames, beside the static prediction."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gausim.cli._run import LoadedRun
+    from gausim.data.objects import ObjectData
+    from gausim.report.curves import ObjectCurves
+
+HELP = "Measure a run on seen, unseen and held-out frames."
+
+
+def main(argv: list[str]) -> int:
+    """Runs the command.
+
+    Args:
+        argv: the arguments after the command's name.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        RunError: the run is missing, has no checkpoint, or predicts what cannot be measured.
+        DataError: an object or sequence that is not there, or broken data.
+    """
+    arguments = _parser().parse_args(argv)
+    from gausim.cli._foresee import state_of
+    from gausim.cli._run import load_run
+    from gausim.engine.evaluation import write_evaluation
+    from gausim.report.figures import error_figure
+
+    run = load_run(arguments.run)
+    state = state_of(run)
+    results = _evaluate(run, arguments)
+    folder = Path(arguments.out) if arguments.out else _default_folder(run, arguments)
+    summary = write_evaluation(folder, results, _facts(run, arguments, state))
+    for curves in results:
+        error_figure(curves, folder / f"errors_{curves.facts.name}.png")
+    if arguments.json:
+        print((folder / "metrics.json").read_text(), end="")
+        return 0
+    _print_tables(summary)
+    for name in ["metrics.json", "metrics.npz", "table.md", *(f"errors_{c.facts.name}.png" for c in results)]:
+        print(f"wrote {folder / name}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="gausim evaluate",
+        description=f"{HELP} Writes metrics.json, metrics.npz, table.md and an error plot per object.",
+    )
+    add = parser.add_argument
+    add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
+    add("--object", nargs="+", metavar="NAME", help="only these objects")
+    add("--sequences", nargs="+", metavar="NAME", help="only these sequences (of every object)")
+    add("--views", default="all", choices=("all", "train", "heldout"), help="which cameras (default: all)")
+    add("--out", metavar="DIR", help="folder to write; default RUN/evaluation, or RUN/evaluation/partial for a part")
+    add("--json", action="store_true", help="print metrics.json instead of tables")
+    return parser
+
+
+def _evaluate(run: LoadedRun, arguments: argparse.Namespace) -> list[ObjectCurves]:
+    from gausim.cli._foresee import METHOD, TrainedPrediction, progress, run_objects, scene_of
+    from gausim.engine.evaluation import evaluate_object
+
+    items = run_objects(run, arguments.object)
+    total = sum(len(arguments.sequences or item.data.sequences) for item in items)
+    bar, advance = progress(total, "evaluate")
+    results = []
+    with bar:
+        for item in items:
+            results.append(
+                evaluate_object(
+                    item.data,
+                    scene_of(run, item),
+                    {METHOD: TrainedPrediction(run, item)},
+                    run.renderer,
+                    sequences=arguments.sequences,
+                    views=_views(item.data, arguments.views),
+                    advance=advance,
+                )
+            )
+    return results
+
+
+def _views(data: ObjectData, group: str) -> list[str]:
+    from gausim.core.errors import DataError
+
+    chosen = {"train": data.train_views, "heldout": data.heldout_views}.get(group, data.views)
+    if not chosen:
+        raise DataError(f"{data.root}: dataset.json names no held-out view. Use --views all or train.")
+    return list(chosen)
+
+
+def _default_folder(run: LoadedRun, arguments: argparse.Namespace) -> Path:
+    """The run's evaluation is never overwritten by that of a part of it."""
+    folder = Path(run.run_dir) / "evaluation"
+    partial = arguments.object or arguments.sequences or arguments.views != "all"
+    return folder / "partial" if partial else folder
+
+
+def _facts(run: LoadedRun, arguments: argparse.Namespace, state: dict[str, Any]) -> dict[str, Any]:
+    name, seed = run.config.get("name"), run.config.get("seed")
+    return {"name": name, "seed": seed, "views": arguments.views, **state}
+
+
+def _print_tables(summary: dict[str, Any]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from gausim.report.tables import object_tables
+
+    # Rich would cut columns at 80 characters where the output goes to a file.
+    console = Console(width=None if sys.stdout.isatty() else 200)
+    for name, entry in summary["objects"].items():
+        for table in object_tables(name, entry):
+            shown = Table(title=table.title, title_justify="left")
+            for i, head in enumerate(table.head):
+                shown.add_column(head.replace("[", r"\["), justify="left" if i < 2 else "right")
+            for i, row in enumerate(table.rows):
+                if i in table.breaks and i:
+                    shown.add_section()
+                shown.add_row(*row)
+            console.print(shown)

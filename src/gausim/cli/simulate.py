@@ -1,0 +1,218 @@
+"""`gausim simulate RUN`: videos, space-time slices, error plots and trajectories of what a run foresees."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from torch import Tensor
+
+    from gausim.cli._foresee import RunObject, TrainedPrediction
+    from gausim.cli._run import LoadedRun
+    from gausim.data.records import SequenceRecord
+    from gausim.report.frames import Timeline
+
+_KICK_HELP = "initial sideways sway of what is not pinned [diagonals per frame] (default: 0.002)"
+HELP = "Roll a run forward and write videos, figures and trajectories."
+
+
+def main(argv: list[str]) -> int:
+    """Runs the command.
+
+    Args:
+        argv: the arguments after the command's name.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        ConfigError: arguments that do not go together.
+        RunError: the run is missing or has no checkpoint.
+        DataError: an object, sequence or view that is not there.
+        DivergenceError: the prediction left the finite numbers.
+    """
+    parser = _parser()
+    arguments = parser.parse_args(argv)
+    if (arguments.run is None) == (arguments.scene is None):
+        parser.error("expected either a RUN or --scene SCENE.ply")
+    parse_background(arguments.background)  # refuses a wrong one before the long work
+    if arguments.scene is not None:
+        from gausim.cli._simulate_scene import simulate_scene
+
+        return simulate_scene(arguments)
+    from gausim.cli._foresee import run_objects, state_of
+    from gausim.cli._run import load_run
+
+    run = load_run(arguments.run)
+    state_of(run)
+    folder = Path(arguments.out) if arguments.out else Path(run.run_dir) / "simulation"
+    for item in run_objects(run, arguments.object):
+        _simulate_object(run, item, arguments, folder / item.data.name)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    from gausim.cli.inspect import add_pin_options
+
+    parser = argparse.ArgumentParser(
+        prog="gausim simulate",
+        description=f"{HELP} Per sequence: trajectory.safetensors, errors.png, and per view an MP4 (ground truth | "
+        "prediction | error), space-time slices and a contact sheet.",
+    )
+    add = parser.add_argument
+    add("run", metavar="RUN", type=Path, nargs="?", help="run directory of `gausim train`")
+    add("--object", nargs="+", metavar="NAME", help="only these objects")
+    add("--sequence", nargs="+", metavar="NAME", help="sequences, or `all`; default the first of each object")
+    add("--frames", type=_positive, metavar="N", help="frames to predict; default as many as were recorded")
+    add("--view", nargs="+", metavar="NAME", help="cameras; default the first trained and the first held-out one")
+    add("--out", metavar="DIR", help="folder to write; default RUN/simulation")
+    add("--background", default="black", metavar="COLOR", help="black, white or R,G,B in 0..1 (default: black)")
+    add("--brighten", type=float, default=1.0, metavar="GAIN", help="gain of the pictures; numbers are never touched")
+    add("--slow", type=float, default=1.0, metavar="FACTOR", help="slow motion of the videos, e.g. 3")
+    add("--gif", action="store_true", help="write GIFs besides")
+    bare = parser.add_argument_group("a scene without a run")
+    bare.add_argument("--scene", type=Path, metavar="SCENE.ply", help="simulate this scene instead of a run")
+    bare.add_argument("--random-weights", action="store_true", help="with an untrained network (needed with --scene)")
+    bare.add_argument("--model", default="gausim_paper", metavar="NAME", help="model config (default: gausim_paper, "
+                      "whose untrained network moves things; that of gausim starts with zero output)")  # fmt: skip
+    bare.add_argument("--steps", type=_positive, default=100, metavar="N", help="steps to simulate (default: 100)")
+    bare.add_argument("--fps", type=float, default=30.0, help="frames per second (default: 30)")
+    bare.add_argument("--seed", type=int, default=0, help="of the random weights")
+    bare.add_argument("--kick", type=float, default=0.002, metavar="FRACTION", help=_KICK_HELP)
+    bare.add_argument("--up", default="z", choices=("x", "y", "z", "-x", "-y", "-z"), help="vertical axis")
+    bare.add_argument("--size", type=_positive, default=480, help="height and width of the pictures [pixels]")
+    add_pin_options(parser)
+    return parser
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected a positive number, got {text}")
+    return value
+
+
+def parse_background(text: str) -> Tensor | None:
+    """Reads a background colour; None is black.
+
+    Raises:
+        ConfigError: it is neither a name nor three numbers in 0..1.
+    """
+    import torch
+
+    from gausim.core.errors import ConfigError
+
+    if text == "black":
+        return None
+    try:
+        color = [1.0, 1.0, 1.0] if text == "white" else [float(v) for v in text.split(",")]
+    except ValueError:
+        color = []
+    if len(color) != 3 or not all(0 <= v <= 1 for v in color):
+        raise ConfigError(
+            f"--background {text}: expected black, white or R,G,B with numbers in 0..1, e.g. 0.2,0.2,0.2."
+        )
+    return torch.tensor(color)
+
+
+def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namespace, folder: Path) -> None:
+    from gausim.cli._foresee import METHOD, TrainedPrediction, progress, scene_of
+    from gausim.core.errors import DataError
+    from gausim.data.records import SequenceRecord
+    from gausim.engine.evaluation import evaluate_object
+    from gausim.report.figures import error_figure
+
+    records = {record.name: record for record in item.data.sequences}
+    names = arguments.sequence or list(records)[:1]
+    names = list(records) if names == ["all"] else names
+    unknown = [name for name in names if name not in records]
+    if unknown:
+        raise DataError(f"{item.data.root}: has no sequence {unknown}; it has {list(records)}.")
+    views = arguments.view or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
+    for name in names:
+        records[name].camera_indices(views)  # likewise an unknown view
+    scene = scene_of(run, item)
+    predict = TrainedPrediction(run, item, frames=arguments.frames or 0)
+    bar, advance = progress(len(names) * (1 + len(views)), f"simulate {item.data.name}")
+    with bar:
+        curves = evaluate_object(item.data, scene, {METHOD: predict}, run.renderer, sequences=names, advance=advance)
+        for name in names:
+            record = SequenceRecord(records[name].root, views=item.data.views, fps=item.data.fps)
+            error_figure(curves, folder / name / "errors.png", sequence=name)
+            _write_sequence(run, item, record, predict, arguments, folder / name)
+            for view in views:
+                _write_view(run, item, record, predict, view, arguments, folder / name)
+                advance(f"{name} {view}")
+    for name in names:
+        print("\n".join(f"wrote {path}" for path in sorted((folder / name).iterdir())))
+
+
+def _write_sequence(
+    run: LoadedRun,
+    item: RunObject,
+    record: SequenceRecord,
+    predict: TrainedPrediction,
+    arguments: argparse.Namespace,
+    folder: Path,
+) -> None:
+    from gausim.cli._foresee import head
+    from gausim.io.trajectory import save_trajectory
+
+    trajectory = head(predict.full(record), arguments.frames or record.count)
+    facts = {"object": item.data.name, "sequence": record.name, "run": Path(run.run_dir).name}
+    save_trajectory(folder / "trajectory.safetensors", trajectory, facts=facts)
+
+
+def _write_view(
+    run: LoadedRun,
+    item: RunObject,
+    record: SequenceRecord,
+    predict: TrainedPrediction,
+    view: str,
+    arguments: argparse.Namespace,
+    folder: Path,
+) -> None:
+    from gausim.cli._foresee import head, scene_of
+    from gausim.io.video import write_gif, write_video
+    from gausim.render.draw import film
+    from gausim.report.figures import contact_sheet, slice_figure
+    from gausim.report.frames import Timeline, brighten
+
+    frames, background = arguments.frames or record.count, parse_background(arguments.background)
+    scene = scene_of(run, item)
+    drawn = film(
+        run.renderer, scene, head(predict.full(record), frames), record.cameras_of([view]),
+        background=background, mask=scene.foreground,
+    )  # fmt: skip
+    prediction = brighten(drawn[:, 0].cpu().numpy(), arguments.brighten)
+    truth = brighten(_truth(record, view, min(frames, record.count), background), arguments.brighten)
+    unseen, title = item.data.train_frames.stop, f"{item.data.name} {record.name} {view}"
+    fps, timeline = item.data.fps / arguments.slow, Timeline(frames, unseen)
+    write_video(folder / f"{view}.mp4", _compare(truth, prediction, timeline, title), fps)
+    if arguments.gif:
+        write_gif(folder / f"{view}.gif", _compare(truth, prediction, timeline, title), fps)
+    slice_figure(truth, prediction, folder / f"{view}_slices.png", title=title, first_unseen=unseen)
+    contact_sheet(truth, prediction, folder / f"{view}_sheet.png", title=title, first_unseen=unseen)
+
+
+def _truth(record: SequenceRecord, view: str, frames: int, background: Tensor | None) -> np.ndarray:
+    import numpy as np
+
+    from gausim.data.images import composite
+    from gausim.render.draw import to_bytes
+
+    # In pieces: floats of a whole sequence take sixteen times the space of its bytes.
+    pieces = [range(start, min(start + 16, frames)) for start in range(0, frames, 16)]
+    parts = [to_bytes(composite(record.frames(piece, [view])[:, 0], background)[0]).numpy() for piece in pieces]
+    return np.concatenate(parts)
+
+
+def _compare(truth: np.ndarray, prediction: np.ndarray, timeline: Timeline, title: str) -> Iterator[np.ndarray]:
+    from gausim.report.frames import video_frame
+
+    for number, image in enumerate(prediction):
+        yield video_frame(truth[number] if number < len(truth) else None, image, number, timeline, title)

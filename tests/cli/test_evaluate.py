@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from gausim.cli import _run, evaluate
+from gausim.core import DataError, RunError
+from gausim.data.objects import ObjectData
+from gausim.render.reference import ReferenceRenderer
+
+TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """A run whose model knows the toy's formula and reads the sequence from its initial state."""
+    toy = TOY["write_toy_object"](tmp_path / "data" / "toy")
+    names = list(toy.amplitudes)
+    initial = SimpleNamespace(previous=lambda sequence: toy.scene.means + sequence)
+
+    def rollout(state, steps):
+        return toy.truth(names[round(float((state.previous - toy.scene.means).mean()))], frames=steps + 1)
+
+    model = SimpleNamespace(scenes=[toy.scene], dynamics=lambda scene_id: SimpleNamespace(rollout=rollout))
+    module = SimpleNamespace(model=model, simulator=model, initial_states=initial)
+    directory = tmp_path / "run"
+    directory.mkdir()
+    torch.save({"state_dict": {}, "gausim": {}, "epoch": 3, "global_step": 40}, directory / "last.ckpt")
+    (directory / "FINISHED").write_text("{}")
+    loaded = SimpleNamespace(config={"name": "toy", "seed": 5}, module=module, objects=[ObjectData(toy.root)],
+                             renderer=ReferenceRenderer(), run_dir=directory)  # fmt: skip
+    monkeypatch.setattr(_run, "load_run", lambda path: loaded)
+    return loaded
+
+
+def test_whole_evaluation(run, capsys):
+    assert evaluate.main([str(run.run_dir)]) == 0
+    captured = capsys.readouterr()
+    assert "views never trained on" in captured.out and "not finished" not in captured.err
+    folder = run.run_dir / "evaluation"
+    names = {p.name for p in folder.iterdir()}
+    assert names == {"metrics.json", "metrics.npz", "table.md", "errors_toy.png"}
+    summary = json.loads((folder / "metrics.json").read_text())
+    expected = {"name": "toy", "seed": 5, "views": "all", "finished": True, "epoch": 3, "updates": 40}
+    assert summary["run"] == expected
+    row = summary["objects"]["toy"]["rows"]["gausim"]["unseen"]
+    assert row["points"]["error_3d"]["ratio"] < 1e-3 and row["heldout"]["l2"]["mean"] < 0.003
+
+
+def test_a_part_does_not_overwrite_the_whole(run, capsys):
+    assert evaluate.main([str(run.run_dir), "--sequences", "seq_001", "--views", "heldout", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["objects"]["toy"]["sequences"] == ["seq_001"]
+    assert set(printed["objects"]["toy"]["rows"]["static"]["seen"]) == {"heldout", "points"}
+    assert not (run.run_dir / "evaluation" / "metrics.json").exists()
+    assert (run.run_dir / "evaluation" / "partial" / "metrics.json").is_file()
+
+
+def test_an_unfinished_run_is_measured_with_a_warning(run, capsys):
+    (run.run_dir / "FINISHED").unlink()
+    assert evaluate.main([str(run.run_dir), "--sequences", "seq_000", "--out", str(run.run_dir / "here")]) == 0
+    assert "warning" in capsys.readouterr().err
+    assert json.loads((run.run_dir / "here" / "metrics.json").read_text())["run"]["finished"] is False
+
+
+def test_what_is_not_there_is_named(run):
+    with pytest.raises(DataError, match=r"no object \['cat'\]; it has \['toy'\]"):
+        evaluate.main([str(run.run_dir), "--object", "cat"])
+    with pytest.raises(DataError, match="no sequence .*seq_7"):
+        evaluate.main([str(run.run_dir), "--sequences", "seq_7"])
+
+
+def test_a_missing_run_is_an_error_that_says_what_to_do(tmp_path):
+    with pytest.raises(RunError, match="no run here .*gausim train"):
+        evaluate.main([str(tmp_path / "nowhere")])

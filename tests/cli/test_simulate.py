@@ -1,0 +1,102 @@
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gausim.cli import _simulate_scene, simulate
+from gausim.core import ConfigError, DataError, SceneError
+from gausim.io.ply import load_scene, save_scene
+from gausim.io.trajectory import load_trajectory
+from gausim.io.video import read_video
+
+TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
+run = runpy.run_path(str(Path(__file__).with_name("test_evaluate.py")))["run"]
+
+
+def test_a_sequence_gives_all_files(run, capsys):
+    assert simulate.main([str(run.run_dir), "--gif"]) == 0
+    folder = run.run_dir / "simulation" / "toy" / "seq_000"
+    views = [f"{view}{end}" for view in ("cam_0", "cam_2") for end in (".gif", ".mp4", "_sheet.png", "_slices.png")]
+    assert {p.name for p in folder.iterdir()} == {*views, "errors.png", "trajectory.safetensors"}
+    assert "trajectory.safetensors" in capsys.readouterr().out
+    frames = list(read_video(folder / "cam_2.mp4"))
+    assert len(frames) == 20 and frames[0].shape[1] == 3 * 320
+    # The prediction is the truth here: the first two panels agree, the error panel is dark.
+    left, middle, right = np.split(frames[12][30:330].astype(int), 3, axis=1)
+    assert np.abs(left - middle).mean() < 4 < left.mean() and right.mean() < 4
+    saved = load_trajectory(folder / "trajectory.safetensors")
+    assert saved.frames == 20 and saved.fps == 24.0
+    toy_scene = run.module.model.scenes[0]
+    assert torch.equal(saved.positions[0], toy_scene.means)
+
+
+def test_more_frames_than_were_recorded(run):
+    options = ["--sequence", "seq_001", "--view", "cam_1", "--frames", "26", "--out", str(run.run_dir / "out")]
+    assert simulate.main([str(run.run_dir), *options, "--background", "white", "--brighten", "1.2"]) == 0
+    folder = run.run_dir / "out" / "toy" / "seq_001"
+    frames = list(read_video(folder / "cam_1.mp4"))
+    assert len(frames) == 26 and load_trajectory(folder / "trajectory.safetensors").frames == 26
+    assert frames[5][40, 20].min() > 240 > 40 > frames[25][40, 20].max()  # beyond the recording there is no truth
+
+
+def test_all_sequences_and_what_is_not_there(run):
+    assert simulate.main([str(run.run_dir), "--sequence", "all", "--view", "cam_0", "--frames", "6"]) == 0
+    assert {p.name for p in (run.run_dir / "simulation" / "toy").iterdir()} == {"seq_000", "seq_001"}
+    with pytest.raises(DataError, match="seq_9"):
+        simulate.main([str(run.run_dir), "--sequence", "seq_9"])
+    with pytest.raises(DataError, match="cam_9"):
+        simulate.main([str(run.run_dir), "--view", "cam_9"])
+    with pytest.raises(ConfigError, match="--background mauve"):
+        simulate.main([str(run.run_dir), "--background", "mauve"])
+
+
+def test_run_and_scene_exclude_each_other(capsys):
+    for argv in ([], ["run", "--scene", "a.ply"]):
+        with pytest.raises(SystemExit):
+            simulate.main(argv)
+        assert "either a RUN or --scene" in capsys.readouterr().err
+
+
+@pytest.fixture
+def bare(tmp_path):
+    scene = TOY["toy_scene"]()
+    save_scene(scene, tmp_path / "toy.ply")
+    (tmp_path / "toy.masks.npz").unlink()
+    return scene, tmp_path / "toy.ply"
+
+
+def test_a_bare_scene_moves_and_stays_finite(bare, tmp_path, capsys):
+    scene, path = bare
+    options = ["--random-weights", "--pin-below", "z=0.1", "--steps", "7", "--size", "48", "--out", str(tmp_path / "o")]
+    assert simulate.main(["--scene", str(path), *options]) == 0
+    assert "all finite: True" in capsys.readouterr().out
+    trajectory = load_trajectory(tmp_path / "o" / "trajectory.safetensors")
+    moved = (trajectory.positions - scene.means).abs().amax((0, 2))
+    assert trajectory.frames == 8 and (moved[scene.pinned] == 0).all() and (moved[~scene.pinned] > 0).all()
+    last = load_scene(tmp_path / "o" / "last_frame.ply")
+    assert torch.equal(last.means, trajectory.positions[-1])
+    assert len(list(read_video(tmp_path / "o" / "video.mp4"))) == 8
+    assert (tmp_path / "o" / "pictures.png").stat().st_size > 10_000
+
+
+def test_bare_scene_errors(bare):
+    _, path = bare
+    with pytest.raises(ConfigError, match="--random-weights"):
+        simulate.main(["--scene", str(path)])
+    with pytest.raises(SceneError, match="no kernel is pinned"):
+        simulate.main(["--scene", str(path), "--random-weights"])
+    with pytest.raises(ConfigError, match="nosuch"):
+        simulate.main(["--scene", str(path), "--random-weights", "--pin-below", "z=0.1", "--model", "nosuch"])
+
+
+def test_sway_grows_from_the_roots(bare):
+    scene = TOY["toy_scene"]()
+    state = _simulate_scene.initial_sway(scene, 0.01)
+    shift = (state.positions - state.previous)[:, 0]
+    assert (shift[scene.pinned] == 0).all() and (shift[~scene.pinned] > 0).all()
+    assert float(shift.max()) == pytest.approx(0.01 * scene.diagonal, rel=1e-5)
+    assert torch.equal(state.positions, scene.means)
