@@ -77,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--kernels", type=int, default=2000, help="number of Gaussians aimed at (default %(default)s)")
     add("--iterations", type=int, default=4000, help="optimiser steps, one image each (default %(default)s)")
     add("--sh-degree", type=int, default=1, choices=(0, 1, 2, 3), help="spherical harmonics (default %(default)s)")
-    add("--video-share", type=float, default=0.4, metavar="S",
+    add("--video-share", type=float, default=0.5, metavar="S",
         help="share of the steps at the size of the videos, on reduced stills and on frame 0 of the views to train "
         "on; 0 uses the stills only (default %(default)s)")  # fmt: skip
     add("--points", metavar="FILE.npz", help="start from the array 'points' (P, 3) instead of the masks' visual hull")

@@ -51,8 +51,8 @@ class ReconstructionOptions:
         rates: Adam's step sizes.
     """
 
-    kernels: int = 4000
-    iterations: int = 3000
+    kernels: int = 2000
+    iterations: int = 4000
     sh_degree: int = 1
     hull_resolution: int = 96
     hull_margin: int = 1

@@ -34,7 +34,7 @@ class LearningRates:
         color_rest: step of the direction-dependent coefficients (3DGS: a twentieth).
     """
 
-    means: float = 2e-4
+    means: float = 5e-4
     log_scales: float = 1e-2
     quats: float = 3e-3
     opacity: float = 5e-2

@@ -61,7 +61,7 @@ def gather_stills(path: Path) -> Material:
     return Material((_part(stills, stills.train, "stills"),), _left_out(stills))
 
 
-def gather_object(data: ObjectData, *, video_share: float = 0.4) -> Material:
+def gather_object(data: ObjectData, *, video_share: float = 0.5) -> Material:
     """The stills of an object and the first frames of its training views, which show the same rest state.
 
     Training compares renderings with the video frames, which are often smaller than the stills, and splats are not
