@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
     from lightning.pytorch import Trainer
@@ -66,7 +66,9 @@ def train(cfg: DictConfig) -> float | None:
     # Hydra's directory of a single job has the run's name only, a sweep's jobs have the seed in it already.
     folder = _config.run_dir()
     run = RunDirectory(folder if folder.name == f"seed_{cfg.seed}" else folder / f"seed_{cfg.seed}")
-    resume = run.prepare(OmegaConf.to_container(cfg, resolve=True), overwrite=cfg.trainer.overwrite)
+    resume = run.prepare(
+        cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True)), overwrite=cfg.trainer.overwrite
+    )
     seed_everything(cfg.seed, workers=True, verbose=False)
     module, datamodule = build(cfg)
     trainer = make(cfg, run)
@@ -96,15 +98,15 @@ def _introduce(
     import torch
 
     datamodule.setup("fit")
-    batches = len(datamodule.train_dataloader().batch_sampler or [])
+    batches = len(datamodule.train_dataloader())
     epochs = trainer.max_epochs or 0
     device = trainer.strategy.root_device
     lines = [f"{'resuming' if resumed else 'training'} on {device} ({torch.get_num_threads()} threads): {run.path}"]
     for item, scene in zip(datamodule.objects, module.simulator.scenes, strict=True):
-        record = item.sequences[0]
+        cameras = item.sequences[0].cameras
         lines.append(
-            f"  {item.name}: {scene.count} kernels ({int(scene.pinned.sum())} pinned), {len(item.sequences)} sequences, "
-            f"{len(item.train_views)} views of {record.cameras.width}x{record.cameras.height}, {item.fps:g} fps"
+            f"  {item.name}: {scene.count} kernels ({int(scene.pinned.sum())} pinned), {len(item.sequences)} "
+            f"sequences, {len(item.train_views)} views of {cameras.width}x{cameras.height}, {item.fps:g} fps"
         )
     sizes = {name: sum(p.numel() for p in own) for name, own in module.simulator.parameter_groups().items()}
     sizes["initial states"] = sum(p.numel() for p in module.initial_states.parameters())

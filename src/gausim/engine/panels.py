@@ -26,7 +26,7 @@ ERROR_GAIN = 4.0
 def panel(
     truth: Float[Tensor, "F H W 3"], prediction: Float[Tensor, "F H W 3"], *, columns: int = 6, gap: int = 2
 ) -> UInt8[Tensor, "R C 3"]:
-    """Three rows (ground truth, prediction, absolute error times four), evenly spread frames, the first and last too."""
+    """Three rows (ground truth, prediction, error times four) of evenly spread frames, the first and the last too."""
     count = truth.shape[0]
     chosen = sorted({round(i * (count - 1) / max(1, columns - 1)) for i in range(columns)})
     error = (truth - prediction).abs() * ERROR_GAIN

@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gausim.core import ConfigError, RunError
+from gausim.engine.callbacks import RunCheckpoint, TimeBudget
+from gausim.engine.run import RunDirectory, changed_keys, make_trainer
+
+CONFIG = {
+    "seed": 0,
+    "loss": {"balance": 0.9},
+    "trainer": {"max_epochs": 3, "threads": 1},
+    "paths": {"output_root": "o"},
+}
+
+
+def test_a_fresh_and_an_interrupted_run(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "a")
+    assert run.prepare(CONFIG) is None
+    assert run.config() == CONFIG
+    run.checkpoint.write_bytes(b"x")
+    assert run.prepare(CONFIG) == run.checkpoint
+
+
+def test_changed_keys_are_named_and_free_ones_are_not(tmp_path: Path) -> None:
+    changed = {**CONFIG, "seed": 1, "paths": {"output_root": "p"}, "trainer": {"max_epochs": 4, "threads": 2}}
+    assert changed_keys(CONFIG, changed) == ["seed", "trainer.max_epochs"]
+    assert changed_keys(CONFIG, {**CONFIG, "extra": None}) == ["extra"]
+    run = RunDirectory(tmp_path)
+    run.prepare(CONFIG)
+    run.prepare(changed)  # nothing was learned yet
+    run.checkpoint.write_bytes(b"x")
+    with pytest.raises(RunError, match=r"changed: seed, trainer\.max_epochs\."):
+        run.prepare(CONFIG)
+
+
+def test_a_finished_run_is_refused_and_overwriting_keeps_foreign_files(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    run.prepare(CONFIG)
+    run.checkpoint.write_bytes(b"x")
+    (tmp_path / "panels").mkdir()
+    (tmp_path / "notes.txt").write_text("mine")
+    run.finish({"epochs": 3})
+    with pytest.raises(RunError, match="this run is finished"):
+        run.prepare(CONFIG)
+    assert run.prepare(CONFIG, overwrite=True) is None
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["config.yaml", "notes.txt"]
+
+
+def test_no_run_here_is_told(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="no run here"):
+        RunDirectory(tmp_path).config()
+    (tmp_path / "config.yaml").write_text("- 1")
+    with pytest.raises(RunError, match="expected a mapping"):
+        RunDirectory(tmp_path).config()
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    with pytest.raises(ConfigError, match="clock"):
+        TimeBudget(minutes=1, clock="sun")
+    with pytest.raises(ConfigError, match="every_epochs"):
+        RunCheckpoint(every_epochs=0)
+    with pytest.raises(ConfigError, match=r"trainer\.devices"):
+        make_trainer(max_epochs=1, devices=2)

@@ -1,0 +1,313 @@
+from __future__ import annotations
+
+import math
+import re
+import runpy
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+from lightning.pytorch import Trainer
+from torch import Tensor, nn
+
+from gausim.core import DivergenceError, GaussianScene, SimState
+from gausim.data.dataset import SequenceSample
+from gausim.data.images import composite
+from gausim.engine.curriculum import LossGatedCurriculum
+from gausim.engine.module import GausSimModule
+from gausim.engine.optim import CosineSchedule, HalvingSchedule, OptimizerSettings
+from gausim.engine.run import make_trainer
+from gausim.losses import ImageLoss, Objective
+from gausim.models.elastic import ElasticTemplate
+from gausim.models.initial_state import FreeInitialStates, ModalInitialStates
+from gausim.models.simulator import GausSim
+from gausim.render.cpu import CpuRenderer
+from gausim.render.draw import draw
+from gausim.render.reference import ReferenceRenderer
+
+TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
+
+
+class Sway(nn.Module):
+    """x' = x + c (x - x_prev) + s z^2 e_x with one drift s per scene and one shared c: the smallest simulator."""
+
+    def __init__(self, scenes: list[GaussianScene]) -> None:
+        super().__init__()
+        self.scenes = scenes
+        self.keep = nn.Parameter(torch.tensor(0.5))
+        self.drift = nn.ParameterList(torch.zeros(()) for _ in scenes)
+        self.poison: float | None = None
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {"network": [self.keep], "scene": list(self.drift)}
+
+    def batch(self, scene_ids: list[int]) -> SimpleNamespace:
+        members, start = [], 0
+        for n, i in enumerate(scene_ids):
+            count = self.scenes[i].count
+            units = torch.zeros(count, dtype=torch.long)
+            rows = slice(start, start + count)
+            members.append(SimpleNamespace(scene_id=i, kernels=rows, units=slice(n, n + 1), unit_of_kernel=units))
+            start += count
+        return SimpleNamespace(rest=torch.cat([self.scenes[i].means for i in scene_ids]), members=tuple(members))
+
+    def step(self, batch: SimpleNamespace, state: SimState, force: Tensor | None = None) -> SimpleNamespace:
+        drift = torch.cat([self.drift[m.scene_id].expand(m.kernels.stop - m.kernels.start) for m in batch.members])
+        push = torch.zeros_like(batch.rest)
+        push[:, 0] = drift * batch.rest[:, 2] ** 2
+        positions = state.positions + self.keep * (state.positions - state.previous) + push
+        if self.poison is not None:
+            positions = positions * self.poison
+        identity = torch.eye(3).expand(len(batch.members), 3, 3)
+        momentum = (self.keep * drift.sum()).square()
+        return SimpleNamespace(positions=positions, gradients=identity, rotations=identity, momentum=momentum)
+
+
+class Previous(nn.Module):
+    def __init__(self, model: Sway, scene_of_sequence: tuple[int, ...]) -> None:
+        super().__init__()
+        self.values = nn.ParameterList(model.scenes[i].means.clone() for i in scene_of_sequence)
+
+    def previous(self, sequence_id: int) -> Tensor:
+        return self.values[sequence_id]
+
+
+SCENE_OF_SEQUENCE = (0, 0, 1)
+
+
+def sample(sequence: int, steps: int = 3, amplitude: float = 0.4) -> SequenceSample:
+    toy = TOY["ToyObject"](Path("unused"), TOY["toy_scene"](), amplitudes={"a": amplitude})
+    frames = TOY["rgba"](toy.scene, toy.truth("a", steps + 1))
+    return SequenceSample(
+        scene_id=SCENE_OF_SEQUENCE[sequence], object_name="toy", sequence_id=sequence, sequence_name=f"seq_{sequence}",
+        frames=frames, cameras=TOY["cameras"](), fps=24.0)  # fmt: skip
+
+
+def sway_module(objective: Objective | None = None, **settings: float) -> GausSimModule:
+    model = Sway([TOY["toy_scene"](), TOY["toy_scene"]()])
+    return GausSimModule(
+        model=model,
+        initial_states=Previous(model, SCENE_OF_SEQUENCE),
+        scene_of_sequence=SCENE_OF_SEQUENCE,
+        renderer=ReferenceRenderer(),
+        objective=objective or Objective(),
+        optimizer=OptimizerSettings(**settings),  # type: ignore[arg-type]
+    )
+
+
+def fit(module: GausSimModule, batches: list[list[SequenceSample]], tmp_path: Path, epochs: int = 1) -> Trainer:
+    trainer = make_trainer(max_epochs=epochs, accelerator="cpu", progress=False, run_dir=tmp_path, log_every_n_steps=1)
+    loader = torch.utils.data.DataLoader(batches, batch_size=None, collate_fn=lambda x: x)  # type: ignore[arg-type]
+    trainer.fit(module, loader)
+    return trainer
+
+
+def snapshot(module: GausSimModule) -> dict[str, Tensor]:
+    return {name: p.detach().clone() for name, p in module.named_parameters()}
+
+
+def test_absent_sequences_and_scenes_do_not_move_in_twenty_steps(tmp_path: Path) -> None:
+    module = sway_module(network_lr=1e-2)
+    fit(module, [[sample(0), sample(1), sample(2)]] * 3, tmp_path / "a")  # every Adam moment is warm
+    before = snapshot(module)
+    fit_again = module.configure_optimizers()
+    assert fit_again is not None
+    trained = [[sample(0)]] * 20
+    warm = [[sample(0), sample(1), sample(2)]] * 3
+    whole = sway_module(network_lr=1e-2)
+    seen: list[dict[str, Tensor]] = []
+    recorded = whole.training_step
+
+    def record(samples: list[SequenceSample], batch_idx: int) -> None:
+        recorded(samples, batch_idx)
+        seen.append(snapshot(whole))
+
+    whole.training_step = record  # type: ignore[method-assign]
+    fit(whole, warm + trained, tmp_path / "b")
+    after_warm, end = seen[2], seen[-1]
+    for name in ("initial_states.values.1", "initial_states.values.2", "model.drift.1"):
+        assert not torch.equal(after_warm[name], snapshot(sway_module())[name])  # it can move
+        torch.testing.assert_close(end[name], after_warm[name], rtol=0, atol=0)
+    for name in ("initial_states.values.0", "model.drift.0", "model.keep"):
+        assert not torch.equal(end[name], after_warm[name])
+    for name, value in before.items():
+        torch.testing.assert_close(value, after_warm[name], rtol=0, atol=0)  # same seed, same steps
+
+
+def gradients(module: GausSimModule, samples: list[SequenceSample], tmp_path: Path) -> dict[str, Tensor]:
+    """Gradients of the first optimiser step."""
+    kept: dict[str, Tensor] = {}
+
+    def keep(*_: object) -> dict[str, Tensor]:
+        kept.update({n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None})
+        return {"network": torch.zeros(())}
+
+    object.__setattr__(module.settings, "clip", keep)
+    fit(module, [samples], tmp_path)
+    return kept
+
+
+@pytest.mark.parametrize("backprop_steps", [1, 2, 0])
+def test_windows_stop_gradients_and_nothing_else(backprop_steps: int, tmp_path: Path) -> None:
+    objective = Objective(backprop_steps=backprop_steps, static_weight=0.0, momentum_weight=0.0)
+    ours = gradients(sway_module(objective), [sample(0), sample(2)], tmp_path)
+    module = sway_module(objective)
+    samples = [sample(0), sample(2)]
+    batch = module.model.batch([0, 1])
+    state, total = module.initial(samples, batch), torch.zeros(())
+    for t in range(3):
+        if t and backprop_steps and t % backprop_steps == 0:
+            state = state.detach()
+        step = module.model.step(batch, state)
+        state = SimState(step.positions, state.positions)
+        for i, s in enumerate(samples):
+            member = batch.members[i]
+            scene, moved = module.simulator.scenes[s.scene_id], step.positions[member.kernels][None]
+            same = torch.eye(3)[None, None]
+            images = draw(ReferenceRenderer(), scene, moved, same, same, member.unit_of_kernel, s.cameras)
+            total = total + ImageLoss()(images.rgb, composite(s.frames[t + 1 : t + 2])[0]).sum() / 6
+    total.backward()
+    assert set(ours) == {n for n, p in module.named_parameters() if p.grad is not None}
+    for name, parameter in module.named_parameters():
+        if parameter.grad is not None:
+            torch.testing.assert_close(ours[name], parameter.grad, rtol=1e-3, atol=1e-3 * float(ours[name].abs().max()))
+
+
+def test_memory_of_one_window_learns_the_drift(tmp_path: Path) -> None:
+    module = sway_module(network_lr=0.0, scene_lr=5e-3, initial_lr=0.0)
+    fit(module, [[sample(0)]] * 40, tmp_path)
+    assert module.model.drift[0] > 0.02
+    assert module.summary["excess_static"] < 1.0
+    assert 0.0 < module.summary["motion_energy"] < 3.0
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf])
+def test_positions_that_break_are_named(poison: float, tmp_path: Path) -> None:
+    module = sway_module()
+    module.model.poison = poison
+    with pytest.raises(DivergenceError, match=r"predicted step 1 of 3, sequence toy/seq_0: positions"):
+        fit(module, [[sample(0)]], tmp_path)
+
+
+def test_a_gradient_that_breaks_is_named_and_nothing_moves(tmp_path: Path) -> None:
+    module = sway_module()
+    module.model.keep.register_hook(lambda grad: grad * math.nan)
+    before = snapshot(module)
+    with pytest.raises(DivergenceError, match=r"gradient of group 'network'"):
+        fit(module, [[sample(0)]], tmp_path)
+    assert all(torch.equal(before[n], p) for n, p in module.named_parameters())
+
+
+def test_an_explosion_ends_the_rollout_and_is_counted(tmp_path: Path) -> None:
+    module = sway_module(Objective(explosion=0.01, static_weight=0.0))
+    with torch.no_grad():
+        module.model.drift[0] += 0.02
+    fit(module, [[sample(0, steps=6)]], tmp_path)
+    assert module.summary["exploded"] == 1.0
+
+
+def test_twenty_barren_batches_are_a_divergence(tmp_path: Path) -> None:
+    module = sway_module(Objective(explosion=1e-3, static_weight=0.0))
+    with torch.no_grad():
+        module.model.drift[0] += 1.0
+    with pytest.raises(DivergenceError, match="20 batches in a row"):
+        fit(module, [[sample(0)]] * 25, tmp_path)
+
+
+def test_a_collapse_is_warned_of_once(tmp_path: Path) -> None:
+    module = sway_module(Objective(static_weight=0.0), network_lr=0.0, scene_lr=0.0, initial_lr=0.0)
+    with pytest.warns(UserWarning, match="collapsed to the rest state") as caught:
+        fit(module, [[sample(0, steps=1)]] * 50, tmp_path, epochs=4)
+    assert sum("collapsed" in str(w.message) for w in caught) == 1
+
+
+def test_noise_moves_only_free_kernels_and_depends_on_the_seed() -> None:
+    from gausim.engine.rollout import UnitNoise
+
+    module = sway_module()
+    batch = module.model.batch([0, 1])
+    pinned = torch.cat([s.pinned for s in module.simulator.scenes])
+    made = []
+    for seed in (0, 0, 1):
+        noise = UnitNoise(batch, module.simulator.scenes, [0.1, 0.1], torch.Generator().manual_seed(seed))
+        made.append(noise(SimState(batch.rest, batch.rest)).positions - batch.rest)
+    assert float(made[0][pinned].abs().max()) == 0.0 and float(made[0][~pinned].abs().min()) > 0.0
+    assert torch.equal(made[0], made[1]) and not torch.equal(made[0], made[2])
+
+
+def test_schedules() -> None:
+    halving = HalvingSchedule(first=16, every=2)
+    assert [halving.factor(e, 25) for e in (0, 15.9, 16, 17.5, 18, 24)] == [1, 1, 0.5, 0.5, 0.25, 0.5**5]
+    cosine = CosineSchedule(warmup=0.1, final=0.1)
+    values = [cosine.factor(e, 100) for e in (1, 10, 55, 100)]
+    assert values == pytest.approx([0.1, 1.0, 0.55, 0.1])
+
+
+def test_clipping_by_group_and_altogether() -> None:
+    for per_group, expected in ((True, (1.0, 1.0)), (False, (0.6, 0.8))):
+        a, b = nn.Parameter(torch.zeros(2)), nn.Parameter(torch.zeros(2))
+        settings = OptimizerSettings(clip_per_group=per_group)
+        optimizer = settings.build({"network": [a], "scene": [b]})
+        a.grad, b.grad = torch.tensor([30.0, 0.0]), torch.tensor([0.0, 40.0])
+        norms = settings.clip(optimizer)
+        assert {k: float(v) for k, v in norms.items()} == {"network": 30.0, "scene": 40.0}
+        assert (float(a.grad.norm()), float(b.grad.norm())) == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_gated_curriculum_waits_for_the_loss_or_its_patience() -> None:
+    gated = LossGatedCurriculum(t_max=3, threshold=0.5, patience=3)
+    assert gated.steps(99) == 1
+    assert [gated.observe(r) for r in (0.9, 0.4, 0.9, 0.9, 0.9, 0.1)] == [False, True, False, False, True, False]
+    other = LossGatedCurriculum(t_max=3)
+    other.load_state_dict(gated.state_dict())
+    assert other.steps(0) == 3
+
+
+def test_absent_sequences_and_scenes_do_not_move_in_the_real_model(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    scenes = [TOY["toy_scene"](), TOY["toy_scene"]()]
+    template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=4)
+    model = GausSim(scenes, [24.0, 24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
+    module = GausSimModule(
+        model=model, initial_states=ModalInitialStates(model, SCENE_OF_SEQUENCE), scene_of_sequence=SCENE_OF_SEQUENCE,
+        renderer=CpuRenderer(threads=1), optimizer=OptimizerSettings(),
+    )  # fmt: skip
+    seen: list[dict[str, Tensor]] = []
+    recorded = module.training_step
+
+    def record(samples: list[SequenceSample], batch_idx: int) -> None:
+        recorded(samples, batch_idx)
+        seen.append(snapshot(module))
+
+    module.training_step = record  # type: ignore[method-assign]
+    fit(module, [[sample(0), sample(1), sample(2)]] * 2 + [[sample(0)]] * 20, tmp_path)
+    own = re.compile(r"initial_states\.velocity\.[12]|.*(log_density|attributes)\.1|model\.template\.scenes\.1\..*")
+    absent = [name for name in seen[0] if own.fullmatch(name)]
+    assert len(absent) > 4
+    for name in absent:
+        torch.testing.assert_close(seen[-1][name], seen[1][name], rtol=0, atol=0)
+    assert not torch.equal(seen[-1]["initial_states.velocity.0"], seen[1]["initial_states.velocity.0"])
+
+
+@pytest.mark.slow
+def test_overfitting_one_sequence_drives_its_loss_down_tenfold(tmp_path: Path) -> None:
+    scene = TOY["toy_scene"]()
+    torch.manual_seed(0)
+    model = GausSim([scene], [24.0], radii=(0.3, 0.7), hidden=16, layers=2, output_scale=0.05, rest_inputs=True)
+    module = GausSimModule(
+        model=model, initial_states=FreeInitialStates(model, [0]), scene_of_sequence=[0],
+        renderer=CpuRenderer(threads=1), objective=Objective(backprop_steps=0, static_weight=0.0),
+        optimizer=OptimizerSettings(network_lr=3e-3, initial_lr=3e-3, clip_per_group=True, schedule=CosineSchedule()),
+    )  # fmt: skip
+    losses: list[float] = []
+    recorded = module.training_step
+
+    def record(samples: list[SequenceSample], batch_idx: int) -> None:
+        recorded(samples, batch_idx)
+        losses.append(module.last_stats["loss_image"])
+
+    module.training_step = record  # type: ignore[method-assign]
+    fit(module, [[sample(0, steps=5)]] * 300, tmp_path)
+    assert sum(losses[-10:]) / 10 < 0.1 * losses[0]
