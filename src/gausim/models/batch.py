@@ -1,0 +1,196 @@
+"""Several sequences, of one or several scenes, as one disjoint graph."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gausim.core import GaussianScene
+from gausim.models.hierarchy import Hierarchy
+from gausim.ops.neighbours import radius_edges
+
+
+@dataclass(frozen=True, eq=False)
+class Member:
+    """Where one sequence stands in the disjoint union.
+
+    Attributes:
+        scene_id: which scene it is of.
+        kernels: its rows of the state (all kernels of the scene).
+        units: its rows of :class:`Step` gradients and rotations; the last of them is the identity unit.
+        unit_of_kernel: unit of every kernel, counted from ``units.start``; pinned and never-simulated kernels point
+            to the identity unit.
+    """
+
+    scene_id: int
+    kernels: slice
+    units: slice
+    unit_of_kernel: Int[Tensor, " K"]
+
+
+@dataclass(frozen=True, eq=False)
+class LevelBatch:
+    """One predicted level of the union.
+
+    Attributes:
+        unit_of_kernel: unit of every simulated kernel.
+        parent: unit of the coarser predicted level, or at the coarsest one the simulated kernel that is the root.
+        pinned: units that never move.
+        rest_edges: neighbours in rest space, sorted by destination.
+        spans: rows of each member.
+        length: bounding-box diagonal of the unit's scene [scene units].
+        volume: volumes V_c.
+        radius: largest edge length of each member [scene units].
+    """
+
+    unit_of_kernel: Int[Tensor, " K"]
+    parent: Int[Tensor, " N"]
+    pinned: Bool[Tensor, " N"]
+    rest_edges: Int[Tensor, "2 E"]
+    spans: tuple[slice, ...]
+    length: Float[Tensor, "N 1"]
+    dt: Float[Tensor, "N 1"]
+    volume: Float[Tensor, " N"]
+    radius: tuple[float, ...]
+    max_neighbours: int
+
+    @property
+    def count(self) -> int:
+        """Number of units in the union."""
+        return self.pinned.shape[0]
+
+    def current_edges(self, positions: Float[Tensor, "N 3"]) -> Int[Tensor, "2 E"]:
+        """Neighbours in the current state, member by member, sorted by destination."""
+        parts = [
+            radius_edges(positions[span], radius, self.max_neighbours) + span.start
+            for span, radius in zip(self.spans, self.radius, strict=True)
+        ]
+        return torch.cat(parts, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class SceneBatch:
+    """The disjoint union of the scenes of several sequences.
+
+    Attributes:
+        members: one per sequence.
+        levels: the predicted levels, coarse to fine.
+        rest: rest positions of all kernels [scene units].
+        simulated: rows of ``rest`` that the dynamics may move (level 0).
+        pinned: which of the simulated kernels are held.
+        volume: volumes of the simulated kernels.
+        dt: frame interval of each simulated kernel's sequence [s].
+    """
+
+    members: tuple[Member, ...]
+    levels: tuple[LevelBatch, ...]
+    rest: Float[Tensor, "K 3"]
+    simulated: Int[Tensor, " M"]
+    pinned: Bool[Tensor, " M"]
+    volume: Float[Tensor, " M"]
+    dt: Float[Tensor, "M 1"]
+
+    @property
+    def scene_ids(self) -> tuple[int, ...]:
+        """Scene of each member."""
+        return tuple(m.scene_id for m in self.members)
+
+
+@dataclass(frozen=True)
+class GraphOptions:
+    """Which units are neighbours: radius per predicted level (fractions of the diagonal) and the cap."""
+
+    radii: tuple[float, ...]
+    max_neighbours: int
+
+
+class BatchBuilder:
+    """Builds unions of scenes from parts computed once per scene."""
+
+    def __init__(
+        self,
+        scenes: Sequence[GaussianScene],
+        hierarchies: Sequence[Hierarchy],
+        fps: Sequence[float],
+        predicted: Sequence[int],
+        graph: GraphOptions,
+    ) -> None:
+        """``predicted`` lists the predicted levels, coarse to fine; ``graph.radii`` follows the same order."""
+        self.scenes, self.hierarchies, self.fps = scenes, hierarchies, fps
+        self.predicted, self.graph = tuple(predicted), graph
+        self._edges = [[self._rest_edges(h, i) for i in range(len(self.predicted))] for h in hierarchies]
+
+    def _rest_edges(self, hierarchy: Hierarchy, position: int) -> Tensor:
+        radius = self.graph.radii[position] * hierarchy.diagonal
+        return radius_edges(hierarchy.levels[self.predicted[position]].rest, radius, self.graph.max_neighbours)
+
+    def build(self, scene_ids: Sequence[int], device: torch.device) -> SceneBatch:
+        """The union of the scenes ``scene_ids`` (repeats allowed), in that order."""
+        members, kernels, units = [], 0, 0
+        finest = self.predicted[-1]
+        simulated, sim_counts = [], []
+        for i in scene_ids:
+            scene, hierarchy = self.scenes[i], self.hierarchies[i]
+            count = hierarchy.levels[finest].count
+            unit_of_kernel = torch.full((scene.count,), count)
+            free = ~hierarchy.levels[0].pinned
+            unit_of_kernel[hierarchy.kernels[free]] = hierarchy.ancestor(0, finest)[free]
+            members.append(
+                Member(
+                    i, slice(kernels, kernels + scene.count), slice(units, units + count + 1), unit_of_kernel.to(device)
+                )
+            )
+            simulated.append(hierarchy.kernels + kernels)
+            sim_counts.append(hierarchy.levels[0].count)
+            kernels, units = kernels + scene.count, units + count + 1
+        base = [self.hierarchies[i].levels[0] for i in scene_ids]
+        dt = torch.tensor([1.0 / self.fps[i] for i in scene_ids], dtype=self.scenes[0].means.dtype)
+        return SceneBatch(
+            members=tuple(members),
+            levels=tuple(self._level(p, scene_ids, sim_counts, device) for p in range(len(self.predicted))),
+            rest=torch.cat([self.scenes[i].means for i in scene_ids]).to(device),
+            simulated=torch.cat(simulated).to(device),
+            pinned=torch.cat([b.pinned for b in base]).to(device),
+            volume=torch.cat([b.volume for b in base]).to(device),
+            dt=dt.repeat_interleave(torch.tensor(sim_counts))[:, None].to(device),
+        )
+
+    def _level(
+        self, position: int, scene_ids: Sequence[int], sim_counts: list[int], device: torch.device
+    ) -> LevelBatch:
+        level = self.predicted[position]
+        chosen = [self.hierarchies[i] for i in scene_ids]
+        counts = [h.levels[level].count for h in chosen]
+        starts = [sum(counts[:j]) for j in range(len(counts))]
+        if position == 0:
+            above = [h.levels[level].root for h in chosen]
+            above_counts = sim_counts
+        else:
+            coarser = self.predicted[position - 1]
+            above = [h.ancestor(level, coarser) for h in chosen]
+            above_counts = [h.levels[coarser].count for h in chosen]
+        above_starts = [sum(above_counts[:j]) for j in range(len(counts))]
+
+        def join(parts: list[Tensor], offsets: list[int], dim: int = 0) -> Tensor:
+            return torch.cat([p + o for p, o in zip(parts, offsets, strict=True)], dim).to(device)
+
+        def spread(values: list[float]) -> Tensor:
+            column = torch.tensor(values, dtype=self.scenes[0].means.dtype)
+            return column.repeat_interleave(torch.tensor(counts))[:, None].to(device)
+
+        return LevelBatch(
+            unit_of_kernel=join([h.ancestor(0, level) for h in chosen], starts),
+            parent=join(above, above_starts),
+            pinned=torch.cat([h.levels[level].pinned for h in chosen]).to(device),
+            rest_edges=join([self._edges[i][position] for i in scene_ids], starts, 1),
+            spans=tuple(slice(s, s + c) for s, c in zip(starts, counts, strict=True)),
+            length=spread([h.diagonal for h in chosen]),
+            dt=spread([1.0 / self.fps[i] for i in scene_ids]),
+            volume=torch.cat([h.levels[level].volume for h in chosen]).to(device),
+            radius=tuple(self.graph.radii[position] * h.diagonal for h in chosen),
+            max_neighbours=self.graph.max_neighbours,
+        )

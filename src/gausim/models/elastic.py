@@ -1,0 +1,246 @@
+"""An elastic template: learned linear elastodynamics in the vibration modes of the units' spring network.
+
+With u the displacement of the units and Phi the lowest mass-orthonormal modes of a spring network over the rest graph,
+z = Phi^T M u obeys z'' + D z' + K z = f(z, z'). One frame is one step of the trapezoidal rule in two-step form,
+
+    (I + K/4 + D/2) z_{t+1} = (2 I - K/2) z_t - (I + K/4 - D/2) z_{t-1} + f(z_t, z_t - z_{t-1})     [frame units]
+
+which for every positive semi-definite K and D is stable and creates no energy; with D = 0 it keeps it. K and D are
+trained as S L L^T S products around the network's own spectrum, so that the modes may mix, and f is a small network
+that is zero at rest and starts at zero.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.sparse import bsr_matrix, diags
+from scipy.sparse.linalg import eigsh
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from gausim.models.batch import SceneBatch
+from gausim.models.hierarchy import Hierarchy
+from gausim.models.template import Motion, Template, TemplateState
+from gausim.nn.mlp import mlp, zero_output
+from gausim.ops.deformation import determinant
+
+# Springs keep this share of their stiffness across their direction: a central-force network alone has soft mechanisms.
+TRANSVERSE_STIFFNESS = 0.3
+# Regularises the least-squares gradient of units whose neighbours lie in a plane (share of the trace).
+GRADIENT_RIDGE = 1e-3
+# Below this the modal gradient is no longer a deformation (matter turned inside out); it is pulled back to it.
+MIN_DETERMINANT = 0.2
+# Logarithms of stiffness and damping may move ten times faster than the mixing of modes; written as gains on the
+# parameters so that one learning rate serves both.
+SPECTRUM_GAIN, MIXING_GAIN = 2.0, 0.3
+# Nearly undamped at the start: exp(-4) per frame of the velocity.
+INITIAL_LOG_DAMPING = -4.0
+
+
+def spring_network(rest: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
+    """Undirected springs (E, 2) between nearest neighbours and their stiffness blocks (E, 3, 3), k = 1 / length^2."""
+    k = min(neighbours + 1, len(rest))
+    near = cKDTree(rest).query(rest, k=k)[1].reshape(len(rest), k)[:, 1:]
+    pairs = np.stack((np.repeat(np.arange(len(rest)), k - 1), near.ravel()), 1)
+    pairs = np.unique(np.sort(pairs, 1), axis=0)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    offset = rest[pairs[:, 1]] - rest[pairs[:, 0]]
+    length = np.maximum(np.linalg.norm(offset, axis=1), 1e-9 * np.abs(rest).max())[:, None, None]
+    outer = offset[:, :, None] * offset[:, None, :] / length**2
+    blocks = ((1 - TRANSVERSE_STIFFNESS) * outer + TRANSVERSE_STIFFNESS * np.eye(3)) / length**2
+    return pairs, blocks
+
+
+def vibration_modes(
+    rest: np.ndarray, mass: np.ndarray, pinned: np.ndarray, *, modes: int, neighbours: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest eigenvalues (M,), relative to the first, and mass-orthonormal modes (N, 3, M), zero on pinned units."""
+    pairs, blocks = spring_network(rest, neighbours)
+    i, j = pairs.T
+    rows, cols = np.concatenate((i, j, i, j)), np.concatenate((i, j, j, i))
+    data = np.concatenate((blocks, blocks, -blocks, -blocks))
+    order = np.lexsort((cols, rows))
+    pointer = np.searchsorted(rows[order], np.arange(len(rest) + 1))
+    stiffness = bsr_matrix((data[order], cols[order], pointer), shape=(3 * len(rest),) * 2).tocsr()
+    free = np.repeat(~pinned, 3)
+    scale = np.repeat(mass, 3)[free] ** -0.5
+    reduced = (diags(scale) @ stiffness[free][:, free] @ diags(scale)).tocsc()
+    size = reduced.shape[0]
+    count = min(modes, size)
+    if size <= max(300, 3 * count):
+        values, vectors = np.linalg.eigh(reduced.toarray())
+    else:
+        shift = -1e-6 * reduced.diagonal().mean()
+        values, vectors = eigsh(reduced, count, sigma=shift, v0=np.ones(size))
+        ascending = np.argsort(values)
+        values, vectors = values[ascending], vectors[:, ascending]
+    values, vectors = values[:count], vectors[:, :count]
+    vectors = vectors * np.sign(vectors[np.abs(vectors).argmax(0), np.arange(count)])
+    full = np.zeros((3 * len(rest), count))
+    full[free] = scale[:, None] * vectors
+    values = np.maximum(values, 1e-4 * values[-1])
+    return values / values[0], full.reshape(len(rest), 3, count)
+
+
+def mode_gradients(rest: np.ndarray, modes: np.ndarray, neighbours: int) -> np.ndarray:
+    """Least-squares displacement gradient of each mode at each unit, (N, 3, 3, M)."""
+    k = min(neighbours + 1, len(rest))
+    near = cKDTree(rest).query(rest, k=k)[1].reshape(len(rest), k)[:, 1:]
+    offset = rest[near] - rest[:, None]
+    weight = 1.0 / np.maximum((offset**2).sum(-1), 1e-12)
+    moment = np.einsum("nk,nka,nkb->nab", weight, offset, offset)
+    moment += GRADIENT_RIDGE * np.trace(moment, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    difference = modes[near] - modes[:, None]
+    return np.einsum("nk,nkim,nka,nab->nibm", weight, difference, offset, np.linalg.inv(moment), optimize=True)
+
+
+class ElasticScene(nn.Module):
+    """Modes of one scene and the trained matrices that move them."""
+
+    values: Tensor
+    modes: Tensor
+    projection: Tensor
+    gradients: Tensor
+
+    def __init__(
+        self,
+        hierarchy: Hierarchy,
+        finest: int,
+        *,
+        modes: int,
+        neighbours: int,
+        period: float,
+        hidden: int,
+        amplitude: float,
+    ) -> None:
+        """``period`` of the lowest mode [frames] and ``amplitude`` [diagonals] only set the start."""
+        super().__init__()
+        level = hierarchy.levels[finest]
+        rest = level.rest.double().numpy()
+        mass = level.volume.double().numpy()
+        mass = mass / mass.mean()
+        values, phi = vibration_modes(rest, mass, level.pinned.numpy(), modes=modes, neighbours=neighbours)
+        count = phi.shape[-1]
+        self.register_buffer("values", torch.from_numpy(values).float())
+        self.register_buffer("modes", torch.from_numpy(phi).float())
+        self.register_buffer("projection", torch.from_numpy(phi * mass[:, None, None]).float())
+        self.register_buffer("gradients", torch.from_numpy(mode_gradients(rest, phi, neighbours)).float())
+        self.scale = amplitude * hierarchy.diagonal * math.sqrt(len(rest) / count)
+        self.initial_log_stiffness = 2 * math.log(2 * math.pi / period)
+        self.stiffness = nn.Parameter(torch.zeros(()))
+        self.spectrum = nn.Parameter(torch.zeros(count))
+        self.mixing = nn.Parameter(torch.zeros(count, count))
+        self.damping = nn.Parameter(torch.zeros(count))
+        self.damping_mixing = nn.Parameter(torch.zeros(count, count))
+        self.force = mlp((2 * count, hidden, hidden, count)) if hidden else None
+        if self.force is not None:
+            zero_output(self.force)
+
+    def matrices(self) -> tuple[Tensor, Tensor, Tensor]:
+        """A, B and H of z_{t+1} = A z_t - B z_{t-1} + H f."""
+        identity = torch.eye(len(self.values), dtype=self.values.dtype, device=self.values.device)
+        log_stiffness = self.initial_log_stiffness + SPECTRUM_GAIN * (self.stiffness + self.spectrum)
+        root = (0.5 * log_stiffness).exp() * self.values.sqrt()
+        factor = root[:, None] * (identity + MIXING_GAIN * self.mixing)
+        stiffness = factor @ factor.mT
+        root = (0.5 * (INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping)).exp()
+        factor = root[:, None] * (identity + MIXING_GAIN * self.damping_mixing)
+        damping = factor @ factor.mT
+        inverse = torch.linalg.inv(identity + stiffness / 4 + damping / 2)
+        return inverse @ (2 * identity - stiffness / 2), inverse @ (identity + stiffness / 4 - damping / 2), inverse
+
+    def forward(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S M"]:
+        """Modal coordinates at t + 1 from the displacements at t and t - 1 of S sequences."""
+        z = torch.einsum("snd,ndm->sm", now, self.projection)
+        previous = torch.einsum("snd,ndm->sm", before, self.projection)
+        a, b, h = self.matrices()
+        following = z @ a.mT - previous @ b.mT
+        if self.force is not None:
+            inputs = torch.cat((z, z - previous), -1) / self.scale
+            force = self.force(inputs) - self.force(torch.zeros_like(inputs[:1]))
+            following = following + 0.1 * self.scale * force @ h.mT
+        return following
+
+
+class ElasticTemplate(Template):
+    """Proposes the next state by learned elastodynamics, one set of matrices per scene."""
+
+    def __init__(
+        self,
+        hierarchies: Sequence[Hierarchy],
+        finest: int,
+        *,
+        modes: int = 48,
+        neighbours: int = 24,
+        period: float = 8.0,
+        hidden: int = 64,
+        amplitude: float = 0.02,
+        conserve_volume: bool = True,
+    ) -> None:
+        """See the module's text.
+
+        Args:
+            hierarchies: one per scene.
+            finest: level whose units carry the modes.
+            modes: number of vibration modes kept.
+            neighbours: springs per unit.
+            period: initial period of the lowest mode [frames].
+            hidden: width of the nonlinear force network, 0 for none.
+            amplitude: typical displacement [diagonals], scales that network's inputs.
+            conserve_volume: scale the template's gradients to determinant 1 (METHOD's mass conservation).
+        """
+        super().__init__()
+        self.conserve_volume = conserve_volume
+        self.scenes = nn.ModuleList(
+            ElasticScene(
+                h, finest, modes=modes, neighbours=neighbours, period=period, hidden=hidden, amplitude=amplitude
+            )
+            for h in hierarchies
+        )
+
+    def _scenes(self) -> list[ElasticScene]:
+        return [scene for scene in self.scenes if isinstance(scene, ElasticScene)]
+
+    def networks(self) -> list[nn.Parameter]:
+        """Weights of the nonlinear forces."""
+        return [p for scene in self._scenes() if scene.force is not None for p in scene.force.parameters()]
+
+    def forward(self, batch: SceneBatch, motion: Motion) -> TemplateState:
+        """Positions X + Phi z and gradients I + grad(Phi) z of the next frame."""
+        spans = batch.levels[-1].spans
+        positions: list[Tensor] = [motion.rest[s] for s in spans]
+        gradients: list[Tensor] = [motion.rest[s] for s in spans]
+        for scene_id in sorted(set(batch.scene_ids)):
+            rows = [i for i, s in enumerate(batch.scene_ids) if s == scene_id]
+            scene = self._scenes()[scene_id]
+            now = torch.stack([motion.now[spans[i]] - motion.rest[spans[i]] for i in rows])
+            before = torch.stack([motion.before[spans[i]] - motion.rest[spans[i]] for i in rows])
+            z = scene(now, before)
+            displacement = torch.einsum("sm,ndm->snd", z, scene.modes)
+            gradient = torch.einsum("sm,nabm->snab", z, scene.gradients)
+            for j, i in enumerate(rows):
+                positions[i] = positions[i] + displacement[j]
+                gradients[i] = gradient[j]
+        total = torch.cat(gradients) + torch.eye(3, device=motion.rest.device)
+        return TemplateState(torch.cat(positions), self._valid(total))
+
+    def _valid(self, gradient: Tensor) -> Tensor:
+        """Keeps the determinant above its bound (towards the identity) and, with mass on, scales it to one."""
+        det = determinant(gradient)
+        share = torch.where(det < MIN_DETERMINANT, 0.0, 1.0).detach()[:, None, None]
+        identity = torch.eye(3, device=gradient.device)
+        gradient = share * gradient + (1 - share) * identity
+        if not self.conserve_volume:
+            return gradient
+        det = torch.where(det < MIN_DETERMINANT, torch.ones_like(det), det)
+        return gradient / det[:, None, None].pow(1 / 3)
+
+    def basis(self, scene_id: int) -> tuple[Tensor, Tensor]:
+        """Modes (N, 3, M) and their gradients (N, 3, 3, M): a basis of smooth motions of one scene."""
+        scene = self._scenes()[scene_id]
+        return scene.modes * scene.scale, scene.gradients * scene.scale

@@ -1,0 +1,132 @@
+"""Levels as data: kernels, centre-of-mass systems, their parents and roots (METHOD section 1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gausim.core import ConfigError, GaussianScene, SceneError
+from gausim.ops.clustering import CLUSTERINGS
+from gausim.ops.covariance import kernel_volumes
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One level of N units.
+
+    Attributes:
+        rest: centres of mass at rest with unit density [scene units].
+        volume: volumes V_c = sum of V_i.
+        pinned: units made of pinned kernels; they never move. Clusters never mix pinned and free kernels.
+        parent: the unit of the next level that holds each unit; empty at the top level.
+        root: the nearest pinned kernel (index into the simulated kernels), the parent of a top unit.
+    """
+
+    rest: Float[Tensor, "N 3"]
+    volume: Float[Tensor, " N"]
+    pinned: Bool[Tensor, " N"]
+    parent: Int[Tensor, " M"]
+    root: Int[Tensor, " N"]
+
+    @property
+    def count(self) -> int:
+        """Number of units."""
+        return self.rest.shape[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Hierarchy:
+    """Levels 0 (the simulated kernels) to L of one scene.
+
+    Attributes:
+        levels: the levels, kernels first.
+        kernels: scene index of each level-0 unit.
+        diagonal: bounding-box diagonal of the simulated kernels [scene units].
+    """
+
+    levels: tuple[Level, ...]
+    kernels: Int[Tensor, " K"]
+    diagonal: float
+
+    def ancestor(self, fine: int, coarse: int) -> Int[Tensor, " N"]:
+        """The unit of level ``coarse`` that holds each unit of level ``fine``."""
+        index = torch.arange(self.levels[fine].count)
+        for level in range(fine, coarse):
+            index = self.levels[level].parent[index]
+        return index
+
+    def predictions(self, predicted: Sequence[int]) -> int:
+        """N_F: how many deformation gradients a step predicts (pinned units need none)."""
+        return sum(int((~self.levels[level].pinned).sum()) for level in predicted)
+
+
+def build_hierarchy(scene: GaussianScene, *, radii: Sequence[float], clustering: str = "ball") -> Hierarchy:
+    """Clusters the simulated kernels level by level.
+
+    Args:
+        scene: the rest scene; at least one kernel must be pinned.
+        radii: largest cluster diameter per level 1..L, as fractions of the bounding-box diagonal.
+        clustering: ``ball`` (near linear) or ``complete_linkage`` (the reference).
+
+    Raises:
+        SceneError: no pinned kernel, or no simulated kernel that is free.
+        ConfigError: unknown clustering.
+    """
+    if clustering not in CLUSTERINGS:
+        raise ConfigError(f"hierarchy.clustering is '{clustering}'; expected one of {', '.join(CLUSTERINGS)}.")
+    require_pinned(scene)
+    index = scene.simulated.nonzero()[:, 0].cpu()
+    rest = scene.means.cpu()[index].double()
+    volume = kernel_volumes(scene.log_scales.cpu()[index].double(), scene.volume_scale)
+    pinned = scene.pinned.cpu()[index]
+    pinned_kernels = pinned.nonzero()[:, 0].numpy()
+    tree = cKDTree(rest[pinned].numpy())
+    levels = []
+    for number in range(len(radii) + 1):
+        root = torch.from_numpy(pinned_kernels[tree.query(rest.numpy())[1]])
+        top = number == len(radii)
+        parent = torch.zeros(0, dtype=torch.int64)
+        if not top:
+            parent = _cluster_by_group(rest, pinned, radii[number] * scene.diagonal, clustering)
+        levels.append(Level(rest.to(scene.means.dtype), volume.to(scene.means.dtype), pinned, parent, root))
+        if not top:
+            rest, volume, pinned = _coarsen(rest, volume, pinned, parent)
+    return Hierarchy(tuple(levels), index, scene.diagonal)
+
+
+def require_pinned(scene: GaussianScene) -> None:
+    """Raises :class:`SceneError` with the remedy when nothing holds the object, or nothing of it is free."""
+    if not bool(scene.pinned.any()):
+        raise SceneError(
+            f"{scene.name}: no kernel is pinned; expected at least one root that holds the object. Mark it with "
+            "`gausim inspect SCENE --pin-below z=HEIGHT --save-masks`, or write the mask 'pinned' of the side file "
+            "SCENE.masks.npz."
+        )
+    if not bool((scene.simulated & ~scene.pinned).any()):
+        raise SceneError(f"{scene.name}: every simulated kernel is pinned; expected some that are free to move.")
+
+
+def _cluster_by_group(rest: Tensor, pinned: Tensor, diameter: float, clustering: str) -> Tensor:
+    """Labels of the free units first, then of the pinned ones; no cluster mixes the two."""
+    labels = torch.zeros(len(rest), dtype=torch.int64)
+    offset = 0
+    for mask in (~pinned, pinned):
+        found = CLUSTERINGS[clustering](np.ascontiguousarray(rest[mask].numpy()), diameter)
+        labels[mask] = torch.from_numpy(found) + offset
+        offset += int(found.max()) + 1
+    return labels
+
+
+def _coarsen(rest: Tensor, volume: Tensor, pinned: Tensor, parent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    count = int(parent.max()) + 1
+    total = torch.zeros(count, dtype=volume.dtype).index_add(0, parent, volume)
+    centre = torch.zeros(count, 3, dtype=rest.dtype).index_add(0, parent, rest * volume[:, None]) / total[:, None]
+    held = torch.zeros(count, dtype=torch.bool)
+    held[parent[pinned]] = True
+    return centre, total, held

@@ -1,0 +1,70 @@
+"""Trainable initial states: x_{-1} of every training sequence (METHOD section 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gausim.core import ConfigError
+from gausim.models.simulator import GausSim
+
+
+class FreeInitialStates(nn.Module):
+    """x_{-1} = X + free displacement of every kernel, K x 3 numbers per sequence, zero at the start."""
+
+    def __init__(self, model: GausSim, scene_of_sequence: Sequence[int]) -> None:
+        """One parameter per sequence; pinned and never-simulated kernels stay at X."""
+        super().__init__()
+        self.scene_of_sequence = tuple(scene_of_sequence)
+        self._rest = [s.means for s in model.scenes]
+        self._diagonal = [h.diagonal for h in model.hierarchies]
+        self._free = [(s.simulated & ~s.pinned)[:, None] for s in model.scenes]
+        self.offset = nn.ParameterList(torch.zeros_like(self._rest[i]) for i in self.scene_of_sequence)
+
+    def previous(self, sequence_id: int) -> Float[Tensor, "K 3"]:
+        """x_{-1} of one sequence [scene units]; the parameter is in diagonals of the scene."""
+        scene, offset = self.scene_of_sequence[sequence_id], self.offset[sequence_id]
+        rest, free = self._rest[scene].to(offset), self._free[scene].to(offset.device)
+        return rest + torch.where(free, offset * self._diagonal[scene], torch.zeros_like(offset))
+
+
+class ModalInitialStates(nn.Module):
+    """x_{-1} = X - sum_m v_m phi_m(X): the motions that the elastic template can carry, M numbers per sequence.
+
+    A velocity field of an elastic body is smooth; free offsets leave most of their numbers undetermined by 16 frames.
+    """
+
+    def __init__(self, model: GausSim, scene_of_sequence: Sequence[int]) -> None:
+        """``model``'s template must offer a basis (:class:`gausim.models.elastic.ElasticTemplate`)."""
+        super().__init__()
+        self.scene_of_sequence = tuple(scene_of_sequence)
+        self._rest = [s.means for s in model.scenes]
+        self._basis = [_kernel_basis(model, i) for i in range(len(model.scenes))]
+        self.velocity = nn.ParameterList(torch.zeros(self._basis[i].shape[-1]) for i in self.scene_of_sequence)
+
+    def previous(self, sequence_id: int) -> Float[Tensor, "K 3"]:
+        """x_{-1} of one sequence [scene units]."""
+        scene, velocity = self.scene_of_sequence[sequence_id], self.velocity[sequence_id]
+        return self._rest[scene].to(velocity) - self._basis[scene].to(velocity) @ velocity
+
+
+def _kernel_basis(model: GausSim, scene_id: int) -> Float[Tensor, "K 3 M"]:
+    """The template's modes at every kernel: unit displacement plus its gradient times the offset in the unit."""
+    scene, hierarchy, finest = model.scenes[scene_id], model.hierarchies[scene_id], model.predicted_levels[-1]
+    motions = model.template.basis(scene_id)
+    if motions is None:
+        raise ConfigError(
+            f"model.initial_states: {type(model.template).__name__} carries no basis of motions. "
+            "Use gausim.models.initial_state.FreeInitialStates with it."
+        )
+    modes, gradients = motions
+    unit = hierarchy.ancestor(0, finest)
+    offset = scene.means[hierarchy.kernels] - hierarchy.levels[finest].rest[unit]
+    moved = modes[unit] + torch.einsum("kabm,kb->kam", gradients[unit], offset)
+    moved = moved * ~hierarchy.levels[0].pinned[:, None, None]
+    basis = moved.new_zeros(scene.count, 3, modes.shape[-1])
+    basis[hierarchy.kernels] = moved
+    return basis

@@ -1,0 +1,68 @@
+"""Template states: the configuration that the predicted gradients deform.
+
+The recursion of METHOD section 2 deforms a template: x_i = x_p + C_i (T_i - T_p), where C_i accumulates the network's
+gradients. In the paper the template is the rest state. An inertial template (:mod:`gausim.models.elastic`) moves on its
+own between frames; the network then predicts its correction, and zero output keeps the motion instead of the rest pose.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gausim.models.batch import SceneBatch
+from gausim.models.hierarchy import Hierarchy
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Unit positions of the finest predicted level [scene units]."""
+
+    rest: Float[Tensor, "N 3"]
+    now: Float[Tensor, "N 3"]
+    before: Float[Tensor, "N 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class TemplateState:
+    """The template of the finest predicted level.
+
+    Attributes:
+        positions: unit positions [scene units].
+        gradients: deformation gradient of each unit, or None for the identity.
+    """
+
+    positions: Float[Tensor, "N 3"]
+    gradients: Float[Tensor, "N 3 3"] | None
+
+
+class Template(nn.Module, ABC):
+    """Proposes the next configuration of the finest predicted level from its two latest ones."""
+
+    @abstractmethod
+    def forward(self, batch: SceneBatch, motion: Motion) -> TemplateState:
+        """The template state at t + 1."""
+
+    def networks(self) -> list[nn.Parameter]:
+        """Weights of neural networks in the template; they learn at the pace of a network."""
+        return []
+
+    def basis(self, scene_id: int) -> tuple[Tensor, Tensor] | None:
+        """Smooth motions of one scene that the template can carry: (N, 3, M) and their gradients (N, 3, 3, M)."""
+        return None
+
+
+class RestTemplate(Template):
+    """The paper's template: the rest state, whatever the motion."""
+
+    def __init__(self, hierarchies: Sequence[Hierarchy], finest: int) -> None:
+        """Takes what every template takes; the rest state needs none of it."""
+        super().__init__()
+
+    def forward(self, batch: SceneBatch, motion: Motion) -> TemplateState:
+        """Rest positions, identity gradients."""
+        return TemplateState(motion.rest, None)

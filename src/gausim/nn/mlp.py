@@ -1,0 +1,23 @@
+"""Small building blocks of networks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torch import nn
+
+
+def mlp(sizes: Sequence[int]) -> nn.Sequential:
+    """Linear layers of the given sizes with SiLU between them (none after the last)."""
+    layers: list[nn.Module] = []
+    for i, (a, b) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
+        layers += ([nn.SiLU()] if i else []) + [nn.Linear(a, b)]
+    return nn.Sequential(*layers)
+
+
+def zero_output(network: nn.Sequential) -> None:
+    """Sets the last linear layer to zero, so that training starts from output zero."""
+    last = network[-1]
+    assert isinstance(last, nn.Linear)
+    nn.init.zeros_(last.weight)
+    nn.init.zeros_(last.bias)

@@ -1,0 +1,81 @@
+"""Clusters of bounded diameter: how kernels become centre-of-mass systems (METHOD section 1)."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.cluster.hierarchy import fcluster, linkage
+from scipy.spatial import cKDTree
+
+# Above this the pairwise distances of complete linkage alone take more than 1.6 GB.
+MAX_COMPLETE_LINKAGE = 20_000
+LLOYD_ITERATIONS = 8
+
+
+def _canonical_order(points: np.ndarray) -> np.ndarray:
+    """An order that depends on the positions only, so that permuting kernels permutes the result."""
+    return np.lexsort((points[:, 2], points[:, 1], points[:, 0]))
+
+
+def _relabel(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Numbers the clusters 0.. in the order in which their first member stands in the canonical order."""
+    order = _canonical_order(points)
+    _, first, inverse = np.unique(labels[order], return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    result = np.empty(len(points), np.int64)
+    result[order] = rank[inverse]
+    return result
+
+
+def ball_clusters(points: Float[np.ndarray, "N 3"], diameter: float) -> Int[np.ndarray, " N"]:
+    """Near-linear clustering: every member lies within ``diameter`` / 2 of its cluster's centre.
+
+    A greedy ball cover seeds the centres; Lloyd iterations then move each centre to its members' mean as long as
+    all of them stay inside the ball, so the diameter bound holds by construction.
+
+    Args:
+        points: positions [scene units].
+        diameter: largest allowed distance between two members [scene units].
+    """
+    radius = diameter / 2
+    tree = cKDTree(points)
+    labels = np.full(len(points), -1, np.int64)
+    centres: list[np.ndarray] = []
+    for i in _canonical_order(points):
+        if labels[i] < 0:
+            near = np.asarray(tree.query_ball_point(points[i], radius * (1 - 1e-9)))
+            labels[near[labels[near] < 0]] = len(centres)
+            centres.append(points[i])
+    seeds = np.asarray(centres)
+    for _ in range(LLOYD_ITERATIONS):
+        distance, nearest = cKDTree(seeds).query(points)
+        inside = distance <= radius
+        labels = np.where(inside, nearest, labels)
+        used, labels = np.unique(labels, return_inverse=True)
+        seeds = seeds[used]
+        sums = np.stack([np.bincount(labels, points[:, d], len(used)) for d in range(3)], 1)
+        means = sums / np.bincount(labels, minlength=len(used))[:, None]
+        reach = np.zeros(len(used))
+        np.maximum.at(reach, labels, np.linalg.norm(points - means[labels], axis=1))
+        seeds = np.where((reach <= radius)[:, None], means, seeds)
+    return _relabel(points, labels)
+
+
+def complete_linkage_clusters(points: Float[np.ndarray, "N 3"], diameter: float) -> Int[np.ndarray, " N"]:
+    """Complete-linkage agglomerative clustering cut at ``diameter``; the reference, O(N^2) memory.
+
+    Raises:
+        ValueError: above 20,000 points, where the distances no longer fit; use :func:`ball_clusters`.
+    """
+    if len(points) > MAX_COMPLETE_LINKAGE:
+        raise ValueError(
+            f"complete linkage of {len(points)} points needs {len(points) ** 2 * 4 / 1e9:.0f} GB; "
+            f"the limit is {MAX_COMPLETE_LINKAGE} points. Use clustering=ball."
+        )
+    if len(points) == 1:
+        return np.zeros(1, np.int64)
+    return _relabel(points, fcluster(linkage(points, "complete"), diameter, "distance"))
+
+
+CLUSTERINGS = {"ball": ball_clusters, "complete_linkage": complete_linkage_clusters}

@@ -1,0 +1,62 @@
+"""Deformation gradients: from network outputs, and their rotations."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.ops.quaternion import quaternion_to_matrix
+
+# Bound of the logarithmic stretch (METHOD section 2).
+MAX_LOG_STRETCH = 5.0
+POLAR_ITERATIONS = 8
+
+
+def gradient_from_output(
+    output: Float[Tensor, "*N 11"], *, conserve_mass: bool
+) -> tuple[Float[Tensor, "*N 3 3"], Float[Tensor, "*N 3 3"]]:
+    """F = U diag(lambda) V^T and its rotation U V^T from 11 numbers; zero output gives the identity.
+
+    The first eight numbers are two quaternions relative to (1, 0, 0, 0), the last three logarithms of the stretches;
+    with ``conserve_mass`` their mean is subtracted, so that det F = 1 (METHOD section 2).
+    """
+    one = output.new_tensor((1.0, 0.0, 0.0, 0.0))
+    u = quaternion_to_matrix(output[..., 0:4] + one)
+    v = quaternion_to_matrix(output[..., 4:8] + one)
+    stretch = torch.clamp(output[..., 8:11], -MAX_LOG_STRETCH, MAX_LOG_STRETCH)
+    if conserve_mass:
+        stretch = stretch - stretch.mean(-1, keepdim=True)
+    return (u * torch.exp(stretch)[..., None, :]) @ v.mT, u @ v.mT
+
+
+def unit_determinant(gradient: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:
+    """The gradient scaled to determinant 1 (volume kept); needs a positive determinant."""
+    det = determinant(gradient).clamp_min(1e-6)
+    return gradient / det[..., None, None].pow(1 / 3)
+
+
+def determinant(a: Float[Tensor, "*N 3 3"]) -> Float[Tensor, " *N"]:
+    """Det of 3x3 matrices, written out: several times faster than LU on the CPU and exact to rounding."""
+    return (a[..., 0, :] * torch.linalg.cross(a[..., 1, :], a[..., 2, :])).sum(-1)
+
+
+def _inverse_transpose(a: Tensor) -> Tensor:
+    """A^-T by cofactors."""
+    rows = torch.stack(
+        (
+            torch.linalg.cross(a[..., 1, :], a[..., 2, :]),
+            torch.linalg.cross(a[..., 2, :], a[..., 0, :]),
+            torch.linalg.cross(a[..., 0, :], a[..., 1, :]),
+        ),
+        -2,
+    )
+    return rows / (a[..., 0, :] * rows[..., 0, :]).sum(-1)[..., None, None]
+
+
+def polar_rotation(gradient: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:
+    """Rotation of the polar decomposition by Newton's iteration R <- (R + R^-T) / 2 (Higham 1986); det > 0 assumed."""
+    rotation = gradient
+    for _ in range(POLAR_ITERATIONS):
+        rotation = 0.5 * (rotation + _inverse_transpose(rotation))
+    return rotation
