@@ -1,0 +1,120 @@
+"""Shapes of the synthetic set: lattices of hexahedral cells bent into a pudding and a flower.
+
+A lattice is a list of unit cubes on an integer grid; a smooth map takes its nodes to the rest shape. The same cells
+carry the finite elements (split into tetrahedra) and the Gaussians (by trilinear coordinates within a cell).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+# Corner c of a cell has the bits (c >> 2, c >> 1, c) & 1 along its three axes.
+CORNERS = np.array([[a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)])
+# Kuhn's split of a cube into six tetrahedra along its long diagonal; neighbouring cubes fit together.
+_PATHS = ((4, 2, 1), (4, 1, 2), (2, 4, 1), (2, 1, 4), (1, 4, 2), (1, 2, 4))
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A rest shape.
+
+    Attributes:
+        nodes: (N, 3) rest positions [scene units], z up.
+        cells: (C, 8) node numbers of each cell's corners.
+        grid: (C, 3) integer position of each cell in the lattice.
+        held: (N,) nodes that never move.
+    """
+
+    nodes: Array
+    cells: Ints
+    grid: Ints
+    held: NDArray[np.bool_]
+
+    @property
+    def tetrahedra(self) -> Ints:
+        """(6 C, 4) node numbers, positively oriented."""
+        corners = [[0, p[0], p[0] + p[1], 7] for p in _PATHS]
+        tets = np.concatenate([self.cells[:, c] for c in corners])
+        x = self.nodes[tets]
+        negative = np.linalg.det(x[:, 1:] - x[:, :1]) < 0
+        tets[negative] = tets[negative][:, [0, 2, 1, 3]]
+        return tets
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the bounding-box diagonal [scene units]."""
+        return float(np.linalg.norm(np.ptp(self.nodes, axis=0)))
+
+
+def pudding() -> Body:
+    """A tapered block with rounded sides on a plate: 1.1 wide, 0.8 high; the lowest tenth is held."""
+    count, heights = 5, np.array([0.0, 0.1, 0.325, 0.55, 0.775, 1.0])
+    cells = [(i, j, k) for i in range(count) for j in range(count) for k in range(len(heights) - 1)]
+
+    def shape(grid: Array) -> Array:
+        u, v = 2 * grid[:, 0] / count - 1, 2 * grid[:, 1] / count - 1
+        w = heights[grid[:, 2].astype(int)]
+        radius = 0.55 - 0.13 * w - 0.05 * w**6  # tapered, its upper rim rounded
+        x, y = _round_square(u, v, 0.7)
+        dome = 0.06 * w**2 * (1 - 0.5 * (u * u + v * v))
+        return np.stack((radius * x, 0.92 * radius * y, 0.74 * w + dome), 1)
+
+    return _body(cells, shape, held_layers=2)
+
+
+def flower() -> Body:
+    """A curved stem with a leaf and a tilted five-petalled blossom, 1.1 high; the foot of the stem is held."""
+    stem, half = 7, 2.5
+    cells = [(2, 2, k) for k in range(stem)] + [(3, 2, 3), (4, 2, 3)]
+    cells += [(i, j, stem) for i in range(5) for j in range(5)]
+    heights = np.concatenate(([0.0, 0.1], 0.1 + 0.8 * np.arange(1, stem) / (stem - 1)))
+
+    def shape(grid: Array) -> Array:
+        i, j, k = grid.T
+        is_blossom = k >= stem
+        z = heights[np.minimum(k, stem).astype(int)]
+        leaf = np.maximum(i - 3.0, 0.0) * ~is_blossom  # how far out along the leaf
+        wide = np.where(is_blossom, 0.16, 0.19 - 0.02 * z)
+        x, y = wide * (i - half), wide * (j - half)
+        middle = heights[3] + 0.5 * (heights[4] - heights[3])
+        z_stem = np.where(leaf > 0, middle + (z - middle) * (1 - 0.38 * leaf) + 0.09 * leaf, z)
+        y = np.where(leaf > 0, y * (1.5 - 0.5 * leaf), y)
+        u, v = _round_square((i - half) / half, (j - half) / half, 0.9)
+        radius, angle = np.hypot(u, v), np.arctan2(v, u)
+        petals = 1 + 0.25 * np.clip(2 * radius - 0.8, 0, 1) * np.cos(5 * angle)
+        up = 0.12 * (k - stem) * (1 - 0.4 * radius) + 0.12 * radius**2
+        tilt = 0.4
+        bx, by = 0.4 * petals * u, 0.4 * petals * v
+        blossom = np.stack((bx * np.cos(tilt) + up * np.sin(tilt), by, z + up * np.cos(tilt) - bx * np.sin(tilt)), 1)
+        rest = np.where(is_blossom[:, None], blossom, np.stack((x, y, z_stem), 1))
+        rest[:, 0] += 0.1 * np.sin(2.2 * z)  # the curve of the stem, which the blossom rides on
+        return rest
+
+    return _body(cells, shape, held_layers=2)
+
+
+BODIES: dict[str, Callable[[], Body]] = {"pudding": pudding, "flower": flower}
+
+
+def _round_square(u: Array, v: Array, roundness: float) -> tuple[Array, Array]:
+    """Maps the square [-1, 1]^2 towards the unit disc: roundness 0 keeps it, 1 gives the disc."""
+    return u * np.sqrt(1 - 0.5 * roundness * v * v), v * np.sqrt(1 - 0.5 * roundness * u * u)
+
+
+def _body(cells: list[tuple[int, int, int]], shape: Callable[[Array], Array], *, held_layers: int) -> Body:
+    grid = np.array(sorted(cells))
+    nodes, inverse = np.unique((grid[:, None] + CORNERS).reshape(-1, 3), axis=0, return_inverse=True)
+    return Body(
+        nodes=shape(nodes.astype(float)),
+        cells=inverse.reshape(-1, 8),
+        grid=grid,
+        # Two layers of held nodes make the lowest cells rigid: Gaussians in them are pinned, exactly.
+        held=nodes[:, 2] < held_layers,
+    )

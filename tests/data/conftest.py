@@ -1,0 +1,113 @@
+"""A hand-made object directory, small enough to rebuild for every test that spoils it."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gausim.core import Cameras, GaussianScene
+from gausim.io.ply import save_scene
+from gausim.io.transforms import write_transforms
+
+VIEWS = ("cam_0", "cam_1", "cam_2")
+FRAMES, SEQUENCES, WIDTH, HEIGHT, POINTS = 20, 3, 8, 6, 5
+
+
+def ring_of_cameras(names: tuple[str, ...], *, width: int = WIDTH, height: int = HEIGHT) -> Cameras:
+    """Cameras that stand around the z axis and look at the origin, level."""
+    viewmats = torch.eye(4).repeat(len(names), 1, 1)
+    for i in range(len(names)):
+        a = 2 * math.pi * i / max(3, len(names))
+        rows = [[-math.sin(a), math.cos(a), 0.0], [0.0, 0.0, -1.0], [-math.cos(a), -math.sin(a), 0.0]]
+        viewmats[i, :3, :3] = torch.tensor(rows)
+        viewmats[i, :3, 3] = torch.tensor([0.0, 0.0, 4.0])
+    k = torch.tensor([[9.0, 0.0, width / 2], [0.0, 9.5, height / 2], [0.0, 0.0, 1.0]])
+    return Cameras(viewmats, k.expand(len(names), 3, 3).clone(), width, height, names)
+
+
+def frame_pixels(sequence: int, view: int, frame: int) -> np.ndarray:
+    """RGBA whose four channels tell sequence, view and frame."""
+    pixels = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    pixels[...] = (10 * sequence + 1, 20 * view + 2, frame + 3, 255)
+    pixels[0, 0] = (200, 100, 50, 0)
+    return pixels
+
+
+def write_png(path: Path, rgba: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))
+
+
+def make_object(root: Path, *, name: str = "blob", sequences: int = SEQUENCES) -> Path:
+    """Writes the whole directory."""
+    root.mkdir(parents=True)
+    facts = {"name": name, "fps": 24, "views": VIEWS, "train_views": VIEWS[:2], "heldout_views": VIEWS[2:]}
+    (root / "dataset.json").write_text(json.dumps({**facts, "train_frames": [0, 16], "object_diagonal": 1.5}))
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(POINTS, 3, generator=generator)
+    scene = GaussianScene.create(
+        means=means,
+        log_scales=torch.full((POINTS, 3), -3.0),
+        quats=torch.tensor([1.0, 0, 0, 0]).repeat(POINTS, 1),
+        opacity_logits=torch.zeros(POINTS),
+        sh=torch.zeros(POINTS, 1, 3),
+        pinned=torch.arange(POINTS) == 0,
+        name=name,
+    )
+    save_scene(scene, root / "scene.ply")
+    np.savez(root / "rest_points.npz", points=means.numpy())
+    for s in range(sequences):
+        _write_sequence(root / "sequences" / f"seq_{s:03d}", s)
+    stills = tuple(f"{i:04d}" for i in range(12))
+    for i, still in enumerate(stills):
+        write_png(root / "static" / "images" / f"{still}.png", frame_pixels(0, 0, i))
+    entries = [{"file_path": f"images/{still}.png"} for still in stills]
+    write_transforms(root / "static" / "transforms.json", ring_of_cameras(stills), entries)
+    return root
+
+
+def _write_sequence(folder: Path, number: int) -> None:
+    cameras, entries, index = ring_of_cameras(VIEWS), [], []
+    for v, view in enumerate(VIEWS):
+        for f in range(FRAMES):
+            write_png(folder / view / f"{f:04d}.png", frame_pixels(number, v, f))
+            entries.append({"file_path": f"{view}/{f:04d}.png", "camera": view, "frame": f, "heldout": v == 2})
+            index.append(v)
+    write_transforms(folder / "transforms.json", cameras.select(index), entries, fps=24)
+    displacement = np.zeros((FRAMES, POINTS, 3), np.float16)
+    displacement[:] = np.arange(FRAMES)[:, None, None] / 64
+    np.savez(folder / "ground_truth.npz", displacement=displacement)
+
+
+@pytest.fixture(scope="session")
+def blob(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One object, not to be changed."""
+    return make_object(tmp_path_factory.mktemp("data") / "blob")
+
+
+@pytest.fixture
+def spoilt(tmp_path: Path) -> Path:
+    """One object of one sequence, to be spoilt."""
+    return make_object(tmp_path / "blob", sequences=1)
+
+
+def edit_json(path: Path, edit) -> None:
+    """Applies ``edit`` to the JSON object in a file."""
+    data = json.loads(path.read_text())
+    edit(data)
+    path.write_text(json.dumps(data))
+
+
+@pytest.fixture(scope="session")
+def tiny() -> SimpleNamespace:
+    """The helpers of this file, for tests that make or spoil objects."""
+    return SimpleNamespace(
+        cameras=ring_of_cameras, pixels=frame_pixels, png=write_png, object=make_object, edit=edit_json
+    )

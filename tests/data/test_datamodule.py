@@ -1,0 +1,186 @@
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import lightning as L
+import pytest
+import torch
+
+from gausim.core import ConfigError, DataError
+from gausim.data.curriculum import Curriculum
+from gausim.data.datamodule import ReadyDataModule
+from gausim.data.dataset import SampleKey, SequenceIndex, TrainingDataset, collate
+from gausim.data.objects import ObjectData
+from gausim.data.sampler import SequenceBatchSampler
+
+
+@pytest.fixture(scope="module")
+def two_objects(tmp_path_factory: pytest.TempPathFactory, tiny: SimpleNamespace) -> Path:
+    root = tmp_path_factory.mktemp("set")
+    tiny.object(root / "apple", name="apple", sequences=2)
+    tiny.object(root / "pear", name="pear", sequences=3)
+    return root
+
+
+def sampler(**options: int) -> SequenceBatchSampler:
+    settings = {"batch_size": 2, "repeats": 3, "seed": 4, "curriculum": Curriculum(), **options}
+    return SequenceBatchSampler(5, **settings)
+
+
+def test_curriculum_grows_to_its_cap() -> None:
+    grown = [Curriculum().steps(e) for e in (0, 1, 5, 13, 14, 15, 90)]
+    assert grown == [1, 2, 6, 14, 15, 15, 15]
+    assert [Curriculum(t_start=3, t_max=5, epochs_per_increase=2).steps(e) for e in range(8)] == [
+        *(3, 3, 4, 4),
+        *(5, 5, 5, 5),
+    ]
+    for wrong in ({"t_start": 0}, {"t_start": 16}, {"epochs_per_increase": 0}):
+        with pytest.raises(ConfigError, match="curriculum"):
+            Curriculum(**wrong)
+
+
+def test_training_cannot_hand_out_unseen_frames(blob: Path) -> None:
+    dataset = TrainingDataset(SequenceIndex([ObjectData(blob)]))
+    frames = dataset[SampleKey(1, 15)].frames
+    assert frames.shape[0] == 16 and frames[:, :, -1, -1, 2].amax() == 15 + 3  # the frame's number is painted in
+    for steps in (16, 17, 0, -1):
+        with pytest.raises(DataError, match="predicted steps asked for"):
+            dataset[SampleKey(1, steps)]
+
+
+def test_training_cannot_hand_out_heldout_views(blob: Path) -> None:
+    dataset = TrainingDataset(SequenceIndex([ObjectData(blob)]))
+    sample = dataset[SampleKey(0, 2)]
+    assert sample.cameras.names == ("cam_0", "cam_1")
+    assert sorted(set(sample.frames[..., -1, -1, 1].flatten().tolist())) == [2, 22]  # views 0 and 1, never 2
+
+
+def test_curriculum_beyond_the_training_frames_is_refused(blob: Path) -> None:
+    data = ReadyDataModule(blob, curriculum=Curriculum(t_max=16))
+    with pytest.raises(ConfigError, match=r"16 steps would see frame 16, .*at most 15"):
+        data.setup("fit")
+
+
+def test_epoch_shows_every_sequence_equally_often_and_never_twice_in_a_batch() -> None:
+    for epoch in range(20):
+        one = sampler()
+        one.set_epoch(epoch)
+        batches = list(one)
+        assert len(batches) == len(one) == 8
+        assert sorted(k.sequence for b in batches for k in b) == sorted(list(range(5)) * 3)
+        assert all(len({k.sequence for k in b}) == len(b) for b in batches)
+        assert {k.steps for b in batches for k in b} == {Curriculum().steps(epoch)}
+
+
+def test_order_follows_from_seed_and_epoch() -> None:
+    assert sampler().order(3) == sampler().order(3)
+    orders = [tuple(sampler(seed=s).order(e)) for s in (4, 5) for e in (0, 1, 2)]
+    assert len(set(orders)) == 6
+
+
+def test_position_survives_a_resume() -> None:
+    whole, broken = sampler(), sampler()
+    whole.set_epoch(2)
+    broken.set_epoch(2)
+    expected = list(whole)
+    iterator = iter(broken)
+    head = [next(iterator) for _ in range(3)]
+    resumed = sampler()
+    resumed.load_state_dict(broken.state_dict())
+    resumed.set_epoch(2)  # Lightning announces the epoch again
+    assert head + list(resumed) == expected
+    resumed.set_epoch(3)
+    assert len(list(resumed)) == 8
+
+
+def test_ranks_share_an_epoch_in_equal_parts() -> None:
+    ranks = [sampler(rank=r, world_size=2) for r in (0, 1)]
+    batches = [list(r) for r in ranks]
+    assert len(batches[0]) == len(batches[1]) == len(ranks[0]) == 4
+    assert all(len(a) == len(b) == 2 for a, b in zip(*batches, strict=True))
+    assert {k.sequence for rank in batches for b in rank for k in b} == set(range(5))
+    together = [{k.sequence for k in a} & {k.sequence for k in b} for a, b in zip(*batches, strict=True)]
+    assert not any(together[:3])  # the last, filled up, may repeat
+
+
+def test_samples_of_several_objects_are_numbered_through(two_objects: Path) -> None:
+    data = ReadyDataModule(two_objects, batch_size=5)
+    data.setup("fit")
+    assert [o.name for o in data.objects] == ["apple", "pear"] and len(data.index) == 5
+    (batch,) = list(data.train_dataloader())
+    found = {s.sequence_id: (s.scene_id, s.object_name, s.sequence_name, s.steps) for s in batch}
+    assert found == {
+        0: (0, "apple", "seq_000", 1),
+        1: (0, "apple", "seq_001", 1),
+        2: (1, "pear", "seq_000", 1),
+        3: (1, "pear", "seq_001", 1),
+        4: (1, "pear", "seq_002", 1),
+    }
+    assert all(s.frames.dtype == torch.uint8 and s.frames.shape == (2, 2, 6, 8, 4) for s in batch)
+
+
+def test_whole_sequences_have_all_frames_and_views(two_objects: Path) -> None:
+    data = ReadyDataModule(two_objects, names=["pear"], sequences=2)
+    batches = list(data.test_dataloader())
+    assert [b[0].sequence_name for b in batches] == ["seq_000", "seq_001"]
+    assert batches[0][0].frames.shape[:2] == (20, 3) and batches[0][0].cameras.names[-1] == "cam_2"
+
+
+def test_collate_refuses_mixed_lengths(blob: Path) -> None:
+    dataset = TrainingDataset(SequenceIndex([ObjectData(blob)]))
+    with pytest.raises(ConfigError, match="one number of steps"):
+        collate([dataset[SampleKey(0, 2)], dataset[SampleKey(1, 3)]])
+
+
+def test_roots_that_are_not_there(two_objects: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"data.root: no directory .* data.root=PATH"):
+        _ = ReadyDataModule(None).objects
+    with pytest.raises(DataError, match="data_prep.synthesize"):
+        _ = ReadyDataModule(tmp_path / "none").objects
+    with pytest.raises(ConfigError, match=r"data.names: \['plum'\] asked for, the roots hold"):
+        _ = ReadyDataModule(two_objects, names=["plum"]).objects
+    with pytest.raises(ConfigError, match="each name once"):
+        _ = ReadyDataModule([two_objects / "pear", two_objects / "pear"]).objects
+    with pytest.raises(ConfigError, match="unknown key"):
+        _ = ReadyDataModule([{"root": two_objects, "scen": "x"}]).objects
+    with pytest.raises(ConfigError, match="of one object"):
+        _ = ReadyDataModule(two_objects, scene="x.ply").objects
+
+
+class Recorder(L.LightningModule):
+    """Notes what it is shown, and stops the run after some batches."""
+
+    def __init__(self, stop: int | None) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(2))
+        self.stop, self.seen = stop, []
+
+    def training_step(self, batch, index: int) -> torch.Tensor:
+        self.seen.append((self.current_epoch, batch[0].steps, [s.sequence_id for s in batch]))
+        return self.weight.square().sum()
+
+    def on_train_batch_end(self, *_) -> None:
+        if self.stop and self.global_step == self.stop:
+            self.trainer.should_stop = True
+            self.trainer.save_checkpoint(Path(self.trainer.default_root_dir) / "stopped.ckpt")
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("stop", [1, 2, 3, 4])
+def test_a_resumed_run_sees_what_an_uninterrupted_one_sees(two_objects: Path, tmp_path: Path, stop: int) -> None:
+    def fit(stop: int | None, checkpoint: Path | None = None) -> list:
+        quiet = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False}
+        trainer = L.Trainer(
+            max_epochs=2, default_root_dir=tmp_path, accelerator="cpu", enable_model_summary=False, **quiet
+        )
+        recorder = Recorder(stop)
+        trainer.fit(recorder, ReadyDataModule(two_objects, batch_size=2), ckpt_path=checkpoint, weights_only=True)
+        return recorder.seen if stop is None else recorder.seen[:stop]
+
+    whole = fit(None)
+    assert [(epoch, steps) for epoch, steps, _ in whole] == [(0, 1)] * 3 + [(1, 2)] * 3
+    assert fit(stop) + fit(None, tmp_path / "stopped.ckpt") == whole

@@ -1,0 +1,225 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gausim.core import ConfigError, DataError, SceneError
+from gausim.data.images import composite
+from gausim.data.objects import ObjectData, find_objects
+from gausim.data.records import read_stills
+
+VIEWS = ("cam_0", "cam_1", "cam_2")
+FRAMES, POINTS = 20, 5  # of tests/data/conftest.py
+
+
+def test_frames_are_those_of_the_files_in_the_order_asked_for(blob: Path, tiny: SimpleNamespace) -> None:
+    record = ObjectData(blob).sequences[1]
+    frames = record.frames(range(4, 7), ["cam_2", "cam_0"])
+    expected = [[tiny.pixels(1, v, f) for v in (2, 0)] for f in (4, 5, 6)]
+    assert torch.equal(frames, torch.from_numpy(np.array(expected)))
+    assert record.cameras_of(["cam_2", "cam_0"]).names == ("cam_2", "cam_0")
+    assert torch.equal(record.cameras_of(["cam_2"]).viewmats[0], record.cameras.viewmats[2])
+
+
+def test_a_frame_is_decoded_once(blob: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    record = ObjectData(blob).sequences[0]
+    first = record.frames(range(3), ["cam_0"])
+    monkeypatch.setattr(cv2, "imread", lambda *_: pytest.fail("decoded again"))
+    again = record.frames(range(3), ["cam_0"])
+    assert torch.equal(first, again)
+    again += 1
+    assert torch.equal(record.frames(range(3), ["cam_0"]), first), "samples must not share memory with the store"
+
+
+def test_facts_and_true_motion(blob: Path) -> None:
+    item = ObjectData(blob)
+    assert (item.name, item.fps, item.diagonal) == ("blob", 24.0, 1.5)
+    assert (item.train_views, item.heldout_views, item.train_frames) == (VIEWS[:2], VIEWS[2:], range(16))
+    truth = item.ground_truth(item.sequences[0])
+    assert truth is not None and truth.positions.shape == (FRAMES, POINTS, 3)
+    torch.testing.assert_close(truth.positions[8], truth.rest + 8 / 64)
+    assert torch.equal(truth.rest, item.scene().means)
+
+
+def test_stills_are_split(blob: Path, tiny: SimpleNamespace) -> None:
+    stills = ObjectData(blob).stills()
+    assert stills.images.shape == (12, 6, 8, 4) and stills.heldout == (9,) and len(stills.train) == 11
+    assert torch.equal(stills.images[5], torch.from_numpy(tiny.pixels(0, 0, 5)))
+    assert torch.equal(read_stills(blob / "static" / "transforms.json").images, stills.images)
+
+
+def test_sequences_can_be_limited(blob: Path) -> None:
+    assert [s.name for s in ObjectData(blob, sequences=2).sequences] == ["seq_000", "seq_001"]
+    assert [s.name for s in ObjectData(blob, sequences=["seq_002"]).sequences] == ["seq_002"]
+    for wrong in (4, 0, ["seq_009"], []):
+        with pytest.raises(DataError, match="asked for, it has 3"):
+            _ = ObjectData(blob, sequences=wrong).sequences
+
+
+def test_composite_over_black_and_over_a_color() -> None:
+    frame = torch.tensor([[[255, 102, 0, 51], [10, 20, 30, 0]]], dtype=torch.uint8)
+    rgb, alpha = composite(frame)
+    torch.testing.assert_close(rgb[0, 0], torch.tensor([0.2, 0.08, 0.0]))
+    torch.testing.assert_close(alpha[0], torch.tensor([0.2, 0.0]))
+    assert rgb[0, 1].abs().max() == 0
+    rgb, _ = composite(frame, torch.tensor([0.5, 0.25, 1.0]))
+    torch.testing.assert_close(rgb[0], torch.tensor([[0.6, 0.28, 0.8], [0.5, 0.25, 1.0]]))
+
+
+def test_missing_view_is_named(spoilt: Path, tiny: SimpleNamespace) -> None:
+    path = spoilt / "sequences" / "seq_000" / "transforms.json"
+    tiny.edit(path, lambda d: d.update(frames=[f for f in d["frames"] if f["camera"] != "cam_1"]))
+    with pytest.raises(DataError, match=r"seq_000/transforms.json: view 'cam_1' lacks 20 of 20 frames"):
+        _ = ObjectData(spoilt).sequences
+
+
+def test_missing_frame_of_a_view_is_named(spoilt: Path, tiny: SimpleNamespace) -> None:
+    path = spoilt / "sequences" / "seq_000" / "transforms.json"
+    tiny.edit(path, lambda d: d["frames"].pop(FRAMES + 7))
+    with pytest.raises(DataError, match=r"view 'cam_1' lacks 1 of 20 frames \(first: 7\)"):
+        _ = ObjectData(spoilt).sequences
+
+
+def test_frame_of_another_size(spoilt: Path, tiny: SimpleNamespace) -> None:
+    path = spoilt / "sequences" / "seq_000" / "cam_1" / "0003.png"
+    tiny.png(path, tiny.pixels(0, 1, 3)[:4, :4])
+    record = ObjectData(spoilt).sequences[0]
+    with pytest.raises(DataError, match=r"cam_1/0003.png: expected 8x6 RGBA \(8 bit\), got 4x4 RGBA"):
+        record.frames(range(16), ["cam_0", "cam_1"])
+
+
+def test_rgb_without_alpha(spoilt: Path, tiny: SimpleNamespace) -> None:
+    path = spoilt / "sequences" / "seq_000" / "cam_0" / "0002.png"
+    cv2.imwrite(str(path), tiny.pixels(0, 0, 2)[..., :3].copy())
+    record = ObjectData(spoilt).sequences[0]
+    with pytest.raises(DataError, match=r"cam_0/0002.png: expected 8x6 RGBA .*got 8x6 RGB .*with alpha"):
+        record.frames(range(3), ["cam_0"])
+
+
+def test_sixteen_bit_and_undecodable_and_missing_images(spoilt: Path, tiny: SimpleNamespace) -> None:
+    folder = spoilt / "sequences" / "seq_000" / "cam_0"
+    record = ObjectData(spoilt).sequences[0]
+    cv2.imwrite(str(folder / "0000.png"), tiny.pixels(0, 0, 0).astype(np.uint16))
+    (folder / "0001.png").write_bytes(b"no image")
+    (folder / "0002.png").unlink()
+    for frame, message in enumerate((r"got 8x6 RGBA \(16 bit\)", "cannot be decoded", "no such image")):
+        with pytest.raises(DataError, match=rf"{frame:04d}.png: .*{message}"):
+            record.frames(range(frame, frame + 1), ["cam_0"])
+
+
+def test_moving_camera(spoilt: Path, tiny: SimpleNamespace) -> None:
+    path = spoilt / "sequences" / "seq_000" / "transforms.json"
+
+    def move(data) -> None:
+        data["frames"][FRAMES + 5]["transform_matrix"][0][3] += 0.1
+
+    tiny.edit(path, move)
+    with pytest.raises(DataError, match="camera 'cam_1' moves at frame 5"):
+        _ = ObjectData(spoilt).sequences
+
+
+def test_frames_and_views_out_of_range(blob: Path) -> None:
+    record = ObjectData(blob).sequences[0]
+    with pytest.raises(DataError, match=r"frames 0..19"):
+        record.frames(range(FRAMES + 1), None)
+    with pytest.raises(DataError, match=r"no view \['cam_9'\]"):
+        record.frames(range(2), ["cam_9"])
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("fps", 0, "field 'fps' must be a positive number"),
+        ("views", "cam_0", "field 'views' must be a list"),
+        ("train_views", ["cam_0", "cam_7"], "must be disjoint parts of 'views'"),
+        ("heldout_views", ["cam_0"], "must be disjoint parts of 'views'"),
+        ("train_frames", [1, 16], "field 'train_frames'"),
+        ("train_frames", [0, 40], "has 20 frames, dataset.json trains on"),
+    ],
+)
+def test_wrong_facts(spoilt: Path, field: str, value: object, message: str, tiny: SimpleNamespace) -> None:
+    tiny.edit(spoilt / "dataset.json", lambda d: d.update({field: value}))
+    with pytest.raises(DataError, match=message):
+        _ = ObjectData(spoilt).sequences
+
+
+def test_missing_dataset_and_broken_json(spoilt: Path, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no data set here"):
+        find_objects(tmp_path / "nowhere")
+    (spoilt / "dataset.json").write_text("{")
+    with pytest.raises(DataError, match=r"dataset.json: cannot be read as JSON"):
+        ObjectData(spoilt)
+
+
+def test_true_motion_of_another_shape(spoilt: Path) -> None:
+    path = spoilt / "sequences" / "seq_000" / "ground_truth.npz"
+    np.savez(path, displacement=np.zeros((FRAMES, POINTS + 1, 3), np.float32))
+    item = ObjectData(spoilt)
+    with pytest.raises(DataError, match=r"ground_truth.npz: field 'displacement'"):
+        item.ground_truth(item.sequences[0])
+    np.savez(path, other=np.zeros(3))
+    with pytest.raises(DataError, match="array 'displacement' is missing"):
+        item.ground_truth(item.sequences[0])
+
+
+def test_true_motion_is_none_where_unknown(spoilt: Path) -> None:
+    (spoilt / "rest_points.npz").unlink()
+    item = ObjectData(spoilt)
+    assert item.ground_truth(item.sequences[0]) is None
+
+
+def test_scene_without_a_pinned_kernel_says_how_to_pin_one(spoilt: Path) -> None:
+    (spoilt / "scene.masks.npz").unlink()
+    with pytest.raises(SceneError, match=r"no kernel is pinned.*data.selections.pinned"):
+        ObjectData(spoilt).scene()
+    assert not ObjectData(spoilt, free_root=True).scene().pinned.any()
+
+
+def test_selections_replace_masks(blob: Path) -> None:
+    means = ObjectData(blob).scene().means
+    height = float(means[:, 2].median())
+    scene = ObjectData(blob, selections={"pinned": f"z={height}"}).scene()
+    assert torch.equal(scene.pinned, means[:, 2] < height) and scene.pinned.any()
+    with pytest.raises(ConfigError, match="no such mask"):
+        ObjectData(blob, selections={"pined": "z=0.5"}).scene()
+
+
+def test_missing_scene_names_the_remedy(spoilt: Path) -> None:
+    (spoilt / "scene.ply").unlink()
+    with pytest.raises(DataError, match="gausim reconstruct"):
+        ObjectData(spoilt).scene()
+
+
+def test_fps_of_a_sequence_must_agree(spoilt: Path, tiny: SimpleNamespace) -> None:
+    tiny.edit(spoilt / "dataset.json", lambda d: d.update(fps=30))
+    with pytest.raises(DataError, match=r"'fps' is 24, dataset.json says 30"):
+        _ = ObjectData(spoilt).sequences
+
+
+def test_bunny(data_root: Path) -> None:
+    root = data_root / "bunny"
+    if not root.is_dir():
+        pytest.skip("GAUSIM_TEST_DATA holds no bunny")
+    item = ObjectData(root)
+    record = item.sequences[11]
+    assert len(item.sequences) == 12 and record.count == 60
+    frames = record.frames(range(2), item.train_views)
+    assert frames.shape == (2, 4, 128, 128, 4)
+    truth = item.ground_truth(record)
+    assert truth is not None and truth.positions.shape == (60, 2048, 3)
+    assert torch.equal(truth.positions[0], truth.rest) and not torch.equal(truth.positions[1], truth.rest)
+    # The true points must fall on the silhouette in every view: this fails if a camera's axes are mixed up.
+    cameras = record.cameras_of(item.train_views)
+    camera = torch.einsum("vij,pj->vpi", cameras.viewmats[:, :3, :3], truth.rest) + cameras.viewmats[:, None, :3, 3]
+    pixel = torch.einsum("vij,vpj->vpi", cameras.Ks, camera)
+    column, row = (pixel[..., :2] / pixel[..., 2:]).long().unbind(-1)
+    for v in range(4):
+        assert (frames[0, v, row[v], column[v], 3] > 0).float().mean() > 0.98
+    stills = json.loads((root / "static" / "transforms.json").read_text())
+    assert item.stills().images.shape[0] == len(stills["frames"])

@@ -1,0 +1,215 @@
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+if importlib.util.find_spec("mujoco") is None:
+    pytest.skip("MuJoCo is not installed (extra 'synth')", allow_module_level=True)
+
+from data_prep.bodies import BODIES, Body
+from data_prep.elastic import ElasticBody, Material
+from data_prep.embedding import Embedding, _area_vector, _outer_faces, cover_surface
+from data_prep.pushes import push_field, pushed_motion, random_push
+from data_prep.rig import still_cameras, video_cameras
+from data_prep.synthesize import main
+from data_prep.writer import RECIPES
+from gausim.core import DivergenceError, Trajectory
+from gausim.data.datamodule import ReadyDataModule
+from gausim.data.images import composite
+from gausim.render.draw import film
+from gausim.render.reference import ReferenceRenderer
+
+TINY = ["--quick", "--workers", "1", "--kernels", "60", "--resolution", "24", "--frames", "17"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("synthetic") / "set"
+    assert main([*TINY, "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture(params=sorted(BODIES))
+def body(request: pytest.FixtureRequest) -> Body:
+    return BODIES[request.param]()
+
+
+def digests(root: Path) -> dict[str, str]:
+    files = [p for p in sorted(root.rglob("*")) if p.is_file()]
+    return {str(p.relative_to(root)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def test_same_seed_same_bytes_other_seed_others(made: Path, tmp_path: Path) -> None:
+    assert main([*TINY, "--out", str(tmp_path / "again"), "--objects", "pudding_soft"]) == 0
+    assert main([*TINY, "--out", str(tmp_path / "other"), "--objects", "pudding_soft", "--seed", "1"]) == 0
+    first, again, other = (digests(p / "pudding_soft") for p in (made, tmp_path / "again", tmp_path / "other"))
+    assert first == again and len(first) > 100
+    motion = "sequences/seq_000/ground_truth.npz"
+    assert first[motion] != other[motion] and first["scene.ply"] != other["scene.ply"]
+
+
+def test_set_is_read_by_the_data_module(made: Path) -> None:
+    data = ReadyDataModule(made, batch_size=4)
+    data.setup("fit")
+    (batch,) = list(data.train_dataloader())
+    assert sorted(s.object_name for s in batch) == ["flower_soft"] * 2 + ["pudding_soft"] * 2
+    assert all(s.frames.shape == (2, 4, 24, 24, 4) for s in batch)
+    assert all(o.stills().images.shape == (10, 64, 64, 4) for o in data.objects)
+
+
+def test_first_frame_is_the_rest_scene_as_the_oracle_draws_it(made: Path) -> None:
+    """Closes the loop through PLY, cameras and PNG: a wrong axis, order or alpha anywhere breaks it."""
+    for item in ReadyDataModule(made).objects:
+        scene, record = item.scene(), item.sequences[0]
+        still = torch.zeros(1, dtype=torch.long).expand(scene.count)
+        eye = torch.eye(3).expand(1, 1, 3, 3)
+        rest = Trajectory(scene.means[None], eye, eye, still, record.fps)
+        drawn = film(ReferenceRenderer(), scene, rest, record.cameras, as_bytes=False)
+        stored, alpha = composite(record.frames(range(1)))
+        assert (drawn - stored).abs().max() < 1.5 / 255
+        assert 0.05 < (alpha > 0.5).float().mean() < 0.8
+
+
+def test_true_motion_starts_at_rest_and_spares_the_pinned(made: Path) -> None:
+    for item in ReadyDataModule(made).objects:
+        scene = item.scene()
+        assert 0.01 < scene.pinned.float().mean() < 0.25
+        for record in item.sequences:
+            truth = item.ground_truth(record)
+            assert truth is not None
+            assert torch.equal(truth.rest, scene.means) and torch.equal(truth.positions[0], truth.rest)
+            moved = (truth.positions - truth.rest).norm(dim=-1)
+            assert moved[:, scene.pinned].max() == 0
+            assert 0.06 < moved.max() / scene.diagonal < 0.15
+            assert moved[1, ~scene.pinned].mean() > 0.005
+
+
+def test_existing_folders_are_spared(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stamp = (made / "synthetic.json").stat().st_mtime_ns
+    assert main([*TINY, "--out", str(made)]) == 0
+    assert (made / "synthetic.json").stat().st_mtime_ns == stamp and "there already" in capsys.readouterr().out
+    assert main([*TINY, "--out", str(made), "--seed", "5"]) == 2
+    assert "--force" in capsys.readouterr().err
+    (tmp_path / "mine.txt").write_text("precious")
+    assert main([*TINY, "--out", str(tmp_path), "--force"]) == 2
+    assert "is no synthetic set" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_force_replaces_a_set_whole(tmp_path: Path) -> None:
+    out = tmp_path / "set"
+    assert main([*TINY, "--out", str(out), "--objects", "pudding_soft", "--sequences", "1"]) == 0
+    assert main([*TINY, "--out", str(out), "--objects", "pudding_firm", "--sequences", "1", "--force"]) == 0
+    assert sorted(p.name for p in out.iterdir()) == ["pudding_firm", "synthetic.json"]
+    assert [p.name for p in tmp_path.iterdir()] == ["set"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--objects", "jelly"], "no recipe for ['jelly']"),
+        (["--frames", "15"], "at least the 16"),
+        (["--kernels", "3"], "expected at least 50"),
+    ],
+)
+def test_wrong_settings(tmp_path: Path, capsys, arguments: list[str], message: str) -> None:
+    assert main(["--quick", "--out", str(tmp_path / "set"), *arguments]) == 2
+    assert message in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_trilinear_points_follow_an_affine_motion_exactly(body: Body) -> None:
+    points, frames, _ = cover_surface(body, 40, np.random.default_rng(0))
+    matrix = np.array([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.3], [0.0, 0.1, 1.2]])
+    rest = points.positions(body.nodes)
+    moved = np.stack((body.nodes, body.nodes @ matrix.T + [0.1, 0.2, 0.3]))
+    np.testing.assert_allclose(points.positions(moved)[1], rest @ matrix.T + [0.1, 0.2, 0.3], atol=1e-12)
+    np.testing.assert_allclose(points.gradients(moved)[1], np.tile(matrix, (40, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(points.gradients(moved)[0], np.tile(np.eye(3), (40, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(frames.transpose(0, 2, 1) @ frames, np.tile(np.eye(3), (40, 1, 1)), atol=1e-9)
+    assert (np.linalg.det(frames) > 0).all()
+
+
+def test_objects_stay_in_every_image_while_they_swing(body: Body) -> None:
+    low, high = body.nodes.min(0), body.nodes.max(0)
+    center, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+    names = tuple(f"cam_{i}" for i in range(5))
+    swing = 0.12 * body.diagonal * np.concatenate((np.eye(3), -np.eye(3), np.zeros((1, 3))))
+    swing[[2, 5]] *= 0.3  # bodies are pushed sideways
+    height = (body.nodes[:, 2] - low[2]) / (high[2] - low[2])
+    moving = torch.from_numpy(body.nodes + height[:, None] * swing[:, None]).float().reshape(-1, 3)
+    video, still = video_cameras(center, radius, 96, names), still_cameras(center, radius, 96, 24)
+    for cameras, x in ((video, moving), (still, torch.from_numpy(body.nodes).float())):
+        camera = x @ cameras.viewmats[:, :3, :3].mT + cameras.viewmats[:, None, :3, 3]
+        pixel = camera @ cameras.Ks.mT
+        pixel = pixel[..., :2] / pixel[..., 2:]
+        assert camera[..., 2].min() > 0 and pixel.min() > 2 and pixel.max() < 94
+        assert (pixel.amax(1) - pixel.amin(1)).amax(-1).min() > 48, "the object is small in the image"
+
+
+def test_normals_point_outward(body: Body) -> None:
+    """The flux of the position through the surface is three times the volume, if all normals point outward."""
+    cell, axis, side = _outer_faces(body)
+    center = np.full((len(cell), 3), 0.5)
+    center[np.arange(len(cell)), axis] = side
+    x = Embedding(body, cell, center).positions(body.nodes)
+    flux = (x * _area_vector(body, cell, axis, side, center)).sum() / 3
+    corners = body.nodes[body.tetrahedra]
+    volume = np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 6
+    assert flux == pytest.approx(volume, rel=0.1)
+
+
+def test_tetrahedra_fill_the_body_without_gaps(body: Body) -> None:
+    """Every inner triangle is shared by exactly two tetrahedra: Kuhn's split fits across cells."""
+    tets = body.tetrahedra
+    triangles = np.sort(np.concatenate([tets[:, np.delete(np.arange(4), i)] for i in range(4)]), axis=1)
+    _, counts = np.unique(triangles, axis=0, return_counts=True)
+    assert set(counts.tolist()) == {1, 2}
+    assert (counts == 1).sum() == 2 * len(_outer_faces(body)[0])
+
+
+@pytest.mark.parametrize("name", sorted(RECIPES))
+def test_objects_swing_slowly_enough_to_be_filmed(name: str) -> None:
+    """Amplitude 8 to 12 % of the diagonal, periods of 6 to 16 frames, about half the swing left after 50 frames."""
+    recipe = RECIPES[name]
+    body = BODIES[recipe.body]()
+    elastic = ElasticBody(body, recipe.material, fps=24, time_step=recipe.time_step)
+    push = random_push(body, "drag", np.random.default_rng(3))
+    motion = pushed_motion(body, elastic, push, 50) - body.nodes
+    peak = np.linalg.norm(motion, axis=-1).max() / body.diagonal
+    assert peak == pytest.approx(push.amplitude, rel=0.15) and 0.07 < peak < 0.14
+    spectrum = (np.abs(np.fft.rfft(motion - motion.mean(0), 512, axis=0)) ** 2).sum((1, 2))
+    assert 6 < 512 / (1 + spectrum[1:].argmax()) < 16
+    power = (np.abs(np.fft.rfft(motion, axis=0)) ** 2).sum((1, 2))
+    fast = np.fft.rfftfreq(50) > 1 / 5
+    assert power[fast].sum() / power[1:].sum() < 0.2
+    swing = np.sqrt((motion**2).sum((1, 2)))
+    assert 0.4 < swing[-16:].max() / swing[:16].max() < 0.7
+
+
+def test_pokes_are_local_and_held_nodes_stay(body: Body) -> None:
+    push = random_push(body, "poke", np.random.default_rng(0))
+    field = np.linalg.norm(push_field(body, push), axis=1)
+    distance = np.linalg.norm(body.nodes - np.array(push.point), axis=1)
+    assert field[body.held].max() == 0
+    assert field[distance < 0.1 * body.diagonal].min() > 3 * field[distance > 0.6 * body.diagonal].max()
+
+
+def test_instability_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    body = BODIES["pudding"]()
+    elastic = ElasticBody(body, Material(1e7, 0.35, 0.7), fps=24, time_step=5e-3)
+    with pytest.raises(DivergenceError, match=r"left the finite numbers .* Soften the material"):
+        elastic.simulate(np.where(body.held[:, None], 0.0, 1.0), 20)
+    assert not list(tmp_path.iterdir()), "MuJoCo left a log file"
+
+
+@pytest.mark.slow
+def test_worker_processes_write_the_same_set(made: Path, tmp_path: Path) -> None:
+    arguments = [a if a != "1" else "2" for a in TINY]
+    assert main([*arguments, "--out", str(tmp_path / "set")]) == 0
+    assert digests(tmp_path / "set") == digests(made)

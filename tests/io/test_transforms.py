@@ -1,0 +1,135 @@
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gausim.core import Cameras, DataError
+from gausim.io.transforms import read_transforms, write_transforms
+
+
+def two_cameras() -> Cameras:
+    a = 0.7
+    turned = torch.tensor([[math.cos(a), 0.0, -math.sin(a)], [0.0, 1.0, 0.0], [math.sin(a), 0.0, math.cos(a)]])
+    viewmats = torch.eye(4).repeat(2, 1, 1)
+    viewmats[1, :3, :3] = turned
+    viewmats[:, :3, 3] = torch.tensor([[0.1, 0.2, 3.0], [-0.4, 0.3, 2.5]])
+    k = torch.tensor([[30.0, 0.0, 10.0], [0.0, 31.0, 7.0], [0.0, 0.0, 1.0]])
+    return Cameras(viewmats, k.expand(2, 3, 3).clone(), 20, 16, ("a/0.png", "a/1.png"))
+
+
+def written(tmp_path: Path, **changes: object) -> Path:
+    path = tmp_path / "transforms.json"
+    write_transforms(path, two_cameras(), [{"file_path": f"a/{i}.png", "camera": "a", "frame": i} for i in (0, 1)])
+    data = json.loads(path.read_text())
+    for key, value in changes.items():
+        if value is None:
+            del data[key]
+        else:
+            data[key] = value
+    path.write_text(json.dumps(data))
+    return path
+
+
+def test_written_cameras_are_read_back(tmp_path: Path) -> None:
+    posed = read_transforms(written(tmp_path, fps=24))
+    torch.testing.assert_close(posed.cameras.viewmats, two_cameras().viewmats)
+    torch.testing.assert_close(posed.cameras.Ks, two_cameras().Ks)
+    assert (posed.cameras.width, posed.cameras.height, posed.fps) == (20, 16, 24.0)
+    assert [(f.camera, f.frame, f.path.name) for f in posed.frames] == [("a", 0, "0.png"), ("a", 1, "1.png")]
+
+
+def test_opengl_pose_becomes_opencv(tmp_path: Path) -> None:
+    """A camera at (0, -5, 0) with the identity's axes turned to look along +y, z up: the origin is 5 ahead."""
+    pose = [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, -5.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    path = written(tmp_path, frames=[{"file_path": "x.png", "transform_matrix": pose}] * 2)
+    viewmat = read_transforms(path).cameras.viewmats[0]
+    torch.testing.assert_close(viewmat @ torch.tensor([0.0, 0.0, 0.0, 1.0]), torch.tensor([0.0, 0.0, 5.0, 1.0]))
+    right_and_up = viewmat @ torch.tensor([1.0, 0.0, 2.0, 1.0])
+    torch.testing.assert_close(right_and_up[:3], torch.tensor([1.0, -2.0, 5.0]))
+
+
+def test_blenders_own_layout(tmp_path: Path) -> None:
+    """camera_angle_x alone, no image size, file names without extension."""
+    (tmp_path / "train").mkdir()
+    cv2.imwrite(str(tmp_path / "train" / "r_0.png"), np.zeros((12, 18, 4), np.uint8))
+    pose = torch.eye(4).tolist()
+    data = {"camera_angle_x": 0.8, "frames": [{"file_path": "./train/r_0", "transform_matrix": pose}] * 2}
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    posed = read_transforms(tmp_path / "transforms.json")
+    assert (posed.cameras.width, posed.cameras.height) == (18, 12)
+    focal = 9 / math.tan(0.4)
+    expected = torch.tensor([[focal, 0.0, 9.0], [0.0, focal, 6.0], [0.0, 0.0, 1.0]])
+    torch.testing.assert_close(posed.cameras.Ks, expected.expand(2, 3, 3))
+    assert posed.frames[0].path.is_file() and posed.frames[0].frame is None
+
+
+def test_intrinsics_of_a_frame_win(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    data = json.loads(path.read_text())
+    data["frames"][1]["fl_x"] = 77.0
+    path.write_text(json.dumps(data))
+    assert read_transforms(path).cameras.Ks[:, 0, 0].tolist() == [30.0, 77.0]
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        ((1.1 * torch.eye(3)).tolist(), "is not a rotation"),
+        (torch.diag(torch.tensor([1.0, 1.0, -1.0])).tolist(), "is not a rotation"),
+        (torch.zeros(3, 3).tolist(), "is not a rotation"),
+    ],
+)
+def test_pose_that_is_no_rotation(tmp_path: Path, matrix: list[list[float]], message: str) -> None:
+    path = written(tmp_path)
+    data = json.loads(path.read_text())
+    pose = data["frames"][1]["transform_matrix"]
+    for i in range(3):
+        pose[i][:3] = matrix[i]
+    path.write_text(json.dumps(data))
+    with pytest.raises(DataError, match=rf"transforms.json: transform_matrix of 'a/1.png' {message}"):
+        read_transforms(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"frames": []}, "field 'frames' must be a non-empty list"),
+        ({"fl_x": None, "camera_angle_x": None}, "neither field 'fl_x'"),
+        ({"fl_x": "wide"}, "field 'fl_x' must be a finite number"),
+        ({"fl_x": -3.0}, "focal lengths must be positive"),
+        ({"fl_x": None, "camera_angle_x": 0}, "'camera_angle_x' must be between 0 and pi"),
+        ({"h": None}, "field 'h' must be a finite number"),
+        ({"w": None, "h": None}, "has no 'w' and 'h'"),
+        ({"k1": 0.02}, r"the lens is distorted \(\{'k1': 0.02\}\)"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "camera_model 'OPENCV_FISHEYE' is not supported"),
+        ({"frames": [{"transform_matrix": torch.eye(4).tolist()}]}, "field 'file_path' must name an image"),
+        ({"frames": [{"file_path": "a.png"}]}, "field 'transform_matrix' is missing"),
+        ({"frames": [{"file_path": "a.png", "transform_matrix": [[1, 2], [3, 4]]}]}, "finite 4 x 4 matrix"),
+        ({"frames": [{"file_path": "a.png", "transform_matrix": "eye"}]}, "finite 4 x 4 matrix"),
+    ],
+)
+def test_malformed_fields_are_named(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    path = written(tmp_path, **changes)
+    with pytest.raises(DataError, match=message) as error:
+        read_transforms(path)
+    assert str(path) in str(error.value)
+
+
+def test_images_of_several_sizes(tmp_path: Path) -> None:
+    path = written(tmp_path)
+    data = json.loads(path.read_text())
+    data["frames"][1]["w"] = 21
+    path.write_text(json.dumps(data))
+    with pytest.raises(DataError, match=r"frames\[1\]: is 21x16, frames\[0\] is 20x16"):
+        read_transforms(path)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        read_transforms(tmp_path / "transforms.json")
