@@ -76,9 +76,7 @@ def train(cfg: DictConfig) -> float | None:
     trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
-    run.finish(
-        {"epochs": trainer.current_epoch, "steps": module.global_step, **{k: v for k, v in module.summary.items()}}
-    )
+    run.finish({"epochs": trainer.current_epoch, "optimizer_steps": module.global_step, "last_epoch": module.summary})
     print(f"\nrun: {run.path}\nnext: gausim evaluate {run.path}\n      gausim simulate {run.path}", flush=True)
     return module.summary.get("excess_static")
 
