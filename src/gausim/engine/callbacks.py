@@ -38,7 +38,7 @@ class RunCheckpoint(Checkpoint):
         self._every, self._snapshot_every = every_epochs, snapshot_every
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Saves when the epoch has come, the optimiser included (Lightning calls this after all other callbacks' epoch ends)."""
+        """Saves when the epoch has come, the optimiser included (Lightning calls this last)."""
         epoch, folder = trainer.current_epoch + 1, Path(trainer.default_root_dir)
         last = trainer.should_stop or epoch == trainer.max_epochs
         if last or epoch % self._every == 0:
