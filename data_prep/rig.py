@@ -48,7 +48,8 @@ def still_cameras(center: Array, radius: float, size: int, count: int) -> Camera
     highest = math.sin(math.radians(70.0))
     elevation = np.array([math.asin((i + 0.5) / count * highest) for i in range(count)])
     names = tuple(f"{i:04d}" for i in range(count))
-    return look_at(GOLDEN_ANGLE * np.arange(count), elevation, center, radius, size, names)
+    azimuth = np.array([i * GOLDEN_ANGLE for i in range(count)])
+    return look_at(azimuth, elevation, center, radius, size, names)
 
 
 def photograph(
