@@ -1,0 +1,58 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import pdist
+
+from gausim.ops import clustering
+from gausim.ops.clustering import CLUSTERINGS, ball_clusters, complete_linkage_clusters
+
+
+def _cloud(count: int = 150, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(count, 3)) * (1.0, 0.5, 2.0)
+
+
+@pytest.mark.parametrize("name", CLUSTERINGS)
+@pytest.mark.parametrize("diameter", [0.4, 1.1])
+def test_every_cluster_keeps_the_diameter_bound(name: str, diameter: float) -> None:
+    points = _cloud()
+    labels = CLUSTERINGS[name](points, diameter)
+    assert sorted(set(labels)) == list(range(labels.max() + 1))
+    sizes = np.bincount(labels)
+    assert sizes.max() > 1 and len(sizes) < len(points)  # else the bound says nothing
+    for c in np.flatnonzero(sizes > 1):
+        assert pdist(points[labels == c]).max() <= diameter * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("name", CLUSTERINGS)
+def test_permuting_points_permutes_labels(name: str) -> None:
+    points = _cloud()
+    order = np.random.default_rng(1).permutation(len(points))
+    assert np.array_equal(CLUSTERINGS[name](points[order], 0.8), CLUSTERINGS[name](points, 0.8)[order])
+
+
+def test_ball_needs_at_most_twice_the_clusters_of_the_reference() -> None:
+    points = _cloud(400)
+    assert ball_clusters(points, 0.9).max() + 1 <= 2 * (complete_linkage_clusters(points, 0.9).max() + 1)
+
+
+@pytest.mark.parametrize("name", CLUSTERINGS)
+def test_separate_clumps_are_found_whatever_the_method(name: str) -> None:
+    rng = np.random.default_rng(2)
+    truth = np.repeat(np.arange(4), 6)
+    points = np.array([[0, 0, 0], [5, 0, 0], [0, 5, 0], [0, 0, 5.0]])[truth] + rng.uniform(-0.1, 0.1, (24, 3))
+    labels = CLUSTERINGS[name](points, 1.0)
+    assert labels.max() == 3
+    assert np.array_equal(labels[:, None] == labels, truth[:, None] == truth)
+
+
+@pytest.mark.parametrize("name", CLUSTERINGS)
+def test_one_point_and_coincident_points(name: str) -> None:
+    assert CLUSTERINGS[name](np.ones((1, 3)), 0.5).tolist() == [0]
+    assert CLUSTERINGS[name](np.ones((7, 3)), 0.5).tolist() == [0] * 7
+
+
+def test_complete_linkage_refuses_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clustering, "MAX_COMPLETE_LINKAGE", 20)
+    with pytest.raises(ValueError, match="clustering=ball"):
+        complete_linkage_clusters(_cloud(21), 1.0)

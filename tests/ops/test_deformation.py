@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from gausim.ops.deformation import determinant, gradient_from_output, polar_rotation, unit_determinant
+
+
+def _outputs(scale: float, dtype: torch.dtype = torch.float64) -> Tensor:
+    return scale * torch.randn(200, 11, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(dtype)
+
+
+@pytest.mark.parametrize(
+    ("scale", "dtype"), [(0.5, torch.float32), (1.0, torch.float64), (20.0, torch.float64), (1e4, torch.float64)]
+)
+def test_mass_on_gives_determinant_one_for_large_outputs(scale: float, dtype: torch.dtype) -> None:
+    gradient, _ = gradient_from_output(_outputs(scale, dtype), conserve_mass=True)
+    assert (torch.linalg.det(gradient.double()) - 1).abs().max() < 1e-5
+    assert (gradient - torch.eye(3, dtype=dtype)).abs().amax((-1, -2)).min() > 1e-2  # no trivial identity
+
+
+def test_mass_off_leaves_the_product_of_the_clamped_stretches() -> None:
+    output = _outputs(4.0)
+    gradient, _ = gradient_from_output(output, conserve_mass=False)
+    expected = output[:, 8:].clamp(-5, 5).sum(-1)
+    assert torch.allclose(torch.linalg.det(gradient).log(), expected, atol=1e-6)
+    assert (torch.linalg.det(gradient) - 1).abs().median() > 0.5
+
+
+def test_zero_output_is_the_identity() -> None:
+    for conserve in (True, False):
+        for value in gradient_from_output(torch.zeros(4, 11), conserve_mass=conserve):
+            assert torch.equal(value, torch.eye(3).expand(4, 3, 3))
+
+
+def test_second_result_is_the_polar_rotation_of_the_first() -> None:
+    gradient, rotation = gradient_from_output(_outputs(1.0), conserve_mass=True)
+    eye = torch.eye(3, dtype=torch.float64)
+    assert torch.allclose(rotation @ rotation.mT, eye.expand_as(rotation), atol=1e-12)
+    stretch = rotation.mT @ gradient
+    assert torch.allclose(stretch, stretch.mT, atol=1e-10)
+    assert torch.linalg.eigvalsh(stretch).min() > 0
+
+
+def test_gradcheck_of_the_head() -> None:
+    output = _outputs(0.7)[:4].requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: gradient_from_output(x, conserve_mass=True), output)
+
+
+def test_determinant_and_unit_determinant() -> None:
+    a = torch.randn(50, 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    assert torch.allclose(determinant(a), torch.linalg.det(a))
+    b = torch.eye(3, dtype=torch.float64) + 0.2 * a
+    b = b[torch.linalg.det(b) > 0.05]
+    unit = unit_determinant(b)
+    assert len(b) > 20 and torch.allclose(torch.linalg.det(unit), torch.ones(len(b), dtype=torch.float64))
+    assert torch.allclose(unit / unit[:, :1, :1], b / b[:, :1, :1])
+
+
+def test_polar_rotation_equals_the_singular_value_decomposition() -> None:
+    # stretches up to a factor of 8 in every direction, any rotation
+    generator = torch.Generator().manual_seed(2)
+    u, v = (torch.linalg.qr(torch.randn(60, 3, 3, generator=generator, dtype=torch.float64))[0] for _ in range(2))
+    u, v = (q * torch.linalg.det(q)[:, None, None] for q in (u, v))
+    stretch = torch.exp(2 * torch.rand(60, 3, generator=generator, dtype=torch.float64) * 2 - 2)
+    gradient = (u * stretch[:, None, :]) @ v.mT
+    assert torch.allclose(polar_rotation(gradient), u @ v.mT, atol=1e-6)
