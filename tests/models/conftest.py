@@ -1,0 +1,89 @@
+"""Small synthetic scenes and simulators with random, trained-looking parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from gausim.core import GaussianScene, SimState
+from gausim.models.simulator import GausSim
+
+
+def _scene(count: int = 70, *, seed: int = 0, dtype: torch.dtype = torch.float32, spare: int = 6) -> GaussianScene:
+    """A column of kernels whose foot is pinned; the first ``spare`` kernels are not simulated at all."""
+    generator = torch.Generator().manual_seed(seed)
+    means = torch.rand(count, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.5, 0.4, 1.2]) + 0.1
+    means[spare : spare + 8, 2] *= 0.1  # at least eight pinned kernels
+    simulated = torch.arange(count) >= spare
+    return GaussianScene.create(
+        means=means.to(dtype),
+        log_scales=(torch.randn(count, 3, generator=generator, dtype=torch.float64) * 0.3 - 3).to(dtype),
+        quats=torch.randn(count, 4, generator=generator, dtype=torch.float64).to(dtype),
+        opacity_logits=torch.zeros(count, dtype=dtype),
+        sh=torch.randn(count, 4, 3, generator=generator, dtype=torch.float64).to(dtype),
+        simulated=simulated,
+        pinned=simulated & (means[:, 2] < 0.25),
+        name=f"column{seed}",
+    )
+
+
+def _model(scenes: GaussianScene | Sequence[GaussianScene], *, seed: int = 0, **options: object) -> GausSim:
+    """A simulator with random weights, densities, attributes and normaliser statistics, in evaluation mode."""
+    scenes = [scenes] if isinstance(scenes, GaussianScene) else list(scenes)
+    torch.manual_seed(seed)
+    settings = {"radii": (0.2, 0.5), "graph_radii": (0.8, 0.35), "max_neighbours": 6, "hidden": 16, "layers": 2}
+    model = GausSim(scenes, [24.0 + 6 * i for i in range(len(scenes))], **(settings | options))
+    model.to(scenes[0].means.dtype)
+    with torch.no_grad():
+        for parameter in (*model.log_density, *model.attributes):
+            parameter.copy_(0.4 * torch.randn(parameter.shape))
+    for i, scene in enumerate(scenes):
+        for j in range(3):
+            model.step(model.batch((i,)), _state(scene, seed=j))
+    return model.eval()
+
+
+def _state(scene: GaussianScene, *, seed: int = 0, amount: float = 0.02) -> SimState:
+    """Free kernels displaced at random in both frames."""
+    generator = torch.Generator().manual_seed(100 + seed)
+    shift = torch.randn(2, scene.count, 3, generator=generator, dtype=torch.float64).to(scene.means) * amount
+    shift = shift * (scene.simulated & ~scene.pinned)[:, None]
+    return SimState(scene.means + shift[0], scene.means + shift[1])
+
+
+def _join(states: Sequence[SimState]) -> SimState:
+    return SimState(torch.cat([s.positions for s in states]), torch.cat([s.previous for s in states]))
+
+
+def _permuted(scene: GaussianScene, order: Tensor) -> GaussianScene:
+    names = ("means", "log_scales", "quats", "opacity_logits", "sh", "simulated", "pinned", "foreground")
+    return replace(scene, **{n: getattr(scene, n)[order] for n in names})
+
+
+@pytest.fixture(scope="session")
+def make_scene() -> Callable[..., GaussianScene]:
+    return _scene
+
+
+@pytest.fixture(scope="session")
+def make_model() -> Callable[..., GausSim]:
+    return _model
+
+
+@pytest.fixture(scope="session")
+def make_state() -> Callable[..., SimState]:
+    return _state
+
+
+@pytest.fixture(scope="session")
+def join_states() -> Callable[..., SimState]:
+    return _join
+
+
+@pytest.fixture(scope="session")
+def permuted() -> Callable[..., GaussianScene]:
+    return _permuted

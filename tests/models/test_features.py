@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gausim.core import SimState
+from gausim.models.features import FeatureOptions, UnitState, edge_features, node_features
+
+DT = 0.25
+
+
+def _unit_state(seed: int, count: int = 4) -> UnitState:
+    generator = torch.Generator().manual_seed(seed)
+    return UnitState(*torch.randn(4, count, 3, generator=generator, dtype=torch.float64))
+
+
+def _angle(a: np.ndarray, b: np.ndarray) -> float:
+    return math.acos(float(a @ b) / float(np.linalg.norm(a) * np.linalg.norm(b)))
+
+
+@pytest.mark.parametrize("coarse", [False, True])
+@pytest.mark.parametrize("rest_inputs", [False, True])
+def test_node_features_by_hand(rest_inputs: bool, coarse: bool) -> None:
+    unit, parent = _unit_state(0), _unit_state(1)
+    gravity = torch.tensor([[0.0, 0.0, -9.81]], dtype=torch.float64).expand(4, 3)
+    density, attributes = torch.linspace(-1, 1, 4).double(), torch.rand(4, 2).double()
+    options = FeatureOptions(rest_inputs=rest_inputs)
+    dt = torch.full((4, 1), DT, dtype=torch.float64)
+    out = node_features(unit, parent, dt, gravity, density, attributes, options, coarse=coarse)
+    for i in range(4):
+        u = {n: getattr(unit, n)[i].numpy() for n in ("rest", "now", "before", "after")}
+        p = {n: getattr(parent, n)[i].numpy() for n in ("rest", "now", "before", "after")}
+        current = "after" if coarse else "now"
+        expected = [
+            np.array([0, 0, -9.81]) - (p["after"] - 2 * p["now"] + p["before"]) / DT**2,
+            ((u[current] - p[current]) - (u["before"] - p["before"])) / DT,
+        ]
+        if rest_inputs:
+            expected += [u["now"] - u["rest"], (u["after"] - u["now"]) / DT]
+        expected += [density[i : i + 1].numpy(), attributes[i].numpy()]
+        np.testing.assert_allclose(out[i].numpy(), np.concatenate(expected), rtol=1e-12)
+    assert out.shape[1] == options.node_normalised + 1 + 2
+
+
+@pytest.mark.parametrize("coarse", [False, True])
+@pytest.mark.parametrize("angle", ["cos_sin", "inner"])
+def test_edge_features_by_hand(angle: str, coarse: bool) -> None:
+    unit, centre = _unit_state(0), _unit_state(1)
+    edge_index = torch.tensor([[1, 2, 0, 3], [0, 0, 1, 2]])
+    options = FeatureOptions(angle=angle, rest_inputs=True)
+    dt = torch.full((4, 1), DT, dtype=torch.float64)
+    out = edge_features(unit, centre, edge_index, dt, options, coarse=coarse)
+    current, about = (unit.after, centre.after) if coarse else (unit.now, centre.now)
+    for e, (s, d) in enumerate(edge_index.T.tolist()):
+        x, c = current.numpy(), about.numpy()[d]
+        rest, rest_c, before = unit.rest.numpy(), centre.rest.numpy()[d], unit.before.numpy()
+        now, length = x[d] - x[s], np.linalg.norm(x[d] - x[s])
+        offset = rest[d] - rest[s]
+        expected = [[length / np.linalg.norm(offset)], now / length, (now - (before[d] - before[s])) / DT]
+        expected += [offset, now - offset]
+        if angle == "inner":
+            expected.append([(x[d] - c) @ (x[s] - c) - (rest[d] - rest_c) @ (rest[s] - rest_c)])
+        else:
+            turn = _angle(x[d] - c, x[s] - c) - _angle(rest[d] - rest_c, rest[s] - rest_c)
+            expected.append([math.cos(turn), math.sin(turn)])
+        np.testing.assert_allclose(out[e].numpy(), np.concatenate(expected), rtol=1e-6, atol=1e-9)
+    assert out.shape[1] == options.edge_size
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("angle", ["cos_sin", "inner"])
+def test_degenerate_geometry_gives_finite_bounded_features_and_gradients(angle: str, dtype: torch.dtype) -> None:
+    # Units 0 and 1 coincide at rest and now, 2 stands on its barycentre as an only child, 3 is in line with 0 and 1.
+    rest = torch.tensor([[0.3, 0, 0], [0.3, 0, 0], [0.1, 0.2, 0], [0.6, 0, 0]], dtype=dtype)
+    centre = torch.tensor([[0.0, 0, 0], [0.0, 0, 0], [0.1, 0.2, 0], [0.0, 0, 0]], dtype=dtype)
+    unit, about = rest.clone().requires_grad_(), centre.clone().requires_grad_()
+    edge_index = torch.tensor([[1, 0, 3, 2, 2, 3], [0, 1, 2, 3, 0, 0]])
+    out = edge_features(
+        UnitState(rest, unit, unit, unit),
+        UnitState(centre, about, about, about),
+        edge_index,
+        torch.full((4, 1), DT, dtype=dtype),
+        FeatureOptions(angle=angle),
+    )
+    assert bool(torch.isfinite(out).all())
+    assert float(out.detach()[:, 7:].abs().max()) <= 1 + 1e-6  # angles stay angles: they are not normalised later
+    for column in range(out.shape[1]):
+        for gradient in torch.autograd.grad(out[:, column].sum(), (unit, about), retain_graph=True):
+            assert bool(torch.isfinite(gradient).all())
+
+
+def test_parent_with_one_child_gives_a_finite_step_and_gradient(make_scene, make_model, make_state) -> None:
+    scene = make_scene(60)
+    model = make_model(scene, radii=(0.3, 0.35))
+    batch = model.batch((0,))
+    assert 1 in torch.bincount(batch.levels[1].parent).tolist()
+    state = make_state(scene)
+    positions = state.positions.requires_grad_()
+    step = model.step(batch, SimState(positions, state.previous))
+    gradient = torch.autograd.grad(step.positions.square().sum(), positions)[0]
+    assert bool(torch.isfinite(step.positions).all()) and bool(torch.isfinite(gradient).all())
+    assert float(gradient.abs().max()) > 0

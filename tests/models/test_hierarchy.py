@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from gausim.core import ConfigError, SceneError
+from gausim.models import simulator
+from gausim.models.hierarchy import build_hierarchy
+from gausim.ops.covariance import kernel_volumes
+
+RADII = (0.15, 0.35, 0.7)
+
+
+@pytest.mark.parametrize("clustering", ["ball", "complete_linkage"])
+def test_every_unit_has_one_parent_of_its_own_kind_and_volumes_add_up(make_scene, clustering) -> None:
+    scene = make_scene(120, dtype=torch.float64)
+    hierarchy = build_hierarchy(scene, radii=RADII, clustering=clustering)
+    counts = [level.count for level in hierarchy.levels]
+    assert counts[0] == int(scene.simulated.sum()) and counts == sorted(set(counts), reverse=True)
+    volume = kernel_volumes(scene.log_scales, scene.volume_scale)[scene.simulated]
+    for fine, coarse in zip(hierarchy.levels[:-1], hierarchy.levels[1:], strict=True):
+        assert fine.parent.shape == (fine.count,)
+        assert set(fine.parent.tolist()) == set(range(coarse.count))  # each has a parent, no parent is empty
+        assert torch.equal(coarse.pinned[fine.parent], fine.pinned)  # a cluster never mixes pinned and free
+        assert torch.allclose(
+            coarse.volume, coarse.volume.new_zeros(coarse.count).index_add(0, fine.parent, fine.volume)
+        )
+        assert torch.allclose(coarse.volume.sum(), volume.sum(), rtol=1e-12)
+    assert len(hierarchy.levels[-1].parent) == 0
+    assert 0 < int(hierarchy.levels[-1].pinned.sum()) < hierarchy.levels[-1].count
+
+
+@pytest.mark.parametrize("predicted", [[3, 2, 1], [0]])
+def test_masses_add_up_level_by_level_with_random_densities(make_scene, make_model, predicted) -> None:
+    scenes = [make_scene(90, dtype=torch.float64), make_scene(60, seed=1, dtype=torch.float64)]
+    model = make_model(scenes, radii=RADII, predicted_levels=predicted, graph_radii=[0.6] * len(predicted))
+    batch = model.batch((0, 1, 0))
+    mass, log_density = model.masses(batch)
+    assert float(log_density.detach().std()) > 0.1
+    assert torch.allclose(mass, batch.volume * log_density.exp())
+    zeros = torch.zeros(len(mass), 3, dtype=mass.dtype)
+    kernels = (zeros, zeros, zeros, mass, log_density, zeros)
+    for level in batch.levels:
+        unit = simulator._aggregate(level, kernels)
+        assert torch.allclose(unit.mass.sum(), mass.sum(), rtol=1e-12)
+        assert torch.allclose(level.volume.sum(), batch.volume.sum(), rtol=1e-12)
+        for c in range(level.count):
+            members = level.unit_of_kernel == c
+            assert torch.allclose(unit.mass[c], mass[members].sum())
+            assert torch.allclose(unit.log_density[c].exp(), mass[members].sum() / batch.volume[members].sum())
+
+
+@pytest.mark.parametrize("clustering", ["ball", "complete_linkage"])
+def test_cluster_diameters_are_bounded_by_fractions_of_the_diagonal(make_scene, clustering) -> None:
+    scene = make_scene(120, dtype=torch.float64)
+    hierarchy = build_hierarchy(scene, radii=RADII, clustering=clustering)
+    assert hierarchy.diagonal == pytest.approx(scene.diagonal)
+    for level, radius in zip(hierarchy.levels[:-1], RADII, strict=True):
+        distance = torch.cdist(level.rest, level.rest, compute_mode="donot_use_mm_for_euclid_dist")
+        together = level.parent[:, None] == level.parent
+        assert float(distance[together].max()) <= radius * scene.diagonal * (1 + 1e-9)
+        assert float(distance[together].max()) > 0.3 * radius * scene.diagonal
+
+
+def test_centres_are_volume_weighted_and_ancestors_compose(make_scene) -> None:
+    scene = make_scene(90, dtype=torch.float64)
+    hierarchy = build_hierarchy(scene, radii=RADII)
+    base = hierarchy.levels[0]
+    assert torch.equal(base.rest, scene.means[hierarchy.kernels])
+    for number in range(4):
+        ancestor, level = hierarchy.ancestor(0, number), hierarchy.levels[number]
+        for c in range(level.count):
+            members = ancestor == c
+            weight = base.volume[members, None]
+            assert torch.allclose(level.rest[c], (weight * base.rest[members]).sum(0) / weight.sum())
+    assert torch.equal(hierarchy.ancestor(1, 3)[hierarchy.ancestor(0, 1)], hierarchy.ancestor(0, 3))
+    free = [int((~level.pinned).sum()) for level in hierarchy.levels]
+    assert hierarchy.predictions([2, 1]) == free[2] + free[1]
+
+
+def test_root_is_the_nearest_pinned_kernel(make_scene) -> None:
+    scene = make_scene(90, dtype=torch.float64)
+    hierarchy = build_hierarchy(scene, radii=RADII)
+    base = hierarchy.levels[0]
+    for level in hierarchy.levels:
+        for c in range(level.count):
+            distance = (base.rest - level.rest[c]).norm(dim=-1).masked_fill(~base.pinned, float("inf"))
+            assert int(level.root[c]) == int(distance.argmin())
+
+
+@pytest.mark.parametrize("clustering", ["ball", "complete_linkage"])
+def test_permuting_kernels_permutes_the_clusters(make_scene, permuted, clustering) -> None:
+    scene = make_scene(90, dtype=torch.float64)
+    order = torch.randperm(90, generator=torch.Generator().manual_seed(0))
+    plain = build_hierarchy(scene, radii=RADII, clustering=clustering)
+    other = build_hierarchy(permuted(scene, order), radii=RADII, clustering=clustering)
+    for number in range(1, 4):
+        label = torch.full((90,), -1)
+        label[plain.kernels] = plain.ancestor(0, number)
+        other_label = torch.full((90,), -1)
+        other_label[other.kernels] = other.ancestor(0, number)
+        assert torch.equal(other_label, label[order])
+        assert torch.allclose(other.levels[number].rest, plain.levels[number].rest, atol=1e-12)
+
+
+def test_scene_that_nothing_holds_is_refused_with_the_remedy(make_scene) -> None:
+    scene = make_scene(40)
+    loose = dataclasses.replace(scene, pinned=torch.zeros_like(scene.pinned))
+    with pytest.raises(SceneError, match=r"column0: no kernel is pinned.*--pin-below.*mask 'pinned'"):
+        build_hierarchy(loose, radii=RADII)
+    rigid = dataclasses.replace(scene, pinned=scene.simulated)
+    with pytest.raises(SceneError, match="every simulated kernel is pinned"):
+        build_hierarchy(rigid, radii=RADII)
+    with pytest.raises(ConfigError, match="'spectral'; expected one of ball, complete_linkage"):
+        build_hierarchy(scene, radii=RADII, clustering="spectral")

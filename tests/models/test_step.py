@@ -1,0 +1,131 @@
+"""Invariants of one step and of rollouts (METHOD sections 1, 2 and 6)."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gausim.core import SimState
+from gausim.models.elastic import ElasticTemplate
+
+LEVELS = pytest.mark.parametrize(
+    ("predicted", "graph"), [((2, 1), (0.8, 0.35)), ((0,), (0.3,))], ids=["hierarchy", "no_hierarchy"]
+)
+
+
+@LEVELS
+def test_predicted_gradients_have_determinant_one_only_with_mass_on(
+    make_scene, make_model, make_state, predicted, graph
+) -> None:
+    scene = make_scene(dtype=torch.float64)
+    state = make_state(scene)
+    for conserve in (True, False):
+        model = make_model(
+            scene, predicted_levels=predicted, graph_radii=graph, output_scale=30.0, conserve_mass=conserve
+        )
+        with torch.no_grad():
+            step = model.step(model.batch((0,)), state)
+        error = torch.cat([torch.linalg.det(f) - 1 for f in (*step.predicted, step.gradients)]).abs()
+        size = torch.cat([(f - torch.eye(3)).abs().amax((-1, -2)) for f in step.predicted])
+        assert float(size.max()) > 0.5
+        assert float(error.max()) < 1e-5 if conserve else float(error.max()) > 0.1
+
+
+@LEVELS
+@pytest.mark.parametrize("edges", ["rest", "union", "intersection"])
+def test_zero_output_is_the_rest_state_from_any_state(
+    make_scene, make_model, make_state, predicted, graph, edges
+) -> None:
+    scene = make_scene()
+    model = make_model(scene, predicted_levels=predicted, graph_radii=graph, edges=edges, zero_output=True)
+    for amount in (0.0, 0.01, 3.0):
+        with torch.no_grad():
+            step = model.step(model.batch((0,)), make_state(scene, amount=amount))
+        assert float((step.positions - scene.means).abs().max()) < 1e-6
+        assert torch.equal(step.gradients, torch.eye(3).expand_as(step.gradients))
+        assert torch.equal(step.rotations, torch.eye(3).expand_as(step.rotations))
+
+
+def test_zero_output_at_rest_stays_at_rest_with_the_elastic_template(make_scene, make_model) -> None:
+    scene = make_scene()
+
+    def template(hierarchies, finest):
+        return ElasticTemplate(hierarchies, finest, modes=8, neighbours=6, hidden=8)
+
+    model = make_model(scene, zero_output=True, template=template)
+    with torch.no_grad():  # an untrained force would be zero anyway
+        for p in model.template.networks():
+            p.copy_(torch.randn_like(p))
+    trajectory = model.dynamics().rollout(SimState(scene.means, scene.means), 50)
+    assert float((trajectory.positions - scene.means).abs().max()) < 1e-6
+    moved = model.dynamics().rollout(SimState(scene.means * 1.01, scene.means), 2)
+    assert float((moved.positions[2] - scene.means).abs().max()) > 1e-3
+
+
+@pytest.mark.parametrize("elastic", [False, True])
+def test_pinned_and_never_simulated_kernels_never_move_in_1000_steps(make_scene, make_model, elastic) -> None:
+    scene = make_scene(40)
+    options = {"edges": "rest", "output_scale": 0.2}
+    if elastic:
+        options["output_scale"] = 1e-3  # random corrections of a template that remembers them may grow without bound
+        options["template"] = lambda h, finest: ElasticTemplate(h, finest, modes=6, neighbours=6, hidden=0)
+    model = make_model(scene, **options)
+    generator = torch.Generator().manual_seed(0)
+
+    def push(step: int) -> torch.Tensor:
+        return 3.0 * torch.randn(scene.count, 3, generator=generator)
+
+    positions = model.dynamics().rollout(SimState(scene.means, scene.means), 1000, forces=push).positions
+    held = scene.pinned | ~scene.simulated
+    assert int(scene.pinned.sum()) > 5 and int((~scene.simulated).sum()) == 6
+    assert torch.equal(positions[:, held], scene.means[held].expand(1001, -1, 3))
+    assert float((positions[1:, ~held] - scene.means[~held]).norm(dim=-1).amax(0).min()) > 1e-4
+
+
+def test_force_displaces_free_kernels_by_half_f_dt_squared_over_m(make_scene, make_model, make_state) -> None:
+    scene = make_scene(dtype=torch.float64)
+    model = make_model(scene, predicted_levels=(0,), graph_radii=(0.3,))
+    seen = []
+    plain = model._predict
+
+    def spy(level, unit, *args, **kwargs):
+        seen.append(unit)
+        return plain(level, unit, *args, **kwargs)
+
+    model._predict = spy
+    state = make_state(scene)
+    force = torch.randn(scene.count, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    with torch.no_grad():
+        model.step(model.batch((0,)), state, force)
+    mass = model.masses(model.batch((0,)))[0].detach()
+    expected = force[scene.simulated] * (1 / 24.0) ** 2 / (2 * mass[:, None])
+    expected[scene.pinned[scene.simulated]] = 0
+    assert torch.allclose(seen[0].now - state.positions[scene.simulated], expected, atol=1e-12)
+    assert torch.allclose(seen[0].before, state.previous[scene.simulated], atol=1e-15)
+    assert float(expected.abs().max()) > 1e-4
+
+
+@LEVELS
+def test_permuting_kernels_permutes_the_step(make_scene, make_model, make_state, permuted, predicted, graph) -> None:
+    scene, order = make_scene(90), torch.randperm(90, generator=torch.Generator().manual_seed(3))
+    options = {"predicted_levels": predicted, "graph_radii": graph, "gravity": (0.1, 0.0, -2.0)}
+    model, other = make_model(scene, **options), make_model(permuted(scene, order), seed=1, **options)
+    weights = {k: v for k, v in model.state_dict().items() if not k.startswith(("log_density", "attributes"))}
+    other.load_state_dict(weights, strict=False)
+    index, other_index = (s.simulated.nonzero()[:, 0] for s in (scene, permuted(scene, order)))
+    rows = torch.full((90,), -1)
+    rows[index] = torch.arange(len(index))
+    with torch.no_grad():
+        for name in ("log_density", "attributes"):
+            getattr(other, name)[0].copy_(getattr(model, name)[0][rows[order[other_index]]])
+        state, force = make_state(scene), torch.randn(90, 3, generator=torch.Generator().manual_seed(4))
+        step = model.step(model.batch((0,)), state, force)
+        shuffled = SimState(state.positions[order], state.previous[order])
+        result = other.step(other.batch((0,)), shuffled, force[order])
+    assert float((step.positions - scene.means).norm(dim=-1).max()) > 1e-3
+    assert float((result.positions - step.positions[order]).abs().max()) < 1e-5
+    unit, other_unit = (m.batch((0,)).members[0].unit_of_kernel for m in (model, other))
+    for name in ("gradients", "rotations"):
+        difference = getattr(result, name)[other_unit] - getattr(step, name)[unit][order]
+        assert float(difference.abs().max()) < 2e-5
+    assert float(result.momentum) == pytest.approx(float(step.momentum), rel=1e-3, abs=1e-12)
