@@ -12,7 +12,7 @@ STAMP := $(VENV)/.installed
 # Two test processes with one thread each suit a small machine; more cores: make test WORKERS=8.
 WORKERS ?= 2
 DATA ?= data/synthetic
-RUN ?= outputs/demo
+RUN ?= outputs/demo/seed_0
 ARGS ?=
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 
@@ -55,18 +55,18 @@ $(DATA)/.made: | install
 train: install ## Train: make train ARGS="experiment=demo seed=1"
 	$(BIN)/gausim train $(ARGS)
 
-evaluate: install ## Evaluate a run: make evaluate RUN=outputs/demo
+evaluate: install ## Evaluate a run: make evaluate RUN=outputs/demo/seed_0
 	$(BIN)/gausim evaluate $(RUN) $(ARGS)
 
-simulate: install ## Write the videos and figures of a run: make simulate RUN=outputs/demo
+simulate: install ## Write the videos and figures of a run: make simulate RUN=outputs/demo/seed_0
 	$(BIN)/gausim simulate $(RUN) $(ARGS)
 
 demo: data ## From nothing to a simulator that foresees: install, make data, train, evaluate, simulate
-	$(BIN)/gausim train experiment=demo hydra.run.dir=outputs/demo
-	$(BIN)/gausim evaluate outputs/demo
-	$(BIN)/gausim simulate outputs/demo
+	test -e outputs/demo/seed_0/FINISHED || $(BIN)/gausim train experiment=demo
+	$(BIN)/gausim evaluate outputs/demo/seed_0
+	$(BIN)/gausim simulate outputs/demo/seed_0
 	echo "Numbers and pictures of the demo:"
-	find outputs/demo -type f \( -name '*.json' -o -name '*.md' -o -name '*.png' -o -name '*.mp4' \) | sort | sed 's/^/  /'
+	find outputs/demo/seed_0 -type f \( -name '*.json' -o -name '*.md' -o -name '*.png' -o -name '*.mp4' \) | sort | sed 's/^/  /'
 
 clean: ## Remove caches and builds (not .venv, data or outputs)
 	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -18,6 +18,7 @@ from lightning.pytorch.loggers import Logger
 from gausim.core import ConfigError, RunError
 from gausim.engine.callbacks import LAST_CHECKPOINT, TimeBudget
 from gausim.engine.checkpoint import AtomicCheckpointIO
+from gausim.engine.memory import keep_freed_memory
 
 CONFIG, FINISHED = "config.yaml", "FINISHED"
 # What may differ when a run is resumed: where it is kept, how it is shown and what computes it, not what is learned.
@@ -174,6 +175,7 @@ def make_trainer(
         raise ConfigError(f"trainer.devices: expected 1, got {devices}. Start one run per device instead.")
     if threads is not None:
         torch.set_num_threads(threads)
+    keep_freed_memory()
     own = [c for c in callbacks if progress or not isinstance(c, ProgressBar)]
     if max_minutes is not None:
         own.append(TimeBudget(minutes=max_minutes, clock=clock))

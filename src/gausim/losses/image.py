@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -15,6 +16,9 @@ from gausim.core import ConfigError
 REFERENCE_PIXELS = 518_400
 # (k L)^2 of Wang et al. 2004 with k = 0.01, 0.03 and L = 1, and the width of their Gaussian window [pixels].
 SSIM_C1, SSIM_C2, SSIM_SIGMA = 1e-4, 9e-4, 1.5
+
+# Maps of this many images of a usual size stay in a core's cache.
+IMAGES_AT_ONCE = 12
 
 
 class ImageLoss(nn.Module):
@@ -55,13 +59,47 @@ class ImageLoss(nn.Module):
         if self.crop:
             rows, columns = _not_black(prediction.detach(), target, margin=2 * (self.window // 2), least=self.window)
             prediction, target = (x[:, :, rows, columns] for x in (prediction, target))
-        squared = (prediction - target).square().sum((1, 2, 3, 4))
-        total = self.balance * squared
+        loss: Tensor = _StateByState.apply(prediction, target, self)
+        return loss * (self.pixels / count)
+
+    def _of_states(self, prediction: Tensor, target: Tensor) -> Tensor:
+        """Sums over views, pixels and channels of each state."""
+        total = self.balance * (prediction - target).square().sum((1, 2, 3, 4))
         if self.balance < 1:
             first, second = (x.movedim(-1, 2).flatten(0, 2) for x in (prediction, target))
             loss = (1 - structural_similarity(first, second, self.window)) / 2
-            total = total + (1 - self.balance) * loss.reshape(squared.shape[0], -1).sum(1)
-        return total * (self.pixels / count)
+            total = total + (1 - self.balance) * loss.reshape(total.shape[0], -1).sum(1)
+        return total
+
+
+class _StateByState(torch.autograd.Function):
+    """The losses of the states and their gradients, a few images at a time.
+
+    The intermediate maps of SSIM for a whole rollout fill hundreds of megabytes; a few images stay in the cache, which
+    is two to three times as fast on a CPU. The gradient is formed with the loss and scaled in the backward pass.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, prediction: Tensor, target: Tensor, loss: ImageLoss) -> Tensor:
+        states = max(1, IMAGES_AT_ONCE // prediction.shape[1])
+        wanted = ctx.needs_input_grad[0]
+        gradient = torch.empty_like(prediction) if wanted else None
+        values = []
+        for start in range(0, prediction.shape[0], states):
+            part = prediction[start : start + states].detach().clone().requires_grad_(wanted)
+            with torch.set_grad_enabled(wanted):
+                value = loss._of_states(part, target[start : start + states])
+                total = value.sum()
+            if gradient is not None:
+                (gradient[start : start + states],) = torch.autograd.grad(total, part)
+            values.append(value.detach())
+        ctx.save_for_backward(gradient)
+        return torch.cat(values)
+
+    @staticmethod
+    def backward(ctx: Any, *incoming: Tensor) -> tuple[Tensor | None, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return None if gradient is None else gradient * incoming[0][:, None, None, None, None], None, None
 
 
 def structural_similarity(

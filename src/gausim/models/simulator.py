@@ -113,7 +113,7 @@ class GausSim(nn.Module):
             conserve_momentum: compute the momentum loss.
             gravity: acceleration [scene units / s^2].
             normaliser_floor: smallest standard deviation of a normalised input.
-            template: what the gradients deform; a class called with (hierarchies, finest level).
+            template: what the gradients deform; called with (hierarchies, finest level, conserve_volume=conserve_mass).
         """
         super().__init__()
         _check(predicted_levels, radii, graph_radii, edges, angle, scenes, fps)
@@ -127,7 +127,7 @@ class GausSim(nn.Module):
         self._builder = BatchBuilder(self.scenes, self.hierarchies, self.fps, self.predicted_levels, graph)
         self._batches: dict[tuple[tuple[int, ...], torch.device], SceneBatch] = {}
         self.register_buffer("gravity", torch.tensor([float(g) for g in gravity]), persistent=False)
-        self.template: Template = template(self.hierarchies, self.predicted_levels[-1])
+        self.template: Template = template(self.hierarchies, self.predicted_levels[-1], conserve_volume=conserve_mass)
         counts = [h.levels[0].count for h in self.hierarchies]
         self.log_density = nn.ParameterList(torch.zeros(n) for n in counts)
         self.attributes = nn.ParameterList(torch.zeros(n, attributes) for n in counts)

@@ -59,7 +59,7 @@ class Template(nn.Module, ABC):
 class RestTemplate(Template):
     """The paper's template: the rest state, whatever the motion."""
 
-    def __init__(self, hierarchies: Sequence[Hierarchy], finest: int) -> None:
+    def __init__(self, hierarchies: Sequence[Hierarchy], finest: int, *, conserve_volume: bool = True) -> None:
         """Takes what every template takes; the rest state needs none of it."""
         super().__init__()
 
