@@ -19,13 +19,15 @@ def test_positions_equal_the_corrected_sum_over_three_levels(make_scene, make_mo
     levels, fractions = (3, 2, 1), (0.15, 0.35, 0.7)
     model = make_model(scene, radii=fractions, predicted_levels=levels, graph_radii=(0.9, 0.6, 0.3))
     own: dict[int, Tensor] = {}
+    turns: dict[int, Tensor] = {}
     order = iter(levels)
 
     def random_gradients(level, unit, above, target, *, top):
         number = next(order)
         generator = torch.Generator().manual_seed(number)
         own[number] = torch.eye(3) + 0.4 * torch.randn(level.count, 3, 3, generator=generator, dtype=torch.float64)
-        return own[number], own[number]
+        turns[number] = quaternion_to_matrix(torch.randn(level.count, 4, generator=generator, dtype=torch.float64))
+        return own[number], turns[number]
 
     model._predict = random_gradients
     with torch.no_grad():
@@ -62,6 +64,8 @@ def test_positions_equal_the_corrected_sum_over_three_levels(make_scene, make_mo
             gradient = factors[1] @ factors[2] @ factors[3]
             expected = expected + gradient @ (rest[k] - points[0])
             assert torch.allclose(step.gradients[chains[1, k]], gradient, atol=1e-12)
+            rotation = turns[1][chains[1, k]] @ turns[2][chains[2, k]] @ turns[3][chains[3, k]]
+            assert torch.allclose(step.rotations[chains[1, k]], rotation, atol=1e-12)
             checked += 1
         assert torch.allclose(step.positions[hierarchy.kernels[k]], expected, atol=1e-12)
     assert checked > 60 and torch.equal(step.positions[~scene.simulated], scene.means[~scene.simulated])

@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+
+from gausim.models.elastic import ElasticTemplate
+
+LEVELS = pytest.mark.parametrize(
+    ("predicted", "graph"), [((2, 1), (0.8, 0.35)), ((1,), (0.5,)), ((0,), (0.3,)), ((2, 0), (0.8, 0.3))]
+)
+
+
+@LEVELS
+@pytest.mark.parametrize("elastic", [False, True])
+@torch.no_grad()
+def test_union_of_scenes_and_sequences_equals_each_alone(
+    make_scene, make_model, make_state, join_states, predicted, graph, elastic
+) -> None:
+    scenes = [make_scene(70), make_scene(55, seed=1)]
+    options = {"template": partial(ElasticTemplate, modes=5, neighbours=6, hidden=4)} if elastic else {}
+    model = make_model(
+        scenes, predicted_levels=predicted, graph_radii=graph, gravity=(0.0, 1.0, -3.0), output_scale=2.0, **options
+    )
+    ids = (0, 1, 0)
+    states = [make_state(scenes[s], seed=i) for i, s in enumerate(ids)]
+    forces = [torch.randn(scenes[s].count, 3, generator=torch.Generator().manual_seed(i)) for i, s in enumerate(ids)]
+    batch = model.batch(ids)
+    assert batch.scene_ids == ids and [m.scene_id for m in batch.members] == [0, 1, 0]
+    joint = model.step(batch, join_states(states), torch.cat(forces))
+    momentum = 0.0
+    for member, scene_id, state, force in zip(batch.members, ids, states, forces, strict=True):
+        alone = model.step(model.batch((scene_id,)), state, force)
+        assert torch.allclose(joint.positions[member.kernels], alone.positions, atol=1e-6)
+        assert torch.allclose(joint.gradients[member.units], alone.gradients, atol=1e-5)
+        assert torch.allclose(joint.rotations[member.units], alone.rotations, atol=1e-5)
+        assert torch.equal(member.unit_of_kernel, model.batch((scene_id,)).members[0].unit_of_kernel)
+        momentum += float(alone.momentum)
+        assert float((alone.positions - scenes[scene_id].means).abs().max()) > 1e-3
+    assert float(joint.momentum) == pytest.approx(momentum, rel=1e-4)
+    first, _, third = (joint.positions[m.kernels] for m in batch.members)
+    assert float((first - third).abs().max()) > 1e-4  # two sequences of one scene keep their own states
+
+
+@LEVELS
+@torch.no_grad()
+def test_kernels_follow_their_unit_and_held_ones_the_identity(
+    make_scene, make_model, make_state, predicted, graph
+) -> None:
+    scene = make_scene(70)
+    model = make_model(scene, predicted_levels=predicted, graph_radii=graph, output_scale=3.0)
+    batch = model.batch((0,))
+    member, hierarchy = batch.members[0], model.hierarchies[0]
+    step = model.step(batch, make_state(scene))
+    held = scene.pinned | ~scene.simulated
+    last = member.units.stop - 1
+    assert torch.equal(step.gradients[last], torch.eye(3)) and torch.equal(step.rotations[last], torch.eye(3))
+    assert bool((member.unit_of_kernel[held] == last).all()) and not bool((member.unit_of_kernel[~held] == last).any())
+    finest = hierarchy.ancestor(0, predicted[-1])
+    free = ~hierarchy.levels[0].pinned
+    assert torch.equal(member.unit_of_kernel[hierarchy.kernels[free]], finest[free])
+    assert len(step.predicted) == len(predicted)
+    assert [len(f) for f in step.predicted] == [hierarchy.levels[n].count for n in predicted]
+
+
+def test_batches_are_cached_and_edges_stay_within_members(make_scene, make_model) -> None:
+    model = make_model([make_scene(70), make_scene(55, seed=1)])
+    batch = model.batch([0, 1])
+    assert model.batch((0, 1)) is batch and model.batch((1, 0)) is not batch
+    for level in batch.levels:
+        owner = torch.cat([torch.full((s.stop - s.start,), i) for i, s in enumerate(level.spans)])
+        positions = torch.zeros(level.count, 3)  # all at one place: neighbours are cut off by members only
+        for edges in (level.rest_edges, level.current_edges(positions)):
+            assert edges.shape[1] > 0 and torch.equal(owner[edges[0]], owner[edges[1]])
+            assert bool((edges[1].diff() >= 0).all())
+            assert int(torch.bincount(edges[1]).max()) <= 6
+    assert {round(1 / float(v)) for v in batch.dt} == {24, 30}
+
+
+def test_absent_scene_gets_no_gradient(make_scene, make_model, make_state) -> None:
+    scenes = [make_scene(70), make_scene(55, seed=1)]
+    model = make_model(scenes)
+    model.step(model.batch((1,)), make_state(scenes[1])).positions.square().sum().backward()
+    assert model.log_density[0].grad is None and model.attributes[0].grad is None
+    assert float(model.log_density[1].grad.abs().max()) > 0 and float(model.attributes[1].grad.abs().max()) > 0

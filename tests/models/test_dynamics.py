@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gausim.core import ConfigError, DivergenceError, Dynamics, SceneError, SimState
+from gausim.models.simulator import GausSim
+
+
+def test_offers_the_protocol_and_rolls_out_what_steps_give(make_scene, make_model, make_state) -> None:
+    scenes = [make_scene(50), make_scene(60, seed=1)]
+    model = make_model(scenes)
+    dynamics = model.dynamics(1)
+    assert isinstance(dynamics, Dynamics)
+    state = make_state(scenes[1])
+    force = torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
+
+    def poke(frame: int):
+        return force if frame == 1 else None
+
+    trajectory = dynamics.rollout(state, 4, forces=poke)
+    assert trajectory.frames == 5 and trajectory.fps == 30.0 and not trajectory.positions.requires_grad
+    assert torch.equal(trajectory.positions[0], state.positions)
+    assert torch.equal(trajectory.gradients[0], torch.eye(3).expand_as(trajectory.gradients[0]))
+    current = state
+    for frame in range(4):
+        with torch.no_grad():
+            step = model.step(model.batch((1,)), current, poke(frame))
+        current = SimState(step.positions, current.positions)
+        assert torch.equal(trajectory.positions[frame + 1], step.positions)
+        assert torch.equal(trajectory.gradients[frame + 1], step.gradients)
+        assert torch.equal(trajectory.rotations[frame + 1], step.rotations)
+    still = dynamics.rollout(state, 4)
+    assert torch.equal(still.positions[1], trajectory.positions[1])
+    assert not torch.equal(still.positions[2], trajectory.positions[2])
+
+
+def test_rollout_leaves_mode_and_statistics_alone(make_scene, make_model, make_state) -> None:
+    scene = make_scene(50)
+    model = make_model(scene).train()
+    before = {k: v.clone() for k, v in model.state_dict().items()}
+    model.dynamics().rollout(make_state(scene), 3)
+    assert model.training and model.node_normaliser.training
+    assert all(torch.equal(v, before[k]) for k, v in model.state_dict().items())
+
+
+def test_points_are_carried_by_the_unit_of_their_kernel(make_scene, make_model, make_state) -> None:
+    scene = make_scene(80, dtype=torch.float64)
+    model = make_model(scene, output_scale=3.0)
+    trajectory = model.dynamics().rollout(make_state(scene), 3)
+    generator = torch.Generator().manual_seed(0)
+    kernel = torch.randint(0, 80, (50,), generator=generator)
+    points = scene.means[kernel] + 0.02 * torch.randn(50, 3, generator=generator, dtype=torch.float64)
+    carried = trajectory.carry(points, kernel, scene.means)
+    hierarchy = model.hierarchies[0]
+    unit = torch.full((80,), -1)
+    unit[hierarchy.kernels] = hierarchy.ancestor(0, 1)
+    free = scene.simulated & ~scene.pinned
+    mass = torch.zeros(80, dtype=torch.float64)
+    mass[hierarchy.kernels] = model.masses(model.batch((0,)))[0].detach()
+    assert int(free[kernel].sum()) > 20
+    for frame in range(1, 4):
+        for p, k in enumerate(kernel.tolist()):
+            expected = points[p]
+            if free[k]:
+                members = unit == unit[k]
+                weight = mass[members, None] / mass[members].sum()
+                rest, now = (
+                    (weight * scene.means[members]).sum(0),
+                    (weight * trajectory.positions[frame][members]).sum(0),
+                )
+                gradient = trajectory.gradients[frame, trajectory.unit_of_kernel[k]]
+                expected = now + gradient @ (points[p] - rest)
+            assert torch.allclose(carried[frame, p], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("edges", ["rest", "union"])
+def test_numbers_that_are_not_finite_stop_the_rollout_and_name_the_frame(
+    make_scene, make_model, make_state, edges
+) -> None:
+    scene = make_scene(50)
+    model = make_model(scene, edges=edges)
+    state, nan = make_state(scene), torch.full((50, 3), float("nan"))
+    with pytest.raises(DivergenceError, match="column0: positions are not finite at frame 0"):
+        model.dynamics().rollout(SimState(state.positions, nan), 3)
+    with pytest.raises(DivergenceError, match="column0: forces are not finite at frame 2"):
+        model.dynamics().rollout(state, 3, forces=lambda frame: nan if frame == 2 else None)
+    with torch.no_grad():
+        model.network.decoder[-1].bias.fill_(float("nan"))
+    model.train()
+    with pytest.raises(DivergenceError, match="column0: positions are not finite at frame 1"):
+        model.dynamics().rollout(state, 3)
+    assert model.training  # restored after the error too
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"predicted_levels": (1, 2)}, "coarse to fine"),
+        ({"predicted_levels": (2, 2)}, "coarse to fine"),
+        ({"predicted_levels": (1, -1)}, "coarse to fine"),
+        ({"predicted_levels": ()}, "coarse to fine"),
+        ({"predicted_levels": (3, 1)}, "names level 3, but model.radii has 2 levels"),
+        ({"graph_radii": (0.5,)}, "1 values for 2 predicted levels"),
+        ({"edges": "both"}, "'both'; expected one of rest, union, intersection"),
+        ({"angle": "degrees"}, "'degrees'; expected one of cos_sin, inner"),
+        ({"clustering": "kmeans"}, "'kmeans'; expected one of ball, complete_linkage"),
+    ],
+)
+def test_contradicting_options_are_refused(make_scene, options, message) -> None:
+    with pytest.raises(ConfigError, match=message):
+        GausSim([make_scene(40)], [24.0], hidden=8, layers=2, **options)
+
+
+def test_scenes_without_rates_or_roots_are_refused(make_scene) -> None:
+    scene = make_scene(40)
+    for scenes, fps in (([], []), ([scene], [24.0, 30.0])):
+        with pytest.raises(ConfigError, match="expected one rate per scene, at least one"):
+            GausSim(scenes, fps)
+    loose = replace(scene, pinned=torch.zeros_like(scene.pinned))
+    with pytest.raises(SceneError, match="no kernel is pinned.*Mark it with"):
+        GausSim([loose], [24.0], hidden=8, layers=2)

@@ -1,0 +1,223 @@
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+import pytest
+import scipy.linalg
+import torch
+
+from gausim.core import SimState
+from gausim.models.elastic import ElasticScene, ElasticTemplate, mode_gradients, vibration_modes
+from gausim.models.hierarchy import build_hierarchy
+from gausim.models.initial_state import ModalInitialStates
+from gausim.models.template import Motion
+
+
+def _spring_block(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Stiffness 1 / length^2 along the spring and three tenths of it across."""
+    length = np.linalg.norm(b - a)
+    n = (b - a) / length
+    return (np.outer(n, n) + 0.3 * (np.eye(3) - np.outer(n, n))) / length**2
+
+
+def _dense_modes(rest: np.ndarray, mass: np.ndarray, pinned: np.ndarray, pairs: set[tuple[int, int]]):
+    stiffness = np.zeros((len(rest), 3, len(rest), 3))
+    for i, j in pairs:
+        block = _spring_block(rest[i], rest[j])
+        for a, b, sign in ((i, i, 1), (j, j, 1), (i, j, -1), (j, i, -1)):
+            stiffness[a, :, b] += sign * block
+    free = np.flatnonzero(~pinned)
+    k = stiffness[free][:, :, free].reshape(3 * len(free), -1)
+    values, vectors = scipy.linalg.eigh(k, np.diag(np.repeat(mass[free], 3)))
+    full = np.zeros((len(rest), 3, len(values)))
+    full[free] = vectors.reshape(len(free), 3, -1)
+    return values, full
+
+
+def _same_spaces(phi: np.ndarray, reference: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    overlap = np.einsum("ndm,n,ndk->mk", phi, mass, reference)
+    return np.linalg.svd(overlap, compute_uv=False)
+
+
+def test_modes_of_a_chain_solve_the_generalised_eigenproblem() -> None:
+    rng = np.random.default_rng(0)
+    # Links grow, so that the nearest neighbour of every bead is the one before it: the springs are the chain.
+    steps = (
+        np.array([[1.0, 0.2 * math.sin(i), 0.2 * math.cos(2 * i)] for i in range(11)]) * 1.12 ** np.arange(11)[:, None]
+    )
+    rest = np.concatenate((np.zeros((1, 3)), np.cumsum(steps, 0)))
+    mass, pinned = rng.uniform(0.5, 2.0, 12), np.arange(12) == 0
+    values, phi = vibration_modes(rest, mass, pinned, modes=7, neighbours=1)
+    expected, reference = _dense_modes(rest, mass, pinned, {(i, i + 1) for i in range(11)})
+    np.testing.assert_allclose(values, np.maximum(expected[:7], 1e-4 * expected[6]) / expected[0], rtol=1e-9)
+    np.testing.assert_allclose(np.einsum("ndm,n,ndk->mk", phi, mass, phi), np.eye(7), atol=1e-10)
+    np.testing.assert_allclose(_same_spaces(phi, reference[:, :, :7], mass), np.ones(7), atol=1e-9)
+    assert values[-1] > 2 * values[0] and not phi[0].any()
+
+
+def test_large_networks_use_the_sparse_solver_and_agree_with_the_dense_one() -> None:
+    rng = np.random.default_rng(1)
+    rest, mass = rng.uniform(size=(130, 3)) * (1, 0.5, 2), rng.uniform(0.5, 2.0, 130)
+    pinned = rest[:, 2] < 0.2
+    assert 3 * int((~pinned).sum()) > 300
+    values, phi = vibration_modes(rest, mass, pinned, modes=5, neighbours=8)
+    near = np.argsort(np.linalg.norm(rest[:, None] - rest, axis=-1), 1)[:, 1:9]
+    pairs = {(min(i, int(j)), max(i, int(j))) for i in range(130) for j in near[i]}
+    expected, reference = _dense_modes(rest, mass, pinned, pairs)
+    np.testing.assert_allclose(values, expected[:5] / expected[0], rtol=1e-6)
+    np.testing.assert_allclose(_same_spaces(phi, reference[:, :, :5], mass), np.ones(5), atol=1e-6)
+
+
+def test_mode_gradients_of_an_affine_motion_are_its_matrix() -> None:
+    rng = np.random.default_rng(2)
+    rest, matrices = rng.uniform(size=(60, 3)), rng.normal(size=(3, 3, 4))
+    motion = np.einsum("ijm,nj->nim", matrices, rest) + rng.normal(size=(1, 3, 4))
+    found = mode_gradients(rest, motion, 8)
+    error = np.abs(found - matrices)  # the ridge shrinks gradients a little where neighbours are almost coplanar
+    assert error.max() < 0.1 and np.median(error) < 0.01
+
+
+@pytest.fixture
+def elastic(make_scene) -> ElasticScene:
+    hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
+    scene = ElasticScene(hierarchy, 1, modes=9, neighbours=8, period=12.0, hidden=0, amplitude=0.02)
+    return scene.double().requires_grad_(False)
+
+
+def _undamped(scene: ElasticScene) -> None:
+    scene.damping.fill_(-1e4)
+
+
+@pytest.mark.parametrize("mode", [0, 3, 8])
+def test_undamped_mode_keeps_its_amplitude_and_turns_by_two_atan_half_omega(elastic: ElasticScene, mode: int) -> None:
+    _undamped(elastic)
+    omega = 2 * math.pi / 12.0 * math.sqrt(float(elastic.values[mode]))
+    angle = 2 * math.atan(omega / 2)
+    shape = elastic.modes[None, :, :, mode]
+    before, now = shape * math.cos(-angle), shape * 1.0
+    peak = 0.0
+    for frame in range(1, 501):
+        z = elastic(now, before)[0]
+        assert abs(float(z[mode]) - math.cos(angle * frame)) < 1e-3
+        assert float(z[torch.arange(9) != mode].abs().max()) < 1e-3  # without mixing the modes do not talk
+        before, now = now, torch.einsum("m,ndm->nd", z, elastic.modes)[None]
+        peak = max(peak, abs(float(z[mode])))
+    assert peak > 0.99
+
+
+def test_first_mode_starts_with_the_given_period(elastic: ElasticScene) -> None:
+    stiffness = _stiffness(elastic)
+    assert math.sqrt(float(torch.linalg.eigvalsh(stiffness)[0])) == pytest.approx(2 * math.pi / 12.0, rel=1e-6)
+
+
+def _stiffness(scene: ElasticScene) -> torch.Tensor:
+    a, _, inverse = scene.matrices()
+    return 2 * (2 * torch.eye(len(a)) - torch.linalg.solve(inverse, a))
+
+
+def _shake(scene: ElasticScene, generator: torch.Generator) -> None:
+    for p in scene.parameters():
+        p.copy_(torch.randn(p.shape, generator=generator, dtype=torch.float64) * (3.0 if p.ndim == 2 else 0.5))
+
+
+@pytest.mark.parametrize("damped", [False, True])
+@pytest.mark.parametrize("seed", range(3))
+def test_discrete_energy_never_grows_for_random_mixing(elastic: ElasticScene, seed: int, damped: bool) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    _shake(elastic, generator)
+    if not damped:
+        _undamped(elastic)
+    stiffness = _stiffness(elastic)
+    assert float((stiffness - torch.diag(stiffness.diagonal())).abs().max()) > 0.1  # the modes do mix
+    a, b, _ = elastic.matrices()
+    before, now = torch.randn(2, 9, generator=generator, dtype=torch.float64)
+    energies = []
+    for _ in range(2000):
+        velocity, middle = now - before, (now + before) / 2
+        energies.append(float(velocity @ velocity + middle @ stiffness @ middle) / 2)
+        before, now = now, a @ now - b @ before
+    energy = torch.tensor(energies, dtype=torch.float64)
+    assert bool((energy.diff() <= 1e-9 * energy[0]).all())
+    if damped:
+        assert float(energy[-1]) < 0.5 * float(energy[0])
+    else:
+        assert float(energy[-1]) == pytest.approx(float(energy[0]), rel=1e-6)
+
+
+def test_single_precision_rollout_stays_bounded_for_2000_steps(make_scene) -> None:
+    hierarchy = build_hierarchy(make_scene(90), radii=(0.2, 0.5))
+    scene = ElasticScene(hierarchy, 1, modes=9, neighbours=8, period=6.0, hidden=0, amplitude=0.02).requires_grad_(
+        False
+    )
+    generator = torch.Generator().manual_seed(7)
+    _shake(scene.double(), generator)
+    scene.float()
+    start = torch.randn(2, 9, generator=generator)
+    before, now = (torch.einsum("m,ndm->nd", z, scene.modes)[None] for z in start)
+    largest = []
+    for _ in range(2000):
+        z = scene(now, before)
+        before, now = now, torch.einsum("sm,ndm->snd", z, scene.modes)
+        largest.append(float(z.abs().max()))
+    assert max(largest) < 1e3 and max(largest[1000:]) <= max(largest[:1000])
+
+
+def _template(make_model, scene, **options):
+    return make_model(scene, zero_output=True, template=partial(ElasticTemplate, modes=9, neighbours=8, **options))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("amount", [0.3, 60.0])
+def test_template_gradients_conserve_volume(make_scene, make_model, amount) -> None:
+    scene = make_scene(90, dtype=torch.float64)
+    spread = {}
+    for conserve in (True, False):
+        model = _template(make_model, scene, conserve_volume=conserve)
+        batch = model.batch((0,))
+        rest = model.hierarchies[0].levels[1].rest
+        modes, _ = model.template.basis(0)
+        now = rest + modes @ torch.linspace(amount, -amount, 9, dtype=torch.float64)
+        state = model.template(batch, Motion(rest, now, now))
+        det = torch.linalg.det(state.gradients)
+        assert bool(torch.isfinite(state.gradients).all()) and float(det.min()) > 0
+        spread[conserve] = float((det - 1).abs().max())
+        assert float((state.gradients - torch.eye(3)).abs().max()) > 1e-3
+    assert spread[True] < 1e-5 < 1e-3 < spread[False]
+
+
+@torch.no_grad()
+def test_simulator_carries_a_mode_through_its_whole_recursion(make_scene, make_model) -> None:
+    """One undamped mode, zero network output: kernels of the full simulator swing as the formula says."""
+    scene = make_scene(90, dtype=torch.float64)
+    model = _template(make_model, scene, hidden=0, period=12.0)
+    model.log_density[0].zero_()  # modes are those of unit density
+    inner = model.template.scenes[0]
+    inner.damping.fill_(-1e4)
+    initial = ModalInitialStates(model, [0]).double()
+    initial.velocity[0][0] = 0.5
+    offset = scene.means - initial.previous(0)  # amplitude times the first mode, at every kernel
+    angle = 2 * math.atan(math.pi / 12.0)
+    start = SimState(scene.means, scene.means - offset * math.sin(angle))
+    trajectory = model.dynamics().rollout(start, 40)
+    level, unit = model.hierarchies[0].levels[1], model.hierarchies[0].ancestor(0, 1)
+    moved = trajectory.positions[:, model.hierarchies[0].kernels] - level.rest[unit]
+    weight = model.hierarchies[0].levels[0].volume[:, None]
+    centre = torch.zeros(41, level.count, 3, dtype=torch.float64).index_add(1, unit, moved * weight)
+    centre = centre / level.volume[:, None]
+    expected = torch.sin(angle * torch.arange(41, dtype=torch.float64))
+    shape = model.template.basis(0)[0][..., 0] * 0.5
+    assert float(shape.abs().max()) > 1e-3
+    error = (centre - expected[:, None, None] * shape).abs().max()
+    assert float(error) < 1e-5 * float(shape.abs().max()) + 1e-9
+
+
+def test_parameters_are_grouped_by_role(make_scene, make_model) -> None:
+    model = _template(make_model, [make_scene(60), make_scene(50, seed=1)], hidden=8)
+    groups = model.parameter_groups()
+    ids = [id(p) for group in groups.values() for p in group]
+    assert len(ids) == len(set(ids)) and set(ids) == {id(p) for p in model.parameters()}
+    assert all(any(p is q for q in groups["network"]) for p in model.template.networks())
+    assert any(p is model.template.scenes[1].mixing for p in groups["template"])
+    assert any(p is model.attributes[1] for p in groups["scene"])

@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+
+from gausim.core import ConfigError
+from gausim.models.elastic import ElasticTemplate
+from gausim.models.initial_state import FreeInitialStates, ModalInitialStates
+
+
+@pytest.fixture
+def model(make_scene, make_model):
+    template = partial(ElasticTemplate, modes=5, neighbours=6, hidden=4)
+    return make_model([make_scene(60), make_scene(50, seed=1)], template=template)
+
+
+@pytest.mark.parametrize("kind", [FreeInitialStates, ModalInitialStates])
+def test_starts_at_rest_and_moves_only_free_kernels(model, kind) -> None:
+    initial = kind(model, [0, 1, 0])
+    parameters = list(initial.parameters())
+    assert len(parameters) == 3
+    for number, scene_id in enumerate((0, 1, 0)):
+        scene = model.scenes[scene_id]
+        assert torch.equal(initial.previous(number), scene.means)
+        with torch.no_grad():
+            parameters[number].copy_(torch.randn(parameters[number].shape))
+        moved = initial.previous(number).detach() - scene.means
+        free = scene.simulated & ~scene.pinned
+        assert not bool(moved[~free].any())
+        assert float(moved[free].norm(dim=-1).min()) > 0
+
+
+@pytest.mark.parametrize("kind", [FreeInitialStates, ModalInitialStates])
+def test_only_the_sequence_that_is_asked_for_gets_a_gradient(model, kind) -> None:
+    initial = kind(model, [0, 1, 0])
+    initial.previous(2).square().sum().backward()
+    gradients = [p.grad for p in initial.parameters()]
+    assert gradients[0] is None and gradients[1] is None
+    assert float(gradients[2].abs().max()) > 0
+
+
+def test_free_displacement_is_in_diagonals_of_the_scene(model) -> None:
+    initial = FreeInitialStates(model, [0, 1])
+    torch.nn.init.constant_(initial.offset[1], 0.01)
+    scene = model.scenes[1]
+    moved = (initial.previous(1) - scene.means)[scene.simulated & ~scene.pinned]
+    assert torch.allclose(moved, torch.full_like(moved, 0.01 * scene.diagonal), atol=1e-6)
+
+
+def test_modal_velocity_moves_units_as_the_basis_says(model) -> None:
+    initial = ModalInitialStates(model, [0])
+    velocity = torch.randn(5, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        initial.velocity[0].copy_(velocity)
+    scene, hierarchy = model.scenes[0], model.hierarchies[0]
+    moved = (scene.means - initial.previous(0).detach())[hierarchy.kernels]
+    level, unit = hierarchy.levels[1], hierarchy.ancestor(0, 1)
+    modes, gradients = model.template.basis(0)
+    for c in (~level.pinned).nonzero()[:, 0].tolist():
+        weight = hierarchy.levels[0].volume[unit == c, None]
+        centre = (weight * moved[unit == c]).sum(0) / weight.sum()
+        assert torch.allclose(centre, modes[c] @ velocity, atol=1e-5)
+        offset = scene.means[hierarchy.kernels][unit == c] - level.rest[c]
+        within = moved[unit == c] - modes[c] @ velocity
+        assert torch.allclose(within, offset @ (gradients[c] @ velocity).T, atol=1e-5)
+
+
+def test_template_without_a_basis_is_refused(make_scene, make_model) -> None:
+    with pytest.raises(ConfigError, match="RestTemplate carries no basis.*FreeInitialStates"):
+        ModalInitialStates(make_model(make_scene(40)), [0])
