@@ -164,8 +164,9 @@ def test_single_precision_rollout_stays_bounded_for_2000_steps(make_scene) -> No
     assert max(largest) < 1e3 and max(largest[1000:]) <= max(largest[:1000])
 
 
-def _template(make_model, scene, **options):
-    return make_model(scene, zero_output=True, template=partial(ElasticTemplate, modes=9, neighbours=8, **options))
+def _template(make_model, scene, *, conserve_mass=True, **options):
+    template = partial(ElasticTemplate, modes=9, neighbours=8, **options)
+    return make_model(scene, zero_output=True, conserve_mass=conserve_mass, template=template)
 
 
 @torch.no_grad()
@@ -174,7 +175,7 @@ def test_template_gradients_conserve_volume(make_scene, make_model, amount) -> N
     scene = make_scene(90, dtype=torch.float64)
     spread = {}
     for conserve in (True, False):
-        model = _template(make_model, scene, conserve_volume=conserve)
+        model = _template(make_model, scene, conserve_mass=conserve)
         batch = model.batch((0,))
         rest = model.hierarchies[0].levels[1].rest
         modes, _ = model.template.basis(0)
