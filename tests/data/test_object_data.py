@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from gausim.cli._config import compose
 from gausim.core import ConfigError, DataError, SceneError
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData, find_objects
@@ -176,9 +178,11 @@ def test_true_motion_is_none_where_unknown(spoilt: Path) -> None:
 
 def test_scene_without_a_pinned_kernel_says_how_to_pin_one(spoilt: Path) -> None:
     (spoilt / "scene.masks.npz").unlink()
-    with pytest.raises(SceneError, match=r"no kernel is pinned.*data.selections.pinned"):
+    with pytest.raises(SceneError, match=r"no kernel is pinned.*gausim inspect SCENE --pin-below") as caught:
         ObjectData(spoilt).scene()
-    assert not ObjectData(spoilt, free_root=True).scene().pinned.any()
+    override = re.findall(r"'(data\.selections=.*)'", str(caught.value))
+    config = compose("train", [*override, f"data.root={spoilt}"])  # the override that is proposed, as it is
+    assert ObjectData(spoilt, selections=config.data.selections).scene().pinned.any()
 
 
 def test_selections_replace_masks(blob: Path) -> None:

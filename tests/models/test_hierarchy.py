@@ -108,7 +108,7 @@ def test_permuting_kernels_permutes_the_clusters(make_scene, permuted, clusterin
 def test_scene_that_nothing_holds_is_refused_with_the_remedy(make_scene) -> None:
     scene = make_scene(40)
     loose = dataclasses.replace(scene, pinned=torch.zeros_like(scene.pinned))
-    with pytest.raises(SceneError, match=r"column0: no kernel is pinned.*--pin-below.*mask 'pinned'"):
+    with pytest.raises(SceneError, match=r"column0: no kernel is pinned.*--pin-below.*data.selections"):
         build_hierarchy(loose, radii=RADII)
     rigid = dataclasses.replace(scene, pinned=scene.simulated)
     with pytest.raises(SceneError, match="every simulated kernel is pinned"):

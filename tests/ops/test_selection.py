@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
+
 import pytest
 import torch
 
 from gausim.core.errors import SceneError
 from gausim.core.scene import GaussianScene
-from gausim.ops.selection import Box, ColorBall, HalfSpace, NearPoints, apply_masks, parse_half_space
+from gausim.ops.selection import (
+    Box,
+    ColorBall,
+    HalfSpace,
+    NearPoints,
+    apply_masks,
+    parse_half_space,
+    require_pinned,
+)
 
 
 @pytest.fixture
@@ -74,3 +85,25 @@ def test_empty_selection_is_refused_with_the_extent(scene: GaussianScene) -> Non
 def test_half_space_of_another_form_is_refused(text: str) -> None:
     with pytest.raises(SceneError, match="AXIS=VALUE"):
         parse_half_space(text)
+
+
+def test_what_nothing_holds_and_what_nothing_frees_is_refused(scene: GaussianScene) -> None:
+    held = apply_masks(scene, pinned=parse_half_space("z=0.1"))
+    assert require_pinned(held) is held
+    with pytest.raises(SceneError, match="every simulated kernel is pinned"):
+        require_pinned(dataclasses.replace(scene, pinned=scene.simulated))
+    with pytest.raises(SceneError, match="mask 'simulated' marks no kernel"):
+        require_pinned(dataclasses.replace(scene, simulated=scene.pinned))
+    with pytest.raises(SceneError, match="no kernel is pinned") as caught:
+        require_pinned(scene)
+    proposed = re.findall(r"z=[-.0-9e]+", str(caught.value))
+    assert len(proposed) == 2  # one for either remedy
+    assert {tuple(selected(parse_half_space(text)(scene))) for text in proposed} == {(0,)}
+
+
+def test_the_height_proposed_for_pins_holds_something_that_is_simulated(scene: GaussianScene) -> None:
+    raised = dataclasses.replace(scene, simulated=torch.tensor([False, False, True, True]))
+    with pytest.raises(SceneError) as caught:
+        require_pinned(raised)
+    height = re.findall(r"--pin-below (z=\S+)", str(caught.value))[0]
+    assert selected(apply_masks(raised, pinned=parse_half_space(height)).pinned) == [2]

@@ -36,9 +36,9 @@ def simulate_scene(arguments: argparse.Namespace) -> int:
     from gausim.cli.inspect import pinned_by
     from gausim.cli.simulate import parse_background
     from gausim.core.errors import ConfigError
-    from gausim.data.scenes import require_pinned
     from gausim.io.ply import load_scene
     from gausim.ops.orbit import orbit_cameras
+    from gausim.ops.selection import require_pinned
 
     if not arguments.random_weights:
         raise ConfigError("--scene has no trained network: add --random-weights, or simulate a RUN of that scene.")

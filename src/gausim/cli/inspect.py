@@ -38,8 +38,6 @@ def main(argv: list[str]) -> int:
         raise SceneError(f"--radii {arguments.radii}: expected fractions of the diagonal in (0, 1], fine to coarse.")
     scene = _marked(load_scene(arguments.scene, masks=arguments.masks), arguments)
     _print_scene(scene)
-    if not scene.pinned.any():
-        raise SceneError(_no_pins(scene))
     hierarchy = build_hierarchy(scene, radii=arguments.radii, clustering=arguments.clustering)
     _print_hierarchy(hierarchy, arguments.radii)
     out = Path(arguments.out) if arguments.out else Path(f"{Path(arguments.scene).stem}.clusters.png")
@@ -97,15 +95,6 @@ def _marked(scene: GaussianScene, arguments: argparse.Namespace) -> GaussianScen
             mask = scene.simulated & parse_half_space(text, above=above)(scene)
             scene = apply_masks(scene, simulated=mask)
     return pinned_by(scene, arguments.pin_below, arguments.pin_above)
-
-
-def _no_pins(scene: GaussianScene) -> str:
-    low, high = scene.means.amin(0).tolist(), scene.means.amax(0).tolist()
-    example = low[2] + 0.1 * (high[2] - low[2])
-    return (
-        f"{scene.name}: no kernel is pinned; expected at least one, the root that holds the object. Mark some, e.g. "
-        f"--pin-below z={example:.3g} (or --pin-above where up is negative), and keep them with --save-masks."
-    )
 
 
 def _print_scene(scene: GaussianScene) -> None:

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from gausim.core import DataError, GaussianScene
 from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_array, read_stills
-from gausim.data.scenes import require_pinned, select_masks
+from gausim.data.scenes import select_masks
 from gausim.io.ply import load_scene
 from gausim.io.transforms import read_json
-from gausim.ops.selection import Selection
+from gausim.ops.selection import Selection, require_pinned
 
 
 class ObjectData:

@@ -1,10 +1,10 @@
-"""The rest scene of a data set: masks that the data config selects, and the pinned kernel that every scene needs."""
+"""The rest scene of a data set: masks that the data config selects."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from gausim.core import ConfigError, GaussianScene, SceneError
+from gausim.core import ConfigError, GaussianScene
 from gausim.ops.selection import Selection, apply_masks, parse_half_space
 
 MASKS = ("simulated", "pinned", "foreground")
@@ -24,15 +24,3 @@ def select_masks(scene: GaussianScene, selections: Mapping[str, Selection | str]
     return apply_masks(
         scene, simulated=given.get("simulated"), pinned=given.get("pinned"), foreground=given.get("foreground")
     )
-
-
-def require_pinned(scene: GaussianScene) -> GaussianScene:
-    """Returns the scene, or raises :class:`SceneError` where no kernel is pinned, saying how to pin some."""
-    if not scene.pinned.any():
-        low, high = float(scene.means[:, 2].amin()), float(scene.means[:, 2].amax())
-        raise SceneError(
-            f"{scene.name}: no kernel is pinned, so nothing holds the object. Put a boolean array 'pinned' into the "
-            f"scene's .masks.npz, or select kernels in the data config, e.g. data.selections.pinned='z="
-            f"{low + 0.1 * (high - low):.3g}' for the lowest tenth; data.free_root=true if it floats."
-        )
-    return scene

@@ -11,9 +11,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gausim.core import ConfigError, GaussianScene, SceneError
+from gausim.core import ConfigError, GaussianScene
 from gausim.ops.clustering import CLUSTERINGS
 from gausim.ops.covariance import kernel_volumes
+from gausim.ops.selection import require_pinned
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,18 +99,6 @@ def build_hierarchy(scene: GaussianScene, *, radii: Sequence[float], clustering:
         if not top:
             rest, volume, pinned = _coarsen(rest, volume, pinned, parent)
     return Hierarchy(tuple(levels), index, scene.diagonal)
-
-
-def require_pinned(scene: GaussianScene) -> None:
-    """Raises :class:`SceneError` with the remedy when nothing holds the object, or nothing of it is free."""
-    if not bool(scene.pinned.any()):
-        raise SceneError(
-            f"{scene.name}: no kernel is pinned; expected at least one root that holds the object. Mark it with "
-            "`gausim inspect SCENE --pin-below z=HEIGHT --save-masks`, or write the mask 'pinned' of the side file "
-            "SCENE.masks.npz."
-        )
-    if not bool((scene.simulated & ~scene.pinned).any()):
-        raise SceneError(f"{scene.name}: every simulated kernel is pinned; expected some that are free to move.")
 
 
 def _cluster_by_group(rest: Tensor, pinned: Tensor, diameter: float, clustering: str) -> Tensor:

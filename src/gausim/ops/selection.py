@@ -137,6 +137,28 @@ def parse_half_space(text: str, *, above: bool = False) -> HalfSpace:
     return HalfSpace(axis, above=value) if above else HalfSpace(axis, below=value)
 
 
+def require_pinned(scene: GaussianScene) -> GaussianScene:
+    """Returns the scene if something holds it and something of it may move.
+
+    Raises:
+        SceneError: no kernel is simulated, none is pinned (says how to pin some), or every simulated one is.
+    """
+    if not scene.simulated.any():
+        raise SceneError(f"{scene.name}: mask 'simulated' marks no kernel; expected those of the object that moves.")
+    if not scene.pinned.any():
+        z = scene.means[scene.simulated, 2]
+        low, high = float(z.amin()), float(z.amax())
+        height = f"z={low + 0.1 * (high - low):.3g}"
+        raise SceneError(
+            f"{scene.name}: no kernel is pinned; expected at least one root that holds the object. Store the mask with "
+            f"`gausim inspect SCENE --pin-below {height} --save-masks` (here the lowest tenth; --pin-above where up is "
+            f"negative), or select kernels in the data config, 'data.selections={{pinned: \"{height}\"}}'."
+        )
+    if not (scene.simulated & ~scene.pinned).any():
+        raise SceneError(f"{scene.name}: every simulated kernel is pinned; expected some that are free to move.")
+    return scene
+
+
 def apply_masks(
     scene: GaussianScene,
     *,
