@@ -120,5 +120,5 @@ def test_scenes_without_rates_or_roots_are_refused(make_scene) -> None:
         with pytest.raises(ConfigError, match="expected one rate per scene, at least one"):
             GausSim(scenes, fps)
     loose = replace(scene, pinned=torch.zeros_like(scene.pinned))
-    with pytest.raises(SceneError, match="no kernel is pinned.*Mark it with"):
+    with pytest.raises(SceneError, match="no kernel is pinned.*gausim inspect SCENE"):
         GausSim([loose], [24.0], hidden=8, layers=2)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
 
@@ -48,10 +50,7 @@ def test_zero_output_is_the_rest_state_from_any_state(
 
 def test_zero_output_at_rest_stays_at_rest_with_the_elastic_template(make_scene, make_model) -> None:
     scene = make_scene()
-
-    def template(hierarchies, finest):
-        return ElasticTemplate(hierarchies, finest, modes=8, neighbours=6, hidden=8)
-
+    template = partial(ElasticTemplate, modes=8, neighbours=6, hidden=8)
     model = make_model(scene, zero_output=True, template=template)
     with torch.no_grad():  # an untrained force would be zero anyway
         for p in model.template.networks():
@@ -68,7 +67,7 @@ def test_pinned_and_never_simulated_kernels_never_move_in_1000_steps(make_scene,
     options = {"edges": "rest", "output_scale": 0.2}
     if elastic:
         options["output_scale"] = 1e-3  # random corrections of a template that remembers them may grow without bound
-        options["template"] = lambda h, finest: ElasticTemplate(h, finest, modes=6, neighbours=6, hidden=0)
+        options["template"] = partial(ElasticTemplate, modes=6, neighbours=6, hidden=0)
     model = make_model(scene, **options)
     generator = torch.Generator().manual_seed(0)
 

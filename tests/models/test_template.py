@@ -12,7 +12,7 @@ from gausim.ops.deformation import gradient_from_output
 class _Given(Template):
     """A fixed random configuration of the finest units."""
 
-    def __init__(self, hierarchies, finest) -> None:
+    def __init__(self, hierarchies, finest, *, conserve_volume) -> None:
         super().__init__()
         level = hierarchies[0].levels[finest]
         generator = torch.Generator().manual_seed(0)
