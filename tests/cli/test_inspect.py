@@ -8,6 +8,7 @@ import cv2
 import pytest
 import torch
 
+from gausim.cli._config import compose
 from gausim.cli.main import main
 from gausim.core.scene import GaussianScene
 from gausim.io.ply import load_scene, masks_path, save_scene
@@ -96,3 +97,24 @@ def test_wrong_options_are_explained(
 def test_missing_scene_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["inspect", str(tmp_path / "absent.ply")]) == 2
     assert "absent.ply: no such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["gausim", "gausim_paper"])
+def test_the_default_hierarchy_is_that_of_the_models(
+    option: str, scene_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    simulator = compose("train", [f"model={option}"]).model.simulator
+    common = ["inspect", str(scene_file), "--pin-below", "z=0.1", "--out", str(scene_file.parent / "clusters.png")]
+    assert main(common) == 0
+    default = capsys.readouterr().out
+    radii = [str(radius) for radius in simulator.radii]
+    assert main([*common, "--clustering", simulator.clustering, "--radii", *radii]) == 0
+    assert capsys.readouterr().out == default
+    assert all(f"{float(radius):.3g} of diagonal" in default for radius in radii)
+
+
+def test_help_says_what_radii_are_fractions_of(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["inspect", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "fractions of the diagonal" in text and "0.13 0.4" in text

@@ -13,8 +13,9 @@ if TYPE_CHECKING:
 
 HELP = "Print a scene's kernels and hierarchy and draw its clusters."
 
-# Cluster diameters as fractions of the bounding-box diagonal (METHOD section 1, the range of the paper's objects).
-DEFAULT_RADII = (0.04, 0.3)
+# The hierarchy of the model configurations (conf/model), which take a while to compose.
+DEFAULT_RADII = (0.13, 0.4)
+DEFAULT_CLUSTERING = "ball"
 
 
 def main(argv: list[str]) -> int:
@@ -60,8 +61,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--simulate-above", metavar="AXIS=VALUE", help="simulate only kernels above")
     add("--save-masks", action="store_true", help="store the masks so that every command uses them")
     add("--radii", type=float, nargs="+", default=list(DEFAULT_RADII), metavar="R",
-        help="largest cluster diameter per level, fine to coarse [fraction of the bounding-box diagonal]")  # fmt: skip
-    add("--clustering", default="ball", choices=("ball", "complete_linkage"), help="clustering method")
+        help="largest cluster diameter per level, fine to coarse, as fractions of the diagonal of the simulated kernels' "
+        "bounding box; default {:g} {:g}, as in the model configurations".format(*DEFAULT_RADII))  # fmt: skip
+    add("--clustering", default=DEFAULT_CLUSTERING, choices=("ball", "complete_linkage"),
+        help="clustering method; default %(default)s, as in the model configurations")  # fmt: skip
     add("--up", choices=("x", "y", "z", "-x", "-y", "-z"),
         help="axis drawn upwards (write --up=-y); default away from the pins, else z")  # fmt: skip
     add("--out", metavar="PICTURE.png", help="picture of the clusters; default <stem>.clusters.png")

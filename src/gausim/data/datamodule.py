@@ -38,7 +38,6 @@ class ReadyDataModule(LightningDataModule):
         seed: int = 0,
         names: Sequence[str] | None = None,
         sequences: int | Sequence[str] | None = None,
-        free_root: bool = False,
     ) -> None:
         """Keeps the settings; the disk is first touched by :attr:`objects` or :meth:`setup`.
 
@@ -54,13 +53,11 @@ class ReadyDataModule(LightningDataModule):
             seed: of the order.
             names: keep only the objects of these names.
             sequences: keep only so many sequences per object, or those of these names.
-            free_root: accept scenes that pin no kernel.
         """
         super().__init__()
         self._root, self._names, self._sequences = root, names, sequences
         self._options: dict[str, Any] = {"scene": scene, "masks": masks, "selections": selections}
         self._batch_size, self._repeats, self._seed = batch_size, repeats, seed
-        self._free_root = free_root
         self.curriculum = curriculum if curriculum is not None else Curriculum()
         self._sampler: SequenceBatchSampler | None = None
 
@@ -145,7 +142,7 @@ class ReadyDataModule(LightningDataModule):
         roots = find_objects(root)
         if len(roots) > 1 and any(options[key] is not None for key in ("scene", "masks")):
             raise ConfigError(f"data.root: 'scene' and 'masks' are of one object, but {root} holds {len(roots)}.")
-        return [ObjectData(r, sequences=self._sequences, free_root=self._free_root, **options) for r in roots]
+        return [ObjectData(r, sequences=self._sequences, **options) for r in roots]
 
     def _check_curriculum(self) -> None:
         for item in self.objects:

@@ -44,7 +44,6 @@ class ObjectData:
         scene: Path | str | None = None,
         masks: Path | str | None = None,
         selections: Mapping[str, Selection | str] | None = None,
-        free_root: bool = False,
     ) -> None:
         """Reads ``dataset.json``; everything else is read when first asked for.
 
@@ -54,7 +53,6 @@ class ObjectData:
             scene: PLY of the rest scene; ``root/scene.ply`` when None.
             masks: npz of its masks; beside the PLY when None.
             selections: what replaces its masks, see :func:`gausim.data.scenes.select_masks`.
-            free_root: accept a scene without a pinned kernel.
 
         Raises:
             DataError: ``dataset.json`` is missing or a field of it is wrong.
@@ -71,7 +69,7 @@ class ObjectData:
         self._check_views(path)
         self.scene_path = Path(scene) if scene is not None else self.root / "scene.ply"
         self.masks_path = Path(masks) if masks is not None else None
-        self._chosen, self._selections, self._free_root = sequences, dict(selections or {}), free_root
+        self._chosen, self._selections = sequences, dict(selections or {})
 
     @cached_property
     def sequences(self) -> list[SequenceRecord]:
@@ -132,7 +130,7 @@ class ObjectData:
 
         Raises:
             DataError: there is no scene file yet.
-            SceneError: the scene is unusable, or pins nothing and ``free_root`` is off.
+            SceneError: the scene is unusable or pins nothing.
         """
         if not self.scene_path.is_file():
             raise DataError(
@@ -140,7 +138,7 @@ class ObjectData:
                 "or name one in the data config (scene: path/to/scene.ply)."
             )
         scene = select_masks(load_scene(self.scene_path, masks=self.masks_path, name=self.name), self._selections)
-        return scene if self._free_root else require_pinned(scene)
+        return require_pinned(scene)
 
     def _check_views(self, path: Path) -> None:
         both = set(self.train_views) & set(self.heldout_views)
