@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -132,6 +134,40 @@ def test_a_sweep_gives_every_seed_its_directory(tmp_path: Path, monkeypatch: pyt
     assert [seed for seed, _ in seen] == [3, 4]
     assert [path.name for _, path in seen] == ["seed_3", "seed_4"]
     assert sys.argv[1:] != ["-m", "seed=3,4", "name=rose"]
+
+
+@pytest.mark.parametrize(
+    "swept",
+    [
+        ["model.simulator.layers=2,3"],
+        ["loss=default,paper", "seed=3,4"],
+        ["trainer.max_minutes=1,2", "ablation=none,mass_off", "model=gausim,gausim_paper"],
+        ["data.root=a/b,a/../b,a_b"],
+        ["name=rose,tulip"],
+        ["experiment=bunny,bunny_paper", "name=rose"],
+    ],
+)
+def test_jobs_of_a_sweep_never_share_a_directory(
+    swept: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    seen: list[Path] = []
+    arguments = ["-m", *swept, "paths.output_root=o", *(() if swept[-1].startswith("name") else ("name=rose",))]
+    run_hydra("train", lambda config: seen.append(_config.run_dir()), arguments)
+    assert len(seen) == math.prod(len(override.split(",")) for override in swept)
+    assert len(set(seen)) == len(seen)
+    for path in seen:
+        inside = path.resolve().relative_to(tmp_path / "o")
+        assert inside.name.startswith("seed_")
+        assert not re.search(r"(name|seed|ablation|model|output_root)=", str(inside))  # said by the path already
+
+
+def test_a_folder_name_is_one_short_component_and_tells_texts_apart() -> None:
+    assert _config.folder_name("") == "" and _config.folder_name("a.b=1,+c=x") == "a.b=1,+c=x"
+    texts = ["a/b", "a_b", "a//b", "a b", "../b", "k=" + 200 * "x", "k=" + 201 * "x"]
+    names = [_config.folder_name(text) for text in texts]
+    assert len(set(names)) == len(names)
+    assert all("/" not in name and len(name) <= 120 for name in names)
 
 
 def test_an_experiment_wins_over_the_root_file() -> None:

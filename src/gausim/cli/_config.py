@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
 import os
 import re
 import sys
@@ -24,6 +25,7 @@ import gausim
 from gausim.core.errors import ConfigError, GausSimError
 
 HYDRA_VERSION_BASE = "1.3"
+LONGEST_FOLDER_NAME = 120
 # What a configuration may name in `_target_`. A configuration comes with data and runs from other people, so it must
 # not be able to call whatever the interpreter can import.
 ALLOWED_PACKAGES = ("gausim", "torch", "lightning", "torchmetrics", "kornia")
@@ -77,7 +79,16 @@ class RootConfig:
     task_name: str = "train"
 
 
+def folder_name(text: str) -> str:
+    """Returns a text as the name of one directory: the same if it can be, else legible, short and with a hash."""
+    plain = re.sub(r"[^\w.,=+~:-]+", "_", text)
+    if plain == text and len(text) <= LONGEST_FOLDER_NAME:
+        return text
+    return f"{plain[: LONGEST_FOLDER_NAME - 9]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+
+
 ConfigStore.instance().store(name="base_schema", node=RootConfig, provider="gausim")
+OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
 
 
 def conf_dir() -> Path:
