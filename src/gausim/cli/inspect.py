@@ -61,8 +61,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--simulate-above", metavar="AXIS=VALUE", help="simulate only kernels above")
     add("--save-masks", action="store_true", help="store the masks so that every command uses them")
     add("--radii", type=float, nargs="+", default=list(DEFAULT_RADII), metavar="R",
-        help="largest cluster diameter per level, fine to coarse, as fractions of the diagonal of the simulated kernels' "
-        "bounding box; default {:g} {:g}, as in the model configurations".format(*DEFAULT_RADII))  # fmt: skip
+        help="largest cluster diameter per level, fine to coarse, as fractions of the diagonal of the simulated "
+        "kernels' bounding box; default {:g} {:g}, as in the model configurations".format(*DEFAULT_RADII))  # fmt: skip
     add("--clustering", default=DEFAULT_CLUSTERING, choices=("ball", "complete_linkage"),
         help="clustering method; default %(default)s, as in the model configurations")  # fmt: skip
     add("--up", choices=("x", "y", "z", "-x", "-y", "-z"),
