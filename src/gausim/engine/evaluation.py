@@ -41,7 +41,7 @@ from gausim.report.tables import markdown
 Predict = Callable[[SequenceRecord], Trajectory]
 Rows = dict[str, dict[str, np.ndarray]]
 
-# METHOD's linear references; LEARNING's trials have the same two sizes.
+# Modes of the linear references: few, which are robust, and more, which follow finer motion.
 AR_MODES = (8, 24)
 # Pixels that are rendered and compared at once: about 100 MB of float images and their filters.
 PIXELS_AT_ONCE = 1 << 20

@@ -74,8 +74,8 @@ def forward_tile(records, entries, begin, end, left, top, alpha_max, buf):
 def backward_tile(records, entries, begin, end, left, top, alpha_max, buf, sums):
     """Adds the tile's contribution to ``sums`` (rows, SUMS); ``buf`` = [T | B | vr | vg | vb | last | x | y].
 
-    Runs back to front: B is the derivative with respect to what lies behind the current kernel (RENDERER recursion
-    B <- B + alpha (d - B)), T the transmittance in front of it.
+    Runs back to front: B is the derivative with respect to what lies behind the current kernel, by the recursion
+    B <- B + alpha (d - B) with d = v . colour of the kernel; T is the transmittance in front of it.
     """
     one, zero = np.float32(1), np.float32(0)
     final = np.float32(-1)
