@@ -23,6 +23,15 @@ def test_error_3d_weighs_every_frame_alike():
     assert float(metric.compute()) == pytest.approx(float(expected), rel=1e-6)
 
 
+def test_a_frame_that_is_not_a_number_is_not_left_out():
+    metric = Error3D()
+    prediction = torch.zeros(3, 4, 3)
+    metric.update(prediction, torch.ones(3, 4, 3), 2.0)
+    prediction[1, 2, 0] = torch.nan
+    metric.update(prediction, torch.ones(3, 4, 3), 2.0)
+    assert torch.isnan(metric.compute())
+
+
 def test_motion_energy_by_hand_with_mass():
     frames = torch.zeros(3, 2, 3)
     frames[1, 0, 0] = 2.0  # 4 in the first step, and back again

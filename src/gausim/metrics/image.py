@@ -2,43 +2,19 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import ClassVar
+from abc import abstractmethod
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torchmetrics import Metric
+
+from gausim.metrics.mean import PooledMean
 
 
-class ImageMetric(Metric, ABC):
-    """Mean over images of :meth:`per_image`; sums are reduced over ranks, so every rank computes the same mean.
+class ImageMetric(PooledMean):
+    """Mean over images of :meth:`per_image`.
 
-    A subclass is one file that states :meth:`per_image` and how its figure is printed:
-
-    Attributes:
-        key: name in result files.
-        label: name in tables and figures.
-        scale: tables print the value times this.
-        unit: what the printed number is in.
-        higher_is_better: which way is good.
+    A subclass is one file that states :meth:`per_image` and how its figure is printed (see :class:`PooledMean`).
     """
-
-    key: ClassVar[str]
-    label: ClassVar[str]
-    scale: ClassVar[float] = 1.0
-    unit: ClassVar[str] = ""
-    higher_is_better = False
-    is_differentiable = True
-    full_state_update = False
-
-    total: Tensor
-    count: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
 
     @abstractmethod
     def per_image(
@@ -65,14 +41,8 @@ class ImageMetric(Metric, ABC):
         mask: Bool[Tensor, "B H W"],
     ) -> None:
         """Adds a batch of images; images without a value (no foreground) do not count."""
-        values = self.per_image(prediction, target, mask).detach().double()
-        defined = ~values.isnan()
-        self.total += values[defined].sum()
-        self.count += defined.sum()
-
-    def compute(self) -> Float[Tensor, ""]:
-        """Mean over all images seen so far."""
-        return self.total / self.count
+        values = self.per_image(prediction, target, mask)
+        self.add(values[~values.isnan()])
 
 
 def masked_mean(values: Float[Tensor, "B H W"], mask: Bool[Tensor, "B H W"]) -> Float[Tensor, " B"]:
