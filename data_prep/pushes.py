@@ -32,13 +32,13 @@ class Push:
 
 
 def random_push(body: Body, kind: str, rng: np.random.Generator) -> Push:
-    """A push of the upper half of a body, mostly sideways, of 8 to 12 % of its diagonal."""
+    """A push of the upper half of a body, mostly sideways, of 5 to 8 % of its diagonal."""
     height = np.ptp(body.nodes[:, 2])
     upper = np.flatnonzero(body.nodes[:, 2] > body.nodes[:, 2].min() + 0.5 * height)
     point = body.nodes[rng.choice(upper)]
     angle, lift = rng.uniform(0, 2 * np.pi), rng.uniform(-0.5, 0.5) if kind == "poke" else 0.0
     direction = np.array([np.cos(angle), np.sin(angle), lift]) / np.hypot(1.0, lift)
-    return Push(kind, tuple(point.tolist()), tuple(direction.tolist()), float(rng.uniform(0.08, 0.12)))
+    return Push(kind, tuple(point.tolist()), tuple(direction.tolist()), float(rng.uniform(0.05, 0.08)))
 
 
 def push_field(body: Body, push: Push) -> Array:

@@ -36,10 +36,10 @@ class Recipe:
 
 # Periods of the slowest mode are about 14 frames (soft) and 9 frames (firm) at 24 frames per second.
 RECIPES = {
-    "pudding_soft": Recipe("pudding", Material(young_modulus=170.0, poisson_ratio=0.35, drag=0.7), 2e-3),
-    "pudding_firm": Recipe("pudding", Material(young_modulus=400.0, poisson_ratio=0.35, drag=0.7), 2e-3),
-    "flower_soft": Recipe("flower", Material(young_modulus=8e4, poisson_ratio=0.35, drag=0.7), 2e-4),
-    "flower_firm": Recipe("flower", Material(young_modulus=1.7e5, poisson_ratio=0.35, drag=0.7), 1.5e-4),
+    "pudding_soft": Recipe("pudding", Material(young_modulus=170.0, poisson_ratio=0.35, drag=0.5), 2e-3),
+    "pudding_firm": Recipe("pudding", Material(young_modulus=400.0, poisson_ratio=0.35, drag=0.5), 2e-3),
+    "flower_soft": Recipe("flower", Material(young_modulus=8e4, poisson_ratio=0.35, drag=0.5), 2e-4),
+    "flower_firm": Recipe("flower", Material(young_modulus=1.7e5, poisson_ratio=0.35, drag=0.5), 1.5e-4),
 }
 
 
