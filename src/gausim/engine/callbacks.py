@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -86,6 +87,7 @@ class EpochSummary(Callback):
         self._write(path, [row], append=path.is_file())
         if self._console and trainer.is_global_zero:
             pl_module.print(self._line(trainer, means))
+            sys.stdout.flush()  # where output is piped, the epochs of a long run should show as they end
 
     def _line(self, trainer: Trainer, means: dict[str, Any]) -> str:
         parts = [f"epoch {means['epoch']}/{trainer.max_epochs}", f"T {means.get('steps', math.nan):.0f}"]
