@@ -85,7 +85,7 @@ def test_true_motion_starts_at_rest_and_spares_the_pinned(made: Path) -> None:
             assert torch.equal(truth.rest, scene.means) and torch.equal(truth.positions[0], truth.rest)
             moved = (truth.positions - truth.rest).norm(dim=-1)
             assert moved[:, scene.pinned].max() == 0
-            assert 0.06 < moved.max() / scene.diagonal < 0.15
+            assert 0.04 < moved.max() / scene.diagonal < 0.1
             assert moved[1, ~scene.pinned].mean() > 0.005
 
 
@@ -181,7 +181,7 @@ def test_objects_swing_slowly_enough_to_be_filmed(name: str) -> None:
     push = random_push(body, "drag", np.random.default_rng(3))
     motion = pushed_motion(body, elastic, push, 50) - body.nodes
     peak = np.linalg.norm(motion, axis=-1).max() / body.diagonal
-    assert peak == pytest.approx(push.amplitude, rel=0.15) and 0.07 < peak < 0.14
+    assert peak == pytest.approx(push.amplitude, rel=0.15) and 0.045 < peak < 0.095
     spectrum = (np.abs(np.fft.rfft(motion - motion.mean(0), 512, axis=0)) ** 2).sum((1, 2))
     assert 6 < 512 / (1 + spectrum[1:].argmax()) < 16
     power = (np.abs(np.fft.rfft(motion, axis=0)) ** 2).sum((1, 2))

@@ -20,9 +20,7 @@ from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import draw
 
 SIZE = 40
-TINY = ReconstructionOptions(
-    kernels=160, iterations=400, hull_resolution=24, rounds=4, rates=LearningRates(means=1e-3)
-)
+TINY = ReconstructionOptions(kernels=160, iterations=400, hull_resolution=24, rounds=4, rates=LearningRates(means=1e-3))
 
 
 def cameras_around(count: int) -> Cameras:
