@@ -27,7 +27,7 @@ from gausim.models.batch import SceneBatch
 from gausim.models.hierarchy import Hierarchy
 from gausim.models.template import Motion, Template, TemplateState
 from gausim.nn.mlp import mlp, zero_output
-from gausim.ops.deformation import determinant
+from gausim.ops.deformation import determinant, unit_determinant
 
 # Springs keep this share of their stiffness across their direction: a central-force network alone has soft mechanisms.
 TRANSVERSE_STIFFNESS = 0.3
@@ -235,10 +235,7 @@ class ElasticTemplate(Template):
         share = torch.where(det < MIN_DETERMINANT, 0.0, 1.0).detach()[:, None, None]
         identity = torch.eye(3, device=gradient.device)
         gradient = share * gradient + (1 - share) * identity
-        if not self.conserve_volume:
-            return gradient
-        det = torch.where(det < MIN_DETERMINANT, torch.ones_like(det), det)
-        return gradient / det[:, None, None].pow(1 / 3)
+        return unit_determinant(gradient) if self.conserve_volume else gradient
 
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor]:
         """Modes (N, 3, M) and their gradients (N, 3, 3, M): a basis of smooth motions of one scene."""
