@@ -33,6 +33,10 @@ COMMANDS: dict[str, Command] = {
     "reconstruct": Command("gausim.cli.reconstruct", "Fit the Gaussians of the rest scene to posed stills."),
     "train": Command("gausim.cli.train", "Learn an object's dynamics from multi-view videos."),
     "evaluate": Command("gausim.cli.evaluate", "Measure a run on seen, unseen and held-out frames."),
+    "benchmark": Command(
+        "gausim.cli.benchmark",
+        "Measure the speed of rendering, stepping, training and clustering as ratios within one run.",
+    ),
     "simulate": Command("gausim.cli.simulate", "Roll a run forward and write videos, figures and trajectories."),
 }
 

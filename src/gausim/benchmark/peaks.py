@@ -1,0 +1,91 @@
+"""What the machine can do at best, measured in the same run: the yardsticks of every share of a peak."""
+
+# Annotations would be checked by beartype in the tests, around a function that numba has to compile.
+# mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
+from __future__ import annotations
+
+import functools
+import time
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import torch
+
+from gausim.benchmark.harness import Options, medians, torch_threads
+
+# Independent accumulators: enough vectors of any width to hide the latency of a fused multiply-add.
+LANES = 192
+ROUNDS = 400_000
+GEMM_SIZE = {True: 512, False: 1024}
+COPY_BYTES = 256 << 20  # far beyond any cache
+TRIES = 7
+
+
+@dataclass(frozen=True)
+class Peaks:
+    """Best rates of one thread count on one device.
+
+    Attributes:
+        fma: float32 fused multiply-adds in registers [FLOP/s], one CPU thread; 0 on a GPU, where nothing compares.
+        gemm: float32 matrix product [FLOP/s].
+        copy: bytes read plus bytes written by a large copy [B/s].
+    """
+
+    fma: float
+    gemm: float
+    copy: float
+
+
+def _make_fma_loop():
+    @numba.njit(nogil=True, fastmath=True, error_model="numpy", cache=True)
+    def loop(values, scale, shift, rounds):
+        # A local array of known length stays in vector registers.
+        a = np.empty(LANES, np.float32)
+        for i in range(LANES):
+            a[i] = values[i]
+        for _ in range(rounds):
+            for i in range(LANES):
+                a[i] = a[i] * scale + shift
+        for i in range(LANES):
+            values[i] = a[i]
+
+    return loop
+
+
+_fma_loop = _make_fma_loop()
+
+
+def fma_peak() -> float:
+    """Fused multiply-adds per second of one thread, times two [FLOP/s]."""
+    values, scale, shift = np.ones(LANES, np.float32), np.float32(0.9999), np.float32(1e-4)
+    _fma_loop(values, scale, shift, 1)
+    best = float("inf")
+    for _ in range(TRIES):
+        start = time.perf_counter()
+        _fma_loop(values, scale, shift, ROUNDS)
+        best = min(best, time.perf_counter() - start)
+    return 2.0 * LANES * ROUNDS / best
+
+
+def gemm_peak(options: Options) -> float:
+    """Square float32 matrix product [FLOP/s]."""
+    size = GEMM_SIZE[options.quick] * (8 if options.device.type == "cuda" else 1)
+    a, b = (torch.randn(size, size, device=options.device) for _ in range(2))
+    out = torch.empty_like(a)
+    return 2.0 * size**3 / medians({"gemm": lambda: torch.mm(a, b, out=out)}, options)["gemm"]
+
+
+def copy_peak(options: Options) -> float:
+    """A copy much larger than the caches, bytes read plus bytes written [B/s]."""
+    source = torch.zeros(COPY_BYTES // 4, device=options.device)
+    target = torch.empty_like(source)
+    return 2.0 * COPY_BYTES / medians({"copy": lambda: target.copy_(source)}, options)["copy"]
+
+
+@functools.cache
+def peaks(options: Options) -> Peaks:
+    """The three rates, measured once per process and set of options."""
+    with torch_threads(options.threads):
+        fma = fma_peak() if options.device.type == "cpu" else 0.0
+        return Peaks(fma, gemm_peak(options), copy_peak(options))

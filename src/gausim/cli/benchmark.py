@@ -1,0 +1,145 @@
+"""`gausim benchmark`: how fast this machine runs the renderer, the step, training and clustering."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import sys
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gausim.benchmark.harness import Options, Row
+
+HELP = "Measure the speed of rendering, stepping, training and clustering as ratios within one run."
+
+CASES = {
+    "render": "the CPU renderer against plain torch and the peak of the processor, threads, views, compilation",
+    "network": "the graph network against the textbook form: time, memory, share of the matrix-product peak",
+    "step": "one predicted frame at the paper's size, with and without hierarchy, part by part",
+    "train": "whole optimiser steps, part by part; KEY=VALUE chooses the experiment as in `gausim train`",
+    "cluster": "clusters of bounded diameter and neighbour search",
+}
+DEFAULT_OVERRIDES = ("experiment=demo",)
+
+
+def main(argv: list[str]) -> int:
+    """Runs the command.
+
+    Args:
+        argv: the arguments after the command's name.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        ConfigError: there is no such device, or the training configuration is wrong.
+        DataError: the training case's data set is missing.
+    """
+    arguments = _parser().parse_args(argv)
+    import torch
+
+    from gausim.benchmark.harness import Options, torch_threads
+    from gausim.benchmark.machine import machine
+
+    options = Options(_device(arguments.device), arguments.threads, arguments.quick, arguments.rounds)
+    torch.manual_seed(0)
+    chosen = list(CASES) if arguments.case == "all" else [arguments.case]
+    rows: list[Row] = []
+    with torch_threads(options.threads):
+        described = machine(options)
+        if not arguments.json:
+            print("\n".join(f"{key:<10} {value}" for key, value in described.items()), flush=True)
+        for name in chosen:
+            print(f"measuring {name} ...", file=sys.stderr, flush=True)
+            made = _run(name, options, arguments.overrides, optional=arguments.case == "all")
+            rows += made
+            if not arguments.json:
+                _print(name, made)
+    if arguments.json:
+        document = {"machine": described, "rows": [vars(row) for row in rows]}
+        json.dump(document, sys.stdout, indent=1)
+        print()
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    cases = "\n".join(f"  {name:<9} {text}" for name, text in CASES.items())
+    parser = argparse.ArgumentParser(
+        prog="gausim benchmark",
+        description=f"{HELP}\n\ncases:\n{cases}\n  all       all of them",
+        epilog="docs/performance.md explains how to read the table. Close everything else first: single times drift "
+        "with the machine's load, ratios within one run hold.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("case", choices=[*CASES, "all"], metavar="CASE", help="one of the cases above, or all")
+    add("overrides", nargs="*", metavar="KEY=VALUE",
+        help=f"training configuration of the case train; default {' '.join(DEFAULT_OVERRIDES)}")  # fmt: skip
+    add("--json", action="store_true", help='print one JSON object: {"machine": ..., "rows": [...]}')
+    add("--quick", action="store_true", help="tiny sizes: to see that it works, not to quote")
+    add("--threads", type=_positive, default=1, help="threads of torch and the renderer; default %(default)s")
+    add("--rounds", type=_positive, default=7, help="timed calls of each candidate; default %(default)s")
+    add("--device", default="cpu", help="cpu, cuda or cuda:N; default %(default)s")
+    return parser
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected at least 1, got {value}")
+    return value
+
+
+def _device(name: str) -> Any:
+    import torch
+
+    from gausim.core.errors import ConfigError
+
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ConfigError(f"--device {name}: expected cpu, cuda or cuda:N.") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ConfigError(f"--device {name}: torch {torch.__version__} sees no CUDA device. Use --device cpu.")
+    return device
+
+
+def _run(name: str, options: Options, overrides: list[str], *, optional: bool) -> list[Row]:
+    case = importlib.import_module(f"gausim.benchmark.{name}")
+    if name != "train":
+        return list(case.run(options))
+    from gausim.cli._config import compose
+    from gausim.cli._run import build
+    from gausim.core.errors import DataError
+
+    try:
+        module, datamodule = build(compose("train", overrides or list(DEFAULT_OVERRIDES)))
+    except DataError as error:
+        if not optional:
+            raise
+        print(f"train left out: {error}", file=sys.stderr)
+        return []
+    return list(case.run(options, module, datamodule))
+
+
+def _print(name: str, rows: list[Row]) -> None:
+    print(f"\n{name}")
+    widths = [
+        max((len(text) for text in column), default=0) for column in ([r.case for r in rows], [r.metric for r in rows])
+    ]
+    for row in rows:
+        reference = f"  ({row.reference})" if row.reference else ""
+        value, unit = _readable(row.value, row.unit)
+        print(f"  {row.case:<{widths[0]}}  {row.metric:<{widths[1]}}  {value:>9} {unit}{reference}", flush=True)
+
+
+def _readable(value: float, unit: str) -> tuple[str, str]:
+    """A figure with three significant digits and a prefix where its unit takes one."""
+    if unit == "s" and value < 1:
+        return f"{1000 * value:.3g}", "ms"
+    if unit in ("B", "FLOP/s", "B/s"):
+        for power, prefix in ((9, "G"), (6, "M"), (3, "k")):
+            if value >= 10**power:
+                return f"{value / 10**power:.3g}", prefix + unit
+    return (f"{value:.0f}" if value >= 1000 else f"{value:.3g}"), "" if unit == "1" else unit

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+import json
+import sys
+import types
+
+import pytest
+import torch
+
+from gausim.benchmark import Options, Row, medians, peaks, saved_bytes
+from gausim.cli import benchmark
+from gausim.core import ConfigError
+
+QUICK = Options(torch.device("cpu"), quick=True, rounds=3)
+
+
+def test_candidates_are_called_in_turn_and_warm_up_is_not_timed() -> None:
+    calls: list[str] = []
+    result = medians({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, QUICK, warmup=2)
+    assert calls == ["a", "b"] * 5
+    assert set(result) == {"a", "b"} and all(value >= 0 for value in result.values())
+
+
+def test_saved_bytes_counts_each_kept_storage_once() -> None:
+    x = torch.randn(50, 40, requires_grad=True)
+    # The square keeps x (twice the same storage), the sine keeps its argument, a sum keeps nothing.
+    assert saved_bytes(lambda: (x * x).sin().sum()) == 2 * 50 * 40 * 4
+    with torch.no_grad():
+        assert saved_bytes(lambda: (x * x).sin().sum()) == 0
+
+
+def test_peaks_are_rates_of_a_real_machine() -> None:
+    found = peaks(QUICK)
+    assert 1e8 < found.fma < 1e13 and 1e8 < found.gemm < 1e13 and 1e8 < found.copy < 1e13
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "shown"),
+    [(0.00123, "s", ("1.23", "ms")), (2.5e9, "FLOP/s", ("2.5", "GFLOP/s")), (41.26, "x", ("41.3", "x")),
+     (0.5, "1", ("0.5", "")), (23422, "kernels", ("23422", "kernels"))],
+)  # fmt: skip
+def test_figures_are_shown_with_three_digits(value: float, unit: str, shown: tuple[str, str]) -> None:
+    assert benchmark._readable(value, unit) == shown
+
+
+def test_json_is_one_object_on_stdout(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    case = types.ModuleType("gausim.benchmark.cluster")
+    case.run = lambda options: [Row("2k kernels", "time", 0.5, "s"), Row("2k kernels", "ratio", 3.0, "x", "scipy")]
+    monkeypatch.setitem(sys.modules, case.__name__, case)
+    assert benchmark.main(["cluster", "--json", "--quick"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert set(document) == {"machine", "rows"} and "processor" in document["machine"]
+    assert document["rows"][1] == {
+        "case": "2k kernels", "metric": "ratio", "value": 3.0, "unit": "x", "reference": "scipy"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("device", ["nonsense", "cuda:7"])
+def test_a_missing_device_is_refused(device: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="--device"):
+        benchmark.main(["cluster", "--quick", "--device", device])
