@@ -341,7 +341,9 @@ class GausSimModule(LightningModule):
     def on_train_epoch_end(self) -> None:
         """Forms the epoch's means, warns of a collapse and lets the curriculum look at the loss."""
         self.summary = self.epoch_means()
-        self.log_dict({f"epoch/{name}": value for name, value in self.summary.items()}, sync_dist=False)
+        row = {f"epoch/{name}": value for name, value in self.summary.items()}
+        for logger in self.trainer.loggers:  # not log_dict: Lightning would write it after the epoch's checkpoint
+            logger.log_metrics({"epoch": self.current_epoch, **row}, step=self.global_step)
         energy = self.summary.get("motion_energy")
         if energy is not None and energy < COLLAPSED and self.global_step >= COLLAPSE_AFTER and not self._warned:
             self._warned = True
@@ -363,15 +365,17 @@ class GausSimModule(LightningModule):
     # ------------------------------------------------------------------------------------------------ checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds the scenes' fingerprints, the averaged weights and the curriculum's state."""
+        """Adds the scenes' fingerprints, the averaged weights, the curriculum's state and the epoch's numbers."""
         own: dict[str, Any] = {"scenes": fingerprints(self.simulator.scenes), "average": self.average.state_dict()}
+        own["epoch"] = {"sums": self._sums, "summary": self.summary, "warned": self._warned, "barren": self._barren}
+        own["yardsticks"] = self.yardsticks.state_dict()
         curriculum = self._curriculum()
         if curriculum is not None:
             own["curriculum"] = curriculum.state_dict()
         checkpoint["gausim"] = own
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuses a checkpoint of other scenes; restores the averaged weights and the curriculum.
+        """Refuses a checkpoint of other scenes; restores what :meth:`on_save_checkpoint` added.
 
         Raises:
             RunError: naming both scenes.
@@ -379,6 +383,10 @@ class GausSimModule(LightningModule):
         check_scenes(checkpoint, self.simulator.scenes, "the checkpoint")
         own = checkpoint["gausim"]
         self.average.load_state_dict(own["average"])
+        epoch = own["epoch"]
+        self._sums, self.summary = epoch["sums"], epoch["summary"]
+        self._warned, self._barren = epoch["warned"], epoch["barren"]
+        self.yardsticks.load_state_dict(own["yardsticks"])
         curriculum = self._curriculum()
         if curriculum is not None and "curriculum" in own:
             curriculum.load_state_dict(own["curriculum"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import torch
@@ -62,3 +62,11 @@ class Yardsticks:
             known.static += losses[1:]
             known.motion += change
         return known
+
+    def state_dict(self) -> dict[int, dict[str, Any]]:
+        """What is known of each sequence: measured with other frames at once, the last bits would differ."""
+        return {sequence: asdict(known) for sequence, known in self._known.items()}
+
+    def load_state_dict(self, state: dict[int, dict[str, Any]]) -> None:
+        """Continues with what ``state`` knew."""
+        self._known = {sequence: Yardstick(**known) for sequence, known in state.items()}
