@@ -89,6 +89,18 @@ class TrainedPrediction:
         self._ids = {name: item.first_sequence + i for i, name in enumerate(names)}
         self._known: dict[str, Trajectory] = {}
 
+    @property
+    def levels(self) -> dict[str, Any] | None:
+        """Units per level of the hierarchy, those predicted, N_F and N_K; None for a model without a hierarchy."""
+        model: Any = self._run.module.model
+        hierarchies = getattr(model, "hierarchies", None)
+        if hierarchies is None:
+            return None
+        hierarchy, predicted = hierarchies[self._item.scene_id], list(model.predicted_levels)
+        counts = [level.count for level in hierarchy.levels]
+        predictions = hierarchy.predictions(predicted)
+        return {"counts": counts, "predicted": predicted, "predictions": predictions, "kernels": counts[0]}
+
     def full(self, record: SequenceRecord) -> Trajectory:
         """All predicted frames of a sequence, the recorded ones and those asked for beyond."""
         if record.name not in self._known:

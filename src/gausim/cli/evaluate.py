@@ -45,7 +45,13 @@ def main(argv: list[str]) -> int:
         print((folder / "metrics.json").read_text(), end="")
         return 0
     _print_tables(summary)
-    for name in ["metrics.json", "metrics.npz", "table.md", *(f"errors_{c.facts.name}.png" for c in results)]:
+    for name in [
+        "metrics.json",
+        "metrics.npz",
+        "pictures.npz",
+        "table.md",
+        *(f"errors_{c.facts.name}.png" for c in results),
+    ]:
         print(f"wrote {folder / name}")
     return 0
 

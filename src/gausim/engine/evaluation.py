@@ -7,6 +7,7 @@ Needs no run: any callable that gives a :class:`Trajectory` for a sequence can b
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +18,26 @@ from torch import Tensor
 
 from gausim.baselines.linear_ar import LinearAR2, fit_linear_ar2
 from gausim.baselines.static import StaticDynamics
-from gausim.core import Cameras, DataError, GaussianScene, Renderer, RunError, SimState, Trajectory
+from gausim.core import Cameras, DataError, GaussianScene, Rendered, Renderer, RunError, SimState, Trajectory
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth, SequenceRecord
-from gausim.metrics import L2, PSNR, SSIM, ForegroundL2, ForegroundPSNR, ImageMetric, motion_energy, point_error
+from gausim.engine.cost import CostMeter
+from gausim.engine.provenance import code_provenance, data_provenance
+from gausim.engine.recorder import PictureRecorder
+from gausim.metrics import (
+    FLIP,
+    L2,
+    LPIPS,
+    PSNR,
+    SSIM,
+    ForegroundL2,
+    ForegroundPSNR,
+    ImageMetric,
+    motion_energy,
+    point_error,
+)
+from gausim.metrics.lpips import NO_WEIGHTS, weights_path
 from gausim.render.draw import SceneAppearance, draw
 from gausim.report.curves import (
     ERROR_3D,
@@ -34,10 +50,12 @@ from gausim.report.curves import (
     ObjectFacts,
     save_curves,
 )
+from gausim.report.pictures import save_pictures
 from gausim.report.summary import write_summary
 from gausim.report.tables import markdown
 
-# Predicts every frame of a sequence (count frames, frame 0 first) for all kernels of the scene.
+# Predicts every frame of a sequence (count frames, frame 0 first) for all kernels of the scene. One that carries an
+# attribute ``levels`` (plain data: counts, predicted, predictions, kernels) has it stored in the summary.
 Predict = Callable[[SequenceRecord], Trajectory]
 Rows = dict[str, dict[str, np.ndarray]]
 
@@ -48,8 +66,9 @@ PIXELS_AT_ONCE = 1 << 20
 
 
 def default_metrics() -> list[ImageMetric]:
-    """The image metrics of every table."""
-    return [L2(), ForegroundL2(), PSNR(), ForegroundPSNR(), SSIM()]
+    """The image metrics of every table; LPIPS only where its weights are."""
+    perceptual = [LPIPS()] if weights_path().is_file() else []
+    return [L2(), ForegroundL2(), PSNR(), ForegroundPSNR(), SSIM(), FLIP(), *perceptual]
 
 
 def evaluate_object(
@@ -83,10 +102,11 @@ def evaluate_object(
     records = _chosen(data, sequences)
     references = _linear_references(data)
     results: list[Rows] = []
+    pictures = PictureRecorder(data, records[0].name, measure.views)
     for record in records:
         # A record of our own: its decoded frames are let go with it instead of filling the memory.
         fresh = SequenceRecord(record.root, views=record.views, fps=record.fps)
-        results.append(measure.sequence(fresh, methods, references))
+        results.append(measure.sequence(fresh, methods, references, pictures if record is records[0] else None))
         if advance is not None:
             advance(record.name)
     facts = ObjectFacts(
@@ -104,14 +124,15 @@ def evaluate_object(
         mean_color=measure.mean_color,
         max_l2=measure.max_l2,
     )
-    return ObjectCurves(facts, _stack(results))
+    return ObjectCurves(facts, _stack(results), measure.record(methods), pictures.finish())
 
 
 def write_evaluation(folder: Path, objects: list[ObjectCurves], run: dict[str, Any]) -> dict[str, Any]:
-    """Writes metrics.json, metrics.npz and table.md into ``folder``; returns what metrics.json holds."""
+    """Writes metrics.json, metrics.npz, pictures.npz and table.md into ``folder``; returns what metrics.json holds."""
     folder.mkdir(parents=True, exist_ok=True)
     save_curves(folder / "metrics.npz", objects)
-    summary = write_summary(folder / "metrics.json", objects, run)
+    save_pictures(folder / "pictures.npz", [c.pictures for c in objects if c.pictures is not None])
+    summary = write_summary(folder / "metrics.json", objects, run, provenance=code_provenance())
     (folder / "table.md").write_text(markdown(summary))
     return summary
 
@@ -141,7 +162,7 @@ def _linear_references(data: ObjectData) -> dict[str, LinearAR2]:
 
 
 class _ObjectMeasure:
-    """Measures one object's sequences; keeps what is summed over all of them (mean colour, largest l2)."""
+    """Measures one object's sequences; keeps what is summed over all of them (mean colour, largest l2, costs)."""
 
     def __init__(
         self,
@@ -160,6 +181,14 @@ class _ObjectMeasure:
         self.attached = None if points is None else attach_points(scene, points)
         self.max_l2 = 0.0
         self._color = torch.zeros(4, dtype=torch.float64)
+        self._costs: dict[str, CostMeter] = {}
+
+    def record(self, methods: Mapping[str, Predict]) -> dict[str, Any]:
+        """Facts of the evaluation beside its figures: costs of every method, hashes of the data, what is absent."""
+        levels = {name: getattr(predict, "levels", None) for name, predict in methods.items()}
+        costs = {name: {**meter.summary(), "levels": levels[name]} for name, meter in self._costs.items()}
+        absent = {} if any(m.key == LPIPS.key for m in self.metrics) else {LPIPS.key: NO_WEIGHTS}
+        return {"efficiency": costs, "sources": data_provenance(self.data), "absent": absent}
 
     @property
     def mean_color(self) -> tuple[float, float, float]:
@@ -169,11 +198,19 @@ class _ObjectMeasure:
 
     @torch.no_grad()
     def sequence(
-        self, record: SequenceRecord, methods: Mapping[str, Predict], references: Mapping[str, LinearAR2]
+        self,
+        record: SequenceRecord,
+        methods: Mapping[str, Predict],
+        references: Mapping[str, LinearAR2],
+        pictures: PictureRecorder | None = None,
     ) -> Rows:
-        """Figures of one sequence, (F, V) and (F,) per row and metric."""
-        trajectories = {name: self._checked(name, record, predict(record)) for name, predict in methods.items()}
-        rows = self._images(record, trajectories)
+        """Figures of one sequence, (F, V) and (F,) per row and metric; frames go to ``pictures``, too."""
+        trajectories = {}
+        for name, predict in methods.items():
+            meter = self._costs.setdefault(name, CostMeter())
+            made = meter.predict(partial(predict, record), record.count - 1)
+            trajectories[name] = self._checked(name, record, made)
+        rows = self._images(record, trajectories, pictures)
         truth = self.data.ground_truth(record)
         if truth is not None:
             self._points(rows, trajectories, references, truth)
@@ -191,18 +228,23 @@ class _ObjectMeasure:
             )
         return trajectory
 
-    def _images(self, record: SequenceRecord, trajectories: Mapping[str, Trajectory]) -> Rows:
+    def _images(
+        self, record: SequenceRecord, trajectories: Mapping[str, Trajectory], pictures: PictureRecorder | None
+    ) -> Rows:
         cameras = record.cameras_of(self.views).to(self.scene.means.device)
         still = SimState(self.scene.means, self.scene.means)
-        rest = self._draw(self.static.rollout(still, 0), range(1), cameras)
+        rest = self._draw(self.static.rollout(still, 0), range(1), cameras).rgb
         parts: dict[str, dict[str, list[Tensor]]] = {}
         before: dict[str, Tensor] = {}
         for frames in _chunks(record, len(self.views)):
-            target, alpha = composite(record.frames(frames, self.views))
+            recorded = record.frames(frames, self.views)
+            target, alpha = composite(recorded)
             target, mask = target.to(rest), (alpha > 0).to(rest.device)
             self._count_color(target, mask)
-            drawn = {name: self._draw(t, frames, cameras) for name, t in trajectories.items()}
-            drawn[STATIC] = rest.expand_as(target)
+            images_of = {name: self._timed(name, t, frames, cameras) for name, t in trajectories.items()}
+            if pictures is not None:
+                pictures.add(recorded, images_of)
+            drawn = {name: images.rgb for name, images in images_of.items()} | {STATIC: rest.expand_as(target)}
             for i, (name, images) in enumerate(drawn.items()):
                 if i == 0:
                     self.max_l2 = max(self.max_l2, float((images - target).norm(dim=-1).max()))
@@ -215,11 +257,17 @@ class _ObjectMeasure:
                 before[name] = images[-1:]
         return {row: {m: torch.cat(v).cpu().numpy() for m, v in ms.items()} for row, ms in parts.items()}
 
-    def _draw(self, trajectory: Trajectory, frames: range, cameras: Cameras) -> Float[Tensor, "F V H W 3"]:
+    def _timed(self, name: str, trajectory: Trajectory, frames: range, cameras: Cameras) -> Rendered:
+        return self._costs[name].draw(
+            partial(self._draw, trajectory, frames, cameras), len(frames) * len(cameras.viewmats)
+        )
+
+    def _draw(self, trajectory: Trajectory, frames: range, cameras: Cameras) -> Rendered:
         """Foreground on black; colours beyond [0, 1] are cut, as in every image file."""
         part = slice(frames.start, frames.stop)
         state = trajectory.positions[part], trajectory.gradients[part], trajectory.rotations[part]
-        return draw(self.renderer, self.look, *state, trajectory.unit_of_kernel, cameras).rgb.clamp(0, 1)
+        images = draw(self.renderer, self.look, *state, trajectory.unit_of_kernel, cameras)
+        return Rendered(images.rgb.clamp(0, 1), images.alpha)
 
     def _count_color(self, target: Float[Tensor, "F V H W 3"], mask: Bool[Tensor, "F V H W"]) -> None:
         total = target[mask].sum(0, dtype=torch.float64)

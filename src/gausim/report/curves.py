@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from gausim.core import RunError
+from gausim.report.pictures import Pictures
 
 STATIC = "static"
 TRUTH = "truth"
@@ -70,10 +71,19 @@ class ObjectFacts:
 
 @dataclass(frozen=True, eq=False)
 class ObjectCurves:
-    """Facts and arrays of one object: ``values[row][metric]``, see the module's text for shapes."""
+    """Facts and arrays of one object: ``values[row][metric]``, see the module's text for shapes.
+
+    Attributes:
+        facts: what was evaluated.
+        values: the arrays.
+        record: plain data that goes into the summary as it is (``efficiency``, ``sources``, ``absent``).
+        pictures: of one sequence; they have a file of their own.
+    """
 
     facts: ObjectFacts
     values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)
+    pictures: Pictures | None = None
 
     @property
     def rows(self) -> list[str]:

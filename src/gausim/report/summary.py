@@ -4,20 +4,27 @@
 
     {"schema": "gausim.evaluation/1",
      "run": {...},                                    what was evaluated, as the caller states it
+     "provenance": {"gausim", "torch", "python", "commit", "modified"},   of the program that evaluated
      "objects": {NAME: {
         "fps", "sequences", "frames", "views", "train_views", "heldout_views", "methods",
         "splits": {"seen": [0, 16], "unseen": [16, 50], "unseen_near": [16, 26], "unseen_all": [16, 60]},
         "metrics": {KEY: {"label", "scale", "unit", "higher_is_better"}},
         "contrast": {"mean_color": [r, g, b], "norm": x, "max_l2": x},
         "floor": {KEY: CELL},                         the reconstruction against frame 0 of every training view
-        "rows": {ROW: {SPLIT: {GROUP: {KEY: CELL}}}}  GROUP: train | heldout (views), points (3D)
+        "rows": {ROW: {SPLIT: {GROUP: {KEY: CELL}}}}, GROUP: train | heldout (views), points (3D)
+        "efficiency": {METHOD: {"seconds_per_frame": {"mean", "std"}, "frames", "seconds_per_image", "device",
+            "threads", "memory": {"kind", "peak_bytes", "added_bytes"}, "levels": {"counts", "predicted",
+            "predictions", "kernels"}}},              memory and levels null where unknown
+        "sources": {"root", "scene": {"file", "sha256"}, "masks": {...}, "manifest": {...}},
+        "absent": {KEY: why}                          metrics that could not be computed
      }}}
 
 A CELL is ``{"mean", "std", "ratio"}``: mean and standard deviation over sequences (of the mean over frames and views
 of a sequence) and the mean divided by the static row's (null for the floor and for what is better when higher). Ends
 of splits are exclusive. The cell of ``motion_energy`` has besides ``"pooled"``: predicted over true energy summed over
 all sequences, which no single sequence at rest can spoil; its mean and std are over the sequences' own ratios and its
-ratio is null. Undefined numbers are null.
+ratio is null. Undefined numbers are null. ``provenance``, ``efficiency``, ``sources`` and ``absent`` are not in files
+of earlier versions.
 """
 
 from __future__ import annotations
@@ -81,6 +88,7 @@ def summarise(curves: ObjectCurves) -> dict[str, Any]:
         "contrast": {"mean_color": color, "norm": math.hypot(*color), "max_l2": facts.max_l2},
         "floor": _floor(curves, groups["train"]),
         "rows": {row: _row(curves, row, splits, groups) for row in curves.rows},
+        **curves.record,
     }
 
 
@@ -153,9 +161,12 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def write_summary(path: Path, objects: list[ObjectCurves], run: dict[str, Any]) -> dict[str, Any]:
+def write_summary(
+    path: Path, objects: list[ObjectCurves], run: dict[str, Any], *, provenance: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """Writes ``metrics.json`` and returns what it holds."""
-    summary = {"schema": SCHEMA, "run": run, "objects": {c.facts.name: summarise(c) for c in objects}}
+    entries = {c.facts.name: summarise(c) for c in objects}
+    summary = {"schema": SCHEMA, "run": run, "provenance": provenance or {}, "objects": entries}
     path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
     return summary
 

@@ -1,0 +1,90 @@
+"""What a prediction costs: seconds and peak memory, measured while it is made."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+
+T = TypeVar("T")
+_STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+class CostMeter:
+    """Collects the costs of one method over sequences.
+
+    Memory is what CUDA allocates where the model lives there, else the peak resident size of the process (Linux), each
+    with what the prediction added to what was there before it.
+    """
+
+    def __init__(self) -> None:
+        self._seconds: list[float] = []
+        self._frames = 0
+        self._peak, self._added = 0, 0
+        self._kind: str | None = None
+        self._drawing, self._images = 0.0, 0
+
+    def predict(self, make: Callable[[], T], frames: int) -> T:
+        """Runs ``make``, which predicts ``frames`` frames beyond the first, and counts what it costs."""
+        cuda = torch.cuda.is_initialized()
+        before = _begin(cuda)
+        start = time.perf_counter()
+        result = make()
+        if cuda:
+            torch.cuda.synchronize()
+        self._seconds.append((time.perf_counter() - start) / max(1, frames))
+        self._frames += frames
+        peak = torch.cuda.max_memory_allocated() if cuda else _resident("VmHWM")
+        if before is not None and peak is not None:
+            self._kind = "CUDA allocated" if cuda else "process, resident"
+            self._peak, self._added = max(self._peak, peak), max(self._added, peak - before)
+        return result
+
+    def draw(self, make: Callable[[], T], images: int) -> T:
+        """Runs ``make``, which draws ``images`` images, and counts its time."""
+        start = time.perf_counter()
+        result = make()
+        if torch.cuda.is_initialized():
+            torch.cuda.synchronize()
+        self._drawing += time.perf_counter() - start
+        self._images += images
+        return result
+
+    def summary(self) -> dict[str, Any]:
+        """Plain data for ``metrics.json``; the first sequence warms up and counts only where it is the only one."""
+        timed = self._seconds[1:] or self._seconds
+        memory = {"kind": self._kind, "peak_bytes": self._peak, "added_bytes": self._added} if self._kind else None
+        return {
+            "seconds_per_frame": {"mean": statistics.fmean(timed), "std": statistics.pstdev(timed)},
+            "frames": self._frames,
+            "seconds_per_image": self._drawing / self._images if self._images else None,
+            "memory": memory,
+            "device": torch.cuda.get_device_name() if torch.cuda.is_initialized() else "cpu",
+            "threads": torch.get_num_threads(),
+        }
+
+
+def _begin(cuda: bool) -> int | None:
+    """Resets the peak; returns the bytes in use."""
+    if cuda:
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        return torch.cuda.memory_allocated()
+    try:
+        _RESET.write_text("5")  # proc(5): resets the peak resident size
+    except OSError:
+        return None
+    return _resident("VmRSS")
+
+
+def _resident(field: str) -> int | None:
+    try:
+        lines = _STATUS.read_text().splitlines()
+    except OSError:
+        return None
+    found = [line.split()[1] for line in lines if line.startswith(f"{field}:")]
+    return int(found[0]) * 1024 if found else None

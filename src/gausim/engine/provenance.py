@@ -1,0 +1,60 @@
+"""Where numbers come from: the commit of this package and hashes of the data, as stored beside every evaluation."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import torch
+
+import gausim
+from gausim.data.objects import ObjectData
+
+PACKAGE = Path(gausim.__file__).resolve().parent
+# A store's manifest says more than the facts of the object; the first that is there counts.
+MANIFESTS = ("manifest.json", "dataset.json")
+
+
+def code_provenance(package: Path = PACKAGE) -> dict[str, Any]:
+    """Versions, and the git commit where the package is part of a checkout (else null).
+
+    Returns:
+        ``gausim``, ``torch``, ``python``: versions; ``commit``; ``modified``: whether tracked files of the package
+        differ from the commit.
+    """
+    facts = {"gausim": gausim.__version__, "torch": torch.__version__, "python": platform.python_version()}
+    # Installed into an environment inside somebody else's checkout, the package is not what that repository tracks.
+    tracked = _git(package, "ls-files", "--error-unmatch", "__init__.py") is not None
+    commit = _git(package, "rev-parse", "HEAD") if tracked else None
+    status = _git(package, "status", "--porcelain", "--untracked-files=no", "--", ".") if commit else None
+    return {**facts, "commit": commit, "modified": None if status is None else bool(status)}
+
+
+def data_provenance(data: ObjectData) -> dict[str, Any]:
+    """Names and SHA-256 of an object's rest scene, its masks and its manifest (null for what is not there)."""
+    manifests = [data.root / name for name in MANIFESTS]
+    manifest = next((path for path in manifests if path.is_file()), manifests[-1])
+    masks = data.masks_path or data.scene_path.with_suffix(".masks.npz")
+    files = {"scene": data.scene_path, "masks": masks, "manifest": manifest}
+    return {"root": str(data.root), **{key: {"file": p.name, "sha256": file_hash(p)} for key, p in files.items()}}
+
+
+def file_hash(path: Path) -> str | None:
+    """SHA-256 of a file in hexadecimal; None where there is no such file."""
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """What git prints, or None where there is no git, no repository or an error."""
+    command = ["git", "-C", str(folder), *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()

@@ -1,0 +1,103 @@
+"""Small pictures of one evaluated sequence, for people: truth and predictions in several cameras, with their alpha.
+
+``pictures.npz`` holds them per object: ``OBJECT/facts`` (JSON text), ``OBJECT/truth`` and ``OBJECT/prediction/METHOD``
+as (F, V, h, w, 4) uint8, colours premultiplied with alpha, and ``OBJECT/background`` (V, h, w, 3) where the recording
+shows one. Numbers are never computed from them.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from gausim.core import RunError
+
+# What stands behind an object whose recording has no background of its own.
+PLAIN = (46, 48, 52)
+_FACTS = ("object", "sequence", "fps", "first_unseen", "views", "heldout_views")
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """Pictures of one sequence of one object.
+
+    Attributes:
+        object: its name.
+        sequence: the sequence's name.
+        fps: frames per second.
+        first_unseen: first frame that training did not see.
+        views: names of the V cameras.
+        heldout_views: those of them that training never saw.
+        truth: recorded frames, RGB premultiplied with alpha.
+        predictions: the same of every method.
+        background: what the cameras saw behind the object; None where the recording does not show it.
+    """
+
+    object: str
+    sequence: str
+    fps: float
+    first_unseen: int
+    views: tuple[str, ...]
+    heldout_views: tuple[str, ...]
+    truth: UInt8[np.ndarray, "F V h w 4"]
+    predictions: dict[str, np.ndarray] = field(default_factory=dict)
+    background: UInt8[np.ndarray, "V h w 3"] | None = None
+
+    def over_background(self, frames: UInt8[np.ndarray, "F V h w 4"]) -> UInt8[np.ndarray, "F V h w 3"]:
+        """Frames over the recorded background, or over plain grey."""
+        behind = np.array(PLAIN, np.uint16) if self.background is None else self.background.astype(np.uint16)
+        rest = 255 - frames[..., 3:].astype(np.uint16)
+        return np.minimum(frames[..., :3] + (behind * rest + 127) // 255, 255).astype(np.uint8)
+
+
+def save_pictures(path: Path, pictures: list[Pictures]) -> None:
+    """Writes the pictures of all objects into one npz without pickles."""
+    arrays: dict[str, Any] = {}
+    for item in pictures:
+        facts = {key: getattr(item, key) for key in _FACTS}
+        arrays |= {f"{item.object}/facts": np.array(json.dumps(facts)), f"{item.object}/truth": item.truth}
+        arrays |= {f"{item.object}/prediction/{name}": frames for name, frames in item.predictions.items()}
+        if item.background is not None:
+            arrays[f"{item.object}/background"] = item.background
+    np.savez_compressed(path, **arrays)
+
+
+def load_pictures(path: Path) -> list[Pictures]:
+    """Reads what :func:`save_pictures` wrote.
+
+    Raises:
+        RunError: the file is missing or not such a file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        names = [name.removesuffix("/facts") for name in arrays if name.endswith("/facts")]
+        return [_pictures(name, arrays) for name in names]
+    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+        raise RunError(f"{path}: cannot be read ({error}). Write it with `gausim evaluate RUN`.") from error
+
+
+def _pictures(name: str, arrays: dict[str, np.ndarray]) -> Pictures:
+    facts = json.loads(str(arrays[f"{name}/facts"]))
+    prefix, truth = f"{name}/prediction/", arrays[f"{name}/truth"]
+    predictions = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
+    frames, views = len(truth), len(facts["views"])
+    for array in (truth, *predictions.values()):
+        if array.dtype != np.uint8 or array.ndim != 5 or array.shape != (frames, views, *truth.shape[2:4], 4):
+            raise ValueError(f"expected uint8 {(frames, views, *truth.shape[2:4], 4)}, got {array.dtype} {array.shape}")
+    return Pictures(
+        object=str(facts["object"]),
+        sequence=str(facts["sequence"]),
+        fps=float(facts["fps"]),
+        first_unseen=int(facts["first_unseen"]),
+        views=tuple(facts["views"]),
+        heldout_views=tuple(facts["heldout_views"]),
+        truth=truth,
+        predictions=predictions,
+        background=arrays.get(f"{name}/background"),
+    )
