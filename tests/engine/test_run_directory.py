@@ -6,6 +6,7 @@ import pytest
 
 from gausim.core import ConfigError, RunError
 from gausim.engine.callbacks import RunCheckpoint, TimeBudget
+from gausim.engine.checkpoint import AtomicCheckpointIO
 from gausim.engine.run import RunDirectory, changed_keys, make_trainer
 
 CONFIG = {
@@ -20,7 +21,7 @@ def test_a_fresh_and_an_interrupted_run(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "a")
     assert run.prepare(CONFIG) is None
     assert run.config() == CONFIG
-    run.checkpoint.write_bytes(b"x")
+    AtomicCheckpointIO().save_checkpoint({"state_dict": {}, "gausim": {}}, run.checkpoint)
     assert run.prepare(CONFIG) == run.checkpoint
 
 
@@ -60,7 +61,8 @@ def test_no_run_here_is_told(tmp_path: Path) -> None:
 def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(ConfigError, match="clock"):
         TimeBudget(minutes=1, clock="sun")
-    with pytest.raises(ConfigError, match="every_epochs"):
-        RunCheckpoint(every_epochs=0)
+    for wrong in ({"every_epochs": 0}, {"every_minutes": -1.0}, {"every_steps": -1}, {"snapshot_every": -1}):
+        with pytest.raises(ConfigError, match="every_epochs"):
+            RunCheckpoint(**wrong)
     with pytest.raises(ConfigError, match=r"trainer\.devices"):
         make_trainer(max_epochs=1, devices=2)

@@ -40,32 +40,49 @@ def main(argv: Sequence[str]) -> int:
 
     Returns:
         The exit status.
+
+    Raises:
+        GausSimError: the configuration or the data are wrong, the directory cannot be written, training diverged.
     """
     if any(a in ("-h", "--help") for a in argv):
         print(USAGE)
         return 0
     from gausim.cli._config import run_hydra
+    from gausim.engine.files import unwritable
 
-    return run_hydra("train", train, argv)
+    try:
+        return run_hydra("train", train, argv)
+    except OSError as error:  # Hydra makes the run's directory before it calls us
+        explained = unwritable(error)
+        if explained is None:
+            raise
+        raise explained from error
 
 
 def train(cfg: DictConfig) -> float | None:
     """Trains one run; returns its last loss above the floor as a fraction of the static prediction's.
 
     Raises:
-        RunError: the run is finished already, or was started with another configuration.
+        RunError: the run is finished already, was started with another configuration, is being trained by another
+            process, has no whole checkpoint, or its directory cannot be written.
         DivergenceError: a number is no longer finite.
     """
-    from lightning.pytorch import seed_everything
-    from omegaconf import OmegaConf
-
     from gausim.cli import _config
-    from gausim.cli._run import build
     from gausim.engine.run import RunDirectory
 
     # Hydra's directory of a single job has the run's name only, a sweep's jobs have the seed in it already.
     folder = _config.run_dir()
     run = RunDirectory(folder if folder.name == f"seed_{cfg.seed}" else folder / f"seed_{cfg.seed}")
+    with run.writing():
+        return _train(cfg, run)
+
+
+def _train(cfg: DictConfig, run: RunDirectory) -> float | None:
+    from lightning.pytorch import seed_everything
+    from omegaconf import OmegaConf
+
+    from gausim.cli._run import build
+
     resume = run.prepare(
         cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True)), overwrite=cfg.trainer.overwrite
     )
@@ -76,7 +93,9 @@ def train(cfg: DictConfig) -> float | None:
     trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
-    run.finish({"epochs": trainer.current_epoch, "optimizer_steps": module.global_step, "last_epoch": module.summary})
+    # Counted by `processed`: of a run that is resumed after its last save, `current_epoch` lags behind.
+    epochs = cast(Any, trainer.fit_loop.epoch_progress.current).processed
+    run.finish({"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary})
     print(f"\nrun: {run.path}\nnext: gausim evaluate {run.path}\n      gausim simulate {run.path}", flush=True)
     return module.summary.get("excess_static")
 

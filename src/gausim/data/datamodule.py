@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
@@ -107,7 +108,12 @@ class ReadyDataModule(LightningDataModule):
     def train_dataloader(self) -> DataLoader:
         """Batches of training samples; frames are decoded once and stay in memory, so no worker is needed."""
         return DataLoader(
-            TrainingDataset(self.index), batch_sampler=self._ready_sampler(), collate_fn=collate, num_workers=0
+            TrainingDataset(self.index),
+            batch_sampler=self._ready_sampler(),
+            collate_fn=collate,
+            num_workers=0,
+            # The loader draws a number per epoch; from the global generator, a resumed run would draw another count.
+            generator=torch.Generator(),
         )
 
     def test_dataloader(self) -> DataLoader:
@@ -116,7 +122,13 @@ class ReadyDataModule(LightningDataModule):
 
     def state_dict(self) -> dict[str, Any]:
         """Epoch and position of the order of training, for an exact resume."""
-        return self._sampler.state_dict() if self._sampler is not None else {}
+        if self._sampler is None:
+            return {}
+        state = self._sampler.state_dict()
+        if self.trainer is not None:
+            # What was trained on, not what a loader may have fetched ahead.
+            state["position"] = self.trainer.fit_loop.epoch_loop.batch_progress.current.ready
+        return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continues the order of training where a checkpoint left it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import sys
 import time
@@ -13,39 +14,103 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, RichProgressBar
 
 from gausim.core import ConfigError
+from gausim.engine.checkpoint import LAST_CHECKPOINT
+from gausim.engine.files import write_durably
+from gausim.engine.loggers import Resumable
 from gausim.engine.module import GausSimModule
+from gausim.engine.randomness import random_state, restore_random_state
 
-LAST_CHECKPOINT = "last.ckpt"
+EPOCHS = "epochs.csv"
 
 
 class RunCheckpoint(Checkpoint):
-    """Saves ``last.ckpt`` at the end of epochs, and numbered snapshots where asked for."""
+    """Saves ``last.ckpt`` every so often, within epochs too, and numbered snapshots where asked for."""
 
-    def __init__(self, *, every_epochs: int = 1, snapshot_every: int = 0) -> None:
-        """Keeps the settings.
+    def __init__(
+        self, *, every_epochs: int = 1, every_minutes: float = 1.0, every_steps: int = 0, snapshot_every: int = 0
+    ) -> None:
+        """Keeps the settings; none of them changes what is learned.
 
         Args:
             every_epochs: epochs between saves of ``last.ckpt``; the last epoch is always saved.
+            every_minutes: wall-clock minutes after which it is saved within an epoch; 0 is never.
+            every_steps: optimiser steps after which it is saved within an epoch; 0 is never.
             snapshot_every: epochs between ``epoch_NNNN.ckpt`` files that stay; 0 is never.
 
         Raises:
             ConfigError: a number out of range.
         """
-        if every_epochs < 1 or snapshot_every < 0:
+        if every_epochs < 1 or min(every_minutes, every_steps, snapshot_every) < 0:
             raise ConfigError(
-                f"callbacks.checkpoint: expected every_epochs >= 1 and snapshot_every >= 0, got {every_epochs} and "
-                f"{snapshot_every}."
+                "callbacks.checkpoint: expected every_epochs >= 1 and every_minutes, every_steps, snapshot_every >= 0, "
+                f"got {every_epochs}, {every_minutes}, {every_steps} and {snapshot_every}."
             )
         self._every, self._snapshot_every = every_epochs, snapshot_every
+        self._minutes, self._steps = every_minutes, every_steps
+        self._saved_at, self._saved_step = time.monotonic(), 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Counts from here."""
+        self._saved_at, self._saved_step = time.monotonic(), trainer.global_step
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Saves within an epoch; where the epoch is about to end, its end saves."""
+        if not (trainer.is_last_batch or trainer.should_stop) and self._due(trainer):
+            self._save(trainer)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Saves when the epoch has come, the optimiser included (Lightning calls this last)."""
-        epoch, folder = trainer.current_epoch + 1, Path(trainer.default_root_dir)
+        epoch = trainer.current_epoch + 1
         last = trainer.should_stop or epoch == trainer.max_epochs
-        if last or epoch % self._every == 0:
-            trainer.save_checkpoint(folder / LAST_CHECKPOINT, weights_only=False)
+        if last or epoch % self._every == 0 or self._due(trainer):
+            self._save(trainer)
         if self._snapshot_every and epoch % self._snapshot_every == 0:
-            trainer.save_checkpoint(folder / "snapshots" / f"epoch_{epoch:04d}.ckpt", weights_only=False)
+            snapshots = Path(trainer.default_root_dir) / "snapshots"
+            trainer.save_checkpoint(snapshots / f"epoch_{epoch:04d}.ckpt", weights_only=False)
+
+    def _due(self, trainer: Trainer) -> bool:
+        if self._steps and trainer.global_step - self._saved_step >= self._steps:
+            return True
+        # All ranks save together, so one clock decides.
+        late = bool(self._minutes) and time.monotonic() - self._saved_at >= 60.0 * self._minutes
+        return bool(trainer.strategy.broadcast(late))
+
+    def _save(self, trainer: Trainer) -> None:
+        for logger in trainer.loggers:
+            logger.save()  # rows up to this step must not be lost: a resumed run does not log them again
+        trainer.save_checkpoint(Path(trainer.default_root_dir) / LAST_CHECKPOINT, weights_only=False)
+        self._saved_at, self._saved_step = time.monotonic(), trainer.global_step
+
+
+class ExactResume(Callback):
+    """Restores what Lightning does not: random generators, loggers' rows, and that a run was already over."""
+
+    def __init__(self) -> None:
+        """Nothing to set."""
+        self._random: dict[str, Any] | None = None
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Adds the state of the global random generators and whether training ends with this epoch."""
+        epochs: Any = trainer.fit_loop.epoch_progress.current
+        at_epoch_end = epochs.processed > epochs.completed
+        checkpoint["resume"] = {"random": random_state(), "over": at_epoch_end and trainer.should_stop}
+
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Takes them; a run that was stopped for good is not trained further."""
+        own = checkpoint["resume"]
+        self._random = own["random"]
+        if own["over"]:
+            trainer.should_stop = True
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Restores the generators and drops what the loggers hold of steps that will be done again."""
+        if self._random is not None:
+            restore_random_state(self._random)
+        for logger in trainer.loggers:
+            if isinstance(logger, Resumable):
+                logger.resume_at(trainer.global_step)
 
 
 class EpochSummary(Callback):
@@ -60,19 +125,20 @@ class EpochSummary(Callback):
 
     def __init__(self, *, console: bool = True) -> None:
         """``console`` prints the line; the row is written in any case."""
-        self._console, self._began = console, 0.0
+        self._console, self._began, self._elapsed = console, time.monotonic(), 0.0
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Starts the clock."""
         self._began = time.monotonic()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Drops rows of epochs that a resumed run does again."""
-        path = Path(trainer.default_root_dir) / "epochs.csv"
-        if path.is_file():
+        """Drops rows of epochs that a resumed run does again, and goes on with the clock of a cut epoch."""
+        self._began = time.monotonic() - self._elapsed
+        path = Path(trainer.default_root_dir) / EPOCHS
+        if trainer.is_global_zero and path.is_file():
             with path.open(newline="") as file:
-                rows = [r for r in csv.DictReader(file) if int(r["epoch"]) <= trainer.current_epoch]
-            self._write(path, rows)
+                rows = list(csv.DictReader(file))[: trainer.current_epoch]  # the last may be torn, but is not of these
+            write_durably(path, self._text(rows, header=True).encode())
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Writes the row and prints the line.
@@ -82,12 +148,25 @@ class EpochSummary(Callback):
         assert isinstance(pl_module, GausSimModule)
         means: dict[str, Any] = pl_module.epoch_means()
         means.update(epoch=trainer.current_epoch + 1, step=trainer.global_step, seconds=time.monotonic() - self._began)
+        if not trainer.is_global_zero:
+            return
+        path = Path(trainer.default_root_dir) / EPOCHS
+        path.parent.mkdir(parents=True, exist_ok=True)
         row = {name: _short(means[name]) if name in means else "" for name in self.COLUMNS}
-        path = Path(trainer.default_root_dir) / "epochs.csv"
-        self._write(path, [row], append=path.is_file())
-        if self._console and trainer.is_global_zero:
+        text = self._text([row], header=not path.is_file())
+        with path.open("a", newline="") as file:
+            file.write(text)
+        if self._console:
             pl_module.print(self._line(trainer, means))
             sys.stdout.flush()  # where output is piped, the epochs of a long run should show as they end
+
+    def state_dict(self) -> dict[str, float]:
+        """Seconds that the epoch under way has taken."""
+        return {"elapsed": time.monotonic() - self._began}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Takes them."""
+        self._elapsed = float(state_dict["elapsed"])
 
     def _line(self, trainer: Trainer, means: dict[str, Any]) -> str:
         parts = [f"epoch {means['epoch']}/{trainer.max_epochs}", f"T {means.get('steps', math.nan):.0f}"]
@@ -100,17 +179,21 @@ class EpochSummary(Callback):
             parts.append(f"exploded {means['exploded']:.0%}")
         return "  ".join([*parts, f"{means['seconds']:.1f} s"])
 
-    def _write(self, path: Path, rows: list[dict[str, Any]], *, append: bool = False) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a" if append else "w", newline="") as file:
-            writer = csv.DictWriter(file, self.COLUMNS)
-            if not append:
-                writer.writeheader()
-            writer.writerows(rows)
+    def _text(self, rows: list[dict[str, Any]], *, header: bool) -> str:
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, self.COLUMNS, extrasaction="ignore")
+        if header:
+            writer.writeheader()
+        writer.writerows(rows)
+        return text.getvalue()
 
 
 class TimeBudget(Callback):
-    """Ends training after so many minutes, resumed runs included; the epoch under way is cut and saved."""
+    """Ends training after so many minutes, resumed runs included; the epoch under way is cut and saved.
+
+    A clock never runs twice alike: with ``drives_schedule`` the learning rates, and without it the number of steps,
+    differ between any two runs. A resumed run is exact in everything else.
+    """
 
     def __init__(self, *, minutes: float, clock: str = "wall", drives_schedule: bool = True) -> None:
         """Keeps the settings.
@@ -135,19 +218,25 @@ class TimeBudget(Callback):
         return self._used >= self._budget
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Starts the clock."""
+        """Starts the clock; a resumed run's first step has the learning rate of the time used so far."""
         self._mark = self._clock()
+        self._drive(pl_module)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Stops the training once the budget is used up."""
         now = self._clock()
-        self._used, self._mark = self._used + now - self._mark, now
-        if self._drives and isinstance(pl_module, GausSimModule):
-            pl_module.time_fraction = min(1.0, self._used / self._budget)
+        # One clock for all ranks: their learning rates and their last step must agree.
+        self._used = float(trainer.strategy.broadcast(self._used + now - self._mark))
+        self._mark = now
+        self._drive(pl_module)
         if self.spent:
             trainer.should_stop = True
+
+    def _drive(self, pl_module: LightningModule) -> None:
+        if self._drives and isinstance(pl_module, GausSimModule):
+            pl_module.time_fraction = min(1.0, self._used / self._budget)
 
     def state_dict(self) -> dict[str, float]:
         """The time used."""

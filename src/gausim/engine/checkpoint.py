@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import os
+import io
 import pickle
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,19 @@ from lightning.pytorch.plugins.io import CheckpointIO
 from torch import Tensor, nn
 
 from gausim.core import GaussianScene, RunError
+from gausim.engine.files import write_durably
+
+LAST_CHECKPOINT, PREVIOUS_CHECKPOINT = "last.ckpt", "last.previous.ckpt"
+DIGEST = "digest"
 
 
 class AtomicCheckpointIO(CheckpointIO):
     """Writes beside the target, flushes to the disk, reads back, and only then renames.
 
-    Whatever fails on the way, the previous file of that name stays. Only tensors and plain containers are written:
-    loading needs ``weights_only`` and nothing more.
+    Whatever fails on the way, the previous file of that name stays, and the run hears of it. ``last.ckpt`` also leaves
+    its predecessor as ``last.previous.ckpt``. Only tensors and plain containers are written: loading needs
+    ``weights_only`` and nothing more. A digest of the content goes with them, because torch reads flipped bits of a
+    tensor without complaint.
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
@@ -29,81 +35,113 @@ class AtomicCheckpointIO(CheckpointIO):
         Raises:
             RunError: the disk refuses, or what was written cannot be read back; the previous file is untouched.
         """
-        target = Path(path)
-        temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+        target, buffer = Path(path), io.BytesIO()
         try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with temporary.open("wb") as file:
-                torch.save(checkpoint, file)
-                file.flush()
-                os.fsync(file.fileno())
-            written = torch.load(temporary, map_location="cpu", weights_only=True)
-            _check_equal(written.get("state_dict", {}), checkpoint.get("state_dict", {}))
-            os.replace(temporary, target)
-            _sync_directory(target.parent)
-        except (OSError, RuntimeError, ValueError, pickle.PickleError) as error:
+            expected = digest(checkpoint)
+            torch.save({**checkpoint, DIGEST: expected}, buffer)
+            write_durably(
+                target,
+                buffer.getvalue(),
+                check=lambda written: _check_written(written, expected),
+                previous=target.with_name(PREVIOUS_CHECKPOINT) if target.name == LAST_CHECKPOINT else None,
+            )
+        except (OSError, RuntimeError, ValueError, TypeError, AttributeError, pickle.PickleError, RunError) as error:
             raise RunError(
                 f"{target}: the checkpoint could not be written ({error}). The previous one, if any, is unharmed. "
-                "Check the free space and the permissions."
+                "Check the free space and the permissions; then the same command continues from it."
             ) from error
-        finally:
-            temporary.unlink(missing_ok=True)
 
     def load_checkpoint(
         self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Reads a checkpoint; never executes what is in it."""
-        return read_checkpoint(Path(path), map_location)
+        """Reads a checkpoint to the CPU; never executes what is in it."""
+        return read_checkpoint(Path(path))
 
     def remove_checkpoint(self, path: str | Path) -> None:
         """Deletes a checkpoint."""
         Path(path).unlink(missing_ok=True)
 
 
-def read_checkpoint(path: Path, map_location: Any = None) -> dict[str, Any]:
-    """Reads a checkpoint that :class:`AtomicCheckpointIO` wrote, to the CPU unless told otherwise.
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """Reads a checkpoint that :class:`AtomicCheckpointIO` wrote, to the CPU.
+
+    Files of earlier versions hold no digest; their weights are read as they are.
 
     Raises:
         RunError: it is missing, damaged or no checkpoint of gausim.
     """
     try:
-        loaded = torch.load(path, map_location=map_location or "cpu", weights_only=True)
+        loaded = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise RunError(f"{path}: no such checkpoint. Train first (`gausim train`).") from error
-    except (OSError, RuntimeError, ValueError, EOFError, pickle.PickleError) as error:
-        raise RunError(
-            f"{path}: cannot be read as a checkpoint ({str(error).splitlines()[0]}). It is damaged."
-        ) from error
+    except pickle.UnpicklingError as error:
+        # Not torch's words: they advise to load it all the same and run what is in it.
+        raise _damaged(path, "it is no archive of tensors and plain containers; nothing in it was executed") from error
+    except Exception as error:  # damage inside an archive surfaces as almost anything
+        raise _damaged(path, (str(error) or type(error).__name__).splitlines()[0]) from error
     if not isinstance(loaded, dict) or "state_dict" not in loaded or "gausim" not in loaded:
         raise RunError(f"{path}: expected a checkpoint of gausim (entries 'state_dict' and 'gausim').")
+    if DIGEST in loaded:
+        expected, found = loaded[DIGEST], digest({k: v for k, v in loaded.items() if k != DIGEST})
+        if found != expected:
+            raise _damaged(path, f"its content has digest {found[:12]}, expected {str(expected)[:12]}")
     return loaded
 
 
-def _check_equal(written: dict[str, Any], given: dict[str, Any]) -> None:
-    different = [
-        k for k, v in given.items() if isinstance(v, Tensor) and not _same(written.get(k), v.detach().cpu())
-    ]  # fmt: skip
-    if set(written) != set(given) or different:
-        raise RuntimeError(f"read back with other contents: {different or sorted(set(written) ^ set(given))}")
+def _damaged(path: Path, reason: str) -> RunError:
+    return RunError(
+        f"{path}: cannot be read as a checkpoint ({reason}). It is damaged, or not gausim's. The command that trained "
+        f"it falls back to {PREVIOUS_CHECKPOINT} beside it, where there is one."
+    )
 
 
-def _same(first: Any, second: Tensor) -> bool:
-    # Bytes, not values: a NaN read back is the same NaN.
-    return isinstance(first, Tensor) and first.dtype == second.dtype and torch.equal(_bytes(first), _bytes(second))
+def check_resumable(path: Path) -> None:
+    """Reads a checkpoint to tell whether a run can continue from it.
+
+    Raises:
+        RunError: it is damaged, or of a version that saved less than an exact resume needs.
+    """
+    if DIGEST not in read_checkpoint(path):
+        raise RunError(
+            f"{path}: written by an earlier version of gausim, which did not save all that a resumed run needs. Finish "
+            "it with that version, or train anew (trainer.overwrite=true)."
+        )
 
 
-def _bytes(value: Tensor) -> Tensor:
-    return value.contiguous().reshape(-1).view(torch.uint8) if value.numel() else value.reshape(-1)
+def _check_written(path: Path, expected: str) -> None:
+    if read_checkpoint(path).get(DIGEST) != expected:
+        raise RuntimeError("it reads back with other contents")
 
 
-def _sync_directory(folder: Path) -> None:
-    if os.name != "posix":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+def digest(content: Any) -> str:
+    """SHA-256 of nested containers of tensors and plain values: bytes, types, shapes and order count.
+
+    Raises:
+        TypeError: something else is in them, which could not be read back without executing it.
+    """
+    running = hashlib.sha256()
+    _feed(running, content, "checkpoint")
+    return running.hexdigest()
+
+
+def _feed(running: Any, value: Any, where: str) -> None:
+    if isinstance(value, Tensor):
+        flat = value.detach().cpu().contiguous().reshape(-1)
+        running.update(f"tensor {value.dtype} {tuple(value.shape)}".encode())
+        running.update(flat.view(torch.uint8).numpy() if flat.numel() else b"")
+    elif isinstance(value, Mapping):
+        running.update(f"mapping {len(value)}".encode())
+        for key, entry in value.items():
+            _feed(running, key, where)
+            _feed(running, entry, f"{where}[{key!r}]")
+    elif isinstance(value, (list, tuple)):
+        running.update(f"{'list' if isinstance(value, list) else 'tuple'} {len(value)}".encode())
+        for place, entry in enumerate(value):
+            _feed(running, entry, f"{where}[{place}]")
+    elif value is None or type(value) in (bool, int, float, str, bytes):
+        running.update(f"{type(value).__name__} {value!r};".encode())
+    else:
+        raise TypeError(f"{where} holds a {type(value).__name__}; expected tensors, containers and plain values")
 
 
 def fingerprints(scenes: Sequence[GaussianScene]) -> list[dict[str, Any]]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +16,17 @@ import yaml
 from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.loggers import Logger
+from lightning.pytorch.utilities import rank_zero_only
 
 from gausim.core import ConfigError, RunError
-from gausim.engine.callbacks import LAST_CHECKPOINT, TimeBudget
-from gausim.engine.checkpoint import AtomicCheckpointIO
+from gausim.engine.callbacks import EPOCHS, ExactResume, TimeBudget
+from gausim.engine.checkpoint import LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, AtomicCheckpointIO, check_resumable
+from gausim.engine.files import remove_leftovers, sole_writer, unwritable, write_durably
+from gausim.engine.loggers import WANDB_ID
 from gausim.engine.memory import keep_freed_memory
 
-CONFIG, FINISHED = "config.yaml", "FINISHED"
+CONFIG, FINISHED, LOCK = "config.yaml", "FINISHED", ".lock"
+DAMAGED_CHECKPOINT = "last.damaged.ckpt"
 # What may differ when a run is resumed: where it is kept, how it is shown and what computes it, not what is learned.
 FREE_KEYS = (
     "paths",
@@ -35,8 +41,8 @@ FREE_KEYS = (
     "trainer.overwrite",
 )
 # What `overwrite` removes; anything else in the directory is not ours.
-OWN_FILES = (CONFIG, FINISHED, LAST_CHECKPOINT, "epochs.csv")
-OWN_FOLDERS = ("panels", "snapshots", "tensorboard", "csv")
+OWN_FILES = (CONFIG, FINISHED, LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, DAMAGED_CHECKPOINT, EPOCHS, WANDB_ID)
+OWN_FOLDERS = ("panels", "snapshots", "tensorboard", "csv", "wandb")
 
 
 class RunDirectory:
@@ -54,6 +60,11 @@ class RunDirectory:
     def checkpoint(self) -> Path:
         """The last checkpoint."""
         return self.path / LAST_CHECKPOINT
+
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether something was learned here."""
+        return any((self.path / name).is_file() for name in (LAST_CHECKPOINT, PREVIOUS_CHECKPOINT))
 
     @property
     def is_finished(self) -> bool:
@@ -77,6 +88,25 @@ class RunDirectory:
             raise RunError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
         return loaded
 
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """The block that trains: no other process may, and what the disk refuses becomes a RunError.
+
+        Raises:
+            RunError: another process trains here, or the directory cannot be written.
+        """
+        try:
+            if getattr(rank_zero_only, "rank", 0):  # the other ranks of a run belong to its first
+                yield
+                return
+            with sole_writer(self.path / LOCK):
+                yield
+        except OSError as error:
+            explained = unwritable(error, self.path)
+            if explained is None:
+                raise
+            raise explained from error
+
     def prepare(self, config: Mapping[str, Any], *, overwrite: bool = False) -> Path | None:
         """Makes the directory and writes the configuration; returns the checkpoint to resume from, if there is one.
 
@@ -85,8 +115,9 @@ class RunDirectory:
             overwrite: remove what an earlier run left here.
 
         Raises:
-            RunError: the run here is finished, or was started with another configuration.
+            RunError: the run here is finished, was started with another configuration, or no checkpoint of it is whole.
         """
+        remove_leftovers(self.path)
         if overwrite:
             self._clear()
         if self.is_finished:
@@ -96,22 +127,44 @@ class RunDirectory:
             )
         if (self.path / CONFIG).is_file():
             changed = changed_keys(self.config(), config)
-            if changed and self.checkpoint.is_file():
+            if changed and self.has_checkpoint:
                 raise RunError(
                     f"{self.path}: the run here was started with another configuration; changed: {', '.join(changed)}. "
                     "Restore these keys to resume it, give the new run another name, or set trainer.overwrite=true."
                 )
-        self.path.mkdir(parents=True, exist_ok=True)
-        temporary = self.path / f".{CONFIG}.tmp"
-        temporary.write_text(yaml.safe_dump(dict(config), sort_keys=False))
-        os.replace(temporary, self.path / CONFIG)
-        return self.checkpoint if self.checkpoint.is_file() else None
+        resume = self._whole_checkpoint()
+        write_durably(self.path / CONFIG, yaml.safe_dump(dict(config), sort_keys=False).encode())
+        return resume
+
+    def _whole_checkpoint(self) -> Path | None:
+        """The last checkpoint, or the one before it where the last is damaged (which is then set aside)."""
+        problems: list[str] = []
+        for path in (self.checkpoint, self.path / PREVIOUS_CHECKPOINT):
+            if not path.is_file():
+                continue
+            try:
+                check_resumable(path)
+            except RunError as error:
+                problems.append(str(error))
+                continue
+            if problems:
+                aside = self.path / DAMAGED_CHECKPOINT
+                os.replace(self.checkpoint, aside)
+                warnings.warn(
+                    f"{problems[0]} Resuming from {path}, the checkpoint before it; the damaged file is now {aside}.",
+                    stacklevel=3,
+                )
+            return path
+        if problems:
+            raise RunError(
+                f"{self.path}: no checkpoint here is whole. {' '.join(problems)} Train anew (trainer.overwrite=true), "
+                "or under another name."
+            )
+        return None
 
     def finish(self, facts: Mapping[str, Any]) -> None:
         """Marks the run as finished, with a few facts about it."""
-        temporary = self.path / f".{FINISHED}.tmp"
-        temporary.write_text(json.dumps(dict(facts), indent=1) + "\n")
-        os.replace(temporary, self.path / FINISHED)
+        write_durably(self.path / FINISHED, (json.dumps(dict(facts), indent=1) + "\n").encode())
 
     def _clear(self) -> None:
         for name in OWN_FILES:
@@ -179,6 +232,7 @@ def make_trainer(
     own = [c for c in callbacks if progress or not isinstance(c, ProgressBar)]
     if max_minutes is not None:
         own.append(TimeBudget(minutes=max_minutes, clock=clock))
+    own.append(ExactResume())
     return Trainer(
         max_epochs=max_epochs,
         accelerator=accelerator,

@@ -1,0 +1,90 @@
+"""Runs `gausim train` in forked children, so that one start of Python serves many runs, and has them die.
+
+A program, not a test: it reads one JSON object per line (argv, die, kill_after, limit) and answers with the child's
+exit status (negative: the signal) and output. Nothing here runs a backward pass: after one, torch refuses to fork.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import resource
+import select
+import signal
+import sys
+import tempfile
+import traceback
+from typing import Any
+
+import torch
+
+import gausim.cli._run
+import gausim.cli.train
+import gausim.engine.loggers
+import gausim.engine.panels  # noqa: F401
+from gausim.cli.main import main
+
+
+def die_at(target: str, match: str, count: int, when: str) -> None:
+    """Ends this process by SIGKILL before or after the count-th call of ``target`` with ``match`` in its arguments."""
+    home, name = target.rsplit(".", 1)
+    try:
+        owner: Any = importlib.import_module(home)
+    except ModuleNotFoundError:
+        owner = getattr(importlib.import_module(home.rsplit(".", 1)[0]), home.rsplit(".", 1)[1])
+    original, calls = getattr(owner, name), 0
+
+    def dying(*args: Any, **kwargs: Any) -> Any:
+        nonlocal calls
+        calls += match in " ".join(map(str, args)) if match else 1
+        if when == "before" and calls == count:
+            os.kill(os.getpid(), signal.SIGKILL)
+        result = original(*args, **kwargs)
+        if when == "after" and calls == count:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+
+    setattr(owner, name, dying)
+
+
+def child(order: dict[str, Any]) -> int:
+    """Trains."""
+    torch.set_num_threads(1)
+    if order.get("limit"):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
+    for point in order.get("die") or []:
+        die_at(**point)
+    try:
+        return main(["train", *order["argv"]])
+    except BaseException:
+        traceback.print_exc()
+        return 1
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+
+
+def answer(order: dict[str, Any]) -> dict[str, Any]:
+    """Forks, waits, and kills after ``kill_after`` seconds where that is asked for."""
+    with tempfile.TemporaryFile() as log:
+        pid = os.fork()
+        if pid == 0:
+            os.dup2(log.fileno(), 1)
+            os.dup2(log.fileno(), 2)
+            os._exit(child(order))
+        if order.get("kill_after"):
+            handle = os.pidfd_open(pid)
+            if not select.select([handle], [], [], order["kill_after"])[0]:
+                os.kill(pid, signal.SIGKILL)
+            os.close(handle)
+        status = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        log.seek(0)
+        return {"status": status, "output": log.read().decode(errors="replace")}
+
+
+if __name__ == "__main__":
+    answers = os.fdopen(os.dup(1), "w")
+    for line in sys.stdin:
+        answers.write(json.dumps(answer(json.loads(line))) + "\n")
+        answers.flush()
