@@ -72,8 +72,15 @@ class Simulator(Protocol):
         """The disjoint graph of one sequence per entry."""
         ...
 
-    def step(self, batch: Any, state: SimState, force: Tensor | None = None) -> Any:
-        """Predicts the next frame of all members."""
+    def prepare(self, batch: Any) -> Any:
+        """What steps of a batch share while no parameter changes; gradients flow through it.
+
+        One serves the steps of one stretch: the next backward pass needs another.
+        """
+        ...
+
+    def step(self, batch: Any, state: SimState, force: Tensor | None = None, prepared: Any = None) -> Any:
+        """Predicts the next frame of all members; ``prepared`` is made for this step alone when None."""
         ...
 
     def parameter_groups(self) -> dict[str, list[Parameter]]:

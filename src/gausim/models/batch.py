@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gausim.core import GaussianScene
 from gausim.models.hierarchy import Hierarchy
+from gausim.models.recursion import Inheritance
 from gausim.ops.neighbours import radius_edges
 
 
@@ -40,6 +41,7 @@ class LevelBatch:
         unit_of_kernel: unit of every simulated kernel.
         parent: unit of the coarser predicted level, or at the coarsest one the simulated kernel that is the root.
         pinned: units that never move.
+        free: 0 for these, 1 for all others; as a number, to multiply with.
         rest_edges: neighbours in rest space, sorted by destination.
         spans: rows of each member.
         length: bounding-box diagonal of the unit's scene [scene units].
@@ -50,6 +52,7 @@ class LevelBatch:
     unit_of_kernel: Int[Tensor, " K"]
     parent: Int[Tensor, " N"]
     pinned: Bool[Tensor, " N"]
+    free: Float[Tensor, "N 1"]
     rest_edges: Int[Tensor, "2 E"]
     spans: tuple[slice, ...]
     length: Float[Tensor, "N 1"]
@@ -84,6 +87,8 @@ class SceneBatch:
         pinned: which of the simulated kernels are held.
         volume: volumes of the simulated kernels.
         dt: frame interval of each simulated kernel's sequence [s].
+        finest: unit of the finest predicted level of every kernel; 0 for never-simulated ones, which weigh nothing.
+        kernels: which kernel inherits from which unit.
     """
 
     members: tuple[Member, ...]
@@ -93,6 +98,8 @@ class SceneBatch:
     pinned: Bool[Tensor, " M"]
     volume: Float[Tensor, " M"]
     dt: Float[Tensor, "M 1"]
+    finest: Int[Tensor, " K"]
+    kernels: Inheritance
 
     @property
     def scene_ids(self) -> tuple[int, ...]:
@@ -148,15 +155,22 @@ class BatchBuilder:
             sim_counts.append(hierarchy.levels[0].count)
             kernels, units = kernels + scene.count, units + count + 1
         base = [self.hierarchies[i].levels[0] for i in scene_ids]
+        levels = tuple(self._level(p, scene_ids, sim_counts, device) for p in range(len(self.predicted)))
+        rest, index = torch.cat([self.scenes[i].means for i in scene_ids]).to(device), torch.cat(simulated).to(device)
+        pinned = torch.cat([b.pinned for b in base]).to(device)
         dt = torch.tensor([1.0 / self.fps[i] for i in scene_ids], dtype=self.scenes[0].means.dtype)
         return SceneBatch(
             members=tuple(members),
-            levels=tuple(self._level(p, scene_ids, sim_counts, device) for p in range(len(self.predicted))),
-            rest=torch.cat([self.scenes[i].means for i in scene_ids]).to(device),
-            simulated=torch.cat(simulated).to(device),
-            pinned=torch.cat([b.pinned for b in base]).to(device),
+            levels=levels,
+            rest=rest,
+            simulated=index,
+            pinned=pinned,
             volume=torch.cat([b.volume for b in base]).to(device),
             dt=dt.repeat_interleave(torch.tensor(sim_counts))[:, None].to(device),
+            finest=torch.zeros(kernels, dtype=torch.int64, device=device).index_copy(
+                0, index, levels[-1].unit_of_kernel
+            ),
+            kernels=_inheritance(rest, index, pinned, levels[-1]),
         )
 
     def _level(
@@ -182,10 +196,12 @@ class BatchBuilder:
             column = torch.tensor(values, dtype=self.scenes[0].means.dtype)
             return column.repeat_interleave(torch.tensor(counts))[:, None].to(device)
 
+        pinned = torch.cat([h.levels[level].pinned for h in chosen]).to(device)
         return LevelBatch(
             unit_of_kernel=join([h.ancestor(0, level) for h in chosen], starts),
             parent=join(above, above_starts),
-            pinned=torch.cat([h.levels[level].pinned for h in chosen]).to(device),
+            pinned=pinned,
+            free=(~pinned).to(self.scenes[0].means.dtype)[:, None],
             rest_edges=join([self._edges[i][position] for i in scene_ids], starts, 1),
             spans=tuple(slice(s, s + c) for s, c in zip(starts, counts, strict=True)),
             length=spread([h.diagonal for h in chosen]),
@@ -194,3 +210,11 @@ class BatchBuilder:
             radius=tuple(self.graph.radii[position] * h.diagonal for h in chosen),
             max_neighbours=self.graph.max_neighbours,
         )
+
+
+def _inheritance(rest: Tensor, simulated: Tensor, pinned: Tensor, finest: LevelBatch) -> Inheritance:
+    """Free kernels follow their unit; behind the units of every member stands the identity of its held kernels."""
+    unit = torch.where(pinned, -1, finest.unit_of_kernel)
+    held = torch.full((len(rest),), -1, device=rest.device)
+    rows = torch.cat([torch.arange(span.start, span.stop) + i for i, span in enumerate(finest.spans)]).to(rest.device)
+    return Inheritance(rest, held.index_copy(0, simulated, unit), rows, len(rows) + len(finest.spans))

@@ -13,7 +13,7 @@ that is zero at rest and starts at zero.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -156,15 +156,67 @@ class ElasticScene(nn.Module):
 
     def forward(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S M"]:
         """Modal coordinates at t + 1 from the displacements at t and t - 1 of S sequences."""
-        z = torch.einsum("snd,ndm->sm", now, self.projection)
-        previous = torch.einsum("snd,ndm->sm", before, self.projection)
-        a, b, h = self.matrices()
-        following = z @ a.mT - previous @ b.mT
+        return PreparedScene(self).coordinates(now, before)
+
+
+class PreparedScene:
+    """An elastic scene while its parameters do not change: its matrices and what the force is at rest."""
+
+    def __init__(self, scene: ElasticScene) -> None:
+        """Computes the constants; gradients flow through them."""
+        self.scene = scene
+        a, b, h = scene.matrices()
+        self.projection = scene.projection.flatten(0, 1)
+        # Positions and gradients of a unit side by side: one product gives both.
+        self.motions = torch.cat((scene.modes, scene.gradients.flatten(1, 2)), 1).flatten(0, 1)
+        self.force, parts = scene.force, [a.mT, -b.mT]
         if self.force is not None:
-            inputs = torch.cat((z, z - previous), -1) / self.scale
-            force = self.force(inputs) - self.force(torch.zeros_like(inputs[:1]))
-            following = following + 0.1 * self.scale * force @ h.mT
-        return following
+            parts.append(0.1 * scene.scale * h.mT)
+            self.still = self.force(a.new_zeros(1, 2 * len(scene.values)))
+        self.transition = torch.cat(parts)
+
+    def coordinates(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S M"]:
+        """Modal coordinates at t + 1 from the displacements at t and t - 1 of S sequences."""
+        z, previous = (torch.cat((now, before)).flatten(1) @ self.projection).chunk(2)
+        parts = [z, previous]
+        if self.force is not None:
+            parts.append(self.force(torch.cat((z, z - previous), -1) / self.scene.scale) - self.still)
+        return torch.cat(parts, -1) @ self.transition
+
+    def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
+        """Displacement and its gradient, row by row, of every unit at t + 1."""
+        z = self.coordinates(now, before)
+        return (z @ self.motions.mT).view(*now.shape[:2], 12)
+
+
+class _PreparedTemplate:
+    """The elastic template of one batch while its parameters do not change."""
+
+    def __init__(self, template: ElasticTemplate, batch: SceneBatch) -> None:
+        self.template = template
+        spans = batch.levels[-1].spans
+        self.parts = []
+        for scene_id in sorted(set(batch.scene_ids)):
+            rows = [torch.arange(t.start, t.stop) for t, s in zip(spans, batch.scene_ids, strict=True) if s == scene_id]
+            self.parts.append(
+                (PreparedScene(template.scene(scene_id)), torch.cat(rows).to(batch.rest.device), len(rows))
+            )
+        order = torch.cat([rows for _, rows, _ in self.parts])
+        self.places = torch.empty_like(order).index_copy(0, order, torch.arange(len(order), device=order.device))
+
+    def __call__(self, motion: Motion) -> TemplateState:
+        now, before = motion.now - motion.rest, motion.before - motion.rest
+        if len(self.parts) == 1:
+            scene, _, count = self.parts[0]
+            moved = scene(now.view(count, -1, 3), before.view(count, -1, 3)).flatten(0, 1)
+        else:
+            made = []
+            for scene, rows, count in self.parts:
+                a, b = (x.index_select(0, rows).view(count, -1, 3) for x in (now, before))
+                made.append(scene(a, b).flatten(0, 1))
+            moved = torch.cat(made).index_select(0, self.places)
+        identity = torch.eye(3, dtype=moved.dtype, device=moved.device)
+        return TemplateState(motion.rest + moved[:, :3], self.template.valid(moved[:, 3:].view(-1, 3, 3) + identity))
 
 
 class ElasticTemplate(Template):
@@ -203,41 +255,36 @@ class ElasticTemplate(Template):
             for h in hierarchies
         )
 
-    def _scenes(self) -> list[ElasticScene]:
-        return [scene for scene in self.scenes if isinstance(scene, ElasticScene)]
+    def scene(self, scene_id: int) -> ElasticScene:
+        """Modes and matrices of one scene."""
+        scene = self.scenes[scene_id]
+        assert isinstance(scene, ElasticScene)
+        return scene
 
     def networks(self) -> list[nn.Parameter]:
         """Weights of the nonlinear forces."""
-        return [p for scene in self._scenes() if scene.force is not None for p in scene.force.parameters()]
+        forces = (self.scene(i).force for i in range(len(self.scenes)))
+        return [p for force in forces if force is not None for p in force.parameters()]
 
     def forward(self, batch: SceneBatch, motion: Motion) -> TemplateState:
         """Positions X + Phi z and gradients I + grad(Phi) z of the next frame."""
-        spans = batch.levels[-1].spans
-        positions: list[Tensor] = [motion.rest[s] for s in spans]
-        gradients: list[Tensor] = [motion.rest[s] for s in spans]
-        for scene_id in sorted(set(batch.scene_ids)):
-            rows = [i for i, s in enumerate(batch.scene_ids) if s == scene_id]
-            scene = self._scenes()[scene_id]
-            now = torch.stack([motion.now[spans[i]] - motion.rest[spans[i]] for i in rows])
-            before = torch.stack([motion.before[spans[i]] - motion.rest[spans[i]] for i in rows])
-            z = scene(now, before)
-            displacement = torch.einsum("sm,ndm->snd", z, scene.modes)
-            gradient = torch.einsum("sm,nabm->snab", z, scene.gradients)
-            for j, i in enumerate(rows):
-                positions[i] = positions[i] + displacement[j]
-                gradients[i] = gradient[j]
-        total = torch.cat(gradients) + torch.eye(3, device=motion.rest.device)
-        return TemplateState(torch.cat(positions), self._valid(total))
+        return self.prepare(batch)(motion)
 
-    def _valid(self, gradient: Tensor) -> Tensor:
+    def prepare(self, batch: SceneBatch) -> Callable[[Motion], TemplateState]:
+        """The template with its matrices computed."""
+        return _PreparedTemplate(self, batch)
+
+    def valid(self, gradient: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 3 3"]:
         """Keeps the determinant above its bound (towards the identity) and, with mass on, scales it to one."""
         det = determinant(gradient)
-        share = torch.where(det < MIN_DETERMINANT, 0.0, 1.0).detach()[:, None, None]
-        identity = torch.eye(3, device=gradient.device)
-        gradient = share * gradient + (1 - share) * identity
-        return unit_determinant(gradient) if self.conserve_volume else gradient
+        kept = ~(det < MIN_DETERMINANT)  # so that NaN stays NaN
+        identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
+        gradient = torch.where(kept[:, None, None], gradient, identity)
+        if not self.conserve_volume:
+            return gradient
+        return unit_determinant(gradient, torch.where(kept, det, 1.0))
 
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor]:
         """Modes (N, 3, M) and their gradients (N, 3, 3, M): a basis of smooth motions of one scene."""
-        scene = self._scenes()[scene_id]
+        scene = self.scene(scene_id)
         return scene.modes * scene.scale, scene.gradients * scene.scale

@@ -8,6 +8,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gausim.models.features_compiled import NetworkInputs
+from gausim.models.recursion import Solved, Units
+from gausim.ops.compiled import fits
+
 # Lengths are divided by the diagonal of the scene before they get here: 1e-6 of it is nothing.
 TINY = 1e-6
 
@@ -62,6 +66,45 @@ class FeatureOptions:
 def safe_norm(x: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 1"]:
     """Length, with a finite gradient at zero."""
     return (x * x).sum(-1, keepdim=True).add(TINY**2).sqrt()
+
+
+def network_inputs(
+    unit: Units,
+    target: Float[Tensor, "N 3"],
+    above: Solved,
+    edge_index: Int[Tensor, "2 E"],
+    size: Float[Tensor, "N 1"],
+    dt: Float[Tensor, "N 1"],
+    gravity: Float[Tensor, " 3"],
+    options: FeatureOptions,
+    *,
+    coarse: bool = False,
+) -> tuple[Float[Tensor, "N Cn"], Float[Tensor, "E Ce"]]:
+    """Node and edge features of the units of one level.
+
+    Args:
+        unit: the units.
+        target: their template positions [scene units].
+        above: their solved parents.
+        edge_index: source and destination.
+        size: diagonal of each unit's scene [scene units].
+        dt: frame interval [s].
+        gravity: acceleration [scene units / s^2].
+        options: among the readings of the paper.
+        coarse: whether positions are those of the coarse prediction.
+    """
+    moving = unit.rest, unit.now, unit.before, target
+    parents = above.rest, above.now, above.before, above.after, above.template, above.gradient
+    if fits(*moving, *parents, unit.log_density, unit.attributes, size, dt, gravity):
+        choices = options.rest_inputs, coarse, options.angle == "cos_sin"
+        constants = above.index, edge_index, size.view(-1), dt.view(-1), gravity
+        return NetworkInputs.apply(*moving, unit.log_density, unit.attributes, *parents, *constants, choices)
+    own = UnitState(unit.rest / size, unit.now / size, unit.before / size, above.carry(target) / size)
+    parent = UnitState(*(x.index_select(0, above.index) / size for x in parents[:4]))
+    nodes = node_features(
+        own, parent, dt, gravity / size, unit.log_density, unit.attributes, options, coarse=coarse
+    )  # fmt: skip
+    return nodes, edge_features(own, parent, edge_index, dt, options, coarse=coarse)
 
 
 def node_features(

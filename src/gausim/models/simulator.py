@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -11,13 +11,16 @@ from torch import Tensor, nn
 
 from gausim.core import ConfigError, DivergenceError, Forces, GaussianScene, SimState, Trajectory
 from gausim.models.batch import BatchBuilder, GraphOptions, LevelBatch, SceneBatch
-from gausim.models.features import FeatureOptions, UnitState, edge_features, node_features
+from gausim.models.features import FeatureOptions, network_inputs
 from gausim.models.hierarchy import build_hierarchy
+from gausim.models.prepared import Prepared, fixed_units
+from gausim.models.recursion import Solved, Units, advance, inherit
 from gausim.models.template import Motion, RestTemplate, Template
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.mlp import zero_output as initialise_zero
 from gausim.nn.normaliser import RunningNormaliser
-from gausim.ops.deformation import gradient_from_output, polar_rotation
+from gausim.ops.aggregation import weighted_sum
+from gausim.ops.deformation import gradient_from_output
 from gausim.ops.neighbours import combine_edges
 
 EDGE_RULES = ("rest", "union", "intersection")
@@ -41,23 +44,6 @@ class Step:
     rotations: Float[Tensor, "N 3 3"]
     momentum: Float[Tensor, ""]
     predicted: tuple[Float[Tensor, "_ 3 3"], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class _Parents:
-    """Solved state of the level above: per unit of the level below it, gathered by its parent index."""
-
-    rest: Tensor
-    now: Tensor
-    before: Tensor
-    after: Tensor
-    template: Tensor
-    gradient: Tensor
-    rotation: Tensor
-
-    def at(self, index: Tensor) -> _Parents:
-        values = (self.rest, self.now, self.before, self.after, self.template, self.gradient, self.rotation)
-        return _Parents(*(v.index_select(0, index) for v in values))
 
 
 class GausSim(nn.Module):
@@ -166,7 +152,26 @@ class GausSim(nn.Module):
         log_density = torch.cat([self.log_density[i] for i in batch.scene_ids])
         return log_density.exp() * batch.volume, log_density
 
-    def step(self, batch: SceneBatch, state: SimState, force: Float[Tensor, "K 3"] | None = None) -> Step:
+    def prepare(self, batch: SceneBatch) -> Prepared:
+        """What steps of this batch have in common as long as no parameter changes.
+
+        Gradients flow through it: make one for every stretch of steps with a backward pass of its own.
+        """
+        mass, _ = self.masses(batch)
+        attributes = torch.cat([self.attributes[i] for i in batch.scene_ids])
+        share, levels = fixed_units(batch, mass, attributes)
+        top = batch.levels[0]
+        roots = batch.rest.index_select(0, batch.simulated.index_select(0, top.parent))
+        template, grad = self.template.prepare(batch), torch.is_grad_enabled()
+        return Prepared(batch, mass, share, levels, Solved.roots(roots), template, grad)
+
+    def step(
+        self,
+        batch: SceneBatch,
+        state: SimState,
+        force: Float[Tensor, "K 3"] | None = None,
+        prepared: Prepared | None = None,
+    ) -> Step:
         """Predicts the next frame.
 
         Args:
@@ -174,138 +179,68 @@ class GausSim(nn.Module):
             state: positions and previous positions of all kernels of the batch [scene units].
             force: force per kernel [mass scene units / s^2]; it displaces free kernels by f dt^2 / (2 m) before the
                 step (METHOD section 6).
+            prepared: from :meth:`prepare`, shared by steps between which no parameter changes; made here when None.
+
+        Raises:
+            ValueError: ``prepared`` is of another batch, or carries no gradients while they are enabled.
         """
-        index = batch.simulated
-        rest, now = batch.rest.index_select(0, index), state.positions.index_select(0, index)
-        before = state.previous.index_select(0, index)
-        mass, log_density = self.masses(batch)
+        prepared = self.prepare(batch) if prepared is None else prepared
+        if prepared.batch is not batch or (torch.is_grad_enabled() and not prepared.with_gradients):
+            raise ValueError(
+                "step: `prepared` was made for another batch, or without gradients while they are enabled now. "
+                "Call prepare(batch) where step is called."
+            )
         if force is not None:
-            push = force.index_select(0, index) * batch.dt**2 / (2 * mass[:, None])
-            now = torch.where(batch.pinned[:, None], now, now + push)
-        attributes = torch.cat([self.attributes[i] for i in batch.scene_ids])
-        kernels = (rest, now, before, mass, log_density, attributes)
-        units = [_aggregate(level, kernels) for level in batch.levels]
-        template = self.template(batch, Motion(units[-1].rest, units[-1].now, units[-1].before))
-        targets = _template_per_level(batch, units, template.positions)
-        identity = torch.eye(3, device=rest.device, dtype=rest.dtype).expand(len(rest), 3, 3)
-        parents = _Parents(rest, rest, rest, rest, rest, identity, identity)
-        momentum = rest.new_zeros(())
-        predicted = []
-        for position, (level, unit) in enumerate(zip(batch.levels, units, strict=True)):
-            above = parents.at(level.parent)
-            gradient, rotation = self._predict(level, unit, above, targets[position], top=position == 0)
+            state = SimState(state.positions + self._push(prepared, force), state.previous)
+        now, before = prepared.motion(state)
+        units = [
+            Units(fixed.rest, x, y, fixed.mass, fixed.log_density, fixed.attributes)
+            for fixed, x, y in zip(prepared.levels, now, before, strict=True)
+        ]
+        template = prepared.template(Motion(units[-1].rest, units[-1].now, units[-1].before))
+        targets = prepared.per_level(template.positions)
+        above, momentum, predicted = prepared.roots, batch.rest.new_zeros(()), []
+        for position, (level, unit, target) in enumerate(zip(batch.levels, units, targets, strict=True)):
+            if position:
+                above = replace(above, index=level.parent)
+            gradient, rotation = self._predict(level, unit, above, target, top=position == 0)
             predicted.append(gradient)
-            accumulated = gradient @ above.gradient
-            after = above.after + _apply(accumulated, targets[position] - above.template)
+            accumulated, turned, after = advance(gradient, rotation, target, above)
             if position and self.conserve_momentum:
-                momentum = momentum + _momentum(level, unit, after, parents.after)
-            rotation = rotation @ above.rotation
-            parents = _Parents(unit.rest, unit.now, unit.before, after, targets[position], accumulated, rotation)
-        return self._finish(batch, parents, template.gradients, rest, momentum, tuple(predicted))
+                momentum = momentum + _momentum(level, unit, after, above.after, prepared.levels[position - 1].mass)
+            above = Solved(unit.rest, unit.now, unit.before, after, target, accumulated, turned, above.index)
+        return Step(*inherit(above, template.gradients, batch.kernels), momentum, tuple(predicted))
+
+    def _push(self, prepared: Prepared, force: Tensor) -> Tensor:
+        """Displacements f dt^2 / (2 m) of all kernels, zero for those that are held."""
+        batch = prepared.batch
+        shift = force.index_select(0, batch.simulated) * batch.dt**2 / (2 * prepared.mass[:, None])
+        shift = torch.where(batch.pinned[:, None], torch.zeros_like(shift), shift)
+        return torch.zeros_like(batch.rest).index_copy(0, batch.simulated, shift)
 
     def _predict(
-        self, level: LevelBatch, unit: _Units, above: _Parents, target: Tensor, *, top: bool
+        self, level: LevelBatch, unit: Units, above: Solved, target: Tensor, *, top: bool
     ) -> tuple[Tensor, Tensor]:
         """The network's gradient and rotation of each unit of a level; the identity for pinned units."""
-        size = level.length
-        coarse = above.after + _apply(above.gradient, target - above.template)
-        own = UnitState(unit.rest / size, unit.now / size, unit.before / size, coarse / size)
-        parent = UnitState(above.rest / size, above.now / size, above.before / size, above.after / size)
-        replace = self.options.coarse_inputs and not top
         edge_index = level.rest_edges
         if self.edges != "rest":
             edge_index = combine_edges(edge_index, level.current_edges(unit.now), level.count, rule=self.edges)
-        nodes = node_features(
-            own,
-            parent,
-            level.dt,
-            self.gravity / size,
-            unit.log_density,
-            unit.attributes,
-            self.options,
-            coarse=replace,
+        coarse = self.options.coarse_inputs and not top
+        nodes, edges = network_inputs(
+            unit, target, above, edge_index, level.length, level.dt, self.gravity, self.options, coarse=coarse
         )
-        edges = edge_features(own, parent, edge_index, level.dt, self.options, coarse=replace)
         output = self.network(self.node_normaliser(nodes), self.edge_normaliser(edges), edge_index)
-        output = torch.where(level.pinned[:, None], torch.zeros_like(output), output * self.output_scale)
-        return gradient_from_output(output, conserve_mass=self.conserve_mass)
-
-    def _finish(
-        self,
-        batch: SceneBatch,
-        finest: _Parents,
-        template: Tensor | None,
-        rest: Tensor,
-        momentum: Tensor,
-        predicted: tuple[Tensor, ...],
-    ) -> Step:
-        """Kernels inherit from the finest predicted units: x_k = x_c + G_c (X_k - X_c)."""
-        gradient, rotation = finest.gradient, finest.rotation
-        if template is not None:
-            gradient = gradient @ template
-            rotation = rotation @ polar_rotation(template.detach())
-        unit = batch.levels[-1].unit_of_kernel
-        offset = rest - finest.rest.index_select(0, unit)
-        moved = finest.after.index_select(0, unit) + _apply(gradient.index_select(0, unit), offset)
-        moved = torch.where(batch.pinned[:, None], rest, moved)
-        positions = batch.rest.index_copy(0, batch.simulated, moved)
-        identity = torch.eye(3, device=rest.device, dtype=rest.dtype)[None]
-        spans = batch.levels[-1].spans
-
-        def with_identity(value: Tensor) -> Tensor:
-            return torch.cat([part for span in spans for part in (value[span], identity)])
-
-        return Step(positions, with_identity(gradient), with_identity(rotation), momentum, predicted)
+        return gradient_from_output(output * (self.output_scale * level.free), conserve_mass=self.conserve_mass)
 
     def dynamics(self, scene_id: int = 0) -> SceneDynamics:
         """The simulator bound to one scene, as the protocol :class:`gausim.core.Dynamics`."""
         return SceneDynamics(self, scene_id)
 
 
-@dataclass(frozen=True, eq=False)
-class _Units:
-    """Mass-weighted aggregates of one level."""
-
-    rest: Tensor
-    now: Tensor
-    before: Tensor
-    mass: Tensor
-    log_density: Tensor
-    attributes: Tensor
-
-
-def _aggregate(level: LevelBatch, kernels: tuple[Tensor, ...]) -> _Units:
-    """y_c = sum m_i y_i / m_c, rho_c = m_c / V_c, a_c = mean of a_i (METHOD section 1)."""
-    rest, now, before, mass, log_density, attributes = kernels
-    index, count = level.unit_of_kernel, level.count
-    total = mass.new_zeros(count).index_add(0, index, mass)
-    weighted = torch.cat((rest, now, before), 1) * mass[:, None]
-    positions = mass.new_zeros(count, 9).index_add(0, index, weighted) / total[:, None]
-    members = mass.new_zeros(count).index_add(0, index, torch.ones_like(mass))
-    mean = attributes.new_zeros(count, attributes.shape[1]).index_add(0, index, attributes) / members[:, None]
-    log_unit = torch.log(total / level.volume)
-    return _Units(positions[:, 0:3], positions[:, 3:6], positions[:, 6:9], total, log_unit, mean)
-
-
-def _template_per_level(batch: SceneBatch, units: list[_Units], finest: Tensor) -> list[Tensor]:
-    """Template positions of every predicted level: coarse units at the centre of mass of their children."""
-    targets = [finest]
-    for position in range(len(batch.levels) - 1, 0, -1):
-        level, mass, count = batch.levels[position], units[position].mass, batch.levels[position - 1].count
-        summed = finest.new_zeros(count, 3).index_add(0, level.parent, targets[0] * mass[:, None])
-        targets.insert(0, summed / units[position - 1].mass[:, None])
-    return targets
-
-
-def _apply(matrix: Tensor, vector: Tensor) -> Tensor:
-    return (matrix @ vector[..., None])[..., 0]
-
-
-def _momentum(level: LevelBatch, unit: _Units, after: Tensor, parents: Tensor) -> Tensor:
-    """sum_c ||m_c x_c - sum_{i in c} m_i x_i||^2 over the parents c of a level."""
-    weighted = torch.zeros_like(parents).index_add(0, level.parent, after * unit.mass[:, None])
-    total = parents.new_zeros(len(parents)).index_add(0, level.parent, unit.mass)
-    return (total[:, None] * parents - weighted).square().sum()
+def _momentum(level: LevelBatch, unit: Units, after: Tensor, parents: Tensor, mass: Tensor) -> Tensor:
+    """sum_c ||m_c x_c - sum_{i in c} m_i x_i||^2 over the parents c, of masses ``mass``, of a level's units."""
+    weighted = weighted_sum(after, unit.mass, level.parent, len(parents))
+    return (mass[:, None] * parents - weighted).square().sum()
 
 
 class SceneDynamics:
@@ -337,11 +272,12 @@ class SceneDynamics:
         positions, gradients, rotations = [initial.positions], [identity], [identity]
         state = initial
         self._require_finite("positions", torch.stack((initial.positions, initial.previous)), 0)
+        prepared = self.model.prepare(batch)
         for number in range(steps):
             force = forces(number) if forces is not None else None
             if force is not None:
                 self._require_finite("forces", force, number)
-            result = self.model.step(batch, state, force)
+            result = self.model.step(batch, state, force, prepared)
             self._require_finite("positions", result.positions, number + 1)
             state = SimState(result.positions, state.positions)
             positions.append(result.positions)

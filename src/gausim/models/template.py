@@ -8,8 +8,9 @@ own between frames; the network then predicts its correction, and zero output ke
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -46,6 +47,10 @@ class Template(nn.Module, ABC):
     @abstractmethod
     def forward(self, batch: SceneBatch, motion: Motion) -> TemplateState:
         """The template state at t + 1."""
+
+    def prepare(self, batch: SceneBatch) -> Callable[[Motion], TemplateState]:
+        """The template of one batch while parameters do not change; what only depends on them is computed here."""
+        return partial(self, batch)
 
     def networks(self) -> list[nn.Parameter]:
         """Weights of neural networks in the template; they learn at the pace of a network."""

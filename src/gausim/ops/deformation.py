@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gausim.ops import deformation_compiled as compiled
+from gausim.ops.compiled import array, fits
 from gausim.ops.quaternion import quaternion_to_matrix
 
 # Bound of the logarithmic stretch (METHOD section 2).
@@ -21,7 +24,10 @@ def gradient_from_output(
     The first eight numbers are two quaternions relative to (1, 0, 0, 0), the last three logarithms of the stretches;
     with ``conserve_mass`` their mean is subtracted, so that det F = 1 (METHOD section 2).
     """
-    one = output.new_tensor((1.0, 0.0, 0.0, 0.0))
+    if fits(output) and output.dim() == 2:
+        return compiled.GradientFromOutput.apply(output, MAX_LOG_STRETCH, conserve_mass)
+    one = torch.zeros(4, dtype=output.dtype, device=output.device)
+    one[:1] = 1  # made on the device: a copy from the host would end a graph capture
     u = quaternion_to_matrix(output[..., 0:4] + one)
     v = quaternion_to_matrix(output[..., 4:8] + one)
     stretch = torch.clamp(output[..., 8:11], -MAX_LOG_STRETCH, MAX_LOG_STRETCH)
@@ -30,10 +36,12 @@ def gradient_from_output(
     return (u * torch.exp(stretch)[..., None, :]) @ v.mT, u @ v.mT
 
 
-def unit_determinant(gradient: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:
-    """The gradient scaled to determinant 1 (volume kept); needs a positive determinant."""
-    det = determinant(gradient).clamp_min(1e-6)
-    return gradient / det[..., None, None].pow(1 / 3)
+def unit_determinant(
+    gradient: Float[Tensor, "*N 3 3"], det: Float[Tensor, " *N"] | None = None
+) -> Float[Tensor, "*N 3 3"]:
+    """The gradient scaled to determinant 1 (volume kept); needs a positive determinant, ``det`` where it is known."""
+    det = determinant(gradient) if det is None else det
+    return gradient * det.clamp_min(1e-6).pow(-1 / 3)[..., None, None]
 
 
 def determinant(a: Float[Tensor, "*N 3 3"]) -> Float[Tensor, " *N"]:
@@ -56,6 +64,10 @@ def _inverse_transpose(a: Tensor) -> Tensor:
 
 def polar_rotation(gradient: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:
     """Rotation of the polar decomposition by Newton's iteration R <- (R + R^-T) / 2 (Higham 1986); det > 0 assumed."""
+    if fits(gradient) and not gradient.requires_grad:
+        found = np.empty((gradient.numel() // 9, 3, 3), np.float32)
+        compiled.polar_rotations(array(gradient).reshape(-1, 3, 3), POLAR_ITERATIONS, found)
+        return torch.from_numpy(found).view(gradient.shape)
     rotation = gradient
     for _ in range(POLAR_ITERATIONS):
         rotation = 0.5 * (rotation + _inverse_transpose(rotation))

@@ -1,0 +1,122 @@
+"""What a step needs and only parameters change: computed once for all steps between two updates of the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import SimState
+from gausim.models.batch import SceneBatch
+from gausim.models.recursion import Solved
+from gausim.models.template import Motion, TemplateState
+from gausim.ops.aggregation import weighted_sum
+
+
+@dataclass(frozen=True, eq=False)
+class FixedUnits:
+    """What of the units of one level stays between two updates of the parameters.
+
+    Attributes:
+        rest: centres of mass X [scene units].
+        mass: m_c = sum of m_i.
+        share: m_c over the mass of its parent among the predicted levels; at the top level over itself.
+        log_density: log of m_c / V_c.
+        attributes: plain mean over the kernels.
+    """
+
+    rest: Float[Tensor, "N 3"]
+    mass: Float[Tensor, " N"]
+    share: Float[Tensor, " N"]
+    log_density: Float[Tensor, " N"]
+    attributes: Float[Tensor, "N A"]
+
+
+@dataclass(eq=False)
+class _Latest:
+    """The positions that were aggregated last and their aggregates; a step later they are x_{t-1}."""
+
+    positions: Tensor | None = None
+    version: int = 0
+    units: list[Tensor] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Constants of a batch between two updates of the parameters.
+
+    Gradients flow through them, so one that was made with gradients serves the steps of one backward pass.
+
+    Attributes:
+        batch: what it was made for.
+        mass: masses of the simulated kernels.
+        share: mass of every kernel over that of its finest predicted unit; 0 for never-simulated kernels.
+        levels: the predicted levels, coarse to fine.
+        roots: what the top level hangs on.
+        template: the template of the batch.
+        with_gradients: whether it was made with gradients enabled.
+    """
+
+    batch: SceneBatch
+    mass: Float[Tensor, " M"]
+    share: Float[Tensor, " K"]
+    levels: tuple[FixedUnits, ...]
+    roots: Solved
+    template: Callable[[Motion], TemplateState]
+    with_gradients: bool
+    _latest: _Latest = field(default_factory=_Latest)
+
+    def aggregate(self, positions: Float[Tensor, "K 3"]) -> list[Tensor]:
+        """Centres of mass of the units of every predicted level, coarse to fine."""
+        return self.per_level(weighted_sum(positions, self.share, self.batch.finest, self.batch.levels[-1].count))
+
+    def per_level(self, finest: Float[Tensor, "N 3"]) -> list[Tensor]:
+        """Positions of every predicted level, coarse to fine: coarser units are the centres of mass of the finer."""
+        return _per_level(self.batch, [level.share for level in self.levels], finest)
+
+    def motion(self, state: SimState) -> tuple[list[Tensor], list[Tensor]]:
+        """Centres of mass at t and t - 1; the latter are those of the step before where the state continues it."""
+        latest, previous = self._latest, state.previous
+        known = latest.positions is previous and latest.version == _version(previous)
+        before = latest.units if known else self.aggregate(previous)
+        latest.units = self.aggregate(state.positions)
+        latest.positions, latest.version = state.positions, _version(state.positions)
+        return latest.units, before
+
+
+def _version(tensor: Tensor) -> int:
+    """How often the tensor was changed in place; inference tensors do not count."""
+    return -1 if tensor.is_inference() else tensor._version
+
+
+def _per_level(batch: SceneBatch, shares: Sequence[Tensor], finest: Tensor) -> list[Tensor]:
+    found = [finest]
+    for position in range(len(batch.levels) - 1, 0, -1):
+        level, count = batch.levels[position], batch.levels[position - 1].count
+        found.insert(0, weighted_sum(found[0], shares[position], level.parent, count))
+    return found
+
+
+def fixed_units(
+    batch: SceneBatch, mass: Float[Tensor, " M"], attributes: Float[Tensor, "M A"]
+) -> tuple[Float[Tensor, " K"], tuple[FixedUnits, ...]]:
+    """Share of every kernel in its finest unit, and the constants of every predicted level (METHOD section 1)."""
+    levels = batch.levels
+    totals = [mass.new_zeros(level.count).index_add(0, level.unit_of_kernel, mass) for level in levels]
+    within = mass / totals[-1].index_select(0, levels[-1].unit_of_kernel)
+    share = mass.new_zeros(len(batch.rest)).index_copy(0, batch.simulated, within)
+    shares = [torch.ones_like(totals[0])]
+    for above, total, level in zip(totals, totals[1:], levels[1:], strict=False):
+        shares.append(total / above.index_select(0, level.parent))
+    rest = _per_level(batch, shares, weighted_sum(batch.rest, share, batch.finest, levels[-1].count))
+    units = []
+    for i, level in enumerate(levels):
+        ones = torch.ones_like(mass)
+        members = mass.new_zeros(level.count).index_add(0, level.unit_of_kernel, ones)[:, None]
+        mean = mass.new_zeros(level.count, attributes.shape[1]).index_add(0, level.unit_of_kernel, attributes) / members
+        log_density = torch.log(totals[i] / level.volume)
+        units.append(FixedUnits(rest[i], totals[i], shares[i], log_density, mean))
+    return share, tuple(units)
