@@ -54,7 +54,7 @@ def test_one_point_and_coincident_points(name: str) -> None:
 
 def test_complete_linkage_refuses_what_does_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(clustering, "MAX_COMPLETE_LINKAGE", 20)
-    with pytest.raises(ValueError, match="clustering=ball"):
+    with pytest.raises(ValueError, match="clustering=agglomerative"):
         complete_linkage_clusters(_cloud(21), 1.0)
 
 

@@ -7,9 +7,16 @@ from jaxtyping import Float, Int
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial import cKDTree
 
+from gausim.ops import agglomeration, kdtree
+from gausim.ops.announce import announced
+
 # Above this the pairwise distances of complete linkage alone take more than 1.6 GB.
 MAX_COMPLETE_LINKAGE = 20_000
 LLOYD_ITERATIONS = 8
+# Agglomeration keeps every pair within the diameter in memory, 48 bytes each. Where there are more than this, points
+# are merged beforehand into groups of at most these fractions of the diameter, the finest that fits.
+MAX_PAIRS = 8_000_000
+GROUP_FRACTIONS = (0.0, 1 / 24, 1 / 16, 1 / 12, 1 / 8, 1 / 6, 1 / 4, 1 / 3, 1 / 2)
 
 
 def _canonical_order(points: np.ndarray) -> np.ndarray:
@@ -66,16 +73,68 @@ def complete_linkage_clusters(points: Float[np.ndarray, "N 3"], diameter: float)
     """Complete-linkage agglomerative clustering cut at ``diameter``; the reference, O(N^2) memory.
 
     Raises:
-        ValueError: above 20,000 points, where the distances no longer fit; use :func:`ball_clusters`.
+        ValueError: above 20,000 points, where the distances no longer fit; use :func:`agglomerative_clusters`.
     """
     if len(points) > MAX_COMPLETE_LINKAGE:
         raise ValueError(
             f"complete linkage of {len(points)} points needs {len(points) ** 2 * 4 / 1e9:.0f} GB; "
-            f"the limit is {MAX_COMPLETE_LINKAGE} points. Use clustering=ball."
+            f"the limit is {MAX_COMPLETE_LINKAGE} points. Use clustering=agglomerative, the same in near-linear memory."
         )
     if len(points) == 1:
         return np.zeros(1, np.int64)
     return _relabel(points, fcluster(linkage(points, "complete"), diameter, "distance"))
 
 
-CLUSTERINGS = {"ball": ball_clusters, "complete_linkage": complete_linkage_clusters}
+def agglomerative_clusters(points: Float[np.ndarray, "N 3"], diameter: float) -> Int[np.ndarray, " N"]:
+    """Near-linear complete linkage cut at ``diameter``: no two members of a cluster are farther apart.
+
+    The clusters are those of :func:`complete_linkage_clusters` (but for ties) as long as at most 8 million pairs of
+    points lie within the diameter. Beyond that, neighbouring points are first merged into groups much smaller than
+    the diameter; the distance of two groups stays that of their farthest points, so the bound holds exactly.
+
+    Args:
+        points: positions [scene units].
+        diameter: largest allowed distance between two members [scene units].
+    """
+    canonical = _canonical_order(points)
+    ordered = points[canonical]
+    distinct = np.ones(len(points), bool)
+    distinct[1:] = (ordered[1:] != ordered[:-1]).any(1)
+    x = np.ascontiguousarray(ordered[distinct].T, np.float64)
+    square = diameter * diameter
+    with announced("the clustering"):
+        depth, order, x, boxes = kdtree.build(x, 4)
+        ends, nodes, pairs = _close_groups(depth, x, boxes, diameter)
+        squares = agglomeration.cross_squares(depth, x, boxes, ends, nodes, pairs, square)
+        group_labels = agglomeration.complete_linkage(len(nodes), pairs, squares, square)
+    of_distinct = np.empty(len(order), np.int64)
+    of_distinct[order] = np.repeat(group_labels, np.diff(ends))
+    labels = np.empty(len(points), np.int64)
+    labels[canonical] = of_distinct[np.cumsum(distinct) - 1]
+    return _relabel(points, labels)
+
+
+def _close_groups(
+    depth: int, x: np.ndarray, boxes: np.ndarray, diameter: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Groups (``kdtree.compact_nodes``) and the pairs of them that one point of each brings within the diameter."""
+    capacity = MAX_PAIRS
+    for fraction in GROUP_FRACTIONS:
+        ends, nodes = kdtree.compact_nodes(depth, x.shape[1], boxes, fraction * diameter)
+        # Any point of a group will do: the farthest points of two groups are at least as far apart as these.
+        some = np.ascontiguousarray(x[:, (ends[:-1] + ends[1:]) // 2])
+        some_depth, order, some, some_boxes = kdtree.build(some, 8)
+        pairs, complete = kdtree.close_pairs(some_depth, some, some_boxes, diameter * diameter, capacity)
+        if complete:
+            break
+    while not complete:
+        capacity *= 2
+        pairs, complete = kdtree.close_pairs(some_depth, some, some_boxes, diameter * diameter, capacity)
+    return ends, nodes, order[pairs]
+
+
+CLUSTERINGS = {
+    "ball": ball_clusters,
+    "complete_linkage": complete_linkage_clusters,
+    "agglomerative": agglomerative_clusters,
+}

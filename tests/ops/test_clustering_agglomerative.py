@@ -1,0 +1,118 @@
+"""Near-linear complete linkage: exact where all pairs fit, always within the bound, about as many clusters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import pdist
+
+from gausim.io.ply import load_scene
+from gausim.ops import clustering
+from gausim.ops.clustering import agglomerative_clusters, complete_linkage_clusters
+
+
+def _count(labels: np.ndarray) -> int:
+    return int(labels.max()) + 1
+
+
+def _widest(points: np.ndarray, labels: np.ndarray) -> float:
+    order = np.argsort(labels, kind="stable")
+    members = np.split(points[order], np.flatnonzero(np.diff(labels[order])) + 1)
+    return max((float(pdist(m).max()) for m in members if len(m) > 1), default=0.0)
+
+
+def _cube(count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).random((count, 3))
+
+
+def _sphere(count: int) -> np.ndarray:
+    x = np.random.default_rng(1).normal(size=(count, 3))
+    return x / np.linalg.norm(x, axis=1, keepdims=True)
+
+
+@pytest.fixture
+def few_pairs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So few pairs fit that points are merged into groups first."""
+    monkeypatch.setattr(clustering, "MAX_PAIRS", 4_000)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("diameter", [0.05, 0.2, 0.6, 2.0])
+def test_equals_complete_linkage_of_all_pairs(seed: int, diameter: float) -> None:
+    points = _cube(200, seed) * (1.0, 0.4, 1.7)
+    assert np.array_equal(agglomerative_clusters(points, diameter), complete_linkage_clusters(points, diameter))
+
+
+@pytest.mark.parametrize("diameter", [0.12, 0.3, 0.7])
+@pytest.mark.parametrize("points", [_cube(2_000), _sphere(2_000)], ids=["cube", "sphere"])
+def test_groups_keep_the_bound_and_about_as_many_clusters(few_pairs: None, points, diameter) -> None:
+    labels = agglomerative_clusters(points, diameter)
+    assert 0.7 * diameter < _widest(points, labels) <= diameter * (1 + 1e-12)
+    assert _count(labels) == pytest.approx(_count(complete_linkage_clusters(points, diameter)), rel=0.25)
+
+
+def test_groups_are_made_only_where_pairs_do_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = _cube(1_500)
+    exact = agglomerative_clusters(points, 0.3)
+    monkeypatch.setattr(clustering, "MAX_PAIRS", 10_000)
+    assert not np.array_equal(agglomerative_clusters(points, 0.3), exact)
+
+
+def test_even_the_coarsest_groups_need_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = _cube(400)
+    monkeypatch.setattr(clustering, "MAX_PAIRS", 1)
+    labels = agglomerative_clusters(points, 0.3)
+    assert 1 < _count(labels) < 200 and _widest(points, labels) <= 0.3 * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("pairs", [8_000_000, 4_000])
+def test_permuting_points_permutes_labels(monkeypatch: pytest.MonkeyPatch, pairs: int) -> None:
+    monkeypatch.setattr(clustering, "MAX_PAIRS", pairs)
+    points = np.concatenate((_cube(1_000), _cube(50)))  # some coincide
+    order = np.random.default_rng(1).permutation(len(points))
+    assert np.array_equal(agglomerative_clusters(points[order], 0.25), agglomerative_clusters(points, 0.25)[order])
+
+
+def test_a_grid_full_of_ties_keeps_the_bound_and_the_equivariance() -> None:
+    points = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), -1).reshape(-1, 3)
+    labels = agglomerative_clusters(points, 2.0)
+    assert _widest(points, labels) <= 2.0 and _count(labels) < len(points) / 3
+    order = np.random.default_rng(0).permutation(len(points))
+    assert np.array_equal(agglomerative_clusters(points[order], 2.0), labels[order])
+
+
+@pytest.mark.parametrize("pairs", [8_000_000, 1_000])
+def test_points_on_a_line_and_clumps_that_coincide(monkeypatch: pytest.MonkeyPatch, pairs: int) -> None:
+    monkeypatch.setattr(clustering, "MAX_PAIRS", pairs)
+    line = np.linspace(0, 1, 400)[:, None] * (1.0, 2.0, -2.0)
+    labels = agglomerative_clusters(line, 0.5)
+    assert _widest(line, labels) <= 0.5 * (1 + 1e-12) and 6 <= _count(labels) <= 12
+    assert (np.diff(labels) >= 0).all()  # intervals, numbered along the line
+    clumps = np.repeat(_cube(5) * 10, 300, axis=0)
+    assert np.array_equal(agglomerative_clusters(clumps, 0.1)[::300], np.argsort(np.argsort(clumps[::300, 0])))
+
+
+def test_a_dense_clump_among_scattered_points(few_pairs: None) -> None:
+    points = np.concatenate((_cube(1_500) * 0.01, _cube(300, 1)))
+    labels = agglomerative_clusters(points, 0.2)
+    assert _widest(points, labels) <= 0.2 * (1 + 1e-12)
+    assert _count(labels) == pytest.approx(_count(complete_linkage_clusters(points, 0.2)), rel=0.25)
+
+
+def test_no_diameter_separates_all_but_coincident_points() -> None:
+    points = np.concatenate((_cube(30), _cube(10)))
+    assert _count(agglomerative_clusters(points, 0.0)) == 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fraction", [0.04, 0.13, 0.4])
+def test_counts_on_a_captured_scene(data_root: Path, fraction: float) -> None:
+    scene = load_scene(data_root / "splats" / "playbot_lod3.ply")
+    every = scene.means.double().numpy()
+    diameter = fraction * scene.diagonal
+    some = every[np.random.default_rng(0).permutation(len(every))[:8_000]]
+    labels = agglomerative_clusters(some, diameter)
+    assert _count(labels) == pytest.approx(_count(complete_linkage_clusters(some, diameter)), rel=0.25)
+    assert _widest(some, labels) <= diameter * (1 + 1e-12)
