@@ -1,0 +1,224 @@
+"""The captured step: its buffers on any device, that the model's step asks its device nothing, and graphs on a GPU."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from gausim.core import ConfigError, SimState
+from gausim.models.cuda_graph import GraphedStep, StepFunction
+from gausim.models.elastic import ElasticTemplate
+from gausim.models.simulator import GausSim
+from gausim.models.template import RestTemplate
+
+TEMPLATES = {"rest": RestTemplate, "elastic": partial(ElasticTemplate, modes=8, neighbours=6, hidden=8)}
+# What makes the host wait for the device, or gives a shape that depends on values: by name in Python and in ATen.
+ASKING = {
+    *("item", "tolist", "numpy", "cpu", "__bool__", "__int__", "__float__", "__index__"),
+    *("tensor", "new_tensor", "as_tensor", "from_numpy"),
+    *("linalg_inv", "linalg_solve", "linalg_svd", "linalg_eigh", "linalg_cholesky", "inverse"),
+}
+ASKING_ATEN = {
+    *("_local_scalar_dense", "nonzero", "masked_select", "bincount", "repeat_interleave"),
+    *("_unique2", "unique_dim", "unique_consecutive"),
+}
+
+
+class _RefuseOperations(TorchDispatchMode):
+    """Refuses operations of ATen that ask the device or use arrays of the CPU, wherever they are called from."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        assert name not in ASKING_ATEN, f"{func} waits for the device"
+        result = func(*args, **(kwargs or {}))
+        for value in tree_leaves((args, kwargs, result)):
+            assert not isinstance(value, Tensor) or value.device.type == "meta" or value.dim() == 0, (
+                f"{func}: on the CPU"
+            )
+        return result
+
+
+class _RefuseFunctions(TorchFunctionMode):
+    """Refuses functions of Python that ask the device or copy from the host: on the CPU ATen does not show them."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        assert getattr(func, "__name__", "") not in ASKING, f"{func} waits for the device"
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.fixture
+def bound(make_scene: Callable, make_model: Callable, make_state: Callable, join_states: Callable) -> Callable:
+    """A model of two scenes and a state of both."""
+
+    def make(template: str = "elastic", **options: object) -> tuple[GausSim, SimState]:
+        scenes = [make_scene(50), make_scene(60, seed=1)]
+        model = make_model(scenes, edges="rest", template=TEMPLATES[template], **options)
+        return model, join_states([make_state(scene, seed=i) for i, scene in enumerate(scenes)])
+
+    return make
+
+
+@torch.no_grad()
+def step_of(model: GausSim) -> StepFunction:
+    batch = model.batch((0, 1))
+    prepared = model.prepare(batch)
+    return lambda state, force: model.step(batch, state, force, prepared)
+
+
+@torch.no_grad()
+def roll(step: StepFunction, state: SimState, force: Tensor | None, steps: int = 4) -> list[Any]:
+    """Frames under a force that acts in the odd steps."""
+    frames = []
+    for number in range(steps):
+        frames.append(step(state, force if number % 2 else None))
+        state = SimState(frames[-1].positions, state.positions)
+    return frames
+
+
+def assert_same(frames: list[Any], expected: list[Any], tolerance: float = 0.0) -> None:
+    for frame, truth in zip(frames, expected, strict=True):
+        for name in ("positions", "gradients", "rotations"):
+            torch.testing.assert_close(getattr(frame, name), getattr(truth, name), atol=tolerance, rtol=tolerance)
+
+
+def test_is_used_like_the_step(bound: Callable) -> None:
+    model, state = bound()
+    force = torch.full_like(state.positions, 0.3)
+    graphed = GraphedStep(step_of(model), state.positions, capture=False)
+    expected = roll(step_of(model), state, force)
+    assert_same(roll(graphed, state, force), expected)
+    assert_same(roll(graphed, state, force), expected)  # nothing is left from the first time
+    free = roll(graphed, state, None)
+    assert torch.equal(free[0].positions, expected[0].positions)
+    assert not torch.equal(free[1].positions, expected[1].positions)
+
+
+def test_step_reads_fixed_buffers_and_results_are_copies(bound: Callable) -> None:
+    """A replayed graph reads and writes fixed addresses."""
+    _, state = bound()
+    seen: list[tuple[int, ...]] = []
+    out = [torch.zeros(110, 3), torch.zeros(4, 3, 3), torch.zeros(4, 3, 3)]
+
+    def step(state: SimState, force: Tensor | None) -> Any:
+        assert not torch.is_grad_enabled()
+        pushed = torch.zeros_like(state.positions) if force is None else force
+        seen.append(
+            (state.positions.data_ptr(), state.previous.data_ptr(), force.data_ptr() if force is not None else 0)
+        )
+        out[0].copy_(2 * state.positions - state.previous + pushed)
+        return Kept(*out)
+
+    start = SimState(state.positions.float(), state.previous.float())
+    frames = roll(GraphedStep(step, start.positions, capture=False), start, torch.ones(110, 3))
+    assert seen[0] == seen[2] and seen[1] == seen[3] and seen[0][:2] == seen[1][:2]
+    assert start.positions.data_ptr() not in seen[0]
+    first = 2 * start.positions - start.previous
+    torch.testing.assert_close(frames[0].positions, first)
+    torch.testing.assert_close(frames[1].positions, 2 * first - start.positions + 1)
+
+
+class Kept:
+    """A step's result."""
+
+    def __init__(self, positions: Tensor, gradients: Tensor, rotations: Tensor) -> None:
+        self.positions, self.gradients, self.rotations = positions, gradients, rotations
+
+
+def test_capture_needs_a_cuda_device(bound: Callable) -> None:
+    model, state = bound()
+    with pytest.raises(ConfigError, match="cuda_graph: expected the model on a CUDA device, got cpu"):
+        GraphedStep(step_of(model), state.positions)
+
+
+@pytest.mark.parametrize("coarse", [False, True])
+@pytest.mark.parametrize("template", TEMPLATES)
+def test_step_asks_its_device_nothing(
+    bound: Callable, monkeypatch: pytest.MonkeyPatch, template: str, coarse: bool
+) -> None:
+    """What a graph can capture, and what lets a rollout run ahead: tensors without values stand in for the device's."""
+    model, state = bound(template, coarse_inputs=coarse, rest_inputs=coarse)
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # which such tensors do not know
+    monkeypatch.setattr(torch, "is_autocast_enabled", lambda _: False)
+    step = step_of(model.to("meta"))
+    state = SimState(state.positions.to("meta"), state.previous.to("meta"))
+    with torch.no_grad(), _RefuseFunctions(), _RefuseOperations():
+        frames = roll(step, state, state.previous)
+    assert {frame.gradients.device.type for frame in frames} == {"meta"}
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda x: x.sum().item(),
+        lambda x: bool(x.sum()),
+        lambda x: x[x > 0],
+        lambda x: x.new_tensor((1.0, 2.0)),
+        lambda x: x + torch.ones(3),
+        lambda x: torch.arange(3).to(x),
+        lambda x: torch.linalg.inv(x.diag()),
+        torch.unique,
+    ],
+)
+def test_what_asks_is_found(ask: Callable) -> None:
+    refusal = pytest.raises((AssertionError, NotImplementedError), match="waits for|on the CPU|data-independent")
+    with _RefuseFunctions(), _RefuseOperations(), refusal:
+        ask(torch.ones(3, device="meta"))
+
+
+def on_gpu(model: GausSim, state: SimState) -> SimState:
+    model.float().cuda()
+    return SimState(state.positions.float().cuda(), state.previous.float().cuda())
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("template", TEMPLATES)
+def test_gpu_replays_equal_the_steps(bound: Callable, template: str) -> None:
+    model, state = bound(template)
+    state = on_gpu(model, state)
+    force = torch.full_like(state.positions, 0.3)
+    expected = roll(step_of(model), state, force, 8)
+    graphed = GraphedStep(step_of(model), state.positions)
+    for _ in range(2):  # the first time records
+        assert_same(roll(graphed, state, force, 8), expected, 1e-5)
+    with torch.no_grad():
+        model.network.decoder[-1].bias.add_(0.05)  # in place: replays read the new weights
+    changed = roll(step_of(model), state, force, 8)
+    assert float((changed[0].gradients - expected[0].gradients).abs().max()) > 1e-3
+    assert_same(roll(graphed, state, force, 8), changed, 1e-5)
+
+
+@pytest.mark.gpu
+def test_gpu_step_that_asks_is_refused(bound: Callable) -> None:
+    model, state = bound()
+    state, step = on_gpu(model, state), step_of(model)
+
+    def asking(now: SimState, force: Tensor | None) -> Any:
+        assert float(now.positions.sum()) != 0
+        return step(now, force)
+
+    with pytest.raises(ConfigError, match="the step cannot be captured"):
+        GraphedStep(asking, state.positions)(state)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("template", TEMPLATES)
+def test_gpu_steps_run_ahead_of_the_device(bound: Callable, template: str) -> None:
+    """CUDA's own sentinel: torch raises where the host waits."""
+    model, state = bound(template)
+    state = on_gpu(model, state)
+    step, force = step_of(model), torch.full_like(state.positions, 0.3)
+    roll(step, state, force)  # whatever is done once
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        roll(step, state, force)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
