@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+import importlib.util
+import math
+import os
+import shutil
+from collections.abc import Callable, Sequence
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint as recomputed
 
+from gausim.core import ConfigError
+from gausim.nn.edge_update import EdgeWeights, edge_update
+from gausim.nn.linear import Linear
 from gausim.nn.mlp import mlp
+
+PRECISIONS = ("fp32", "bf16")
 
 
 class _Message(nn.Module):
@@ -19,32 +31,66 @@ class _Message(nn.Module):
     def __init__(self, hidden: int) -> None:
         super().__init__()
         self.edge_norm, self.node_norm = nn.LayerNorm(hidden), nn.LayerNorm(hidden)
-        self.from_edge = nn.Linear(hidden, hidden)
-        self.from_nodes = nn.Linear(hidden, 2 * hidden, bias=False)
-        self.edge_out = nn.Linear(hidden, hidden)
+        self.from_edge = Linear(hidden, hidden)
+        self.from_nodes = Linear(hidden, 2 * hidden, bias=False)
+        self.edge_out = Linear(hidden, hidden)
         self.node = mlp((2 * hidden, hidden, hidden))
 
-    def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor, bf16: bool) -> tuple[Tensor, Tensor]:
         normed = self.node_norm(nodes)
         source, destination = self.from_nodes(normed).chunk(2, -1)
-        hidden = self.from_edge(self.edge_norm(edges))
-        hidden = hidden + source.index_select(0, edge_index[0]) + destination.index_select(0, edge_index[1])
-        edges = edges + self.edge_out(nn.functional.silu(hidden))
-        received = torch.zeros_like(nodes).index_add(0, edge_index[1], edges)
+        norm, first, second = self.edge_norm, self.from_edge, self.edge_out
+        weights = EdgeWeights(norm.weight, norm.bias, first.weight, first.bias, second.weight, second.bias)
+        edges, received = edge_update(edges, source, destination, edge_index, weights, bf16=bf16)
         return nodes + self.node(torch.cat((normed, received), -1)), edges
 
 
 class MeshGraphNet(nn.Module):
     """Encoder, ``layers`` message-passing layers, decoder hidden -> hidden/2 -> hidden/4 -> outputs.
 
-    One set of weights serves every level of the hierarchy (METHOD section 3).
+    One set of weights serves every level of the hierarchy (METHOD section 3). How it computes (``precision``,
+    ``checkpoint``, ``compile``) changes no parameter: checkpoints fit every choice.
+
+    Fixed shapes: a caller that pads its graph appends one dummy node, of zero features, behind the N real ones, and
+    edges N -> N of zero features. Messages travel along edges only, so the first N rows of the output, and all
+    gradients of them, are those of the graph without padding; the dummy's own row is finite and is to be dropped.
     """
 
     def __init__(
-        self, *, node_features: int, edge_features: int, outputs: int, hidden: int = 128, layers: int = 16
+        self,
+        *,
+        node_features: int,
+        edge_features: int,
+        outputs: int,
+        hidden: int = 128,
+        layers: int = 16,
+        precision: str = "fp32",
+        checkpoint: bool = False,
+        compile: bool = False,
     ) -> None:
-        """Sizes of the input and output features, the width of all hidden layers and the number of layers."""
+        """Builds the network; its gradients are of first order only.
+
+        Args:
+            node_features: number of features per node.
+            edge_features: number of features per edge.
+            outputs: number of outputs per node.
+            hidden: width of all hidden layers.
+            layers: message-passing layers.
+            precision: ``fp32``, or ``bf16``: the products of the message-passing layers in bfloat16, all streams, sums,
+                encoders and the decoder in float32. An autocast around the network means ``bf16`` too.
+            checkpoint: keep only the streams before every few layers (2 of 16) and recompute the rest in the backward
+                pass, with the same gradients bit by bit.
+            compile: compile the layers at the first call, for any number of nodes and edges; needs a C++ compiler on
+                the CPU and triton on a GPU. It pays on a GPU; on the CPU the edges have their own blocked kernels, and
+                only the nodes are compiled.
+
+        Raises:
+            ConfigError: unknown precision.
+        """
         super().__init__()
+        if precision not in PRECISIONS:
+            raise ConfigError(f"model.simulator.precision is '{precision}'; expected one of {', '.join(PRECISIONS)}.")
+        self.precision, self.checkpointed, self.compiled = precision, checkpoint, compile
         self.node_encoder = mlp((node_features, hidden, hidden))
         self.edge_encoder = mlp((edge_features, hidden, hidden))
         self.processor = nn.ModuleList(_Message(hidden) for _ in range(layers))
@@ -54,8 +100,64 @@ class MeshGraphNet(nn.Module):
     def forward(
         self, node_features: Float[Tensor, "N Cn"], edge_features: Float[Tensor, "E Ce"], edge_index: Int[Tensor, "2 E"]
     ) -> Float[Tensor, "N Co"]:
-        """Outputs per node; ``edge_index`` holds (source, destination)."""
-        nodes, edges = self.node_encoder(node_features), self.edge_encoder(edge_features)
-        for layer in self.processor:
-            nodes, edges = layer(nodes, edges, edge_index)
-        return self.decoder(self.norm(nodes))
+        """Outputs per node; ``edge_index`` holds (source, destination), best sorted by destination.
+
+        Raises:
+            ConfigError: ``compile`` without the compiler it needs.
+        """
+        device = node_features.device.type
+        bf16 = self.precision == "bf16" or torch.is_autocast_enabled(device)
+        with torch.autocast(device, enabled=False):
+            nodes, edges = self.node_encoder(node_features), self.edge_encoder(edge_features)
+        with torch.autocast(device, dtype=torch.bfloat16, enabled=bf16):
+            nodes = self._process(nodes, edges, edge_index, bf16)
+        with torch.autocast(device, enabled=False):
+            result: Tensor = self.decoder(self.norm(nodes))
+        return result
+
+    def _process(self, nodes: Tensor, edges: Tensor, edge_index: Tensor, bf16: bool) -> Tensor:
+        modules = list(self.processor)
+        # For none and for one the compiler would build a variant each: such graphs run as they are.
+        compiled = self.compiled and min(len(nodes), len(edges)) > 1
+        if compiled:
+            _compile(modules, nodes.device)
+        layers: list[Callable] = [layer if compiled else layer.forward for layer in modules]
+        edge_index = edge_index.contiguous()
+        if not (self.checkpointed and torch.is_grad_enabled()):
+            return _run(layers, nodes, edges, edge_index, bf16)[0]
+        # 16 layers keep 16 / 2 streams, plus 2 x 2 arrays while a segment is recomputed: near the least sum.
+        size = max(1, math.isqrt(len(layers) // 2))
+        for first in range(0, len(layers), size):
+            segment = layers[first : first + size]
+            nodes, edges = recomputed(
+                _run, segment, nodes, edges, edge_index, bf16, use_reentrant=False, preserve_rng_state=False
+            )
+        return nodes
+
+
+def _run(
+    layers: Sequence[Callable], nodes: Tensor, edges: Tensor, edge_index: Tensor, bf16: bool
+) -> tuple[Tensor, Tensor]:
+    for layer in layers:
+        nodes, edges = layer(nodes, edges, edge_index, bf16)
+    return nodes, edges
+
+
+def _compile(layers: Sequence[nn.Module], device: torch.device) -> None:
+    """Compiles the layers that are not yet; all share their code, so the compiler works once, not once per layer."""
+    pending = [layer for layer in layers if layer._compiled_call_impl is None]
+    if not pending:
+        return
+    compiler = os.environ.get("CXX") or "g++"
+    if device.type == "cpu" and shutil.which(compiler) is None:
+        raise ConfigError(
+            f"model.simulator.compile is true, but the C++ compiler '{compiler}' was not found. Install it, name "
+            "another in the environment variable CXX, or set model.simulator.compile=false."
+        )
+    if device.type == "cuda" and importlib.util.find_spec("triton") is None:
+        raise ConfigError(
+            "model.simulator.compile is true, but triton is not installed. Install it, or set "
+            "model.simulator.compile=false."
+        )
+    for layer in pending:
+        layer.compile(dynamic=True)

@@ -6,12 +6,14 @@ from collections.abc import Sequence
 
 from torch import nn
 
+from gausim.nn.linear import Linear
+
 
 def mlp(sizes: Sequence[int]) -> nn.Sequential:
     """Linear layers of the given sizes with SiLU between them (none after the last)."""
     layers: list[nn.Module] = []
     for i, (a, b) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
-        layers += ([nn.SiLU()] if i else []) + [nn.Linear(a, b)]
+        layers += ([nn.SiLU()] if i else []) + [Linear(a, b)]
     return nn.Sequential(*layers)
 
 

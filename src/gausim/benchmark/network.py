@@ -1,0 +1,145 @@
+"""The graph network against the textbook form: time, share of the matrix product's peak, memory of training."""
+
+from __future__ import annotations
+
+import functools
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from gausim.benchmark.harness import Options, Row, medians, saved_bytes, torch_threads
+from gausim.benchmark.naive_network import naive_network
+from gausim.benchmark.peaks import peaks
+from gausim.nn.meshgraphnet import MeshGraphNet
+
+NODE_FEATURES, EDGE_FEATURES, OUTPUTS = 40, 20, 11
+NAIVE = "the textbook form in fp32"
+
+
+@dataclass(frozen=True)
+class Size:
+    """Of the graph and the network; the default is the fine level of the paper's scene with up to 16 + 16 neighbours.
+
+    Attributes:
+        nodes: number of nodes.
+        edges: number of edges.
+        layers: message-passing layers.
+        hidden: width of the network.
+    """
+
+    nodes: int = 1203
+    edges: int = 30_000
+    layers: int = 16
+    hidden: int = 128
+
+
+def run(options: Options) -> list[Row]:
+    """Forward and forward + backward of every variant, their ratios to the textbook form, and what training keeps.
+
+    Share of the peak: useful operations (:func:`useful_flops`) per second over the rate of the float32 matrix product
+    of :func:`gausim.benchmark.peaks.peaks`, which is torch's. It may exceed 1: float32 layers go through oneDNN, which
+    on some processors is faster than torch's own product, and bfloat16 is faster than float32.
+    """
+    size = Size(nodes=60, edges=700, layers=3, hidden=16) if options.quick else Size()
+    with torch_threads(options.threads):
+        inputs = _graph(size, options.device)
+        networks = _networks(size, options)
+        calls: dict[str, Callable[[], Tensor]] = {
+            "naive": functools.partial(naive_network, networks["split fp32"], *inputs),
+            **{name: functools.partial(network, *inputs) for name, network in networks.items()},
+        }
+        forward = medians({name: functools.partial(_forward, call) for name, call in calls.items()}, options)
+        parameters = {name: list(networks.get(name, networks["split fp32"]).parameters()) for name in calls}
+        both = medians({n: functools.partial(_gradients, call, parameters[n]) for n, call in calls.items()}, options)
+        kept = {name: float(saved_bytes(call)) for name, call in calls.items() if not name.startswith("compiled")}
+        gemm = peaks(options).gemm
+    case = f"network {size.nodes} nodes, {size.edges} edges, {size.layers} x {size.hidden}"
+    flops = useful_flops(networks["split fp32"], size.nodes, size.edges)
+    rows = [row for name in calls for row in _times(f"{case}, {name}", name, forward, both, flops, gemm)]
+    for name, value in kept.items():
+        rows.append(Row(f"{case}, {name}", "kept for the backward pass", value / 2**20, "MiB"))
+        if name != "naive":
+            rows.append(Row(f"{case}, {name}", "kept for the backward pass / naive", value / kept["naive"], "x", NAIVE))
+    return rows
+
+
+def _times(
+    case: str, name: str, forward: dict[str, float], both: dict[str, float], flops: tuple[float, float], gemm: float
+) -> list[Row]:
+    rows = []
+    for metric, times, work in (("forward", forward, flops[0]), ("forward + backward", both, sum(flops))):
+        rows.append(Row(case, metric, 1e3 * times[name], "ms"))
+        if name == "naive":
+            continue
+        rows.append(Row(case, f"{metric} / naive", times[name] / times["naive"], "x", NAIVE))
+        if "checkpointed" not in name:
+            rows.append(Row(case, f"{metric}, useful FLOP/s", work / times[name] / gemm, "1", "fp32 GEMM peak"))
+    return rows
+
+
+def useful_flops(network: MeshGraphNet, nodes: int, edges: int) -> tuple[float, float]:
+    """Floating-point operations of the linear layers in one forward pass, and in one backward pass.
+
+    A layer of ``rows`` rows takes ``2 rows inputs outputs`` forward and twice that backward (gradients of its inputs
+    and of its matrix), except that the encoders' inputs need no gradient. Counted in the split form, so that the
+    products the textbook form repeats per edge are not useful; norms, activations, gathers and recomputation neither.
+    """
+    forward = backward = 0.0
+    for name, layer in network.named_modules():
+        if isinstance(layer, nn.Linear):
+            on_edges = any(part in name for part in ("edge_encoder", "from_edge", "edge_out"))
+            work = 2.0 * (edges if on_edges else nodes) * layer.weight.numel()
+            forward += work
+            backward += work if name.endswith("encoder.0") else 2.0 * work
+    return forward, backward
+
+
+def _graph(size: Size, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    ends = torch.randint(0, size.nodes, (2, size.edges), generator=generator)
+    ends[1] = ends[1].sort().values
+    nodes = torch.randn(size.nodes, NODE_FEATURES, generator=generator)
+    edges = torch.randn(size.edges, EDGE_FEATURES, generator=generator)
+    return nodes.to(device), edges.to(device), ends.to(device)
+
+
+def _networks(size: Size, options: Options) -> dict[str, MeshGraphNet]:
+    """The variants by name, all with the same weights."""
+    torch.manual_seed(0)
+    build = functools.partial(
+        MeshGraphNet,
+        node_features=NODE_FEATURES,
+        edge_features=EDGE_FEATURES,
+        outputs=OUTPUTS,
+        hidden=size.hidden,
+        layers=size.layers,
+    )
+    networks = {
+        "split fp32": build(),
+        "split bf16": build(precision="bf16"),
+        "checkpointed fp32": build(checkpoint=True),
+    }
+    if not options.quick:
+        if options.device.type == "cuda" or shutil.which(os.environ.get("CXX") or "g++"):
+            networks["compiled fp32"] = build(compile=True)
+            networks["compiled bf16"] = build(precision="bf16", compile=True)
+        else:
+            print("network: no C++ compiler was found, so the compiled variants are left out.", file=sys.stderr)
+    for network in networks.values():
+        network.load_state_dict(networks["split fp32"].state_dict())
+        network.to(options.device)
+    return networks
+
+
+@torch.no_grad()
+def _forward(call: Callable[[], Tensor]) -> Tensor:
+    return call()
+
+
+def _gradients(call: Callable[[], Tensor], parameters: list[nn.Parameter]) -> object:
+    return torch.autograd.grad(call().square().sum(), parameters)
