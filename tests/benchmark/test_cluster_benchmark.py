@@ -1,0 +1,28 @@
+from __future__ import annotations
+
+import torch
+
+from gausim.benchmark import cluster
+from gausim.benchmark.harness import Options
+
+
+def test_every_size_reports_its_bound_its_count_and_its_speed() -> None:
+    rows = cluster.run(Options(torch.device("cpu"), quick=True, rounds=1))
+    found = {(row.case, row.metric): row.value for row in rows}
+    for count in cluster.SIZES[True]:
+        case = f"agglomerative, {count} kernels"
+        assert found[case, "clusters ratio"] == 1.0
+        assert 0.5 < found[case, "widest cluster"] <= 1 + 1e-9
+        assert 0 < found[case, "clusters"] < count
+        assert found[f"ball, {count} kernels", "widest cluster"] <= 1 + 1e-9
+    for count, _ in cluster.GRAPHS[True]:
+        assert found[f"neighbours, {count} points", "time ratio"] > 0
+        assert found[f"neighbours, {cluster.MEMBERS} x {count} points", "time ratio"] > 0
+    assert len(found) == len(rows)
+
+
+def test_the_shell_is_thin_and_has_diagonal_one() -> None:
+    points = cluster._shell(4_000)
+    assert abs(float((points.amax(0) - points.amin(0)).norm()) - 1) < 1e-6
+    distance = torch.cdist(points, points).fill_diagonal_(1.0).amin(1)
+    assert float(distance.mean()) < 0.5 * 4_000 ** (-1 / 3)  # far denser than a filled volume
