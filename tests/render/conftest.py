@@ -26,17 +26,19 @@ class Inputs:
     Ks: Tensor
     size: tuple[int, int]
     background: Tensor
+    depth: bool = False
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
-        return self.means, self.covars, self.colors, self.opacities
+        return self.means, self.covars, self.colors, self.opacities, self.background
 
     def to(self, dtype: torch.dtype) -> Inputs:
         names = ("means", "covars", "colors", "opacities", "viewmats", "Ks", "background")
         return replace(self, **{name: getattr(self, name).detach().to(dtype).clone() for name in names})
 
     def draw(self, renderer: Renderer) -> Rendered:
-        return renderer(*self.tensors, self.viewmats, self.Ks, self.size, background=self.background)
+        given = *self.tensors[:4], self.viewmats, self.Ks, self.size
+        return renderer(*given, background=self.background, depth=self.depth)
 
     def draw_with_gradients(self, renderer: Renderer) -> tuple[Rendered, list[Tensor]]:
         """Images and the gradients of a fixed random function of them."""
@@ -46,6 +48,8 @@ class Inputs:
         weight_rgb = torch.randn(images.rgb.shape, generator=generator).to(images.rgb)
         weight_alpha = torch.randn(images.alpha.shape, generator=generator).to(images.rgb)
         loss = (images.rgb * weight_rgb).sum() + (images.alpha * weight_alpha).sum()
+        if images.depth is not None:
+            loss = loss + (images.depth * torch.randn(images.depth.shape, generator=generator).to(images.rgb)).sum()
         return images, list(torch.autograd.grad(loss, leaves))
 
 

@@ -7,6 +7,7 @@ import pickle
 import platform
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numba
 import pytest
@@ -22,29 +23,36 @@ CASES = {
     "two_bands": dict(states=2, views=2, count=200, size=(45, 70)),
     "dense": dict(states=2, views=2, count=1500, size=(40, 36), scale=0.05),
     "big": dict(states=2, views=2, count=60, size=(50, 41), scale=0.8),
+    "odd_size": dict(states=2, views=2, count=150, size=(37, 53)),
     "tiny": dict(states=2, views=2, count=400, size=(50, 41), scale=1e-4),
     "around_the_camera": dict(states=2, views=3, count=400, size=(48, 48), spread=2.0),
     "off_screen": dict(states=2, views=2, count=200, size=(30, 30), spread=4.0, scale=0.5),
 }
 
 
+NAMES = ("means", "covars", "colors", "opacities", "background")
+
+
+@pytest.mark.parametrize("depth", [False, True])
 @pytest.mark.parametrize("case", CASES)
-def test_image_and_gradients_equal_the_reference(inputs: Callable, case: str) -> None:
-    given = inputs(**CASES[case])
+def test_image_and_gradients_equal_the_reference(inputs: Callable, case: str, depth: bool) -> None:
+    given = replace(inputs(**CASES[case]), depth=depth)
     given.opacities[:, 1::9] = 1e-3  # below 1/255
     images, gradients = given.to(torch.float32).draw_with_gradients(CpuRenderer(threads=2))
     expected, expected_gradients = given.to(torch.float64).draw_with_gradients(ReferenceRenderer())
     assert float(expected.alpha.detach().max()) > 0.1
     torch.testing.assert_close(images.rgb.double(), expected.rgb, atol=1e-5, rtol=0)
     torch.testing.assert_close(images.alpha.double(), expected.alpha, atol=1e-5, rtol=0)
-    for name, value, truth in zip(
-        ("means", "covars", "colors", "opacities"), gradients, expected_gradients, strict=True
-    ):
+    assert (images.depth is None) == (expected.depth is None) == (not depth)
+    if images.depth is not None and expected.depth is not None:
+        assert float(expected.depth.detach().max()) > 0.1
+        torch.testing.assert_close(images.depth.double(), expected.depth, atol=3e-5, rtol=0)
+    for name, value, truth in zip(NAMES, gradients, expected_gradients, strict=True):
         assert float((value - truth).norm() / truth.norm()) < 1e-4, name
 
 
 def test_one_view_alone_is_cut_into_more_bands_and_stays_the_same(inputs: Callable) -> None:
-    """A single view has eight bands, six views have two each: images agree bit for bit, gradients to rounding."""
+    """A single view has nine bands, six views have two each: images agree bit for bit, gradients to rounding."""
     given = inputs(2, 3, 300, (40, 130)).to(torch.float32)
     together, gradients = given.draw_with_gradients(CpuRenderer(threads=2))
     sums = [torch.zeros_like(x) for x in gradients]
@@ -53,13 +61,13 @@ def test_one_view_alone_is_cut_into_more_bands_and_stays_the_same(inputs: Callab
     for b, v in itertools.product(range(2), range(3)):
         state, view = slice(b, b + 1), slice(v, v + 1)
         parts = (given.means[state], given.covars[state], given.colors[state, view], given.opacities[state])
-        leaves = [x.detach().requires_grad_() for x in parts]
+        leaves = [x.detach().requires_grad_() for x in (*parts, given.background)]
         cameras = given.viewmats[state, view], given.Ks[state, view]
-        alone = CpuRenderer(threads=2)(*leaves, *cameras, given.size, background=given.background)
+        alone = CpuRenderer(threads=2)(*leaves[:4], *cameras, given.size, background=leaves[4])
         assert torch.equal(alone.rgb[0, 0], together.rgb[b, v])
         loss = (alone.rgb * weights[0][state, view]).sum() + (alone.alpha * weights[1][state, view]).sum()
         for i, grad in enumerate(torch.autograd.grad(loss, leaves)):
-            sums[i][(state, view) if i == 2 else state] += grad
+            sums[i][((state,), (state,), (state, view), (state,), ())[i]] += grad
     for value, expected in zip(sums, gradients, strict=True):
         assert float((value - expected).norm() / expected.norm()) < 1e-5
 
@@ -112,7 +120,7 @@ def test_input_changed_in_place_before_backward_is_refused(inputs: Callable) -> 
 def test_numbers_that_are_not_finite_are_refused(inputs: Callable, name: str, value: float) -> None:
     given = inputs(2, 2, 30, (20, 20)).to(torch.float32)
     getattr(given, name).reshape(-1)[40] = value
-    with pytest.raises(DivergenceError, match="1 of 30 Gaussians of state"):
+    with pytest.raises(DivergenceError, match="1 of the Gaussians .* of state"):
         given.draw(CpuRenderer(threads=2))
 
 
@@ -143,11 +151,11 @@ PACKED = {
 @pytest.mark.parametrize("kernel", [forward_tile, backward_tile])
 def test_hot_loops_are_vectorised(kernel: numba.core.registry.CPUDispatcher) -> None:
     records, entries = numba.float32[:, ::1], numba.int32[::1]
-    args = (records, entries, numba.int64, numba.int64, numba.float32, numba.float32, numba.float32, numba.float32[::1])
-    if kernel is backward_tile:
-        args += (records,)
+    numbers = numba.float32[::1]
+    args = (records, entries, numba.int64, numba.int64, numba.float32, numba.float32, numba.float32, numbers)
+    args += (numba.none,) if kernel is forward_tile else (numbers, numba.none)
     # A fresh compilation: numba does not show the code of functions that it loads from its cache.
     fresh = numba.njit(nogil=True, fastmath=True, error_model="numpy")(kernel.py_func)
     fresh.compile(args)
     (code,) = fresh.inspect_asm().values()
-    assert len(re.findall(PACKED[platform.machine()], code)) >= 20  # the exponential alone is eight per vector
+    assert len(re.findall(PACKED[platform.machine()], code)) >= 12  # the exponential alone is eight per vector

@@ -32,15 +32,19 @@ class Rendered:
     Attributes:
         rgb: colour composited over the background, linear in the input colours, not clamped.
         alpha: accumulated opacity in [0, 1].
+        depth: accumulated depth sum_i w_i z_i [scene units], where kernel i contributes w_i = alpha_i T_i to the pixel
+            and has depth z_i at its centre along the camera's axis (gsplat's mode "D"): not divided by ``alpha``, 0
+            where nothing is, without the background. None unless it was asked for.
     """
 
     rgb: Float[Tensor, "B V H W 3"]
     alpha: Float[Tensor, "B V H W"]
+    depth: Float[Tensor, "B V H W"] | None = None
 
 
 @runtime_checkable
 class Renderer(Protocol):
-    """Draws Gaussians. Differentiable in means, covars, colors and opacities."""
+    """Draws Gaussians. Differentiable in means, covars, colors, opacities and background."""
 
     def __call__(
         self,
@@ -53,9 +57,11 @@ class Renderer(Protocol):
         size: tuple[int, int],
         *,
         background: Float[Tensor, " 3"] | None = None,
+        depth: bool = False,
     ) -> Rendered:
         """Draws B states (of one scene, or of scenes of equal K) in V views each at ``size`` = (width, height).
 
         Colours are per view because they are already evaluated for its directions. No background means black.
+        ``depth`` asks for the depth as well.
         """
         ...

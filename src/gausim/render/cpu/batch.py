@@ -3,23 +3,53 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gausim.core.errors import DivergenceError
-from gausim.render.cpu.binning import TILE_HEIGHT, TILE_WIDTH, collect_band, fill_tiles
+from gausim.render.cpu.binning import TILE_HEIGHT, TILE_WIDTH, bin_band
 from gausim.render.cpu.pool import WorkerPool
-from gausim.render.cpu.projection import add_band_sums, count_unusable, depth_order, project_adjoint, project_view
+from gausim.render.cpu.projection import (
+    EXTENT,
+    RECORD,
+    count_unusable,
+    depth_order,
+    project_adjoint,
+    project_kernels,
+)
 from gausim.render.cpu.raster import PIXELS, SUMS, backward_band, forward_band
 
 Array = NDArray[Any]
-Gradients = tuple[Array, Array, Array, Array]  # of means, covars, colors, opacities
 
 # A call is cut into at least about this many tasks. A constant, not the number of threads, because the cut decides
 # the order of summation and gradients must not depend on the number of threads.
-TASKS = 8
+TASKS = 12
+# [tiles] Picking a tile's kernels looks at all of its strip in the band: high bands would make that quadratic.
+BAND_TILES = 8
+
+
+class Images(NamedTuple):
+    """What is drawn, or the gradients of it."""
+
+    rgb: Array  # (B, V, H, W, 3)
+    alpha: Array  # (B, V, H, W)
+    depth: Array | None  # (B, V, H, W)
+
+    def of(self, b: int, v: int) -> tuple[Array, Array, Array | None]:
+        """Those of one view."""
+        return self.rgb[b, v], self.alpha[b, v], None if self.depth is None else self.depth[b, v]
+
+
+class Gradients(NamedTuple):
+    """With respect to the inputs; the background's is None unless it was asked for."""
+
+    means: Array
+    covars: Array
+    colors: Array
+    opacities: Array
+    background: Array | None
 
 
 @dataclass(slots=True)
@@ -30,21 +60,34 @@ class Band:
     records: Array
     entries: Array
     start: Array
-    row_of: Array
     final: Array
     last: Array
-    sums: Array | None = None
+    used: Array
 
 
 @dataclass(slots=True)
 class View:
-    """The projected kernels of one state in one view, and its bands."""
+    """The kernels of one state as one view sees them, indexed by the kernel, and the view's bands."""
 
-    ids: Array
+    depth: Array
+    spans: Array  # (K, 2): first and last pixel row
+    row_of: Array  # (bands, K): the row of a kernel in the arrays of a band that it reaches
     records: Array | None
     extents: Array | None
-    order: Array | None
+    order: tuple[Array, Array] | None = None  # of depth_order
     bands: list[Band | None] = field(default_factory=list)
+    offsets: Array | None = None  # (bands + 1,): where the rows of each band start in ``sums``
+    sums: Array | None = None
+
+    def make_sums(self) -> None:
+        """Makes room for what the backward pass sums up, all bands in one array."""
+        rows = [0 if band is None else band.records.shape[0] for band in self.bands]
+        self.offsets = np.cumsum([0, *rows])
+        self.sums = np.empty((self.offsets[-1], SUMS), np.float32)
+
+    def forget(self) -> None:
+        """Lets go of what only the forward pass needs."""
+        self.records = self.extents = self.order = None
 
 
 @dataclass(slots=True)
@@ -65,111 +108,171 @@ class Batch:
     views: dict[tuple[int, int], View] = field(default_factory=dict)
 
     @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """State and view of every image."""
+        states, views = self.viewmats.shape[:2]
+        return [(b, v) for b in range(states) for v in range(views)]
+
+    @property
     def band_rows(self) -> list[tuple[int, int]]:
         """First and last pixel row of each band of a view."""
-        states, views = self.viewmats.shape[:2]
         tile_rows = -(-self.height // TILE_HEIGHT)
-        bands = min(tile_rows, max(1, -(-TASKS // (states * views))))
+        bands = min(tile_rows, max(_parts(len(self.pairs)), -(-tile_rows // BAND_TILES)))
         cuts = [i * tile_rows // bands * TILE_HEIGHT for i in range(bands + 1)]
         return [(low, min(high, self.height) - 1) for low, high in zip(cuts, cuts[1:], strict=False)]
 
-    def forward(self, pool: WorkerPool, keep: bool) -> tuple[Array, Array]:
-        """Draws everything: rgb (B, V, H, W, 3) and alpha (B, V, H, W). ``keep`` holds on to what backward needs."""
-        states, views = self.viewmats.shape[:2]
-        rgb = np.empty((states, views, self.height, self.width, 3), np.float32)
-        alpha = np.empty((states, views, self.height, self.width), np.float32)
-        rows = self.band_rows
-        pairs = [(b, v) for b in range(states) for v in range(views)]
+    @property
+    def band_of_row(self) -> Array:
+        """The band of each pixel row."""
+        return np.repeat(np.arange(len(self.band_rows)), [last - first + 1 for first, last in self.band_rows])
+
+    def forward(self, pool: WorkerPool, *, keep: bool, depth: bool) -> Images:
+        """Draws everything. ``keep`` holds on to what backward needs."""
+        shape = (*self.viewmats.shape[:2], self.height, self.width)
+        images = Images(
+            np.empty((*shape, 3), np.float32),
+            np.empty(shape, np.float32),
+            np.empty(shape, np.float32) if depth else None,
+        )
+        rows, kernels = self.band_rows, self._kernel_ranges(len(self.pairs))
 
         def draw(item: tuple[int, int, int]) -> None:
             b, v, index = item
-            band = self._draw_band(self.views[b, v], rows[index], index, rgb[b, v], alpha[b, v])
-            self.views[b, v].bands[index] = band if keep else None
+            view = self.views[b, v]
+            band = self._draw_band(view, index, rows[index], images.of(b, v))
+            view.bands[index] = band if keep else None
 
-        def project(item: tuple[int, int]) -> None:
-            self.views[item] = self._project(*item, len(rows))
-            if len(rows) == 1:
-                draw((*item, 0))
-                self._forget(item)
+        def draw_image(item: tuple[int, int]) -> None:
+            for low, high in kernels:
+                self._project((*item, low, high))
+            self._sort(item)
+            for index in range(len(rows)):
+                draw((*item, index))
+            self.views[item].forget()
 
-        pool.run(project, pairs)
-        if len(rows) > 1:
-            pool.run(draw, [(b, v, i) for b, v in pairs for i in range(len(rows))])
-            for item in pairs:
-                self._forget(item)
-        return rgb, alpha
+        self.views = {item: self._empty_view(len(rows)) for item in self.pairs}
+        if len(self.pairs) >= TASKS:
+            pool.run(draw_image, self.pairs)
+            return images
+        pool.run(self._project, [(*item, *part) for item in self.pairs for part in kernels])
+        pool.run(self._sort, self.pairs)
+        pool.run(draw, [(*item, i) for item in self.pairs for i in range(len(rows))])
+        for view in self.views.values():
+            view.forget()
+        return images
 
-    def backward(self, pool: WorkerPool, grad_rgb: Array, grad_alpha: Array) -> Gradients:
-        """Gradients of means, covars, colors and opacities."""
+    def backward(self, pool: WorkerPool, grads: Images, *, background: bool) -> Gradients:
+        """Gradients of the inputs from those of the images."""
         states, views = self.viewmats.shape[:2]
-        count = self.means.shape[1]
+        count, bands = self.means.shape[1], range(len(self.band_rows))
+        result = Gradients(
+            np.zeros((states, count, 3), np.float32),
+            np.zeros((states, count, 3, 3), np.float32),
+            np.empty((states, views, count, 3), np.float32),
+            np.zeros((states, count), np.float32),
+            np.zeros((states, views, len(bands), 3), np.float64) if background else None,
+        )
 
         def composite(item: tuple[int, int, int]) -> None:
-            b, v, index = item
-            band = self.views[b, v].bands[index]
-            assert band is not None
-            band.sums = backward_band(
-                band.records, band.entries, band.start, band.row_low, self.background, self.alpha_max,
-                grad_rgb[b, v], grad_alpha[b, v], band.final, band.last,
-            )  # fmt: skip
+            self._composite(item, grads, result.background)
 
-        bands = range(len(self.band_rows))
-        pool.run(composite, [(b, v, i) for b in range(states) for v in range(views) for i in bands])
-        grads = (
-            np.empty((states, count, 3), np.float32),
-            np.empty((states, count, 3, 3), np.float32),
-            np.empty((states, views, count, 3), np.float32),
-            np.empty((states, count), np.float32),
-        )
-        parts = max(1, TASKS // states)
+        def finish(part: tuple[int, int, int]) -> None:
+            for v in range(views):
+                self._finish(v, part, result)
+
+        def state(b: int) -> None:
+            for v in range(views):
+                self.views[b, v].make_sums()
+                for i in bands:
+                    composite((b, v, i))
+                self._finish(v, (b, 0, count), result)
+                self.views[b, v].sums = None
+
+        if states >= TASKS:  # what is summed up stays in the cache
+            pool.run(state, range(states))
+        else:
+            for view in self.views.values():
+                view.make_sums()
+            pool.run(composite, [(*item, i) for item in self.pairs for i in bands])
+            pool.run(finish, [(b, *part) for b in range(states) for part in self._kernel_ranges(states)])
+            for view in self.views.values():
+                view.sums = None
+        if result.background is None:
+            return result
+        return result._replace(background=result.background.sum((0, 1, 2)).astype(np.float32))
+
+    def _kernel_ranges(self, shared_by: int) -> list[tuple[int, int]]:
+        """Cuts the kernels of one view or state so that all of them make about TASKS tasks."""
+        count, parts = self.means.shape[1], _parts(shared_by)
         cuts = [i * count // parts for i in range(parts + 1)]
-        pool.run(
-            lambda part: self._finish(part, grads),
-            [(b, low, high) for b in range(states) for low, high in zip(cuts, cuts[1:], strict=False) if high > low],
-        )
-        return grads
+        return [(low, high) for low, high in zip(cuts, cuts[1:], strict=False) if high > low]
 
-    def _project(self, b: int, v: int, bands: int) -> View:
-        inputs = self.means[b], self.covars[b], self.colors[b, v], self.opacities[b]
-        unusable = count_unusable(*inputs)
-        if unusable:
+    def _empty_view(self, bands: int) -> View:
+        count = self.means.shape[1]
+        return View(
+            depth=np.empty(count, np.float32),
+            row_of=np.empty((bands, count), np.int32),
+            records=np.empty((count, RECORD), np.float32),
+            extents=np.empty((count, EXTENT), np.float32),
+            spans=np.empty((count, 2), np.int32),
+            bands=[None] * bands,
+        )
+
+    def _project(self, part: tuple[int, int, int, int]) -> None:
+        b, v, low, high = part
+        view = self.views[b, v]
+        kernels = self.means[b], self.covars[b], self.colors[b, v], self.opacities[b]
+        if unusable := count_unusable(*kernels, low, high):
             raise DivergenceError(
-                f"render: {unusable} of {self.means.shape[1]} Gaussians of state {b}, view {v} have a mean, covariance "
-                "or colour that is not finite, or an opacity outside 0..1. Look for the step that made them so."
+                f"render: {unusable} of the Gaussians {low} to {high - 1} of state {b}, view {v} have a mean, "
+                "covariance or colour that is not finite, or an opacity outside 0..1. Look for the step that made "
+                "them so."
             )
-        records, extents, ids, depth = project_view(
-            *inputs, self.viewmats[b, v], self.Ks[b, v], self.width, self.height, self.near
-        )
-        return View(ids, records, extents, depth_order(depth), [None] * bands)
+        project_kernels(
+            *kernels, self.viewmats[b, v], self.Ks[b, v], self.width, self.height, self.near, low, high,
+            view.records, view.extents, view.spans, view.depth,
+        )  # fmt: skip
 
-    def _draw_band(self, view: View, rows: tuple[int, int], index: int, rgb: Array, alpha: Array) -> Band:
+    def _sort(self, item: tuple[int, int]) -> None:
+        self.views[item].order = depth_order(self.views[item].depth, self.views[item].spans)
+
+    def _draw_band(
+        self, view: View, index: int, rows: tuple[int, int], images: tuple[Array, Array, Array | None]
+    ) -> Band:
+        assert view.order is not None
         strips = -(-self.width // TILE_WIDTH)
-        row_of = np.empty(view.ids.shape[0], np.int32)
-        records, extents, bound = collect_band(view.records, view.extents, view.order, row_of, *rows, strips)
-        entries, start = fill_tiles(extents, bound, *rows, strips)
-        final = np.empty((start.shape[0] - 1, PIXELS), np.float32)
-        last = np.empty((start.shape[0] - 1, PIXELS), np.float32)
-        forward_band(records, entries, start, rows[0], self.background, self.alpha_max, rgb, alpha, final, last)
-        return Band(rows[0], records, entries, start, row_of, final, last)
+        records, entries, start = bin_band(
+            view.records, view.extents, *view.order, view.row_of[index], *rows, strips
+        )  # fmt: skip
+        tiles = start.shape[0] - 1
+        final, last = np.empty((tiles, PIXELS), np.float32), np.empty((tiles, PIXELS), np.float32)
+        used = np.empty(tiles, np.int64)
+        forward_band(
+            records, entries, start, rows[0], self.background, self.alpha_max, *images, final, last, used
+        )  # fmt: skip
+        return Band(rows[0], records, entries, start, final, last, used)
 
-    def _forget(self, item: tuple[int, int]) -> None:
-        view = self.views[item]
-        view.records = view.extents = view.order = None
+    def _composite(self, item: tuple[int, int, int], grads: Images, background: Array | None) -> None:
+        b, v, index = item
+        view = self.views[b, v]
+        band, sums, offsets = view.bands[index], view.sums, view.offsets
+        assert band is not None and sums is not None and offsets is not None
+        rgb, alpha, depth = grads.of(b, v)
+        backward_band(
+            band.records, band.entries, band.start, band.row_low, self.background, self.alpha_max, rgb, alpha, depth,
+            band.final, band.last, band.used, sums[offsets[index] : offsets[index + 1]],
+            None if background is None else background[item],
+        )  # fmt: skip
 
-    def _finish(self, part: tuple[int, int, int], grads: Gradients) -> None:
-        (b, low, high), (means, covars, colors, opacities) = part, grads
-        means[b, low:high], covars[b, low:high], opacities[b, low:high] = 0, 0, 0
-        colors[b, :, low:high] = 0
-        for v in range(self.viewmats.shape[1]):
-            view = self.views[b, v]
-            first, end = np.searchsorted(view.ids, (low, high))
-            total = np.zeros((end - first, SUMS), np.float32)
-            for band in view.bands:
-                assert band is not None and band.sums is not None
-                add_band_sums(total, band.sums, band.row_of, first)
-            ids = view.ids[first:end]
-            colors[b, v, ids] = total[:, 6:]
-            project_adjoint(
-                self.means[b], self.covars[b], self.opacities[b], self.viewmats[b, v], self.Ks[b, v], self.width,
-                self.height, ids, total, means[b], covars[b], opacities[b],
-            )  # fmt: skip
+    def _finish(self, v: int, part: tuple[int, int, int], grads: Gradients) -> None:
+        b, low, high = part
+        view = self.views[b, v]
+        project_adjoint(
+            self.means[b], self.covars[b], self.opacities[b], self.viewmats[b, v], self.Ks[b, v], self.width,
+            self.height, low, high, view.depth, view.spans, self.band_of_row, view.row_of, view.offsets, view.sums,
+            grads.means[b], grads.covars[b], grads.opacities[b], grads.colors[b, v],
+        )  # fmt: skip
+
+
+def _parts(shared_by: int) -> int:
+    return max(1, -(-TASKS // shared_by))

@@ -4,116 +4,117 @@
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
-import math
-
 import numba
 import numpy as np
 
-from gausim.render.cpu.projection import EXTENT, FINITE_MATH_OFF, RECORD
+from gausim.render.cpu.projection import FINITE_MATH_OFF, RECORD
+from gausim.render.cpu.simd import (
+    LANES,
+    lane_numbers,
+    maximum,
+    minimum,
+    rounded_down,
+    rounded_up,
+    square_root,
+    store,
+)
 
 # numba freezes constants into its cached code and looks only at the file that holds the function: after changing a
 # constant that other files import, delete their cache (__pycache__/*.nb?).
-TILE_WIDTH = 8  # [pixels]: one vector of float32
+TILE_WIDTH = 8  # [pixels]: half a vector of float32
 TILE_HEIGHT = 16  # [pixels]
-SLACK = 0.002  # [pixels] added to every extent, far above its rounding error
-
-
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True, inline="always")
-def strip_range(extent, strips):
-    """First and one past the last 8-pixel column strip that holds a pixel centre within the ellipse's width."""
-    reach = extent[2] + SLACK
-    low = min(max(math.ceil(extent[0] - reach - 0.5), 0.0), strips * 8.0)
-    high = min(max(math.floor(extent[0] + reach - 0.5), -1.0), strips * 8.0 - 1.0)
-    return int(low) // TILE_WIDTH, int(high + 8.0) // TILE_WIDTH
-
-
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True, inline="always")
-def strip_rows(extent, strip, row_low, row_high):
-    """First and last pixel row within [row_low, row_high] that the ellipse touches inside a column strip."""
-    reach = extent[2]
-    left = min(max(strip * 8.0 + 0.5 - extent[0], -reach), reach)
-    right = min(max(strip * 8.0 + 7.5 - extent[0], -reach), reach)
-    apex = extent[5]
-    at = min(max(apex, left), right)
-    high = -extent[4] * at + math.sqrt(max(0.0, extent[6] - extent[7] * at * at))
-    at = min(max(-apex, left), right)
-    low = -extent[4] * at - math.sqrt(max(0.0, extent[6] - extent[7] * at * at))
-    first = max(math.ceil(extent[1] + low - 0.5 - SLACK), float(row_low))
-    last = min(math.floor(extent[1] + high - 0.5 + SLACK), float(row_high))
-    if first > last:
-        return 0, -1
-    return int(first), int(last)
+HALF, SEVEN, WIDTH, ZERO = np.float32(0.5), np.float32(7), np.float32(TILE_WIDTH), np.float32(0)
 
 
 @numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
-def collect_band(records, extents, order, row_of, row_low, row_high, strips):
-    """Copies the records of the kernels that may touch a band, near to far.
+def strip_rows(extent, first_strip, low_row, high_row, rows):
+    """First and last pixel row within [low_row, high_row] that an ellipse touches in each of 16 column strips.
 
-    ``row_of`` (n,) receives the band-local row of every projected kernel, or -1.
+    Between the pixel centres xa..xb of a strip the ellipse is highest at its apex -(B/A) Y or at the border nearest to
+    it, where y = -(B/C) x + sqrt(t/C - det Q / C^2 x^2); likewise its lowest point. Rows go to ``rows[:16]`` and
+    ``rows[16:]``; the last is before the first where the strip is missed.
+    """
+    reach, slack = extent[2], extent[3] + HALF
+    xs = lane_numbers() * WIDTH + (np.float32(first_strip) * WIDTH + HALF - extent[0])
+    left = minimum(maximum(xs, -reach), reach)
+    right = minimum(maximum(xs + SEVEN, -reach), reach)
+    at = minimum(maximum(left, extent[5]), right)
+    high = square_root(maximum(extent[6] - extent[7] * at * at, ZERO)) - extent[4] * at
+    at = minimum(maximum(left, -extent[5]), right)
+    low = ZERO - square_root(maximum(extent[6] - extent[7] * at * at, ZERO)) - extent[4] * at
+    first = rounded_up(low + (extent[1] - slack))
+    last = rounded_down(high + (extent[1] + slack - HALF - HALF))
+    store(rows, 0, minimum(maximum(first, low_row), high_row + HALF + HALF))
+    store(rows, LANES, maximum(minimum(last, high_row), low_row - HALF - HALF))
+
+
+@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+def collect_band(records, extents, order, spans, row_of, row_low, row_high, strips):
+    """Copies the records of the kernels that may touch a band, near to far; ``order`` and ``spans`` by depth_order.
+
+    ``row_of`` (K,) receives the band-local row of the kernels that are copied.
 
     Returns:
-        band records (m, RECORD), band extents (m, EXTENT) and an upper bound on the number of tile entries.
+        band records (m, RECORD), their kernels (m,), the first and one past the last column strip of each (m, 2), and
+        where the list of each strip starts when every kernel is in the lists of all its strips (strips + 1,).
     """
-    n = order.shape[0]
-    chosen = np.empty(n, np.int32)
-    m, bound = 0, 0
-    for i in range(n):
-        g = order[i]
-        reach = extents[g, 3] + SLACK + 0.5
-        low, high = extents[g, 1] - reach, extents[g, 1] + reach
-        row_of[g] = -1
-        if high < row_low or low > row_high + 1:
-            continue
-        first, last = strip_range(extents[g], strips)
-        if first >= last:
-            continue
-        tiles_high = int(min(high, row_high)) // TILE_HEIGHT - int(max(low, row_low)) // TILE_HEIGHT + 1
-        bound += (last - first) * tiles_high
-        row_of[g] = m
-        chosen[m] = g
-        m += 1
-    band_records = np.empty((m, RECORD), np.float32)
-    band_extents = np.empty((m, EXTENT), np.float64)
+    chosen = np.empty(order.shape[0], np.int32)
+    m = 0
+    for i in range(order.shape[0]):
+        chosen[m] = order[i]
+        m += (spans[i, 0] <= row_high) & (spans[i, 1] >= row_low)  # without a branch, which nothing could predict
+    band_records, reach = np.empty((m, RECORD), np.float32), np.empty((m, 2), np.int32)
+    begins = np.zeros(strips + 2, np.int64)
     for i in range(m):
+        g = chosen[i]
+        row_of[g] = i
         for j in range(RECORD):
-            band_records[i, j] = records[chosen[i], j]
-        for j in range(EXTENT):
-            band_extents[i, j] = extents[chosen[i], j]
-    return band_records, band_extents, bound
+            band_records[i, j] = records[g, j]
+        middle, half = extents[g, 0] - HALF, extents[g, 2] + extents[g, 3]
+        first = int(min(max(middle - half, ZERO), strips * WIDTH)) // TILE_WIDTH
+        end = int(min(max(middle + half, -WIDTH), strips * WIDTH - HALF) + WIDTH) // TILE_WIDTH
+        end = max(first, end)
+        reach[i, 0], reach[i, 1] = first, end
+        begins[first + 1] += 1
+        begins[end + 1] -= 1
+    for _ in range(2):  # from changes to lengths, from lengths to positions
+        for strip in range(strips):
+            begins[strip + 1] += begins[strip]
+    return band_records, chosen[:m], reach, begins[: strips + 1]
 
 
 @numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
-def fill_tiles(extents, bound, row_low, row_high, strips):
+def bin_band(records, extents, order, spans, row_of, row_low, row_high, strips):
     """Lists for every tile of a band the kernels that touch it, near to far.
 
+    First every column strip lists its kernels with their rows, then each tile picks from its strip's list. The picking
+    looks at every kernel of the strip but takes no branch, which pays while a band is a few tiles high.
+
     Returns:
-        entries (E,), each ``row << 8 | first pixel row in the tile << 4 | last``, and where each tile's entries start
-        (tiles + 1,); tiles are numbered row by row.
+        band records (m, RECORD); entries (E,), each ``row << 8 | first pair of pixel rows in the tile << 4 | last``;
+        and where each tile's entries start (tiles + 1,). Tiles are numbered row by row.
     """
-    top = row_low // TILE_HEIGHT
-    tiles = strips * ((row_high - row_low) // TILE_HEIGHT + 1)
-    start = np.zeros(tiles + 1, np.int64)
-    tile_of, packed = np.empty(bound, np.int32), np.empty(bound, np.int32)
+    band_records, chosen, reach, begins = collect_band(
+        records, extents, order, spans, row_of, row_low, row_high, strips
+    )  # fmt: skip
+    cursor, listed = begins[:-1].copy(), np.empty((begins[-1], 3), np.int32)
+    rows = np.empty(2 * LANES, np.float32)
+    for m in range(chosen.shape[0]):
+        for base in range(reach[m, 0], reach[m, 1], LANES):
+            strip_rows(extents[chosen[m]], base, np.float32(row_low), np.float32(row_high), rows)
+            for j in range(min(LANES, reach[m, 1] - base)):
+                at = cursor[base + j]
+                cursor[base + j] = at + 1
+                listed[at, 0], listed[at, 1], listed[at, 2] = m, int(rows[j]) - row_low, int(rows[LANES + j]) - row_low
+    tile_rows = (row_high - row_low) // TILE_HEIGHT + 1
+    start = np.zeros(strips * tile_rows + 1, np.int64)
+    entries = np.empty(begins[-1] * tile_rows + 1, np.int32)
     count = 0
-    for g in range(extents.shape[0]):
-        extent = extents[g]
-        first_strip, end_strip = strip_range(extent, strips)
-        for strip in range(first_strip, end_strip):
-            first, last = strip_rows(extent, strip, row_low, row_high)
-            if first > last:
-                continue
-            for tile_row in range(first // TILE_HEIGHT, last // TILE_HEIGHT + 1):
-                base = tile_row * TILE_HEIGHT
-                low, high = max(first - base, 0), min(last - base, TILE_HEIGHT - 1)
-                tile = (tile_row - top) * strips + strip
-                tile_of[count], packed[count] = tile, (g << 8) | (low << 4) | high
-                start[tile + 1] += 1
-                count += 1
-    for tile in range(tiles):
-        start[tile + 1] += start[tile]
-    entries, cursor = np.empty(count, np.int32), start[:-1].copy()
-    for e in range(count):
-        at = cursor[tile_of[e]]
-        cursor[tile_of[e]] = at + 1
-        entries[at] = packed[e]
-    return entries, start
+    for tile in range(strips * tile_rows):
+        top = tile // strips * TILE_HEIGHT
+        for at in range(begins[tile % strips], begins[tile % strips + 1]):
+            first, last = max(listed[at, 1] - top, 0), min(listed[at, 2] - top, TILE_HEIGHT - 1)
+            entries[count] = (listed[at, 0] << 8) | ((first >> 1) << 4) | (last >> 1)
+            count += first <= last
+        start[tile + 1] = count
+    return band_records, entries[:count].copy(), start

@@ -9,15 +9,21 @@ import math
 import numba
 import numpy as np
 
+from gausim.render.cpu.simd import LANES, load, splat, store
+
 # All of fastmath but nnan and ninf: what overflows here must not turn into an undefined index later.
 FINITE_MATH_OFF = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
 # Raster record, float32: integer and fractional part of the mean, x then y (so that offsets inside a tile stay exact
-# far from the image's origin), -A/16, -B/8, -C/16 of the inverse covariance, opacity, colour, and the exponent below
-# which alpha < 1/255, over 8.
-RECORD = 12
-# Extent record, float64: mean x y, half width X, half height Y, B/C, -(B/A) Y, t/C, det Q / C^2.
+# far from the image's origin), -A/16, -B/8, -C/16 of the inverse covariance, opacity, colour, the exponent below which
+# alpha < 1/255, over 8, and the depth; padded to a cache line.
+RECORD = 16
+# Extent, float32: mean x y, half width X, slack, B/C, -(B/A) Y, t/C, det Q / C^2.
 EXTENT = 8
+SLACK = 0.002  # [pixels] added to every extent, far above the rounding error of extents up to some thousand pixels,
+RELATIVE_SLACK = 2e-6  # and in proportion to the extent above that
+
+AT_ONCE = 64  # kernels whose sums are gathered before they are used
 
 DILATION = 0.3  # [pixels^2], gsplat's and 3DGS's low-pass filter
 ALPHA_MIN = 1.0 / 255.0
@@ -25,19 +31,19 @@ CLAMP_MARGIN = 0.3  # gsplat clamps x/z and y/z to the field of view widened by 
 
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
-def count_unusable(means, covars, colors, opacities):
+def count_unusable(means, covars, colors, opacities, low, high):
     """Number of kernels that are not finite or whose opacity lies outside 0..1 (no fastmath: it would see no NaN)."""
     unusable = 0
-    for k in range(means.shape[0]):
-        total = np.float64(0)
+    for k in range(low, high):
+        total = means[k, 0] + means[k, 1] + means[k, 2] + (colors[k, 0] + colors[k, 1] + colors[k, 2])
         for i in range(3):
-            total += np.float64(means[k, i]) + colors[k, i] + covars[k, i, 0] + covars[k, i, 1] + covars[k, i, 2]
+            total += covars[k, i, 0] + covars[k, i, 1] + covars[k, i, 2]
         if not (math.isfinite(total) and 0.0 <= opacities[k] <= 1.0):
             unusable += 1
     return unusable
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True, inline="always")
+@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
 def screen_covariance(means, covars, viewmat, K, k, width, height, frame):
     """Camera-space mean, M = J R and S = M Sigma M^T + 0.3 I of kernel ``k``, written to ``frame`` (float64, 22).
 
@@ -83,22 +89,18 @@ def screen_covariance(means, covars, viewmat, K, k, width, height, frame):
 
 
 @numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
-def project_view(means, covars, colors, opacities, viewmat, K, width, height, near):
-    """Projects all kernels of one state into one view and drops those that cannot touch a pixel.
+def project_kernels(
+    means, covars, colors, opacities, viewmat, K, width, height, near, low, high, records, extents, spans, depth
+):
+    """Projects the kernels ``low .. high - 1`` of one state into one view; arrays are indexed by the kernel.
 
-    Returns:
-        records (n, RECORD), extents (n, EXTENT), kernel index (n,) and depth (n,) of the n kernels left, in kernel
-        order.
+    ``spans`` (K, 2) receives the first and last pixel row of a kernel's ellipse, ``depth`` (K,) its depth, or -1 where
+    it cannot touch a pixel, which leaves its other rows unwritten.
     """
-    count = means.shape[0]
-    records = np.empty((count, RECORD), np.float32)
-    extents = np.empty((count, EXTENT), np.float64)
-    ids = np.empty(count, np.int32)
-    depth = np.empty(count, np.float32)
     frame = np.empty(22, np.float64)
-    n = 0
-    for k in range(count):
+    for k in range(low, high):
         o = opacities[k]
+        depth[k] = np.float32(-1)
         z = (
             np.float64(viewmat[2, 0]) * means[k, 0]
             + np.float64(viewmat[2, 1]) * means[k, 1]
@@ -116,72 +118,99 @@ def project_view(means, covars, colors, opacities, viewmat, K, width, height, ne
         my = K[1, 1] * frame[1] / z + K[1, 2]
         t = 2.0 * math.log(255.0 * o)
         half_x, half_y = math.sqrt(t * s00), math.sqrt(t * s11)
-        if mx + half_x < 0.0 or mx - half_x > width or my + half_y < 0.0 or my - half_y > height:
+        slack = SLACK + RELATIVE_SLACK * (half_x + half_y + abs(mx) + abs(my))
+        top, bottom = my - half_y - slack - 0.5, my + half_y + slack - 0.5
+        if mx + half_x < 0.0 or mx - half_x > width or bottom < 0.0 or top > height - 1.0:
             continue
+        depth[k] = z
+        spans[k, 0], spans[k, 1] = math.ceil(max(top, 0.0)), math.floor(min(bottom, height - 1.0))
         a, b, c = s11 / det, -s01 / det, s00 / det
         ix, iy = math.floor(mx), math.floor(my)
-        records[n, 0], records[n, 1], records[n, 2], records[n, 3] = ix, mx - ix, iy, my - iy
-        records[n, 4], records[n, 5], records[n, 6] = -a / 16.0, -b / 8.0, -c / 16.0
-        records[n, 7] = o
-        records[n, 8], records[n, 9], records[n, 10] = colors[k, 0], colors[k, 1], colors[k, 2]
-        records[n, 11] = -t / 16.0
-        extents[n, 0], extents[n, 1], extents[n, 2], extents[n, 3] = mx, my, half_x, half_y
-        extents[n, 4], extents[n, 5] = b / c, -(b / a) * half_y
-        extents[n, 6], extents[n, 7] = t / c, 1.0 / (det * c * c)
-        ids[n], depth[n] = k, z
-        n += 1
-    return records, extents, ids[:n], depth[:n]
+        records[k, 0], records[k, 1], records[k, 2], records[k, 3] = ix, mx - ix, iy, my - iy
+        records[k, 4], records[k, 5], records[k, 6] = -a / 16.0, -b / 8.0, -c / 16.0
+        records[k, 7] = o
+        records[k, 8], records[k, 9], records[k, 10] = colors[k, 0], colors[k, 1], colors[k, 2]
+        records[k, 11], records[k, 12] = -t / 16.0, z
+        extents[k, 0], extents[k, 1], extents[k, 2], extents[k, 3] = mx, my, half_x, slack
+        extents[k, 4], extents[k, 5] = b / c, -(b / a) * half_y
+        extents[k, 6], extents[k, 7] = t / c, 1.0 / (det * c * c)
 
 
 @numba.njit(nogil=True, error_model="numpy", cache=True)
-def depth_order(depth):
-    """Stable order of positive depths, near to far: a radix sort on the bits (equal depths keep the kernel order)."""
-    n = depth.shape[0]
-    key, spare_key = depth.view(np.uint32).copy(), np.empty(n, np.uint32)
-    order, spare = np.arange(n).astype(np.int32), np.empty(n, np.int32)
-    start = np.empty(2048, np.int32)
-    for shift in (0, 11, 22):
-        start[:] = 0
-        for i in range(n):
-            start[(key[i] >> np.uint32(shift)) & np.uint32(2047)] += 1
-        total = 0
+def depth_order(depth, spans):
+    """Kernels with a depth that is not negative, near to far, and their rows of ``spans`` in this order.
+
+    A stable radix sort on the bits of the positive floats: equal depths keep the order of the kernels.
+    """
+    bits = depth.view(np.int32)
+    n = 0
+    key, order = np.empty(depth.shape[0], np.int32), np.empty(depth.shape[0], np.int32)
+    start = np.zeros((3, 2048), np.int32)
+    for k in range(depth.shape[0]):
+        b = bits[k]
+        if b >= 0:
+            key[n], order[n] = b, k
+            n += 1
+            for digit in range(3):
+                start[digit, (b >> (11 * digit)) & 2047] += 1
+    spare_key, spare = np.empty(n, np.int32), np.empty(n, np.int32)
+    for digit in range(3):
+        total = np.int32(0)
         for d in range(2048):
-            total, start[d] = total + start[d], total
+            total, start[digit, d] = total + start[digit, d], total
         for i in range(n):
-            d = (key[i] >> np.uint32(shift)) & np.uint32(2047)
-            at = start[d]
-            start[d] = at + 1
+            d = (key[i] >> (11 * digit)) & 2047
+            at = start[digit, d]
+            start[digit, d] = at + 1
             spare_key[at], spare[at] = key[i], order[i]
         key, spare_key, order, spare = spare_key, key, spare, order
-    return order
+    sorted_spans = np.empty((n, 2), np.int32)
+    for i in range(n):
+        sorted_spans[i, 0], sorted_spans[i, 1] = spans[order[i], 0], spans[order[i], 1]
+    return order[:n], sorted_spans
 
 
 @numba.njit(nogil=True, fastmath=True, error_model="numpy", cache=True)
-def add_band_sums(total, sums, row_of, first):
-    """Adds one band's sums to those of the projected kernels ``first .. first + len(total)``."""
-    for i in range(total.shape[0]):
-        row = row_of[first + i]
-        if row >= 0:
-            for j in range(total.shape[1]):
-                total[i, j] += sums[row, j]
+def gather_sums(low, high, depth, spans, band_of, row_of, offsets, sums, totals):
+    """Adds up the bands' sums of the kernels ``low .. high - 1``, in the order of the bands, into ``totals``.
+
+    A loop of its own, because its reads are scattered over more than the caches hold: many are under way at a time.
+    """
+    rows, flat = sums.reshape(-1), totals.reshape(-1)
+    for k in range(low, high):
+        found = splat(np.float32(0))
+        if depth[k] >= 0.0:
+            for i in range(band_of[spans[k, 0]], band_of[spans[k, 1]] + 1):
+                found += load(rows, (offsets[i] + row_of[i, k]) * LANES)
+        store(flat, (k - low) * LANES, found)
 
 
 @numba.njit(nogil=True, fastmath=True, error_model="numpy", cache=True)
 def project_adjoint(
-    means, covars, opacities, viewmat, K, width, height, ids, total, grad_means, grad_covars, grad_opacities
-):
-    """Takes one view's image-space sums back to the kernels ``ids`` and adds them to their gradients.
+    means, covars, opacities, viewmat, K, width, height, low, high, depth, spans, band_of, row_of, offsets, sums,
+    grad_means, grad_covars, grad_opacities, grad_colors,
+):  # fmt: skip
+    """Takes one view's image-space sums back to the kernels ``low .. high - 1`` and adds them to their gradients.
+
+    ``depth`` (K,) and ``spans`` (K, 2) are those of project_kernels; pixel row y lies in band ``band_of[y]``. In band i
+    kernel k has the row ``offsets[i] + row_of[i, k]`` of ``sums``. ``grad_colors`` are of this view alone and are
+    overwritten.
 
     With m0, m1, m11, m2, m12, m22 the sums over pixels of s, s dx, ..: dL/do = m0 / o, dL/dmean2d = Q (m1, m2),
     G_Q = -1/2 [[m11, m12], [m12, m22]], G_S = -Q G_Q Q, dL/dSigma = M^T G_S M, dL/dM = 2 G_S M Sigma, then through J.
     """
-    frame = np.empty(22, np.float64)
+    frame, totals = np.empty(22, np.float64), np.empty((AT_ONCE, LANES), np.float32)
     grad_row0, grad_row1 = np.empty(3, np.float64), np.empty(3, np.float64)
-    for i in range(ids.shape[0]):
-        k = ids[i]
+    for k in range(low, high):
+        if (k - low) % AT_ONCE == 0:
+            gather_sums(k, min(k + AT_ONCE, high), depth, spans, band_of, row_of, offsets, sums, totals)
+        total = totals[(k - low) % AT_ONCE]
+        grad_colors[k, 0], grad_colors[k, 1], grad_colors[k, 2] = total[6], total[7], total[8]
+        if depth[k] < 0.0:
+            continue
         screen_covariance(means, covars, viewmat, K, k, width, height, frame)
-        m0, m1, m11 = np.float64(total[i, 0]), np.float64(total[i, 1]), np.float64(total[i, 2])
-        m2, m12, m22 = np.float64(total[i, 3]), np.float64(total[i, 4]), np.float64(total[i, 5])
+        m0, m1, m11 = np.float64(total[0]), np.float64(total[1]), np.float64(total[2])
+        m2, m12, m22 = np.float64(total[3]), np.float64(total[4]), np.float64(total[5])
         s00, s01, s11 = frame[9], frame[10], frame[11]
         rdet = 1.0 / (s00 * s11 - s01 * s01)
         a, b, c = s11 * rdet, -s01 * rdet, s00 * rdet
@@ -222,5 +251,6 @@ def project_adjoint(
         cam_y = ey * gv - free_y * ey * rz * j12
         cam_z = -ex * frame[0] * rz * gu - ey * frame[1] * rz * gv
         cam_z += ex * rz * (qx * (1.0 + free_x) * j02 - j00) + ey * rz * (qy * (1.0 + free_y) * j12 - j11)
+        cam_z += total[9]
         for j in range(3):
             grad_means[k, j] += cam_x * viewmat[0, j] + cam_y * viewmat[1, j] + cam_z * viewmat[2, j]

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import ConfigError, Rendered
-from gausim.render.cpu.batch import Array, Batch
+from gausim.render.cpu.batch import Array, Batch, Images
 from gausim.render.cpu.pool import WorkerPool
 
 logger = logging.getLogger(__name__)
@@ -28,8 +28,10 @@ class _Render(torch.autograd.Function):
     """The batch as one node of the autograd graph."""
 
     @staticmethod
-    def forward(ctx: Any, means: Tensor, covars: Tensor, colors: Tensor, opacities: Tensor, *rest: Any) -> Any:
-        pool, keep, viewmats, Ks, background, size, near, alpha_max = rest
+    def forward(
+        ctx: Any, means: Tensor, covars: Tensor, colors: Tensor, opacities: Tensor, background: Tensor, *rest: Any
+    ) -> Any:
+        pool, keep, depth, viewmats, Ks, size, near, alpha_max = rest
         batch = Batch(
             means=_array(means),
             covars=_array(covars),
@@ -37,25 +39,35 @@ class _Render(torch.autograd.Function):
             opacities=_array(opacities),
             viewmats=_array(viewmats),
             Ks=_array(Ks),
-            background=background,
+            background=_array(background),
             width=size[0],
             height=size[1],
             near=near,
             alpha_max=np.float32(alpha_max),
         )
-        rgb, alpha = batch.forward(pool, keep)
+        images = batch.forward(pool, keep=keep, depth=depth)
         if keep:
-            ctx.save_for_backward(means, covars, colors, opacities)
-            ctx.batch, ctx.pool = batch, pool
-        return torch.from_numpy(rgb), torch.from_numpy(alpha)
+            ctx.save_for_backward(means, covars, colors, opacities, background)
+            ctx.batch, ctx.pool, ctx.depth = batch, pool, depth
+            ctx.set_materialize_grads(False)
+        return tuple(None if image is None else torch.from_numpy(image) for image in images)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad_rgb: Tensor, grad_alpha: Tensor) -> Any:
+    def backward(ctx: Any, grad_rgb: Tensor | None, grad_alpha: Tensor | None, grad_depth: Tensor | None) -> Any:
         _ = ctx.saved_tensors  # raises if an input was changed in place since: the batch shares their memory
-        grads = ctx.batch.backward(ctx.pool, _array(grad_rgb), _array(grad_alpha))
-        needed = ctx.needs_input_grad[:4]
-        return (*(torch.from_numpy(g) if n else None for g, n in zip(grads, needed, strict=True)), *[None] * 8)
+        batch, needed = ctx.batch, ctx.needs_input_grad[:5]
+        shape = (*batch.viewmats.shape[:2], batch.height, batch.width)
+        images = Images(
+            np.zeros((*shape, 3), np.float32) if grad_rgb is None else _array(grad_rgb),
+            np.zeros(shape, np.float32) if grad_alpha is None else _array(grad_alpha),
+            None if grad_depth is None else _array(grad_depth),
+        )
+        grads = batch.backward(ctx.pool, images, background=needed[4])
+        return (
+            *(torch.from_numpy(grad) if need else None for grad, need in zip(grads, needed, strict=True)),
+            *[None] * 8,
+        )
 
 
 class CpuRenderer:
@@ -96,6 +108,7 @@ class CpuRenderer:
         size: tuple[int, int],
         *,
         background: Float[Tensor, " 3"] | None = None,
+        depth: bool = False,
     ) -> Rendered:
         """Draws B states in V views each (see core.Renderer). Tensors must be float32 on the CPU.
 
@@ -110,14 +123,14 @@ class CpuRenderer:
                     f"CpuRenderer: expected {name} as float32 on the CPU, got {value.dtype} on {value.device}. "
                     "Convert it, or use ReferenceRenderer for float64."
                 )
+        behind = torch.from_numpy(np.zeros(3, np.float32)) if background is None else background.to(means)
+        inputs["background"] = behind
         keep = torch.is_grad_enabled() and any(value.requires_grad for value in inputs.values())
-        behind = np.zeros(3, np.float32) if background is None else background.detach().to(torch.float32).numpy()
         with _announced():
-            rgb, alpha = _Render.apply(
-                means, covars, colors, opacities, self._workers(), keep, viewmats, Ks, np.ascontiguousarray(behind),
-                size, self.near, self.alpha_max,
-            )  # fmt: skip
-        return Rendered(rgb, alpha)
+            images = _Render.apply(
+                *inputs.values(), self._workers(), keep, depth, viewmats, Ks, size, self.near, self.alpha_max
+            )
+        return Rendered(*images)
 
     def _workers(self) -> WorkerPool:
         threads = self.threads or torch.get_num_threads()
