@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import random
 import resource
 import select
 import signal
@@ -17,6 +18,7 @@ import tempfile
 import traceback
 from typing import Any
 
+import numpy as np
 import torch
 
 import gausim.cli._run
@@ -24,6 +26,7 @@ import gausim.cli.train
 import gausim.engine.loggers
 import gausim.engine.panels  # noqa: F401
 from gausim.cli.main import main
+from gausim.engine.module import GausSimModule
 
 
 def die_at(target: str, match: str, count: int, when: str) -> None:
@@ -48,11 +51,23 @@ def die_at(target: str, match: str, count: int, when: str) -> None:
     setattr(owner, name, dying)
 
 
+def draw_from_global_generators() -> None:
+    """Lets every training step draw numbers as a careless library would; a resumed run must draw the next ones."""
+    original = GausSimModule.training_step
+
+    def careless(self: GausSimModule, *args: Any) -> None:
+        random.random(), np.random.rand(), torch.rand(())
+        original(self, *args)
+
+    GausSimModule.training_step = careless  # type: ignore[method-assign]
+
+
 def child(order: dict[str, Any]) -> int:
     """Trains."""
     torch.set_num_threads(1)
     if order.get("limit"):
         resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
+    draw_from_global_generators()
     for point in order.get("die") or []:
         die_at(**point)
     try:

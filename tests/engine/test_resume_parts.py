@@ -97,6 +97,15 @@ def test_saves_come_by_steps_and_by_minutes_within_an_epoch(monkeypatch: pytest.
     assert steps_saved(RunCheckpoint(every_minutes=0, every_steps=5), last=5) == [6, 11]  # the epoch's end saves that
 
 
+def test_what_was_logged_is_on_the_disk_before_the_checkpoint_is(tmp_path: Path) -> None:
+    trainer, order = trainer_at(4, last=False), []
+    stand_in = type(trainer)
+    stand_in.loggers = [SimpleNamespace(save=lambda: order.append("rows"))]  # type: ignore[attr-defined, misc]
+    stand_in.save_checkpoint = lambda *_, **__: order.append("checkpoint")  # type: ignore[assignment]
+    RunCheckpoint(every_steps=4).on_train_batch_end(trainer, MODULE, None, None, 0)
+    assert order == ["rows", "checkpoint"]
+
+
 def test_a_resumed_run_has_the_learning_rate_of_the_time_it_used(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [1000.0]
     monkeypatch.setattr("gausim.engine.callbacks.time.monotonic", lambda: now[0])
