@@ -38,6 +38,7 @@ COMMANDS: dict[str, Command] = {
         "Measure the speed of rendering, stepping, training and clustering as ratios within one run.",
     ),
     "simulate": Command("gausim.cli.simulate", "Roll a run forward and write videos, figures and trajectories."),
+    "report": Command("gausim.cli.report", "Compare runs and sweeps: one HTML page, Markdown, LaTeX and CSV."),
 }
 
 

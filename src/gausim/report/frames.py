@@ -46,9 +46,9 @@ def video_frame(
     zoom = max(1.0, PANEL_HEIGHT / prediction.shape[0])
     panels = [_enlarge(p, zoom) for p in (missing if truth is None else truth, prediction, error)]
     labels = ["ground truth" if truth is not None else "no ground truth", "prediction", f"error 0..{ERROR_RANGE:g}"]
-    labelled = [np.concatenate((_label(text, p.shape[1]), p)) for text, p in zip(labels, panels, strict=True)]
+    labelled = [np.concatenate((label_bar(text, p.shape[1]), p)) for text, p in zip(labels, panels, strict=True)]
     picture = np.concatenate(labelled, axis=1)
-    return np.concatenate((picture, _footer(frame, timeline, title, picture.shape[1])))
+    return np.concatenate((picture, timeline_bar(frame, timeline, title, picture.shape[1])))
 
 
 def _enlarge(image: np.ndarray, zoom: float) -> np.ndarray:
@@ -57,15 +57,17 @@ def _enlarge(image: np.ndarray, zoom: float) -> np.ndarray:
     return cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
 
 
-def _label(text: str, width: int) -> np.ndarray:
+def label_bar(text: str, width: int) -> np.ndarray:
+    """A dark bar of this width with a line of text."""
     bar = np.full((_BAR, width, 3), _PAPER, np.uint8)
     return cv2.putText(bar, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.48, _INK, 1, cv2.LINE_AA)
 
 
-def _footer(frame: int, timeline: Timeline, title: str, width: int) -> np.ndarray:
+def timeline_bar(frame: int, timeline: Timeline, title: str, width: int) -> np.ndarray:
+    """Title, number of the frame and a line of time; orange from the first frame that training did not see."""
     foreseen = frame >= timeline.first_unseen
     state = "FORESEEN" if foreseen else "seen in training"
-    bar = _label(f"{title}   frame {frame}/{timeline.frames - 1}   {state}", width)
+    bar = label_bar(f"{title}   frame {frame}/{timeline.frames - 1}   {state}", width)
     line = np.full((8, width, 3), _PAPER, np.uint8)
     begin, now = (round(width * f / timeline.frames) for f in (timeline.first_unseen, frame + 1))
     line[:, : min(begin, now)] = _SEEN

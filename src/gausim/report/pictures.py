@@ -8,6 +8,8 @@ shows one. Numbers are never computed from them.
 from __future__ import annotations
 
 import json
+import zipfile
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -78,7 +80,7 @@ def load_pictures(path: Path) -> list[Pictures]:
             arrays = {name: file[name] for name in file.files}
         names = [name.removesuffix("/facts") for name in arrays if name.endswith("/facts")]
         return [_pictures(name, arrays) for name in names]
-    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
         raise RunError(f"{path}: cannot be read ({error}). Write it with `gausim evaluate RUN`.") from error
 
 
@@ -87,9 +89,14 @@ def _pictures(name: str, arrays: dict[str, np.ndarray]) -> Pictures:
     prefix, truth = f"{name}/prediction/", arrays[f"{name}/truth"]
     predictions = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
     frames, views = len(truth), len(facts["views"])
+    background = arrays.get(f"{name}/background")
     for array in (truth, *predictions.values()):
         if array.dtype != np.uint8 or array.ndim != 5 or array.shape != (frames, views, *truth.shape[2:4], 4):
             raise ValueError(f"expected uint8 {(frames, views, *truth.shape[2:4], 4)}, got {array.dtype} {array.shape}")
+    if not truth.size:
+        raise ValueError("there are no pictures")
+    if background is not None and (background.dtype != np.uint8 or background.shape != (*truth.shape[1:4], 3)):
+        raise ValueError(f"the background has shape {background.shape}, expected {(*truth.shape[1:4], 3)}")
     return Pictures(
         object=str(facts["object"]),
         sequence=str(facts["sequence"]),
@@ -99,5 +106,5 @@ def _pictures(name: str, arrays: dict[str, np.ndarray]) -> Pictures:
         heldout_views=tuple(facts["heldout_views"]),
         truth=truth,
         predictions=predictions,
-        background=arrays.get(f"{name}/background"),
+        background=background,
     )

@@ -1,0 +1,70 @@
+"""Makes a report: from directories of runs to HTML, Markdown, LaTeX and CSV files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from gausim.report.media import Exhibit, object_figures
+from gausim.report.overview import make_sheets
+from gausim.report.page import html_page
+from gausim.report.runs import find_runs
+from gausim.report.sources import Sources
+from gausim.report.study import Study, make_study
+from gausim.report.text import csv_numbers, latex_tables, markdown_report
+
+PAGE, MARKDOWN, LATEX, NUMBERS = "report.html", "report.md", "tables.tex", "numbers.csv"
+
+
+def write_report(
+    roots: Sequence[Path],
+    out: Path,
+    *,
+    title: str = "Report",
+    pictures: bool = True,
+    say: Callable[[str], None] | None = None,
+) -> tuple[Study, list[Path]]:
+    """Writes the report of all runs at or below ``roots`` into ``out``.
+
+    Args:
+        roots: run directories, sweeps, or folders of them.
+        out: folder of the report; not searched for runs.
+        title: heading.
+        pictures: whether the page has figures and videos.
+        say: told what is being drawn.
+
+    Returns:
+        What the report is about, and the files.
+
+    Raises:
+        RunError: a root is no directory, or there is no run.
+    """
+    runs = find_runs(roots, skip=out)
+    study = make_study(runs)
+    sheets = make_sheets(study)
+    sources = Sources(runs, sheets, out)
+    exhibits: list[tuple[str, list[Exhibit]]] = []
+    notes = list(study.notes)
+    for name in study.objects if pictures else ():
+        if say is not None:
+            say(f"pictures of {name}")
+        figures, problems = object_figures(study, name)
+        exhibits.append((name, figures))
+        notes += [f"{name}: {problem}" for problem in dict.fromkeys(problems)]
+    texts = {
+        PAGE: html_page(title, study, sheets, sources, exhibits, notes),
+        MARKDOWN: markdown_report(title, study, sheets, sources),
+        LATEX: latex_tables(sheets, sources),
+        NUMBERS: csv_numbers(study),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    return study, [_write(out / name, text) for name, text in texts.items()]
+
+
+def _write(path: Path, text: str) -> Path:
+    """Writes all or nothing, so that a reader never sees half a page."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(text, encoding="utf-8", errors="replace")
+    os.replace(temporary, path)
+    return path

@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+
+from gausim.core import RunError
+from gausim.report.runs import find_runs
+from gausim.report.study import cell, make_study
+
+MADE = runpy.run_path(str(Path(__file__).with_name("report_runs.py")))
+config, write_run, evaluate, make_curves = (MADE[n] for n in ("config", "write_run", "evaluate", "make_curves"))
+
+
+@pytest.fixture
+def sweep(tmp_path) -> Path:
+    return MADE["write_sweep"](tmp_path / "sweep")
+
+
+def states(root: Path) -> dict[str, str]:
+    return {run.name: run.status for run in find_runs([root])}
+
+
+def test_every_state_of_a_run_is_told_apart(sweep):
+    write_run(sweep / "later" / "seed_0", config(name="later"))
+    (sweep / "dead" / ".hydra").mkdir(parents=True)
+    (sweep / "dead" / ".hydra" / "config.yaml").write_text("model: {}\nseed: 3\ndata: {}\n")
+    (sweep / ".hydra").mkdir()  # of the whole sweep: no run of its own
+    (sweep / ".hydra" / "config.yaml").write_text("seed: 0\n")
+    assert states(sweep) == {
+        "dead": "failed", "full/seed_0": "evaluated", "full/seed_1": "evaluated", "later/seed_0": "not evaluated",
+        "mass_off/seed_0": "evaluated", "momentum_off/seed_0": "unfinished", "no_hierarchy/seed_0": "failed",
+    }  # fmt: skip
+    details = {run.name: run.detail for run in find_runs([sweep])}
+    assert details["no_hierarchy/seed_0"] == "RuntimeError: out of memory"
+    assert "epoch 3" in details["momentum_off/seed_0"] and "before training" in details["dead"]
+    assert "gausim evaluate" in details["later/seed_0"]
+
+
+def test_runs_are_found_once_and_the_report_is_not_searched(sweep):
+    write_run(sweep / "report" / "copy", config(name="copy"))
+    assert len(find_runs([sweep, sweep / "full", sweep / "full" / "seed_0"], skip=sweep / "report")) == 5
+    names = [run.name for run in find_runs([sweep / "full", sweep / "mass_off"])]
+    assert names == ["full/seed_0", "full/seed_1", "mass_off/seed_0"]
+    assert [run.name for run in find_runs([sweep / "full" / "seed_1"])] == ["seed_1"]
+
+
+def test_nothing_found_says_what_to_do(tmp_path):
+    with pytest.raises(RunError, match="no such directory"):
+        find_runs([tmp_path / "nowhere"])
+    (tmp_path / "config.yaml").write_text("site: mkdocs\n")  # of another program
+    with pytest.raises(RunError, match="no run in here.*Train and evaluate first"):
+        find_runs([tmp_path])
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "message"),
+    [
+        ("config.yaml", "a: [", "cannot be read as YAML"),
+        ("config.yaml", "- 1", "expected a mapping"),
+        ("config.yaml", "a: !!python/object/apply:os.mkdir [boom]", "cannot be read as YAML"),
+        ("config.yaml", "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]", "aliases"),
+        ("config.yaml", "#" * (2 << 20), "no configuration is that long"),
+        ("evaluation/metrics.json", "{", "cannot be read as JSON"),
+        ("evaluation/metrics.json", '{"schema": "other"}', "schema"),
+        ("evaluation/metrics.json", '{"schema": "gausim.evaluation/1", "run": {}, "objects": {"o": {}}}', "objects.o"),
+        ("evaluation/metrics.json", '{"schema": "gausim.evaluation/1", "run": 3, "objects": {}}', "'run'"),
+    ],
+)
+def test_broken_files_are_a_state_and_nothing_in_them_runs(sweep, monkeypatch, file, text, message):
+    monkeypatch.chdir(sweep)
+    (sweep / "full" / "seed_0" / file).write_text(text)
+    (broken,) = [run for run in find_runs([sweep]) if run.name == "full/seed_0"]
+    assert broken.status == "broken files" and message in broken.detail
+    assert not (sweep / "boom").exists()
+
+
+def test_rows_are_named_after_what_was_configured(sweep):
+    study = make_study(find_runs([sweep]))
+    assert [(g.label, g.variation, len(g.runs)) for g in study.groups] == [
+        ("gausim", "full", 2), ("gausim w/o mass", "w/o mass", 1), ("gausim w/o momentum", "w/o momentum", 1),
+        ("gausim w/o hierarchy", "w/o hierarchy", 1),
+    ]  # fmt: skip
+    # The failed run has no summary: its object is known from the runs on the same data.
+    assert study.objects == ("toy_bunny",) and all(g.objects == ("toy_bunny",) for g in study.groups)
+
+
+def test_rows_with_one_name_are_told_apart_by_what_differs(tmp_path):
+    for rate in (0.001, 0.01):
+        settings = config()
+        settings["optimizer"]["network_lr"] = rate
+        evaluate(write_run(tmp_path / f"lr_{rate}", settings), make_curves(rate))
+    evaluate(write_run(tmp_path / "other", config(name="other")), make_curves(2.0))
+    labels = [g.label for g in make_study(find_runs([tmp_path])).groups]
+    assert labels == ["gausim (network_lr=0.001)", "gausim (network_lr=0.01)", "gausim (other)"]
+
+
+def test_a_joint_run_is_a_row_over_its_objects(tmp_path):
+    joint = config()
+    joint["data"]["root"] = "/data"
+    evaluate(write_run(tmp_path / "joint", joint), make_curves(1.0, name="one"), make_curves(2.0, name="two"))
+    evaluate(write_run(tmp_path / "one", config()), make_curves(3.0, name="one"))
+    study = make_study(find_runs([tmp_path]))
+    assert [(g.label, g.objects) for g in study.groups] == [("gausim", ("one",)), ("gausim jointly", ("one", "two"))]
+    assert cell(study.groups[1], "two", "seen", "train", "l2").value.mean == pytest.approx(4e-3)
+    assert cell(study.groups[0], "two", "seen", "train", "l2").status == ""
+
+
+def test_runs_on_unknown_data_get_its_directory_as_object(tmp_path):
+    write_run(tmp_path / "a", config(), finished=False)
+    study = make_study(find_runs([tmp_path]))
+    assert study.objects == ("toy",) and cell(study.groups[0], "toy", "seen", "train", "l2").status == "unfinished"
+
+
+def test_seeds_are_pooled_by_hand(sweep):
+    full = make_study(find_runs([sweep])).groups[0]
+    value = cell(full, "toy_bunny", "unseen", "train", "l2").value
+    # Means over sequences 10e-3 and 12e-3 with deviations 5e-3 and 6e-3.
+    assert value.mean == pytest.approx(11e-3) and value.seeds == 2
+    assert value.std == pytest.approx(((5e-3**2 + 6e-3**2) / 2) ** 0.5)
+    assert value.seed_std == pytest.approx(2e-3 / 2**0.5)
+    energy = cell(full, "toy_bunny", "seen", "points", "motion_energy").value
+    assert energy.mean == pytest.approx((1 / 2 + 1 / 2.2) / 2) and energy.std is None
+
+
+def test_why_there_is_no_number(sweep):
+    groups = make_study(find_runs([sweep])).groups
+    found = [cell(g, "toy_bunny", "seen", "train", "l2") for g in groups]
+    assert [c.status for c in found] == ["evaluated", "evaluated", "unfinished", "failed"]
+    assert [r.name for r in found[3].runs] == ["no_hierarchy/seed_0"]
+    assert cell(groups[0], "toy_bunny", "seen", "train", "lpips").status == "no weights"
+    assert cell(groups[0], "toy_bunny", "seen", "train", "flip").status == "not measured"
+
+
+def test_numbers_of_another_type_are_no_numbers(sweep):
+    path = sweep / "mass_off" / "seed_0" / "evaluation" / "metrics.json"
+    summary = json.loads(path.read_text())
+    summary["objects"]["toy_bunny"]["rows"]["gausim"]["seen"]["train"]["l2"] = {"mean": "<b>1</b>", "std": True}
+    summary["objects"]["toy_bunny"]["rows"]["gausim"]["unseen"] = 3
+    path.write_text(json.dumps(summary))
+    group = make_study(find_runs([sweep])).groups[1]
+    assert cell(group, "toy_bunny", "seen", "train", "l2").status == "not measured"
+    assert cell(group, "toy_bunny", "unseen", "train", "l2").status == "not measured"
+
+
+def test_what_makes_seeds_incomparable_is_noted(tmp_path):
+    evaluate(write_run(tmp_path / "a", config(0)), make_curves(1.0))
+    evaluate(write_run(tmp_path / "b", config(1)), make_curves(1.0, frames=40))
+    evaluate(write_run(tmp_path / "c", config(1)), make_curves(1.0))
+    write_run(tmp_path / "d", config(2))
+    notes = "\n".join(make_study(find_runs([tmp_path])).notes)
+    assert "different ranges of frames" in notes and "seed 1 is there more than once" in notes
+    assert "1 of 4 runs have no numbers" in notes
