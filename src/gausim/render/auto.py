@@ -1,0 +1,81 @@
+"""The renderer that suits the tensors: gsplat on CUDA, the compiled CPU renderer elsewhere."""
+
+from __future__ import annotations
+
+import functools
+import logging
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import Rendered
+from gausim.render import gsplat
+from gausim.render.cpu import CpuRenderer
+
+logger = logging.getLogger(__name__)
+
+
+class AutoRenderer:
+    """Draws tensors on the CPU with CpuRenderer and tensors on a CUDA device with GsplatRenderer (core.Renderer).
+
+    Where a CUDA device is used but gsplat cannot be, images are drawn on the CPU and copied back: correct, and far
+    faster than plain torch on the device, but the device waits. The choice follows from the machine and from where the
+    tensors are, and is logged once per process and kind of device, with the reason where gsplat is passed over.
+    """
+
+    def __init__(self, *, threads: int | None = None, near: float = 0.01) -> None:
+        """Sets the options.
+
+        Args:
+            threads: worker threads of the CPU renderer; None means torch.get_num_threads() at the time of each call.
+            near: kernels closer than this to the camera plane are dropped [scene units].
+
+        Raises:
+            ConfigError: an option is out of range.
+        """
+        self.threads, self.near = threads, near
+        self.cpu = CpuRenderer(threads=threads, near=near)
+        self.gsplat = gsplat.GsplatRenderer(near=near)
+
+    def __call__(
+        self,
+        means: Float[Tensor, "B K 3"],
+        covars: Float[Tensor, "B K 3 3"],
+        colors: Float[Tensor, "B V K 3"],
+        opacities: Float[Tensor, "B K"],
+        viewmats: Float[Tensor, "B V 4 4"],
+        Ks: Float[Tensor, "B V 3 3"],
+        size: tuple[int, int],
+        *,
+        background: Float[Tensor, " 3"] | None = None,
+        depth: bool = False,
+    ) -> Rendered:
+        """Draws B states in V views each (see core.Renderer)."""
+        inputs = (means, covars, colors, opacities, viewmats, Ks)
+        if chosen(means.device.type) == "gsplat":
+            return self.gsplat(*inputs, size, background=background, depth=depth)
+        means_, covars_, colors_, opacities_, viewmats_, Ks_ = (value.cpu() for value in inputs)
+        behind = None if background is None else background.cpu()
+        images = self.cpu(means_, covars_, colors_, opacities_, viewmats_, Ks_, size, background=behind, depth=depth)
+        planes = None if images.depth is None else images.depth.to(means.device)
+        return Rendered(images.rgb.to(means.device), images.alpha.to(means.device), planes)
+
+
+@functools.cache
+def chosen(device: str) -> str:
+    """Names what draws tensors on this type of device, ``gsplat`` or ``cpu``, and logs it when it is first asked."""
+    if device == "cpu":
+        reason = "the tensors are on the CPU" if torch.cuda.is_available() else "PyTorch sees no CUDA device"
+        logger.info("render=auto: images are drawn by the CPU renderer, not by gsplat: %s.", reason)
+        return "cpu"
+    passed_over = gsplat.unavailable()
+    if passed_over is None:
+        logger.info("render=auto: images are drawn by gsplat on the GPU.")
+        return "gsplat"
+    logger.warning(
+        "render=auto: images are drawn on the CPU and copied back to %s, which is slow, because %s.",
+        device,
+        passed_over,
+    )
+    return "cpu"

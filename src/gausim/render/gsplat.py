@@ -1,0 +1,131 @@
+"""The CUDA renderer: gsplat's kernels behind core.Renderer."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import ConfigError, Rendered
+
+VERSION = "1.5.3"  # the ceiling of alpha is compiled in: 0.999 there, as our default, but 0.99 on gsplat's main branch
+DILATION = 0.3  # [pixels^2]
+DEVICE = "cuda"  # the type of the devices that gsplat draws on
+INSTALL = "pip install 'gausim[gpu]'"
+
+
+def unavailable() -> str | None:
+    """Says in one line why gsplat cannot draw on this machine, or None if it can.
+
+    Looks for a CUDA device, for gsplat in the version whose conventions are ours, and for its kernels. A gsplat from
+    the package index compiles them when they are first looked for, which takes minutes once per machine.
+    """
+    if not torch.cuda.is_available():
+        return "PyTorch sees no CUDA device (it needs an NVIDIA driver and a CUDA build of torch)"
+    if importlib.util.find_spec("gsplat") is None:
+        return f"gsplat is not installed ({INSTALL})"
+    import gsplat
+
+    if gsplat.__version__.partition("+")[0] != VERSION:
+        return f"gsplat is {gsplat.__version__}, expected {VERSION} ({INSTALL})"
+    try:
+        from gsplat.cuda._backend import _C as kernels
+    except Exception as error:  # nvcc, the linker and the loader fail in many ways; the first line names the culprit
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        return f"gsplat's CUDA kernels do not build or load: {reason}"
+    if kernels is None:
+        return "gsplat finds no CUDA toolkit to build its kernels with (install nvcc of torch's CUDA version)"
+    return None
+
+
+class GsplatRenderer:
+    """Gaussian splatting by gsplat's CUDA kernels (core.Renderer, float32 on a CUDA device).
+
+    Conventions are the reference's: the covariance of the image widened by 0.3 pixels^2, contributions below 1/255
+    dropped, alpha at most 0.999 (compiled into gsplat, no option here), no kernel skipped for its small radius, no far
+    plane within 1e10 scene units. All states and views are one call of gsplat. It waits for the device once per call,
+    to learn how many tiles the kernels touch. Values that are not finite are not looked for.
+    """
+
+    def __init__(self, *, near: float = 0.01) -> None:
+        """Sets the options.
+
+        Args:
+            near: kernels closer than this to the camera plane are dropped [scene units].
+
+        Raises:
+            ConfigError: an option is out of range.
+        """
+        if not near > 0:
+            raise ConfigError(f"render.near: expected more than 0, got {near}.")
+        self.near = near
+        self._rasterization: Callable[..., Any] | None = None
+
+    def __call__(
+        self,
+        means: Float[Tensor, "B K 3"],
+        covars: Float[Tensor, "B K 3 3"],
+        colors: Float[Tensor, "B V K 3"],
+        opacities: Float[Tensor, "B K"],
+        viewmats: Float[Tensor, "B V 4 4"],
+        Ks: Float[Tensor, "B V 3 3"],
+        size: tuple[int, int],
+        *,
+        background: Float[Tensor, " 3"] | None = None,
+        depth: bool = False,
+    ) -> Rendered:
+        """Draws B states in V views each (see core.Renderer). Also differentiable in the background.
+
+        Raises:
+            ConfigError: gsplat cannot draw on this machine, or a tensor is not float32 on a CUDA device.
+        """
+        inputs = {"means": means, "covars": covars, "colors": colors, "opacities": opacities}
+        for name, value in {**inputs, "viewmats": viewmats, "Ks": Ks}.items():
+            if value.dtype != torch.float32 or value.device.type != DEVICE:
+                raise ConfigError(
+                    f"GsplatRenderer: expected {name} as float32 on a CUDA device, got {value.dtype} on "
+                    f"{value.device}. Set trainer=gpu, or use render=cpu for tensors on the CPU."
+                )
+        rasterization = self._load()
+        behind = means.new_zeros(3) if background is None else background.to(means)
+        views = viewmats.shape[:2]
+        if means.shape[1] == 0:  # gsplat divides by the number of kernels
+            empty = colors.sum()  # zero; it keeps an image without any kernel differentiable
+            plane = empty.expand(*views, size[1], size[0])
+            return Rendered(plane[..., None] + behind, plane, plane if depth else None)
+        image, alpha, _ = rasterization(
+            means=means,
+            quats=None,
+            scales=None,
+            opacities=opacities,
+            colors=colors,
+            viewmats=viewmats,
+            Ks=Ks,
+            width=size[0],
+            height=size[1],
+            near_plane=self.near,
+            radius_clip=0.0,
+            eps2d=DILATION,
+            packed=False,
+            backgrounds=behind.expand(*views, 3),
+            render_mode="RGB+D" if depth else "RGB",
+            # gsplat reads the upper triangle only: of the mean with the transpose, so that the gradient is symmetric.
+            covars=0.5 * (covars + covars.mT),
+        )
+        return Rendered(image[..., :3], alpha[..., 0], image[..., 3] if depth else None)
+
+    def _load(self) -> Callable[..., Any]:
+        if self._rasterization is None:
+            reason = unavailable()
+            if reason is not None:
+                raise ConfigError(
+                    f"render=gsplat: {reason}. See docs/gpu.md, or let render=auto choose what this machine can do."
+                )
+            from gsplat import rasterization
+
+            self._rasterization = rasterization
+        return self._rasterization

@@ -1,0 +1,195 @@
+"""The CUDA renderer: what it hands to gsplat (a stand-in drawn by the reference), its refusals; on a GPU, parity."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from types import ModuleType
+
+import pytest
+import torch
+from torch import Tensor
+
+from gausim.core import ConfigError, Rendered
+from gausim.render import gsplat as backend
+from gausim.render.gsplat import GsplatRenderer
+from gausim.render.reference import ReferenceRenderer
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor | None,
+    scales: Tensor | None,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    backgrounds: Tensor | None = None,
+    render_mode: str = "RGB",
+    rasterize_mode: str = "classic",
+    covars: Tensor | None = None,
+) -> tuple[Tensor, Tensor, dict]:
+    """gsplat 1.5.3's function of that name: its arguments, its checks of shapes, its reading of the covariances."""
+    batch, count, views = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
+    assert covars is not None and quats is None and scales is None
+    assert means.shape == (*batch, count, 3) and covars.shape == (*batch, count, 3, 3)
+    assert opacities.shape == (*batch, count) and colors.shape == (*batch, views, count, 3)
+    assert viewmats.shape == (*batch, views, 4, 4) and Ks.shape == (*batch, views, 3, 3)
+    assert backgrounds is not None and backgrounds.shape == (*batch, views, 3)
+    assert (sh_degree, rasterize_mode, radius_clip, eps2d, far_plane) == (None, "classic", 0.0, 0.3, 1e10)
+    i, j = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
+    upper = covars[..., i, j]
+    symmetric = torch.stack([upper[..., k] for k in (0, 1, 2, 1, 3, 4, 2, 4, 5)], -1).unflatten(-1, (3, 3))
+    drawn = ReferenceRenderer(near=near_plane)(
+        means, symmetric, colors, opacities, viewmats, Ks, (width, height), depth=render_mode == "RGB+D"
+    )
+    image = drawn.rgb + (1 - drawn.alpha)[..., None] * backgrounds[..., None, None, :]
+    if drawn.depth is not None:
+        image = torch.cat((image, drawn.depth[..., None]), -1)
+    return image, drawn.alpha[..., None], {}
+
+
+@pytest.fixture
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """A module gsplat whose kernels are the reference's, on a machine that seems to have a CUDA device."""
+    package, cuda, kernels = ModuleType("gsplat"), ModuleType("gsplat.cuda"), ModuleType("gsplat.cuda._backend")
+    package.__spec__ = importlib.util.spec_from_loader("gsplat", None)
+    package.__version__, package.rasterization, kernels._C = "1.5.3+pt24cu124", rasterization, object()
+    package.cuda, cuda._backend = cuda, kernels
+    for module in (package, cuda, kernels):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(backend, "DEVICE", "cpu")
+    return package
+
+
+def assert_same(images: Rendered, expected: Rendered, atol: float) -> None:
+    for name in ("rgb", "alpha", "depth"):
+        value, truth = getattr(images, name), getattr(expected, name)
+        assert (value is None) == (truth is None)
+        if truth is not None:
+            torch.testing.assert_close(value.to(truth), truth, atol=atol, rtol=0)
+
+
+@pytest.mark.parametrize("depth", [False, True])
+def test_states_and_views_reach_gsplat_in_order(inputs: Callable, stand_in: ModuleType, depth: bool) -> None:
+    given = inputs(2, 3, 80, (34, 22)).to(torch.float32)
+    arguments = (*given.tensors[:4], given.viewmats, given.Ks, given.size)
+    images = GsplatRenderer(near=2.3)(*arguments, background=given.background, depth=depth)
+    expected = ReferenceRenderer(near=2.3)(*arguments, background=given.background, depth=depth)
+    assert_same(images, expected, 1e-6)
+    assert_same(GsplatRenderer()(*arguments), ReferenceRenderer()(*arguments), 1e-6)  # another near plane, black
+    assert float((expected.alpha - ReferenceRenderer()(*arguments).alpha).abs().max()) > 0.01
+
+
+def test_gradients_come_back_whole(inputs: Callable, stand_in: ModuleType) -> None:
+    """Of the covariances in particular: gsplat reads one triangle, the gradient belongs to both."""
+    given = replace(inputs(2, 2, 60, (34, 22)), depth=True).to(torch.float32)
+    _, found = given.draw_with_gradients(GsplatRenderer())
+    _, expected = given.draw_with_gradients(ReferenceRenderer())
+    for value, truth in zip(found, expected, strict=True):
+        assert float(truth.norm()) > 0
+        torch.testing.assert_close(value, truth, atol=1e-5 * float(truth.abs().max()), rtol=1e-4)
+    torch.testing.assert_close(found[1], found[1].mT)
+
+
+def test_scene_without_kernels_is_background(inputs: Callable, stand_in: ModuleType) -> None:
+    """gsplat itself would divide by their number."""
+    given = inputs(2, 3, 4, (10, 6)).to(torch.float32)
+    none = [x[:, :0] for x in (given.means, given.covars)] + [given.colors[:, :, :0], given.opacities[:, :0]]
+    none[2].requires_grad_()
+    images = GsplatRenderer()(*none, given.viewmats, given.Ks, given.size, background=given.background, depth=True)
+    assert torch.equal(images.rgb.detach(), given.background.expand(2, 3, 6, 10, 3))
+    assert images.depth is not None and float((images.alpha + images.depth).detach().abs().max()) == 0
+    images.rgb.sum().backward()
+
+
+def test_what_gsplat_cannot_draw_is_refused(inputs: Callable, stand_in: ModuleType) -> None:
+    with pytest.raises(ConfigError, match="means as float32 on a CUDA device, got torch.float64"):
+        inputs(2, 2, 5, (8, 8)).to(torch.float64).draw(GsplatRenderer())
+    with pytest.raises(ConfigError, match=r"render.near: expected more than 0, got 0\.0"):
+        GsplatRenderer(near=0.0)
+
+
+def test_tensors_on_the_cpu_are_refused(inputs: Callable) -> None:
+    with pytest.raises(ConfigError, match=r"got torch.float32 on cpu. Set trainer=gpu, or use render=cpu"):
+        inputs(2, 2, 5, (8, 8)).to(torch.float32).draw(GsplatRenderer())
+
+
+def test_reasons_are_told_in_order(inputs: Callable, stand_in: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From the nearest obstacle to the furthest; each is an error that names the remedy."""
+    assert backend.unavailable() is None
+    given = inputs(2, 2, 5, (8, 8)).to(torch.float32)
+
+    def refused(reason: str) -> None:
+        assert reason in str(backend.unavailable())
+        with pytest.raises(ConfigError, match=r"render=gsplat: .*(See docs/gpu.md)") as caught:
+            given.draw(GsplatRenderer())
+        assert reason in str(caught.value)
+
+    kernels = sys.modules["gsplat.cuda._backend"]
+    monkeypatch.setattr(kernels, "_C", None)
+    refused("finds no CUDA toolkit")
+    monkeypatch.delattr(kernels, "_C")
+    refused("kernels do not build or load: cannot import name '_C'")
+    monkeypatch.setattr(stand_in, "__version__", "1.6.0")
+    refused("gsplat is 1.6.0, expected 1.5.3 (pip install 'gausim[gpu]')")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    refused("gsplat is not installed (pip install 'gausim[gpu]')")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    refused("PyTorch sees no CUDA device")
+
+
+CASES = {
+    "usual": dict(states=2, views=3, count=300, size=(66, 50)),
+    "dense": dict(states=2, views=2, count=1500, size=(40, 36), scale=0.05),
+    "big": dict(states=2, views=2, count=60, size=(50, 41), scale=0.8),
+    "tiny": dict(states=2, views=2, count=400, size=(50, 41), scale=1e-4),
+    "around_the_camera": dict(states=2, views=3, count=400, size=(48, 48), spread=2.0),
+    "off_screen": dict(states=2, views=2, count=200, size=(30, 30), spread=4.0, scale=0.5),
+}
+
+
+def on_gpu(inputs: Callable, case: str) -> tuple[object, object]:
+    """The same arguments in float32 on the GPU and in float64 for the oracle."""
+    reason = backend.unavailable()
+    if reason is not None:
+        pytest.skip(reason)
+    given = replace(inputs(**CASES[case]), depth=True)
+    given.opacities[:, 1::9] = 1e-3  # below 1/255
+    single = given.to(torch.float32)
+    for name in ("means", "covars", "colors", "opacities", "viewmats", "Ks", "background"):
+        setattr(single, name, getattr(single, name).cuda())
+    return single, given.to(torch.float64)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("case", CASES)
+def test_gpu_images_and_depth_equal_the_reference(inputs: Callable, case: str) -> None:
+    single, double = on_gpu(inputs, case)
+    images, expected = single.draw(GsplatRenderer()), double.draw(ReferenceRenderer())
+    for name, scale in (("rgb", 1.0), ("alpha", 1.0), ("depth", float(expected.depth.max()))):
+        error = (getattr(images, name).cpu().double() - getattr(expected, name)).abs() / scale
+        # Single pixels may fall on the other side of a threshold (1/255, 1e-4): gsplat's exponential is a fast one.
+        assert float(error.quantile(0.99)) < 1e-4 and float(error.max()) < 2e-2, name
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("case", CASES)
+def test_gpu_gradients_equal_the_reference(inputs: Callable, case: str) -> None:
+    single, double = on_gpu(inputs, case)
+    _, gradients = single.draw_with_gradients(GsplatRenderer())
+    _, expected = double.draw_with_gradients(ReferenceRenderer())
+    names = ("means", "covars", "colors", "opacities", "background")
+    for name, value, truth in zip(names, gradients, expected, strict=True):
+        assert float((value.cpu() - truth).norm() / truth.norm()) < 5e-3, name
