@@ -7,6 +7,7 @@ from functools import partial
 import pytest
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from gausim.core import SimState
 from gausim.models import features, recursion
@@ -177,22 +178,27 @@ def test_steps_that_share_constants_equal_steps_of_their_own(make_scene, make_mo
         assert torch.allclose(a, b, rtol=1e-3, atol=1e-5 * float(b.abs().max()))
 
 
-def test_known_aggregates_serve_only_the_positions_they_are_of(make_scene, make_model, make_state) -> None:
+def test_constants_serve_a_step_that_is_computed_once_more_in_the_backward_pass(
+    make_scene, make_model, make_state
+) -> None:
     scene = make_scene(70)
-    model = make_model(scene)
+    model = make_model(scene, output_scale=0.5)
     batch, state = model.batch((0,)), make_state(scene)
-    prepared = model.prepare(batch)
-    force = torch.ones(scene.count, 3)
-    for pushed in (None, force):
-        step = model.step(batch, state, pushed, prepared)
-        following = SimState(step.positions, state.positions)
-        assert torch.equal(
-            model.step(batch, following, None, prepared).positions, model.step(batch, following).positions
-        )
-    with torch.no_grad():
-        state.positions.mul_(1.01)  # in place: the same tensor, other numbers
-    changed = SimState(step.positions, state.positions)
-    assert torch.equal(model.step(batch, changed, None, prepared).positions, model.step(batch, changed).positions)
+    results = []
+    for repeat in (False, True):
+        model.zero_grad()
+        prepared, now, before = model.prepare(batch), state.positions, state.previous
+
+        def advance(x, y, prepared=prepared):
+            return model.step(batch, SimState(x, y), None, prepared).positions
+
+        for _ in range(3):
+            following = checkpoint(advance, now, before, use_reentrant=False) if repeat else advance(now, before)
+            now, before = following, now
+        now.square().sum().backward()
+        results.append([now, *(p.grad for p in model.parameters() if p.grad is not None)])
+    assert len(results[0]) == len(results[1]) > 5
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
 def test_constants_of_another_batch_or_without_gradients_are_refused(make_scene, make_model, make_state) -> None:

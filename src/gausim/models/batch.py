@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,7 +13,7 @@ from torch import Tensor
 from gausim.core import GaussianScene
 from gausim.models.hierarchy import Hierarchy
 from gausim.models.recursion import Inheritance
-from gausim.ops.neighbours import radius_edges
+from gausim.ops.neighbours import batched_radius_edges, radius_edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +47,8 @@ class LevelBatch:
         spans: rows of each member.
         length: bounding-box diagonal of the unit's scene [scene units].
         volume: volumes V_c.
-        radius: largest edge length of each member [scene units].
+        radii: largest edge length of each member [scene units], on the CPU.
+        max_neighbours: edges into a unit, at rest and in the current state each.
     """
 
     unit_of_kernel: Int[Tensor, " K"]
@@ -58,7 +60,7 @@ class LevelBatch:
     length: Float[Tensor, "N 1"]
     dt: Float[Tensor, "N 1"]
     volume: Float[Tensor, " N"]
-    radius: tuple[float, ...]
+    radii: Float[Tensor, " S"]
     max_neighbours: int
 
     @property
@@ -66,13 +68,35 @@ class LevelBatch:
         """Number of units in the union."""
         return self.pinned.shape[0]
 
+    @cached_property
+    def offsets(self) -> Int[Tensor, " S_and_end"]:
+        """First unit of each member, then their number; on the CPU."""
+        return torch.tensor([*(span.start for span in self.spans), self.count])
+
+    @cached_property
+    def member(self) -> Int[Tensor, " N"]:
+        """The member of each unit."""
+        return torch.arange(len(self.spans)).repeat_interleave(self.offsets.diff()).to(self.pinned.device)
+
+    @cached_property
+    def device_radii(self) -> Float[Tensor, " S"]:
+        """``radii`` where the units are."""
+        return self.radii.to(self.pinned.device)
+
+    @cached_property
+    def rest_table(self) -> tuple[Int[Tensor, "N k"], Bool[Tensor, "N k"]]:
+        """``rest_edges`` as a table: the sources of each unit, and which entries are edges (the others follow)."""
+        source, destination = self.rest_edges.cpu()
+        degree = torch.bincount(destination, minlength=self.count)
+        place = torch.arange(len(source)) - (degree.cumsum(0) - degree)[destination]
+        index = torch.arange(self.count)[:, None].repeat(1, self.max_neighbours)
+        index[destination, place] = source
+        valid = torch.arange(self.max_neighbours) < degree[:, None]
+        return index.to(self.pinned.device), valid.to(self.pinned.device)
+
     def current_edges(self, positions: Float[Tensor, "N 3"]) -> Int[Tensor, "2 E"]:
-        """Neighbours in the current state, member by member, sorted by destination."""
-        parts = [
-            radius_edges(positions[span], radius, self.max_neighbours) + span.start
-            for span, radius in zip(self.spans, self.radius, strict=True)
-        ]
-        return torch.cat(parts, 1)
+        """Neighbours in the current state, within each member, sorted by destination."""
+        return batched_radius_edges(positions, self.offsets, self.radii, self.max_neighbours)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +231,7 @@ class BatchBuilder:
             length=spread([h.diagonal for h in chosen]),
             dt=spread([1.0 / self.fps[i] for i in scene_ids]),
             volume=torch.cat([h.levels[level].volume for h in chosen]).to(device),
-            radius=tuple(self.graph.radii[position] * h.diagonal for h in chosen),
+            radii=torch.tensor([self.graph.radii[position] * h.diagonal for h in chosen], dtype=torch.float64),
             max_neighbours=self.graph.max_neighbours,
         )
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import SimState
 from gausim.models.batch import SceneBatch
 from gausim.models.recursion import Solved
 from gausim.models.template import Motion, TemplateState
@@ -35,15 +34,6 @@ class FixedUnits:
     attributes: Float[Tensor, "N A"]
 
 
-@dataclass(eq=False)
-class _Latest:
-    """The positions that were aggregated last and their aggregates; a step later they are x_{t-1}."""
-
-    positions: Tensor | None = None
-    version: int = 0
-    units: list[Tensor] = field(default_factory=list)
-
-
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """Constants of a batch between two updates of the parameters.
@@ -67,7 +57,6 @@ class Prepared:
     roots: Solved
     template: Callable[[Motion], TemplateState]
     with_gradients: bool
-    _latest: _Latest = field(default_factory=_Latest)
 
     def aggregate(self, positions: Float[Tensor, "K 3"]) -> list[Tensor]:
         """Centres of mass of the units of every predicted level, coarse to fine."""
@@ -76,20 +65,6 @@ class Prepared:
     def per_level(self, finest: Float[Tensor, "N 3"]) -> list[Tensor]:
         """Positions of every predicted level, coarse to fine: coarser units are the centres of mass of the finer."""
         return _per_level(self.batch, [level.share for level in self.levels], finest)
-
-    def motion(self, state: SimState) -> tuple[list[Tensor], list[Tensor]]:
-        """Centres of mass at t and t - 1; the latter are those of the step before where the state continues it."""
-        latest, previous = self._latest, state.previous
-        known = latest.positions is previous and latest.version == _version(previous)
-        before = latest.units if known else self.aggregate(previous)
-        latest.units = self.aggregate(state.positions)
-        latest.positions, latest.version = state.positions, _version(state.positions)
-        return latest.units, before
-
-
-def _version(tensor: Tensor) -> int:
-    """How often the tensor was changed in place; inference tensors do not count."""
-    return -1 if tensor.is_inference() else tensor._version
 
 
 def _per_level(batch: SceneBatch, shares: Sequence[Tensor], finest: Tensor) -> list[Tensor]:

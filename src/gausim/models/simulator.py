@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from gausim.core import ConfigError, DivergenceError, Forces, GaussianScene, SimState, Trajectory
 from gausim.models.batch import BatchBuilder, GraphOptions, LevelBatch, SceneBatch
 from gausim.models.features import FeatureOptions, network_inputs
+from gausim.models.graph import EdgeSet, fill, fill_edges
 from gausim.models.hierarchy import build_hierarchy
 from gausim.models.prepared import Prepared, fixed_units
 from gausim.models.recursion import Solved, Units, advance, inherit
@@ -20,10 +21,9 @@ from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.mlp import zero_output as initialise_zero
 from gausim.nn.normaliser import RunningNormaliser
 from gausim.ops.aggregation import weighted_sum
+from gausim.ops.announce import announced
 from gausim.ops.deformation import gradient_from_output
-from gausim.ops.neighbours import combine_edges
 
-EDGE_RULES = ("rest", "union", "intersection")
 ANGLES = ("cos_sin", "inner")
 
 
@@ -68,6 +68,10 @@ class GausSim(nn.Module):
         attributes: int = 4,
         hidden: int = 128,
         layers: int = 16,
+        precision: str = "fp32",
+        checkpoint: bool = False,
+        compile: bool = False,
+        edge_bucket: int = 0,
         output_scale: float = 1.0,
         zero_output: bool = False,
         conserve_mass: bool = True,
@@ -93,6 +97,11 @@ class GausSim(nn.Module):
             attributes: material attributes per kernel.
             hidden: width of the network.
             layers: message-passing layers.
+            precision: ``fp32`` or ``bf16`` products in the network's layers.
+            checkpoint: the network keeps little for the backward pass and computes the rest once more.
+            compile: compile the network's layers at the first step.
+            edge_bucket: fill the edges of a level up to a multiple of this with edges of a dummy node, so that their
+                number seldom changes; 0 does not. In evaluation mode on CUDA it never changes.
             output_scale: factor on the network's raw output.
             zero_output: start with zero output (identity gradients).
             conserve_mass: det F = 1.
@@ -102,10 +111,10 @@ class GausSim(nn.Module):
             template: what the gradients deform; called with (hierarchies, finest level, conserve_volume=conserve_mass).
         """
         super().__init__()
-        _check(predicted_levels, radii, graph_radii, edges, angle, scenes, fps)
+        _check(predicted_levels, radii, graph_radii, angle, scenes, fps)
         self.scenes, self.fps = tuple(scenes), tuple(fps)
         self.predicted_levels = tuple(predicted_levels)
-        self.edges, self.output_scale = edges, output_scale
+        self.edges, self.output_scale = EdgeSet(edges, edge_bucket), output_scale
         self.conserve_mass, self.conserve_momentum = conserve_mass, conserve_momentum
         self.options = FeatureOptions(angle, rest_inputs, coarse_inputs)
         self.hierarchies = tuple(build_hierarchy(s, radii=radii, clustering=clustering) for s in scenes)
@@ -125,6 +134,9 @@ class GausSim(nn.Module):
             outputs=11,
             hidden=hidden,
             layers=layers,
+            precision=precision,
+            checkpoint=checkpoint,
+            compile=compile,
         )
         if zero_output:
             initialise_zero(self.network.decoder)
@@ -192,7 +204,13 @@ class GausSim(nn.Module):
             )
         if force is not None:
             state = SimState(state.positions + self._push(prepared, force), state.previous)
-        now, before = prepared.motion(state)
+        with announced("the simulator's step"):
+            return self._solve(prepared, state)
+
+    def _solve(self, prepared: Prepared, state: SimState) -> Step:
+        """All predicted levels, coarse to fine, then the kernels."""
+        batch = prepared.batch
+        now, before = prepared.aggregate(state.positions), prepared.aggregate(state.previous)
         units = [
             Units(fixed.rest, x, y, fixed.mass, fixed.log_density, fixed.attributes)
             for fixed, x, y in zip(prepared.levels, now, before, strict=True)
@@ -218,18 +236,28 @@ class GausSim(nn.Module):
         shift = torch.where(batch.pinned[:, None], torch.zeros_like(shift), shift)
         return torch.zeros_like(batch.rest).index_copy(0, batch.simulated, shift)
 
+    def _fixes_shapes(self, positions: Tensor) -> bool:
+        """Whether the number of edges must not depend on the state: where steps may be captured in a CUDA graph."""
+        return self.edges.rule != "rest" and positions.device.type == "cuda" and not self.training
+
     def _predict(
         self, level: LevelBatch, unit: Units, above: Solved, target: Tensor, *, top: bool
     ) -> tuple[Tensor, Tensor]:
         """The network's gradient and rotation of each unit of a level; the identity for pinned units."""
-        edge_index = level.rest_edges
-        if self.edges != "rest":
-            edge_index = combine_edges(edge_index, level.current_edges(unit.now), level.count, rule=self.edges)
         coarse = self.options.coarse_inputs and not top
+        fixed = self._fixes_shapes(unit.now)
+        edge_index = (self.edges.fixed if fixed else self.edges.of)(level, unit.now)
+        # Edges of the dummy node stand behind all others; their features are never seen, those of any node will do.
+        present = edge_index.clamp_max(level.count - 1) if fixed else edge_index
         nodes, edges = network_inputs(
-            unit, target, above, edge_index, level.length, level.dt, self.gravity, self.options, coarse=coarse
+            unit, target, above, present, level.length, level.dt, self.gravity, self.options, coarse=coarse
         )
-        output = self.network(self.node_normaliser(nodes), self.edge_normaliser(edges), edge_index)
+        nodes, edges = self.node_normaliser(nodes), self.edge_normaliser(edges)
+        extra = self.edges.missing(edge_index.shape[1])
+        if fixed or self.edges.bucket:
+            nodes, edges = fill(nodes, 1), fill(edges, extra)
+            edge_index = fill_edges(edge_index, level.count, extra)
+        output = self.network(nodes, edges, edge_index)[: level.count]
         return gradient_from_output(output * (self.output_scale * level.free), conserve_mass=self.conserve_mass)
 
     def dynamics(self, scene_id: int = 0) -> SceneDynamics:
@@ -303,7 +331,6 @@ def _check(
     predicted: Sequence[int],
     radii: Sequence[float],
     graph_radii: Sequence[float],
-    edges: str,
     angle: str,
     scenes: Sequence[GaussianScene],
     fps: Sequence[float],
@@ -320,8 +347,6 @@ def _check(
         raise ConfigError(
             f"model.graph_radii has {len(graph_radii)} values for {len(predicted)} predicted levels; give one each."
         )
-    if edges not in EDGE_RULES:
-        raise ConfigError(f"model.edges is '{edges}'; expected one of {', '.join(EDGE_RULES)}.")
     if angle not in ANGLES:
         raise ConfigError(f"model.angle is '{angle}'; expected one of {', '.join(ANGLES)}.")
     if not scenes or len(scenes) != len(fps):
