@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from gausim.cli._run import load_run
 from gausim.core import RunError
 from gausim.engine.checkpoint import digest, read_checkpoint
 
@@ -143,6 +144,18 @@ def test_a_run_created_again_from_its_saved_config_is_equal(train: Train, whole:
     status, output = train("again", *config, alone=True)
     assert status == 0, output
     assert_same_run(folder, whole)
+
+
+def test_what_a_module_loads_is_what_it_saves(whole: Path) -> None:
+    module = load_run(whole).module
+    loaded, saved = read_checkpoint(whole / "last.ckpt"), dict[str, Any]()
+    module.on_load_checkpoint(loaded)
+    module.on_save_checkpoint(saved)
+    kept = {
+        name: entry for name, entry in loaded["gausim"].items() if name != "curriculum"
+    }  # the trainer's data has it
+    assert {"average", "epoch", "yardsticks"} < set(kept) and all(kept["epoch"]["sums"].values())
+    assert {k: digest(v) for k, v in saved["gausim"].items()} == {k: digest(v) for k, v in kept.items()}
 
 
 def test_a_run_whose_time_was_up_is_not_trained_further(train: Train) -> None:
