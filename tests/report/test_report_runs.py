@@ -131,6 +131,11 @@ def test_why_there_is_no_number(sweep):
     assert [c.status for c in found] == ["evaluated", "evaluated", "unfinished", "failed"]
     assert [r.name for r in found[3].runs] == ["no_hierarchy/seed_0"]
     assert cell(groups[0], "toy_bunny", "seen", "train", "lpips").status == "no weights"
+    # Of seeds that all lack the number, the worst state is shown.
+    failed = write_run(sweep / "momentum_off" / "seed_1", config(1, conserve_momentum=False), finished=False)
+    (failed / "FAILED").write_text("")
+    (group,) = [g for g in make_study(find_runs([sweep])).groups if g.variation == "w/o momentum"]
+    assert cell(group, "toy_bunny", "seen", "train", "l2").status == "failed" and len(group.runs) == 2
     assert cell(groups[0], "toy_bunny", "seen", "train", "flip").status == "not measured"
 
 

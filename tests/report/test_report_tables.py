@@ -180,6 +180,11 @@ def test_the_papers_own_figures():
     assert TABLES["l2"]["GausSim (paper)"]["mothorchids"] == ((1.78, 0.23), (1.85, 0.14))
     assert TABLES["ssim"]["PhysDreamer (paper)"]["carnation"] == ((9.71, 0.02), (9.73, 0.02))
     assert TABLES["lpips"]["DreamGaussian4D (paper)"]["duck"] == ((1.52, 0.13), (1.82, 0.14))
+    # Sums of all means and of all deviations of each table, taken from the paper's own source.
+    sums = {"l2": (136.28, 21.2), "ssim": (296.18, 0.27), "lpips": (68.25, 5.24)}
+    for metric, expected in sums.items():
+        pairs = [pair for by_object in TABLES[metric].values() for both in by_object.values() for pair in both]
+        assert len(pairs) == 30 and [sum(p[i] for p in pairs) for i in (0, 1)] == pytest.approx(expected)
     assert all(abs(sum(c * c for c in color) ** 0.5 - norm) < 0.05 for color, norm, _ in CONTRAST.values())
 
 
