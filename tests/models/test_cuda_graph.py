@@ -59,9 +59,9 @@ class _RefuseFunctions(TorchFunctionMode):
 def bound(make_scene: Callable, make_model: Callable, make_state: Callable, join_states: Callable) -> Callable:
     """A model of two scenes and a state of both."""
 
-    def make(template: str = "elastic", **options: object) -> tuple[GausSim, SimState]:
+    def make(template: str = "elastic", edges: str = "rest", **options: object) -> tuple[GausSim, SimState]:
         scenes = [make_scene(50), make_scene(60, seed=1)]
-        model = make_model(scenes, edges="rest", template=TEMPLATES[template], **options)
+        model = make_model(scenes, edges=edges, template=TEMPLATES[template], **options)
         return model, join_states([make_state(scene, seed=i) for i, scene in enumerate(scenes)])
 
     return make
@@ -139,16 +139,22 @@ def test_capture_needs_a_cuda_device(bound: Callable) -> None:
         GraphedStep(step_of(model), state.positions)
 
 
-@pytest.mark.parametrize("coarse", [False, True])
+@pytest.mark.parametrize("edges", ["rest", "union", "intersection"])
 @pytest.mark.parametrize("template", TEMPLATES)
 def test_step_asks_its_device_nothing(
-    bound: Callable, monkeypatch: pytest.MonkeyPatch, template: str, coarse: bool
+    bound: Callable, monkeypatch: pytest.MonkeyPatch, template: str, edges: str
 ) -> None:
     """What a graph can capture, and what lets a rollout run ahead: tensors without values stand in for the device's."""
-    model, state = bound(template, coarse_inputs=coarse, rest_inputs=coarse)
+    model, state = bound(template, edges=edges, coarse_inputs=edges == "union", rest_inputs=edges == "union")
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # which such tensors do not know
     monkeypatch.setattr(torch, "is_autocast_enabled", lambda _: False)
-    step = step_of(model.to("meta"))
+    monkeypatch.setattr(model, "_fixes_shapes", lambda _: edges != "rest")  # as on CUDA
+    tables = [level.rest_table for level in model.batch((0, 1)).levels]
+    model.to("meta")
+    for level, table in zip(model.batch((0, 1)).levels, tables, strict=True):
+        vars(level)["rest_table"] = tuple(part.to("meta") for part in table)  # kept from then on, like
+        _ = level.member, level.device_radii
+    step = step_of(model)
     state = SimState(state.positions.to("meta"), state.previous.to("meta"))
     with torch.no_grad(), _RefuseFunctions(), _RefuseOperations():
         frames = roll(step, state, state.previous)
@@ -174,15 +180,25 @@ def test_what_asks_is_found(ask: Callable) -> None:
         ask(torch.ones(3, device="meta"))
 
 
+def test_rollouts_on_the_cpu_capture_nothing(make_scene: Callable, make_model: Callable, make_state: Callable) -> None:
+    scene = make_scene(50)
+    found = [
+        make_model(scene, cuda_graph=chosen).dynamics().rollout(make_state(scene), 3).positions
+        for chosen in (False, True)
+    ]
+    assert torch.equal(*found) and not torch.equal(found[0][0], found[0][3])
+
+
 def on_gpu(model: GausSim, state: SimState) -> SimState:
     model.float().cuda()
     return SimState(state.positions.float().cuda(), state.previous.float().cuda())
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("edges", ["rest", "union"])
 @pytest.mark.parametrize("template", TEMPLATES)
-def test_gpu_replays_equal_the_steps(bound: Callable, template: str) -> None:
-    model, state = bound(template)
+def test_gpu_replays_equal_the_steps(bound: Callable, template: str, edges: str) -> None:
+    model, state = bound(template, edges)
     state = on_gpu(model, state)
     force = torch.full_like(state.positions, 0.3)
     expected = roll(step_of(model), state, force, 8)
@@ -210,10 +226,11 @@ def test_gpu_step_that_asks_is_refused(bound: Callable) -> None:
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("edges", ["rest", "union"])
 @pytest.mark.parametrize("template", TEMPLATES)
-def test_gpu_steps_run_ahead_of_the_device(bound: Callable, template: str) -> None:
+def test_gpu_steps_run_ahead_of_the_device(bound: Callable, template: str, edges: str) -> None:
     """CUDA's own sentinel: torch raises where the host waits."""
-    model, state = bound(template)
+    model, state = bound(template, edges)
     state = on_gpu(model, state)
     step, force = step_of(model), torch.full_like(state.positions, 0.3)
     roll(step, state, force)  # whatever is done once
@@ -222,3 +239,18 @@ def test_gpu_steps_run_ahead_of_the_device(bound: Callable, template: str) -> No
         roll(step, state, force)
     finally:
         torch.cuda.set_sync_debug_mode("default")
+
+
+@pytest.mark.gpu
+def test_gpu_rollouts_are_captured_where_it_is_asked_for(bound: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    replays: list[bool] = []
+    call = GraphedStep.__call__
+    monkeypatch.setattr(GraphedStep, "__call__", lambda *given: replays.append(True) or call(*given))
+    found = []
+    for chosen in (False, True):
+        model, state = bound(cuda_graph=chosen)
+        state = on_gpu(model, state)
+        first = SimState(state.positions[:50], state.previous[:50])
+        found.append(model.dynamics().rollout(first, 5).positions)
+        assert len(replays) == 5 * chosen
+    torch.testing.assert_close(found[0], found[1], atol=1e-5, rtol=1e-5)

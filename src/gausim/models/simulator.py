@@ -9,14 +9,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gausim.core import ConfigError, DivergenceError, Forces, GaussianScene, SimState, Trajectory
+from gausim.core import ConfigError, Forces, GaussianScene, SimState, Trajectory
 from gausim.models.batch import BatchBuilder, GraphOptions, LevelBatch, SceneBatch
+from gausim.models.cuda_graph import GraphedStep, Predicted, StepFunction
 from gausim.models.features import FeatureOptions, network_inputs
 from gausim.models.graph import EdgeSet, fill, fill_edges
 from gausim.models.hierarchy import build_hierarchy
 from gausim.models.prepared import Prepared, fixed_units
 from gausim.models.recursion import Solved, Units, advance, inherit
 from gausim.models.template import Motion, RestTemplate, Template
+from gausim.models.watch import Watch
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.mlp import zero_output as initialise_zero
 from gausim.nn.normaliser import RunningNormaliser
@@ -78,6 +80,7 @@ class GausSim(nn.Module):
         conserve_momentum: bool = True,
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         normaliser_floor: float = 1e-2,
+        cuda_graph: bool = False,
         template: Callable[..., Template] = RestTemplate,
     ) -> None:
         """Builds hierarchies, graph and network.
@@ -108,6 +111,7 @@ class GausSim(nn.Module):
             conserve_momentum: compute the momentum loss.
             gravity: acceleration [scene units / s^2].
             normaliser_floor: smallest standard deviation of a normalised input.
+            cuda_graph: rollouts on a CUDA device replay the step as one graph; of no effect elsewhere.
             template: what the gradients deform; called with (hierarchies, finest level, conserve_volume=conserve_mass).
         """
         super().__init__()
@@ -116,6 +120,7 @@ class GausSim(nn.Module):
         self.predicted_levels = tuple(predicted_levels)
         self.edges, self.output_scale = EdgeSet(edges, edge_bucket), output_scale
         self.conserve_mass, self.conserve_momentum = conserve_mass, conserve_momentum
+        self.cuda_graph = cuda_graph
         self.options = FeatureOptions(angle, rest_inputs, coarse_inputs)
         self.hierarchies = tuple(build_hierarchy(s, radii=radii, clustering=clustering) for s in scenes)
         graph = GraphOptions(tuple(graph_radii), max_neighbours)
@@ -299,18 +304,21 @@ class SceneDynamics:
         identity = torch.eye(3).to(initial.positions).expand(units, 3, 3)
         positions, gradients, rotations = [initial.positions], [identity], [identity]
         state = initial
-        self._require_finite("positions", torch.stack((initial.positions, initial.previous)), 0)
-        prepared = self.model.prepare(batch)
+        watch = Watch(self.model.scenes[self.scene_id].name, steps, initial.positions.device)
+        watch.positions(0, initial.positions, initial.previous)
+        step = self._step(batch)
         for number in range(steps):
             force = forces(number) if forces is not None else None
             if force is not None:
-                self._require_finite("forces", force, number)
-            result = self.model.step(batch, state, force, prepared)
-            self._require_finite("positions", result.positions, number + 1)
+                watch.forces(number, force)
+            watch.ask(number)
+            result = step(state, force)
+            watch.positions(number + 1, result.positions)
             state = SimState(result.positions, state.positions)
             positions.append(result.positions)
             gradients.append(result.gradients)
             rotations.append(result.rotations)
+        watch.ask(steps, now=True)
         return Trajectory(
             torch.stack(positions),
             torch.stack(gradients),
@@ -319,12 +327,15 @@ class SceneDynamics:
             self.model.fps[self.scene_id],
         )
 
-    def _require_finite(self, name: str, value: Tensor, frame: int) -> None:
-        if not bool(torch.isfinite(value).all()):
-            raise DivergenceError(
-                f"{self.model.scenes[self.scene_id].name}: {name} are not finite at frame {frame}. "
-                "Reset the state, or use a smaller force or a model trained longer."
-            )
+    def _step(self, batch: SceneBatch) -> StepFunction:
+        prepared = self.model.prepare(batch)
+
+        def step(state: SimState, force: Tensor | None) -> Predicted:
+            return self.model.step(batch, state, force, prepared)
+
+        if self.model.cuda_graph and batch.rest.device.type == "cuda":
+            return GraphedStep(step, batch.rest)
+        return step
 
 
 def _check(
