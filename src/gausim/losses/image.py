@@ -2,30 +2,37 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.core import ConfigError
+from gausim.losses.fused import SSIM_C1, SSIM_C2, compare
+from gausim.ops.announce import announced
+from gausim.ops.compiled import array, fits
+from gausim.ops.pool import shared_pool
 
 # Pixels of the authors' 960 x 540 frames: sums over their pixels, restated for any image size as mean times this.
 REFERENCE_PIXELS = 518_400
-# (k L)^2 of Wang et al. 2004 with k = 0.01, 0.03 and L = 1, and the width of their Gaussian window [pixels].
-SSIM_C1, SSIM_C2, SSIM_SIGMA = 1e-4, 9e-4, 1.5
+# Width of the Gaussian window of Wang et al. 2004 [pixels].
+SSIM_SIGMA = 1.5
 
-# Maps of this many images of a usual size stay in a core's cache.
-IMAGES_AT_ONCE = 12
+# Pixels whose maps are formed together by the torch path: on a CPU they stay in its cache, on a GPU they fill it.
+CPU_PIXELS, GPU_PIXELS = 200_000, 4_000_000
 
 
 class ImageLoss(nn.Module):
     """lambda times the squared error plus (1 - lambda) times (1 - SSIM) / 2.
 
     Both are summed over channels, averaged over pixels and views and multiplied by ``pixels``, so that weights of
-    other terms mean the same at every image size.
+    other terms mean the same at every image size. float32 on the CPU goes through compiled kernels
+    (:mod:`gausim.losses.fused`); everything else, and the tests' oracle, is plain torch and never waits for a device.
     """
 
     def __init__(
@@ -37,8 +44,8 @@ class ImageLoss(nn.Module):
             balance: lambda, the share of the squared error in [0, 1].
             window: odd size of the SSIM window [pixels].
             pixels: the mean over pixels is multiplied by this.
-            crop: leave out the border that is black in every image. It contributes exactly zero, so only the speed
-                changes; finding it waits for the device, so switch it off on a GPU.
+            crop: the compiled kernels leave out the border that is black in both images. It contributes exactly zero,
+                so only the speed changes.
 
         Raises:
             ConfigError: a setting out of range.
@@ -54,13 +61,61 @@ class ImageLoss(nn.Module):
     def forward(
         self, prediction: Float[Tensor, "B V H W 3"], target: Float[Tensor, "B V H W 3"]
     ) -> Float[Tensor, " B"]:
-        """Loss of each of B states, averaged over its V views."""
-        count = prediction[0, ..., 0].numel()
-        if self.crop:
-            rows, columns = _not_black(prediction.detach(), target, margin=2 * (self.window // 2), least=self.window)
-            prediction, target = (x[:, :, rows, columns] for x in (prediction, target))
-        loss: Tensor = _StateByState.apply(prediction, target, self)
-        return loss * (self.pixels / count)
+        """Loss of each of B states, averaged over its V views.
+
+        Raises:
+            ConfigError: an image is smaller than the SSIM window.
+        """
+        loss: Tensor = _WithGradient.apply(prediction, target, self)
+        return loss
+
+    def value_and_gradient(
+        self, prediction: Float[Tensor, "B V H W 3"], target: Float[Tensor, "B V H W 3"]
+    ) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V H W 3"]]:
+        """The losses and the gradient of their sum with respect to the prediction; neither is part of a graph.
+
+        Raises:
+            ConfigError: an image is smaller than the SSIM window.
+        """
+        height, width = prediction.shape[2:4]
+        if min(height, width) < self.window:
+            raise ConfigError(
+                f"loss.image: images of {width}x{height} pixels are smaller than the SSIM window of {self.window}. "
+                "Draw larger images or lower loss.image.window."
+            )
+        if fits(prediction, target):
+            return self._compiled(prediction, target)
+        return self._plain(prediction.detach(), target)
+
+    def _compiled(self, prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        states, views, height, width, _ = prediction.shape
+        scale = self.pixels / (views * height * width)
+        x, y = (array(v).reshape(states * views, -1) for v in (prediction, target))
+        gradient = np.empty_like(x)
+        sums = np.empty((states * views, 2))
+        taps, slots = _window(self.window)
+        by_error, by_ssim = np.float32(2 * scale * self.balance), np.float32(-0.5 * scale * (1 - self.balance))
+
+        def one(i: int) -> None:
+            sums[i] = compare(x[i], y[i], (height, width), taps, slots, by_error, by_ssim, self.crop, gradient[i])
+
+        with announced("the image loss"):
+            shared_pool(torch.get_num_threads()).run(one, range(states * views))
+        values = scale * (sums @ np.array([self.balance, 0.5 * (1 - self.balance)])).reshape(states, views).sum(1)
+        return torch.from_numpy(values.astype(np.float32)), torch.from_numpy(gradient.reshape(prediction.shape))
+
+    def _plain(self, prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        pixels = prediction[0, ..., 0].numel()
+        states = max(1, (CPU_PIXELS if prediction.device.type == "cpu" else GPU_PIXELS) // pixels)
+        values: list[Tensor] = []
+        gradients: list[Tensor] = []
+        for start in range(0, prediction.shape[0], states):
+            part = prediction[start : start + states].clone().requires_grad_()
+            with torch.enable_grad():
+                value = self._of_states(part, target[start : start + states]) * (self.pixels / pixels)
+                gradients += torch.autograd.grad(value.sum(), part)
+            values.append(value.detach())
+        return torch.cat(values), torch.cat(gradients)
 
     def _of_states(self, prediction: Tensor, target: Tensor) -> Tensor:
         """Sums over views, pixels and channels of each state."""
@@ -72,34 +127,35 @@ class ImageLoss(nn.Module):
         return total
 
 
-class _StateByState(torch.autograd.Function):
-    """The losses of the states and their gradients, a few images at a time.
-
-    The intermediate maps of SSIM for a whole rollout fill hundreds of megabytes; a few images stay in the cache, which
-    is two to three times as fast on a CPU. The gradient is formed with the loss and scaled in the backward pass.
-    """
+class _WithGradient(torch.autograd.Function):
+    """The losses as one node: their gradient is formed with them and scaled in the backward pass."""
 
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor, loss: ImageLoss) -> Tensor:
-        states = max(1, IMAGES_AT_ONCE // prediction.shape[1])
-        wanted = ctx.needs_input_grad[0]
-        gradient = torch.empty_like(prediction) if wanted else None
-        values = []
-        for start in range(0, prediction.shape[0], states):
-            part = prediction[start : start + states].detach().clone().requires_grad_(wanted)
-            with torch.set_grad_enabled(wanted):
-                value = loss._of_states(part, target[start : start + states])
-                total = value.sum()
-            if gradient is not None:
-                (gradient[start : start + states],) = torch.autograd.grad(total, part)
-            values.append(value.detach())
-        ctx.save_for_backward(gradient)
-        return torch.cat(values)
+        values, gradient = loss.value_and_gradient(prediction, target)
+        if ctx.needs_input_grad[0]:
+            ctx.save_for_backward(gradient)
+        return values
 
     @staticmethod
-    def backward(ctx: Any, *incoming: Tensor) -> tuple[Tensor | None, None, None]:
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *incoming: Tensor) -> tuple[Tensor, None, None]:
         (gradient,) = ctx.saved_tensors
-        return None if gradient is None else gradient * incoming[0][:, None, None, None, None], None, None
+        return gradient * incoming[0][:, None, None, None, None], None, None
+
+
+@functools.cache
+def gaussian_taps(window: int) -> tuple[float, ...]:
+    """The Gaussian window of SSIM along one axis; sums to 1."""
+    offsets = torch.arange(window) - window // 2
+    weights = torch.exp(-offsets.square() / (2 * SSIM_SIGMA**2))
+    return tuple((weights / weights.sum()).tolist())
+
+
+@functools.cache
+def _window(window: int) -> tuple[tuple[np.float32, ...], tuple[np.uint64, ...]]:
+    """The taps and as many zeros: tuples tell numba the window by their type."""
+    return tuple(np.float32(tap) for tap in gaussian_taps(window)), (np.uint64(0),) * window
 
 
 def structural_similarity(
@@ -109,9 +165,7 @@ def structural_similarity(
 
     Differentiable in ``first`` only: ``second`` is the ground truth.
     """
-    offsets = torch.arange(window) - window // 2
-    weights = torch.exp(-offsets.square() / (2 * SSIM_SIGMA**2))
-    taps = (weights / weights.sum()).tolist()
+    taps = gaussian_taps(window)
     with torch.no_grad():
         mean_second = _blur(second, taps)
         variance_second = _blur(second * second, taps) - mean_second.square()
@@ -137,20 +191,3 @@ def _blur(image: Tensor, taps: Sequence[float]) -> Tensor:
     for i in range(half):
         result = result + taps[i] * (rows[..., i : i + width] + rows[..., 2 * half - i : 2 * half - i + width])
     return result
-
-
-def _not_black(prediction: Tensor, target: Tensor, *, margin: int, least: int) -> tuple[slice, slice]:
-    """Rows and columns outside which both are black, widened so that no SSIM window of a coloured pixel is cut."""
-    coloured = ((prediction != 0) | (target != 0)).flatten(0, 1).any(-1).any(0)
-    return _span(coloured.any(1), margin, least), _span(coloured.any(0), margin, least)
-
-
-def _span(used: Tensor, margin: int, least: int) -> slice:
-    length, where = used.shape[0], used.nonzero()
-    if len(where) == 0:
-        return slice(0, min(length, least))
-    low, high = max(0, int(where[0]) - margin), min(length, int(where[-1]) + 1 + margin)
-    if high - low < least:  # reflection needs more pixels than half a window
-        low = max(0, min(low, length - least))
-        high = min(length, low + least)
-    return slice(low, high)

@@ -19,6 +19,8 @@ class Objective:
         static_probability: how often a batch carries it; None is 1 / T.
         momentum_weight: of the momentum loss (mean over steps).
         backprop_steps: gradients stop every so many steps; 0 lets them through the whole rollout.
+        checkpoint_steps: keep of each step of a rollout its input only and compute it once more in the backward pass;
+            same gradients in less memory, for about a third more time of the dynamics.
         input_noise: standard deviation of the noise added to each unit's position before a step [diagonals of the
             scene's bounding box]; 0 is off.
         explosion: a rollout that moves a kernel further than this from its rest position ends there and the rest of
@@ -31,6 +33,7 @@ class Objective:
     static_probability: float | None = None
     momentum_weight: float = 1.0
     backprop_steps: int = 1
+    checkpoint_steps: bool = False
     input_noise: float = 0.0
     explosion: float = 3.0
 
