@@ -5,14 +5,13 @@ import re
 import runpy
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
 from lightning.pytorch import Trainer
 from torch import Tensor, nn
 
-from gausim.core import DivergenceError, GaussianScene, SimState
+from gausim.core import DivergenceError, SimState
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.engine.curriculum import LossGatedCurriculum
@@ -27,74 +26,9 @@ from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import draw
 from gausim.render.reference import ReferenceRenderer
 
-TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
-
-
-class Sway(nn.Module):
-    """x' = x + c (x - x_prev) + s z^2 e_x with one drift s per scene and one shared c: the smallest simulator."""
-
-    def __init__(self, scenes: list[GaussianScene]) -> None:
-        super().__init__()
-        self.scenes = scenes
-        self.keep = nn.Parameter(torch.tensor(0.5))
-        self.drift = nn.ParameterList(torch.zeros(()) for _ in scenes)
-        self.poison: float | None = None
-
-    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        return {"network": [self.keep], "scene": list(self.drift)}
-
-    def batch(self, scene_ids: list[int]) -> SimpleNamespace:
-        members, start = [], 0
-        for n, i in enumerate(scene_ids):
-            count = self.scenes[i].count
-            units = torch.zeros(count, dtype=torch.long)
-            rows = slice(start, start + count)
-            members.append(SimpleNamespace(scene_id=i, kernels=rows, units=slice(n, n + 1), unit_of_kernel=units))
-            start += count
-        return SimpleNamespace(rest=torch.cat([self.scenes[i].means for i in scene_ids]), members=tuple(members))
-
-    def step(self, batch: SimpleNamespace, state: SimState, force: Tensor | None = None) -> SimpleNamespace:
-        drift = torch.cat([self.drift[m.scene_id].expand(m.kernels.stop - m.kernels.start) for m in batch.members])
-        push = torch.zeros_like(batch.rest)
-        push[:, 0] = drift * batch.rest[:, 2] ** 2
-        positions = state.positions + self.keep * (state.positions - state.previous) + push
-        if self.poison is not None:
-            positions = positions * self.poison
-        identity = torch.eye(3).expand(len(batch.members), 3, 3)
-        momentum = (self.keep * drift.sum()).square()
-        return SimpleNamespace(positions=positions, gradients=identity, rotations=identity, momentum=momentum)
-
-
-class Previous(nn.Module):
-    def __init__(self, model: Sway, scene_of_sequence: tuple[int, ...]) -> None:
-        super().__init__()
-        self.values = nn.ParameterList(model.scenes[i].means.clone() for i in scene_of_sequence)
-
-    def previous(self, sequence_id: int) -> Tensor:
-        return self.values[sequence_id]
-
-
-SCENE_OF_SEQUENCE = (0, 0, 1)
-
-
-def sample(sequence: int, steps: int = 3, amplitude: float = 0.4) -> SequenceSample:
-    toy = TOY["ToyObject"](Path("unused"), TOY["toy_scene"](), amplitudes={"a": amplitude})
-    frames = TOY["rgba"](toy.scene, toy.truth("a", steps + 1))
-    return SequenceSample(
-        scene_id=SCENE_OF_SEQUENCE[sequence], object_name="toy", sequence_id=sequence, sequence_name=f"seq_{sequence}",
-        frames=frames, cameras=TOY["cameras"](), fps=24.0)  # fmt: skip
-
-
-def sway_module(objective: Objective | None = None, **settings: float) -> GausSimModule:
-    model = Sway([TOY["toy_scene"](), TOY["toy_scene"]()])
-    return GausSimModule(
-        model=model,
-        initial_states=Previous(model, SCENE_OF_SEQUENCE),
-        scene_of_sequence=SCENE_OF_SEQUENCE,
-        renderer=ReferenceRenderer(),
-        objective=objective or Objective(),
-        optimizer=OptimizerSettings(**settings),  # type: ignore[arg-type]
-    )
+SWAY = runpy.run_path(str(Path(__file__).parent / "sway.py"))
+TOY, SCENE_OF_SEQUENCE = SWAY["TOY"], SWAY["SCENE_OF_SEQUENCE"]
+sample, sway_module = SWAY["sample"], SWAY["sway_module"]
 
 
 def fit(module: GausSimModule, batches: list[list[SequenceSample]], tmp_path: Path, epochs: int = 1) -> Trainer:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -15,17 +14,18 @@ from torch.optim import Optimizer
 
 from gausim.core import ConfigError, DivergenceError, Renderer, SimState
 from gausim.data.dataset import SequenceSample
-from gausim.data.images import composite
 from gausim.data.sampler import hash_seed
 from gausim.engine.checkpoint import WeightAverage, check_scenes, fingerprints
+from gausim.engine.comparison import Comparison
 from gausim.engine.contracts import InitialVelocities, SceneBatch, Simulator
-from gausim.engine.contracts import Step as PredictedStep
 from gausim.engine.curriculum import LossGatedCurriculum
 from gausim.engine.optim import OptimizerSettings
 from gausim.engine.reference import Yardsticks
-from gausim.engine.rollout import Looks, UnitNoise, describe, draw_steps, furthest, group_views, windows
+from gausim.engine.rollout import Explosions, Looks, States, UnitNoise, Views, describe, windows
+from gausim.engine.tally import Numbers, Tally
 from gausim.losses.objective import Objective
 from gausim.losses.static import static_loss
+from gausim.render.draw import draw
 
 # Below this share of the true motion energy a prediction counts as collapsed to the rest state.
 COLLAPSED = 0.05
@@ -33,27 +33,6 @@ COLLAPSED = 0.05
 COLLAPSE_AFTER = 100
 # Batches in a row whose rollout explodes before anything can be learned from it; then training has diverged.
 BARREN_BATCHES = 20
-
-
-@dataclass
-class Tally:
-    """What one optimiser step found, on the device until it is read in one go.
-
-    Attributes:
-        images: image loss per predicted step and sequence.
-        momentum: momentum loss per predicted step.
-        motion: squared change of the predicted images, summed over the batch.
-        static: the static loss, if this batch carries it.
-        share: the momentum loss's share of the network's gradient, where it was measured.
-        ended: predicted steps; fewer than T where the rollout exploded.
-    """
-
-    images: list[Tensor] = field(default_factory=list)
-    momentum: list[Tensor] = field(default_factory=list)
-    motion: list[Tensor] = field(default_factory=list)
-    static: Tensor | None = None
-    share: Tensor | None = None
-    ended: int = 0
 
 
 class GausSimModule(LightningModule):
@@ -104,7 +83,8 @@ class GausSimModule(LightningModule):
             )
         self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
         self.looks = Looks(self.simulator.scenes)
-        self.yardsticks = Yardsticks(renderer, self.objective.image)
+        self.views = Views()
+        self.yardsticks = Yardsticks(renderer, self.objective.image, self.views)
         self.average = WeightAverage(self.settings.ema_decay)
         self.summary: dict[str, float] = {}
         self.last_stats: dict[str, float] = {}
@@ -132,15 +112,44 @@ class GausSimModule(LightningModule):
         """Rolls the batch forward, draws it, and makes one step of the optimiser."""
         optimizer = cast(Any, self.optimizers())
         factor = self._set_rates(optimizer, batch_idx)
-        optimizer.zero_grad(set_to_none=True)
         draws = torch.Generator().manual_seed(hash_seed(self.seed, self.global_step))
+        stats = self.optimise(samples, optimizer.optimizer, draws, optimizer.step)
+        self._record({**stats, "lr": self.settings.network_lr * factor}, len(samples))
+
+    def optimise(
+        self,
+        samples: list[SequenceSample],
+        optimizer: Optimizer,
+        draws: torch.Generator,
+        advance: Callable[[], object] | None = None,
+    ) -> dict[str, float]:
+        """One step of the optimiser with all losses; works without a trainer, too.
+
+        Args:
+            samples: the batch.
+            optimizer: from :meth:`configure_optimizers`.
+            draws: of the static loss and the input noise.
+            advance: makes the optimiser's step; its own ``step`` when None.
+
+        Returns:
+            What is logged of the step.
+
+        Raises:
+            DivergenceError: a number is not finite; no parameter has moved.
+        """
+        optimizer.zero_grad(set_to_none=True)
         tally = self._rollout(samples, draws)
         self._static(samples, draws, tally)
-        norms = self.settings.clip(optimizer.optimizer)
-        stats = self._read(samples, tally, norms)
-        optimizer.step()
+        stats = self._read(samples, tally, self.settings.clip(optimizer))
+        (advance or optimizer.step)()
         self.average.update(self)
-        self._record({**stats, "lr": self.settings.network_lr * factor}, len(samples))
+        return stats
+
+    def _backward(self, loss: Tensor) -> None:
+        if self._trainer is None:
+            loss.backward()
+        else:
+            self.manual_backward(loss)
 
     def _set_rates(self, optimizer: Any, batch_idx: int) -> float:
         batches, epochs = self.trainer.num_training_batches, self.trainer.max_epochs or 1
@@ -152,46 +161,56 @@ class GausSimModule(LightningModule):
         if any(s.steps != steps for s in samples):
             raise ConfigError(f"a batch needs sequences of equal length, got {[s.steps for s in samples]} steps.")
         batch = self.simulator.batch([s.scene_id for s in samples])
-        groups = group_views(samples)
-        truths = [composite(s.frames[1:])[0] for s in samples]
-        before: dict[int, Tensor] = {}
-        noise = None
-        if self.objective.input_noise > 0:
-            deviations = [self.objective.input_noise * d for d in self.diagonals]
-            noise = UnitNoise(batch, self.simulator.scenes, deviations, draws)
+        comparison = self.comparison(samples, batch)
         tally, length = Tally(), self.objective.window(steps)
-        for start, made in windows(self.simulator, batch, self.initial(samples, batch), steps, length, noise):
-            if furthest(batch, self.diagonals, made, start, samples) > self.objective.explosion:
+        explosions = Explosions(batch, self.diagonals, samples, self.objective.explosion, deferred=self._defers(batch))
+        starts: list[Callable[[SimState], SimState]] = [explosions.restart, *self._noise(batch, draws)]
+        initial, kept = self.initial(samples, batch), self.objective.checkpoint_steps
+        for start, made in windows(self.simulator, batch, initial, steps, length, starts, checkpoint=kept):
+            states = States.of(made)
+            if explosions.end(states.positions, start, tally.reach):
                 break
-            losses = torch.zeros(len(made), len(samples), device=batch.rest.device)
-            columns: list[Tensor] = [losses[:, 0]] * len(samples)
-            for number, group in enumerate(groups):
-                look = self.looks.of(group.scene_id, batch.rest)
-                images = draw_steps(self.renderer, look, group, batch, made)
-                target = torch.stack([truths[i][start : start + len(made)] for i in group.members], 1)
-                values = self.objective.image(images.flatten(0, 1), target.flatten(0, 1)).reshape(len(made), -1)
-                for place, i in enumerate(group.members):
-                    columns[i] = values[:, place]
-                if number not in before:
-                    before[number] = self._rest_images(samples, group.members, batch)
-                tally.motion.append(_motion(before[number], images.detach()))
-                before[number] = images[-1].detach()
-            self._descend(torch.stack(columns, 1), made, steps, tally, measure=start == 0)
+            losses, motion = comparison(explosions.spared(states), start)
+            tally.motion.append(motion)
+            momentum = explosions.counted(torch.stack([step.momentum for step in made]))
+            self._descend(explosions.counted(losses), momentum, steps, tally, measure=start == 0)
         return tally
 
-    def _descend(self, losses: Tensor, made: list[PredictedStep], steps: int, tally: Tally, *, measure: bool) -> None:
+    @staticmethod
+    def _defers(batch: SceneBatch) -> bool:
+        """Whether reading a number would make the host wait; such reads are put off to the step's end."""
+        return batch.rest.device.type != "cpu"
+
+    def _noise(self, batch: SceneBatch, draws: torch.Generator) -> list[UnitNoise]:
+        if self.objective.input_noise == 0:
+            return []
+        deviations = [self.objective.input_noise * d for d in self.diagonals]
+        return [UnitNoise(batch, self.simulator.scenes, deviations, draws)]
+
+    def comparison(self, samples: list[SequenceSample], batch: SceneBatch) -> Comparison:
+        """What draws and compares the predictions of a batch."""
+        groups = self.views.groups(samples)
+        return Comparison(
+            self.renderer,
+            self.objective.image,
+            batch,
+            groups,
+            [self.looks.of(group.scene_id, batch.rest) for group in groups],
+            [sample.frames[1:] for sample in samples],
+            [self._rest_image(samples, i, batch) for i in range(len(samples))],
+        )
+
+    def _descend(self, losses: Tensor, momentum: Tensor, steps: int, tally: Tally, *, measure: bool) -> None:
         """Backward of one stretch; the mean over steps and sequences, whatever the stretch's length."""
         per = 1.0 / (steps * losses.shape[1])
-        momentum = torch.stack([step.momentum for step in made])
         images_term = self.objective.image_weight * per * losses.sum()
         momentum_term = self.objective.momentum_weight * per * momentum.sum()
         weighted = momentum_term.requires_grad and self.objective.momentum_weight > 0
         if measure and weighted and self.share_every and self.global_step % self.share_every == 0:
             tally.share = self._share(images_term, momentum_term)
-        self.manual_backward(images_term + momentum_term if weighted else images_term)
-        tally.images.extend(losses.detach())
-        tally.momentum.extend(momentum.detach())
-        tally.ended += len(made)
+        self._backward(images_term + momentum_term if weighted else images_term)
+        tally.images.append(losses.detach())
+        tally.momentum.append(momentum.detach())
 
     def _share(self, images: Tensor, momentum: Tensor) -> Tensor:
         """Norm of the momentum loss's gradient of the network over the sum of both norms."""
@@ -211,7 +230,7 @@ class GausSimModule(LightningModule):
         step = self.simulator.step(batch, SimState(batch.rest, batch.rest))
         loss = static_loss(step.positions, batch.rest) / len(scene_ids)
         if loss.requires_grad:
-            self.manual_backward(self.objective.static_weight * loss)
+            self._backward(self.objective.static_weight * loss)
         tally.static = loss.detach()
 
     # ------------------------------------------------------------------------------------------------ states, images
@@ -222,15 +241,10 @@ class GausSimModule(LightningModule):
         previous = torch.cat([states.previous(s.sequence_id) for s in samples])
         return SimState(batch.rest, previous.to(batch.rest))
 
-    def _rest_images(
-        self, samples: Sequence[SequenceSample], members: Sequence[int], batch: SceneBatch
-    ) -> Float[Tensor, "S V H W 3"]:
-        images = []
-        for i in members:
-            look = self.looks.of(samples[i].scene_id, batch.rest)
-            rest = batch.rest[batch.members[i].kernels]
-            images.append(self.yardsticks.rest_image(samples[i], look, rest))
-        return torch.stack(images)
+    def _rest_image(self, samples: Sequence[SequenceSample], place: int, batch: SceneBatch) -> Float[Tensor, "V H W 3"]:
+        sample = samples[place]
+        look = self.looks.of(sample.scene_id, batch.rest)
+        return self.yardsticks.rest_image(sample, look, batch.rest[batch.members[place].kernels])
 
     @torch.no_grad()
     def predict_images(self, sample: SequenceSample) -> Float[Tensor, "F V H W 3"]:
@@ -238,11 +252,11 @@ class GausSimModule(LightningModule):
         was_training = self.training
         self.eval()
         batch = self.simulator.batch([sample.scene_id])
-        (group,) = group_views([sample])
-        look = self.looks.of(sample.scene_id, batch.rest)
-        frames = [self._rest_images([sample], [0], batch)]
+        look, units = self.looks.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
+        frames = [self._rest_image([sample], 0, batch)[None]]
         for _, made in windows(self.simulator, batch, self.initial([sample], batch), sample.steps, 1):
-            frames.append(draw_steps(self.renderer, look, group, batch, made)[0])
+            states = States.of(made).tensors()
+            frames.append(draw(self.renderer, look, *states, units, sample.cameras).rgb)
         self.train(was_training)
         return torch.cat(frames)
 
@@ -251,35 +265,27 @@ class GausSimModule(LightningModule):
     def _read(self, samples: list[SequenceSample], tally: Tally, norms: Mapping[str, Tensor]) -> dict[str, float]:
         """Fetches all numbers of the step at once, checks them and forms what is logged."""
         steps, count = samples[0].steps, len(samples)
-        images = torch.stack(tally.images) if tally.images else torch.zeros(0, count)
-        extra = [torch.stack([m for m in tally.motion]).sum() if tally.motion else torch.zeros(())]
-        extra += [tally.static if tally.static is not None else torch.zeros(())]
-        extra += [tally.share if tally.share is not None else torch.full((), -1.0)]
-        parts = [images.flatten(), *(m.reshape(1) for m in (*tally.momentum, *extra, *norms.values()))]
-        numbers = torch.cat([p.to(images.device, torch.float32) for p in parts]).tolist()
-        table = [numbers[t * count : (t + 1) * count] for t in range(tally.ended)]
-        rest = numbers[tally.ended * count :]
-        momentum, (motion, static, share) = rest[: tally.ended], rest[tally.ended : tally.ended + 3]
-        grads = dict(zip(norms, rest[tally.ended + 3 :], strict=True))
-        self._guard(samples, table, momentum, static, grads)
-        self._barren = 0 if table else self._barren + 1
+        numbers = tally.read(samples, norms, self.objective.explosion)
+        lasted = len(numbers.images)
+        self._barren = 0 if lasted else self._barren + 1
         if self._barren >= BARREN_BATCHES:
             far = f"kernels moved beyond {self.objective.explosion} diagonals in {BARREN_BATCHES} batches in a row"
             raise DivergenceError(describe(0, samples, None, far))
-        stats = {f"grad_{name}": value for name, value in grads.items()}
-        if share >= 0:
-            stats["momentum_share"] = share
-        if tally.static is not None:
-            stats["loss_static"] = static
-        stats.update(steps=float(steps), exploded=float(tally.ended < steps))
-        if table:
-            stats["loss_momentum"] = sum(momentum) / (steps * count)
-            stats["loss_image"] = sum(map(sum, table)) / (tally.ended * count)
-            stats.update(self._compare(samples, table, motion))
+        stats = {f"grad_{name}": value for name, value in numbers.gradients.items()}
+        if numbers.share is not None:
+            stats["momentum_share"] = numbers.share
+        if numbers.static is not None:
+            stats["loss_static"] = numbers.static
+        stats.update(steps=float(steps), exploded=float(lasted < steps))
+        if lasted:
+            stats["loss_momentum"] = sum(numbers.momentum) / (steps * count)
+            stats["loss_image"] = sum(map(sum, numbers.images)) / (lasted * count)
+            stats.update(self._compare(samples, numbers))
         return stats
 
-    def _compare(self, samples: list[SequenceSample], table: list[list[float]], motion: float) -> dict[str, float]:
+    def _compare(self, samples: list[SequenceSample], numbers: Numbers) -> dict[str, float]:
         """The prediction's losses and motion against the static prediction's and the truth's."""
+        table = numbers.images
         batch = self.simulator.batch([s.scene_id for s in samples])
         floor = static = first = moved = 0.0
         for i, sample in enumerate(samples):
@@ -296,28 +302,8 @@ class GausSimModule(LightningModule):
             "ratio_static": loss / max(static, 1e-12),
             "excess_static": (loss - floor) / above,
             "ratio_first": sum(table[0]) / max(first, 1e-12),
-            "motion_energy": motion / max(moved, 1e-12),
+            "motion_energy": numbers.motion / max(moved, 1e-12),
         }
-
-    def _guard(
-        self,
-        samples: list[SequenceSample],
-        table: list[list[float]],
-        momentum: list[float],
-        static: float,
-        grads: Mapping[str, float],
-    ) -> None:
-        for t, row in enumerate(table):
-            for value, sample in zip(row, samples, strict=True):
-                if not abs(value) < float("inf"):
-                    raise DivergenceError(describe(t, samples, sample, f"the image loss is {value}"))
-            if not abs(momentum[t]) < float("inf"):
-                raise DivergenceError(describe(t, samples, None, f"the momentum loss is {momentum[t]}"))
-        if not abs(static) < float("inf"):
-            raise DivergenceError(describe(None, samples, None, f"the static loss is {static}"))
-        for name, value in grads.items():
-            if not abs(value) < float("inf"):
-                raise DivergenceError(describe(None, samples, None, f"the gradient of group '{name}' is {value}"))
 
     def _record(self, stats: dict[str, float], weight: int) -> None:
         self.last_stats = stats
@@ -390,8 +376,3 @@ class GausSimModule(LightningModule):
         curriculum = self._curriculum()
         if curriculum is not None and "curriculum" in own:
             curriculum.load_state_dict(own["curriculum"])
-
-
-def _motion(before: Tensor, images: Tensor) -> Tensor:
-    """Squared change from image to image, (T, S, V, H, W, 3) after (S, V, H, W, 3), summed over everything."""
-    return torch.diff(torch.cat([before[None], images]), dim=0).square().sum()

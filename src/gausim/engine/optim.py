@@ -137,9 +137,11 @@ class OptimizerSettings:
         grads: dict[str, list[Tensor]] = {}
         for group in optimizer.param_groups:
             grads.setdefault(group["name"], []).extend(p.grad for p in group["params"] if p.grad is not None)
-        norms = {name: torch.nn.utils.get_total_norm(g) if g else torch.tensor(0.0) for name, g in grads.items()}
+        device = optimizer.param_groups[0]["params"][0].device  # a zero elsewhere would be waited for
+        zero = torch.zeros((), device=device)
+        norms = {name: torch.nn.utils.get_total_norm(g) if g else zero for name, g in grads.items()}
         if self.clip_norm > 0:
-            total = torch.stack([n.to(next(iter(norms.values()))) for n in norms.values()]).norm()
+            total = torch.stack([n.to(zero) for n in norms.values()]).norm()
             for name, own in grads.items():
                 if own:
                     norm = norms[name] if self.clip_per_group else total

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from gausim.core import Renderer
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
-from gausim.engine.rollout import draw_rest, view_key
+from gausim.engine.rollout import Views, draw_rest
 from gausim.losses.image import ImageLoss
 from gausim.render.draw import SceneAppearance
 
@@ -34,15 +35,15 @@ class Yardstick:
 class Yardsticks:
     """Measures each sequence once; later batches look the numbers up."""
 
-    def __init__(self, renderer: Renderer, loss: ImageLoss) -> None:
-        """Keeps what draws and what measures."""
-        self._renderer, self._loss = renderer, loss
-        self._rest: dict[Any, Tensor] = {}
+    def __init__(self, renderer: Renderer, loss: ImageLoss, views: Views) -> None:
+        """Keeps what draws, what measures and what tells cameras apart."""
+        self._renderer, self._loss, self._views = renderer, loss, views
+        self._rest: dict[Hashable, Tensor] = {}
         self._known: dict[int, Yardstick] = {}
 
     def rest_image(self, sample: SequenceSample, look: SceneAppearance, rest: Tensor) -> Tensor:
         """Images of the rest state in a sample's cameras, (V, H, W, 3); drawn once per scene and set of cameras."""
-        key = view_key(sample.scene_id, sample.cameras)
+        key = self._views.key(sample)
         if key not in self._rest:
             self._rest[key] = draw_rest(self._renderer, look, rest, sample.cameras)
         return self._rest[key]
@@ -54,8 +55,8 @@ class Yardsticks:
         if seen < sample.steps:
             with torch.no_grad():
                 image = self.rest_image(sample, look, rest)
-                frames = composite(sample.frames[seen:])[0]
-                losses = self._loss(image.expand_as(frames).contiguous(), frames).tolist()
+                frames = composite(sample.frames[seen:].to(image.device))[0]
+                losses = self._loss(image.expand_as(frames), frames).tolist()
                 change = (frames[1:] - frames[:-1]).square().sum((1, 2, 3, 4)).tolist()
             if seen == 0:
                 known.floor = losses[0]

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import itertools
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint as torch_checkpoint
 
 from gausim.core import Cameras, DivergenceError, GaussianScene, Renderer, SimState
 from gausim.data.dataset import SequenceSample
 from gausim.engine.contracts import SceneBatch, Simulator
 from gausim.engine.contracts import Step as PredictedStep
+from gausim.nn.normaliser import RunningNormaliser
 from gausim.render.draw import SceneAppearance, draw
 
 
@@ -32,18 +36,105 @@ class ViewGroup:
     cameras: Cameras
 
 
-def view_key(scene_id: int, cameras: Cameras) -> tuple[int, bytes, bytes, int, int]:
-    """What must agree for two sequences to be drawn in one call."""
-    numbers = [x.detach().cpu().numpy().tobytes() for x in (cameras.viewmats, cameras.Ks)]
-    return (scene_id, numbers[0], numbers[1], cameras.width, cameras.height)
+class Views:
+    """Tells which sequences can be drawn together; the cameras of each are fetched from the device once.
+
+    A sequence's cameras stand still, so its number and the names of its views say which they are.
+    """
+
+    def __init__(self) -> None:
+        """Knows no sequence yet."""
+        self._keys: dict[tuple[int, tuple[str, ...]], Hashable] = {}
+
+    def key(self, sample: SequenceSample) -> Hashable:
+        """What must agree for two sequences to be drawn in one call: scene, cameras and image size."""
+        cameras, known = sample.cameras, (sample.sequence_id, sample.cameras.names)
+        if known not in self._keys:
+            numbers = [x.detach().cpu().numpy().tobytes() for x in (cameras.viewmats, cameras.Ks)]
+            self._keys[known] = (sample.scene_id, *numbers, cameras.width, cameras.height)
+        return self._keys[known]
+
+    def groups(self, samples: Sequence[SequenceSample]) -> list[ViewGroup]:
+        """Sorts the sequences of a batch by scene and cameras."""
+        places: dict[Hashable, list[int]] = {}
+        for i, sample in enumerate(samples):
+            places.setdefault(self.key(sample), []).append(i)
+        return [ViewGroup(samples[p[0]].scene_id, tuple(p), samples[p[0]].cameras) for p in places.values()]
 
 
-def group_views(samples: Sequence[SequenceSample]) -> list[ViewGroup]:
-    """Sorts the sequences of a batch by scene and cameras."""
-    places: dict[Any, list[int]] = {}
-    for i, sample in enumerate(samples):
-        places.setdefault(view_key(sample.scene_id, sample.cameras), []).append(i)
-    return [ViewGroup(samples[p[0]].scene_id, tuple(p), samples[p[0]].cameras) for p in places.values()]
+@dataclass(eq=False)
+class Frame:
+    """One predicted frame without what the model adds to it (see :class:`gausim.engine.contracts.Step`)."""
+
+    positions: Tensor
+    gradients: Tensor
+    rotations: Tensor
+    momentum: Tensor
+
+
+def checkpointed_step(model: Simulator, batch: SceneBatch, state: SimState) -> Frame:
+    """A step of which the graph keeps the input only: it is computed once more in the backward pass.
+
+    It shares nothing with other steps, so that computing it again takes the same way. The running statistics of the
+    inputs are then put back to what the step saw the first time, and restored.
+    """
+    normalisers = [m for m in cast(nn.Module, model).modules() if isinstance(m, RunningNormaliser)]
+    statistics = [buffer for normaliser in normalisers for buffer in normaliser.buffers()]
+    before = [buffer.clone() for buffer in statistics]
+    calls = itertools.count()
+
+    def run(positions: Tensor, previous: Tensor) -> tuple[Tensor, ...]:
+        with _rewound(statistics, before) if next(calls) else nullcontext():
+            step = model.step(batch, SimState(positions, previous))
+        return step.positions, step.gradients, step.rotations, step.momentum
+
+    # No random numbers in a step, so no generator is to be put back.
+    return Frame(*torch_checkpoint(run, state.positions, state.previous, use_reentrant=False, preserve_rng_state=False))
+
+
+@contextmanager
+def _rewound(tensors: Sequence[Tensor], values: Sequence[Tensor]) -> Iterator[None]:
+    """Gives tensors these values for the length of a block."""
+    now = [tensor.clone() for tensor in tensors]
+    _assign(tensors, values)
+    try:
+        yield
+    finally:
+        _assign(tensors, now)
+
+
+@torch.no_grad()
+def _assign(tensors: Sequence[Tensor], values: Sequence[Tensor]) -> None:
+    for tensor, value in zip(tensors, values, strict=True):
+        tensor.copy_(value)
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """What is drawn: T predicted frames of all members of a batch.
+
+    Attributes:
+        positions: kernel means [scene units].
+        gradients: accumulated deformation gradients of the units.
+        rotations: their rotations.
+    """
+
+    positions: Float[Tensor, "T K 3"]
+    gradients: Float[Tensor, "T N 3 3"]
+    rotations: Float[Tensor, "T N 3 3"]
+
+    @staticmethod
+    def of(steps: Sequence[PredictedStep]) -> States:
+        """Stacks the steps of a stretch."""
+        return States(
+            torch.stack([step.positions for step in steps]),
+            torch.stack([step.gradients for step in steps]),
+            torch.stack([step.rotations for step in steps]),
+        )
+
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The three of them."""
+        return self.positions, self.gradients, self.rotations
 
 
 class Looks:
@@ -69,7 +160,9 @@ def windows(
     initial: SimState,
     steps: int,
     length: int,
-    perturb: Callable[[SimState], SimState] | None = None,
+    starts: Sequence[Callable[[SimState], SimState]] = (),
+    *,
+    checkpoint: bool = False,
 ) -> Iterator[tuple[int, list[PredictedStep]]]:
     """Rolls a batch ``steps`` frames forward, ``length`` at a time.
 
@@ -82,7 +175,8 @@ def windows(
         initial: x_0 and x_{-1} of all members.
         steps: predicted frames.
         length: of a stretch.
-        perturb: applied to the state that each stretch starts from.
+        starts: applied, in this order, to the state that each stretch starts from.
+        checkpoint: keep of each step its input only and compute it once more in the backward pass.
 
     Yields:
         The number of frames predicted before the stretch, and its steps.
@@ -90,26 +184,18 @@ def windows(
     state = initial
     for start in range(0, steps, length):
         state = state.detach() if start else state
-        state = perturb(state) if perturb is not None else state
-        made = []
+        for change in starts:
+            state = change(state)
+        made: list[PredictedStep] = []
+        prepared = None if checkpoint else model.prepare(batch)
         for _ in range(min(length, steps - start)):
-            step = model.step(batch, state)
+            if checkpoint:
+                step: PredictedStep = checkpointed_step(model, batch, state)
+            else:
+                step = model.step(batch, state, prepared=prepared)
             state = SimState(step.positions, state.positions)
             made.append(step)
         yield start, made
-
-
-def draw_steps(
-    renderer: Renderer, look: SceneAppearance, group: ViewGroup, batch: SceneBatch, steps: Sequence[PredictedStep]
-) -> Float[Tensor, "T S V H W 3"]:
-    """Images of T predicted frames of the S sequences of a group."""
-    members = [batch.members[i] for i in group.members]
-    positions = torch.stack([step.positions[m.kernels] for step in steps for m in members])
-    gradients = torch.stack([step.gradients[m.units] for step in steps for m in members])
-    rotations = torch.stack([step.rotations[m.units] for step in steps for m in members])
-    units = members[0].unit_of_kernel
-    images = draw(renderer, look, positions, gradients, rotations, units, group.cameras).rgb
-    return images.reshape(len(steps), len(members), *images.shape[1:])
 
 
 def draw_rest(
@@ -132,6 +218,9 @@ class UnitNoise:
         self, batch: SceneBatch, scenes: Sequence[GaussianScene], deviation: Sequence[float], generator: torch.Generator
     ) -> None:
         """``deviation`` is one standard deviation per scene [scene units]."""
+        device = batch.rest.device
+        if device.type != "cpu":  # numbers drawn on the host would have to be waited for
+            generator = torch.Generator(device).manual_seed(generator.initial_seed())
         self._batch, self._generator = batch, generator
         self._scales = []
         for member in batch.members:
@@ -144,33 +233,84 @@ class UnitNoise:
         parts = []
         for member, scale in zip(self._batch.members, self._scales, strict=True):
             count = member.units.stop - member.units.start
-            noise = torch.randn(count, 3, generator=self._generator).to(scale)
+            noise = torch.randn(count, 3, generator=self._generator, device=scale.device).to(scale)
             parts.append(noise[member.unit_of_kernel] * scale)
         return SimState(state.positions + torch.cat(parts), state.previous)
 
 
-def furthest(
-    batch: SceneBatch,
-    diagonals: Sequence[float],
-    steps: Sequence[PredictedStep],
-    start: int,
-    samples: Sequence[SequenceSample],
-) -> float:
-    """Largest distance of a kernel from its rest position over all members and steps [diagonals of its scene].
+def reach(batch: SceneBatch, diagonals: Sequence[float], positions: Float[Tensor, "T K 3"]) -> Float[Tensor, "T S"]:
+    """Largest distance of a kernel from its rest position, per step and member [diagonals of the member's scene]."""
+    with torch.no_grad():
+        distance = (positions - batch.rest).norm(dim=-1)
+        columns = [distance[:, m.kernels].amax(1) / diagonals[m.scene_id] for m in batch.members]
+        return torch.stack(columns, 1)
+
+
+def check_reach(table: Sequence[Sequence[float]], start: int, samples: Sequence[SequenceSample]) -> float:
+    """The largest entry of what :func:`reach` found in a stretch.
 
     Raises:
         DivergenceError: a position is not finite; names the step and the sequence.
     """
-    largest = 0.0
-    with torch.no_grad():
-        distance = torch.stack([(step.positions - batch.rest).norm(dim=-1) for step in steps])
-        table = torch.stack([distance[:, m.kernels].amax(1) for m in batch.members], 1).tolist()
     for t, row in enumerate(table):
         for value, sample in zip(row, samples, strict=True):
             if not value < float("inf"):
                 raise DivergenceError(describe(start + t, samples, sample, f"positions are {value}"))
-            largest = max(largest, value / diagonals[sample.scene_id])
-    return largest
+    return max(map(max, table))
+
+
+class Explosions:
+    """Ends a rollout at the stretch in which a kernel moves too far from rest; that stretch is not learned from.
+
+    Where reading a number does not make the host wait, the loop simply stops. Else (``deferred``) it goes on from the
+    rest state, without an influence on anything, and how long the rollout lasted is read at the end of the step.
+    """
+
+    def __init__(
+        self,
+        batch: SceneBatch,
+        diagonals: Sequence[float],
+        samples: Sequence[SequenceSample],
+        limit: float,
+        *,
+        deferred: bool,
+    ) -> None:
+        """``limit`` is what is too far [diagonals of the member's scene]."""
+        self._batch, self._diagonals, self._samples, self._limit = batch, diagonals, samples, limit
+        self._lasts = torch.ones((), dtype=torch.bool, device=batch.rest.device) if deferred else None
+
+    def end(self, positions: Float[Tensor, "T K 3"], start: int, found: list[Tensor]) -> bool:
+        """Looks at a stretch; returns whether to stop, else adds its reach to ``found``.
+
+        Raises:
+            DivergenceError: a position is not finite (not when deferred).
+        """
+        extent = reach(self._batch, self._diagonals, positions)
+        if self._lasts is not None:
+            self._lasts = self._lasts & (extent.amax() <= self._limit)
+        elif check_reach(extent.tolist(), start, self._samples) > self._limit:
+            return True
+        found.append(extent)
+        return False
+
+    def spared(self, states: States) -> States:
+        """The states, or those of rest once the rollout has ended: they can be drawn whatever happened."""
+        if self._lasts is None:
+            return states
+        identity = torch.eye(3, dtype=states.gradients.dtype, device=states.gradients.device)
+        rests = (self._batch.rest, identity, identity)
+        return States(*(torch.where(self._lasts, x, r) for x, r in zip(states.tensors(), rests, strict=True)))
+
+    def counted(self, values: Tensor) -> Tensor:
+        """The values, or zeros once the rollout has ended."""
+        return values if self._lasts is None else torch.where(self._lasts, values, torch.zeros_like(values))
+
+    def restart(self, state: SimState) -> SimState:
+        """The state, or that of rest once the rollout has ended."""
+        if self._lasts is None:
+            return state
+        rest = self._batch.rest
+        return SimState(*(torch.where(self._lasts, x, rest) for x in (state.positions, state.previous)))
 
 
 def describe(step: int | None, samples: Sequence[SequenceSample], sample: SequenceSample | None, what: str) -> str:
