@@ -11,8 +11,9 @@ from torch.autograd.function import once_differentiable
 
 from gausim.nn.linear import product
 
-# Edges per block on the CPU: at width 128 a block is 512 KiB, so that what one operation writes the next still finds
-# in the second-level cache. A GPU takes all edges at once: each launch costs it more than the memory traffic.
+# Edges per block and thread on the CPU: at width 128 these are 512 KiB, so that what one operation writes the next
+# still finds in the core's second-level cache. A GPU takes all edges at once: each launch costs it more than the
+# memory traffic.
 BLOCK = 1024
 # With fewer edges than this, the number of operations is what costs, and autograd's own are fewer.
 FEW = 200
@@ -88,7 +89,7 @@ def _blocked(
 
 
 def _blocks(edges: Tensor) -> list[slice]:
-    size = BLOCK if edges.device.type == "cpu" else max(len(edges), 1)
+    size = BLOCK * torch.get_num_threads() if edges.device.type == "cpu" else max(len(edges), 1)
     return [slice(start, start + size) for start in range(0, len(edges), size)]
 
 
