@@ -15,7 +15,7 @@ from gausim.models.elastic import ElasticTemplate
 from gausim.models.recursion import Inheritance, Solved, Units
 from gausim.ops import aggregation
 from gausim.ops.compiled import fits, torch_only
-from gausim.ops.deformation import gradient_from_output, polar_rotation
+from gausim.ops.deformation import bounded_deformation, gradient_from_output, polar_rotation
 
 NAMES = ("positions", "gradients", "rotations", "momentum")
 
@@ -61,6 +61,13 @@ def test_gradient_from_output(conserve) -> None:
     output[::3, 8:] *= 8  # beyond the bound of the stretch
     assert bool((output[:, 8:].abs() > 5).any())
     _compare(lambda x: gradient_from_output(x, conserve_mass=conserve), [output])
+
+
+@pytest.mark.parametrize("unit", [False, True])
+def test_bounded_deformation(unit) -> None:
+    gradient = torch.eye(3) + 0.4 * _random(60, 3, 3, seed=1)
+    assert 0 < int((torch.linalg.det(gradient) < 0.2).sum()) < 30
+    _compare(lambda x: (bounded_deformation(x, 0.2, unit=unit),), [gradient])
 
 
 def test_polar_rotation() -> None:

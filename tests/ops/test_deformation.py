@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gausim.ops.deformation import determinant, gradient_from_output, polar_rotation, unit_determinant
+from gausim.ops.deformation import bounded_deformation, determinant, gradient_from_output, polar_rotation
 
 
 def _outputs(scale: float, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -48,14 +48,20 @@ def test_gradcheck_of_the_head() -> None:
     assert torch.autograd.gradcheck(lambda x: gradient_from_output(x, conserve_mass=True), output)
 
 
-def test_determinant_and_unit_determinant() -> None:
-    a = torch.randn(50, 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    assert torch.allclose(determinant(a), torch.linalg.det(a))
-    b = torch.eye(3, dtype=torch.float64) + 0.2 * a
-    b = b[torch.linalg.det(b) > 0.05]
-    unit = unit_determinant(b)
-    assert len(b) > 20 and torch.allclose(torch.linalg.det(unit), torch.ones(len(b), dtype=torch.float64))
-    assert torch.allclose(unit / unit[:, :1, :1], b / b[:, :1, :1])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_bounded_deformation_keeps_valid_matrices_up_to_volume_and_replaces_the_others(dtype) -> None:
+    a = torch.eye(3) + 0.4 * torch.randn(80, 3, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    a, kept = a.to(dtype), torch.linalg.det(a) >= 0.2
+    assert torch.allclose(determinant(a), torch.linalg.det(a), atol=1e-5)
+    assert 20 < int(kept.sum()) < 75
+    free, unit = (bounded_deformation(a, 0.2, unit=u) for u in (False, True))
+    assert torch.equal(free[kept], a[kept])
+    for bounded in (free, unit):
+        assert torch.equal(bounded[~kept], torch.eye(3, dtype=dtype).expand(int((~kept).sum()), 3, 3))
+    assert torch.allclose(torch.linalg.det(unit), torch.ones(80, dtype=dtype), atol=1e-5)
+    assert torch.allclose(unit[kept] * a[kept][:, :1, :1], a[kept] * unit[kept][:, :1, :1], atol=1e-5)
+    broken = torch.full((2, 3, 3), float("nan"), dtype=dtype)
+    assert bool(bounded_deformation(broken, 0.2, unit=True).isnan().all())
 
 
 def test_polar_rotation_equals_the_singular_value_decomposition() -> None:

@@ -27,7 +27,7 @@ from gausim.models.batch import SceneBatch
 from gausim.models.hierarchy import Hierarchy
 from gausim.models.template import Motion, Template, TemplateState
 from gausim.nn.mlp import mlp, zero_output
-from gausim.ops.deformation import determinant, unit_determinant
+from gausim.ops.deformation import bounded_deformation
 
 # Springs keep this share of their stiffness across their direction: a central-force network alone has soft mechanisms.
 TRANSVERSE_STIFFNESS = 0.3
@@ -276,13 +276,7 @@ class ElasticTemplate(Template):
 
     def valid(self, gradient: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 3 3"]:
         """Keeps the determinant above its bound (towards the identity) and, with mass on, scales it to one."""
-        det = determinant(gradient)
-        kept = ~(det < MIN_DETERMINANT)  # so that NaN stays NaN
-        identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
-        gradient = torch.where(kept[:, None, None], gradient, identity)
-        if not self.conserve_volume:
-            return gradient
-        return unit_determinant(gradient, torch.where(kept, det, 1.0))
+        return bounded_deformation(gradient, MIN_DETERMINANT, unit=self.conserve_volume)
 
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor]:
         """Modes (N, 3, M) and their gradients (N, 3, 3, M): a basis of smooth motions of one scene."""

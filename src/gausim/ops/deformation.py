@@ -36,12 +36,21 @@ def gradient_from_output(
     return (u * torch.exp(stretch)[..., None, :]) @ v.mT, u @ v.mT
 
 
-def unit_determinant(
-    gradient: Float[Tensor, "*N 3 3"], det: Float[Tensor, " *N"] | None = None
-) -> Float[Tensor, "*N 3 3"]:
-    """The gradient scaled to determinant 1 (volume kept); needs a positive determinant, ``det`` where it is known."""
-    det = determinant(gradient) if det is None else det
-    return gradient * det.clamp_min(1e-6).pow(-1 / 3)[..., None, None]
+def bounded_deformation(gradient: Float[Tensor, "N 3 3"], least: float, *, unit: bool) -> Float[Tensor, "N 3 3"]:
+    """The gradient where its determinant is at least ``least`` > 0, else the identity: matter is not turned inside out.
+
+    Args:
+        gradient: deformation gradients.
+        least: smallest determinant.
+        unit: whether to scale them to determinant 1 (volume kept).
+    """
+    if fits(gradient):
+        return compiled.BoundedDeformation.apply(gradient, least, unit)
+    det = determinant(gradient)
+    kept = ~(det < least)  # so that NaN stays NaN
+    identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
+    gradient = torch.where(kept[:, None, None], gradient, identity)
+    return gradient * torch.where(kept, det, 1.0).pow(-1 / 3)[:, None, None] if unit else gradient
 
 
 def determinant(a: Float[Tensor, "*N 3 3"]) -> Float[Tensor, " *N"]:

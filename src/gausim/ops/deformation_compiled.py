@@ -156,3 +156,63 @@ def polar_rotations(matrices, iterations, rotations):
         r[0, 0], r[0, 1], r[0, 2] = a, b, c
         r[1, 0], r[1, 1], r[1, 2] = d, e, f
         r[2, 0], r[2, 1], r[2, 2] = g, h, k
+
+
+@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+def _bound(matrices, least, unit, bounded, factors):
+    """Matrices, scaled by their ``factors``; a factor of 0 stands for the identity in place of the matrix."""
+    for i in range(matrices.shape[0]):
+        m = matrices[i]
+        det = (
+            m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
+            + m[0, 1] * (m[1, 2] * m[2, 0] - m[1, 0] * m[2, 2])
+            + m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
+        )
+        factors[i] = np.float32(0) if det < least else (np.float32(det ** (-1 / 3)) if unit else ONE)
+        for a in range(3):
+            for b in range(3):
+                if det < least:
+                    bounded[i, a, b] = ONE if a == b else np.float32(0)
+                else:
+                    bounded[i, a, b] = factors[i] * m[a, b]
+
+
+@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+def _bound_adjoint(bounded, factors, unit, g, grad):
+    """From d det = det tr(M^-1 dM), so that of B = det^(-1/3) M, itself of determinant 1, dB has -(1/3) tr(..) B."""
+    for i in range(bounded.shape[0]):
+        b, f = bounded[i], factors[i]
+        along = np.float32(0)
+        if unit and f != 0:
+            for r in range(3):
+                along += b[r, 0] * g[i, r, 0] + b[r, 1] * g[i, r, 1] + b[r, 2] * g[i, r, 2]
+            along *= THIRD
+        for r in range(3):
+            p, q = (r + 1) % 3, (r + 2) % 3
+            for c in range(3):
+                s, t = (c + 1) % 3, (c + 2) % 3
+                cofactor = b[p, s] * b[q, t] - b[p, t] * b[q, s]
+                grad[i, r, c] = f * (g[i, r, c] - along * cofactor)
+
+
+class BoundedDeformation(torch.autograd.Function):
+    """:func:`gausim.ops.deformation.bounded_deformation` of (N, 3, 3) gradients."""
+
+    @staticmethod
+    def forward(ctx: Any, gradient: Tensor, least: float, unit: bool) -> Tensor:
+        """The bounded gradients."""
+        bounded, factors = np.empty(gradient.shape, np.float32), np.empty(len(gradient), np.float32)
+        _bound(array(gradient), np.float32(least), unit, bounded, factors)
+        result = torch.from_numpy(bounded)
+        ctx.save_for_backward(result, torch.from_numpy(factors))
+        ctx.unit = unit
+        return result
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Any:
+        """Gradient of the first."""
+        bounded, factors = (array(t) for t in ctx.saved_tensors)
+        found = np.empty(bounded.shape, np.float32)
+        _bound_adjoint(bounded, factors, ctx.unit, array(grad), found)
+        return torch.from_numpy(found), None, None
