@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 import platform
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -141,6 +145,22 @@ def test_images_smaller_than_the_window_are_refused(double: bool) -> None:
     small = torch.zeros(1, 1, 4, 20, 3, dtype=torch.float64 if double else torch.float32)
     with pytest.raises(ConfigError, match=r"20x4 pixels are smaller than the SSIM window of 5"):
         ImageLoss()(small, small)
+
+
+@pytest.mark.slow
+def test_the_process_that_compiles_gives_the_bits_of_later_ones(tmp_path: Path) -> None:
+    code = """
+import hashlib, torch
+from gausim.losses import ImageLoss
+x, y = torch.rand(2, 1, 2, 40, 37, 3, generator=torch.Generator().manual_seed(0))
+values, gradient = ImageLoss().value_and_gradient(x, y)
+print(hashlib.sha256(values.numpy().tobytes() + gradient.numpy().tobytes()).hexdigest())
+"""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    runs = [subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+            for _ in range(2)]  # fmt: skip
+    assert list(tmp_path.rglob("*.nbc"))  # the second one had something to load
+    assert len(runs[0].stdout) > 60 and runs[0].stdout == runs[1].stdout
 
 
 @pytest.mark.skipif(platform.machine() not in PACKED, reason="names of vector instructions unknown here")

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gausim.core import DataError
 from gausim.ops.compiled import fits
+from gausim.ops.jit import KERNEL
 
 # Decoding releases the interpreter lock; more threads than this only queue for the disk.
 DECODER_THREADS = 4
@@ -44,7 +45,7 @@ def composite(
     return rgb, alpha
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**KERNEL)
 def over_black(frames, rgb, alpha):  # type: ignore[no-untyped-def]
     """Writes RGB and alpha of straight-alpha 8-bit RGBA over black; all three lie flat in memory.
 

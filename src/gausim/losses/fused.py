@@ -16,6 +16,8 @@ import numba
 import numpy as np
 from numba.cpython.unsafe.tuple import tuple_setitem
 
+from gausim.ops.jit import HELPER, KERNEL
+
 # (k L)^2 of Wang et al. 2004 with k = 0.01, 0.03 and L = 1.
 SSIM_C1, SSIM_C2 = 1e-4, 9e-4
 C1, C2 = np.float32(SSIM_C1), np.float32(SSIM_C2)
@@ -24,7 +26,7 @@ ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@numba.njit(fastmath=FAST, **HELPER)
 def blur_moments(x, y, rows, taps, maps, pad):
     """Blurs x, y, x^2, x y and y^2 along H into the five ``maps`` from column ``pad`` on.
 
@@ -49,7 +51,7 @@ def blur_moments(x, y, rows, taps, maps, pad):
         m4[i] = bb
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@numba.njit(fastmath=FAST, **HELPER)
 def ssim_slopes(maps, taps, slopes, pad):
     """Blurs the ``maps`` along W; returns the row's sum of 1 - SSIM and writes the ``slopes`` from column ``pad`` on.
 
@@ -80,7 +82,7 @@ def ssim_slopes(maps, taps, slopes, pad):
     return total
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@numba.njit(fastmath=FAST, **HELPER)
 def spread_along_width(slopes, taps, spread):
     """The adjoint of the blur along W, borders included: ``slopes`` lie between zeros, ``spread`` keeps its margin."""
     half = 3 * (len(taps) // 2)
@@ -98,7 +100,7 @@ def spread_along_width(slopes, taps, spread):
                 target[count - half - 3 - 3 * j + c] += target[count - half - 3 + 3 * j + c]
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@numba.njit(fastmath=FAST, **HELPER)
 def gather_row(spread, offsets, weights, x, y, by_error, by_ssim, gradient):
     """The gradient of one row and its sum of squared errors; ``offsets`` and ``weights`` are of the rows around it."""
     first = spread.reshape(-1)
@@ -118,7 +120,7 @@ def gather_row(spread, offsets, weights, x, y, by_error, by_ssim, gradient):
     return total
 
 
-@numba.njit(nogil=True, fastmath=FAST, error_model="numpy", cache=True)
+@numba.njit(fastmath=FAST, **HELPER)
 def mark_colour(x, y, columns):
     """Marks the columns of one row where an image is not zero; returns whether there are any."""
     found = np.int32(0)
@@ -129,7 +131,7 @@ def mark_colour(x, y, columns):
     return found != 0
 
 
-@numba.njit(nogil=True, cache=True)
+@numba.njit(**HELPER)
 def widened(low, high, length, margin, least):
     """The range low..high with a margin, at least ``least`` long, within 0..length."""
     low, high = max(0, low - margin), min(length, high + margin)
@@ -139,7 +141,7 @@ def widened(low, high, length, margin, least):
     return low, high
 
 
-@numba.njit(nogil=True, cache=True)
+@numba.njit(**HELPER)
 def coloured_box(x, y, height, width, window):
     """Rows and columns (top, bottom, left, right) outside which loss and gradient are exactly zero."""
     columns = np.zeros(3 * width, np.int32)
@@ -159,7 +161,7 @@ def coloured_box(x, y, height, width, window):
     return top, bottom, left, right
 
 
-@numba.njit(nogil=True, cache=True)
+@numba.njit(**HELPER)
 def reflected(row, top, bottom):
     """The row that stands in for one beyond the border (which itself is not repeated)."""
     if row < top:
@@ -167,7 +169,7 @@ def reflected(row, top, bottom):
     return 2 * (bottom - 1) - row if row >= bottom else row
 
 
-@numba.njit(nogil=True, cache=True)
+@numba.njit(**HELPER)
 def adjoint_weights(row, top, bottom, taps, slots, size, inset):
     """Offsets and weights of the spread rows around ``row``, such that gathering them is the adjoint of the blur."""
     window, half = len(taps), len(taps) // 2
@@ -184,7 +186,7 @@ def adjoint_weights(row, top, bottom, taps, slots, size, inset):
     return offsets, weights
 
 
-@numba.njit(nogil=True, cache=True)
+@numba.njit(**KERNEL)
 def compare(x, y, shape, taps, slots, by_error, by_ssim, crop, gradient):
     """Sums of squared errors and of 1 - SSIM over pixels and channels of one image; writes the gradient.
 

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gausim.ops.compiled import FINITE_MATH_OFF, array
+from gausim.ops.compiled import array
+from gausim.ops.jit import HELPER, KERNEL, ORDERED
 
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 TINY2, TINY4 = np.float32(1e-12), np.float32(1e-24)  # squares of gausim.models.features.TINY
@@ -21,7 +22,7 @@ TINY2, TINY4 = np.float32(1e-12), np.float32(1e-24)  # squares of gausim.models.
 REST, NOW, BEFORE, AFTER = 0, 3, 6, 9
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _gather(unit, parents, index, size, own, above):
     """Own and parent's positions in diagonals; AFTER is the coarse prediction and the parent's new place."""
     rest, now, before, target = unit
@@ -38,7 +39,7 @@ def _gather(unit, parents, index, size, own, above):
             above[i, BEFORE + k], above[i, AFTER + k] = p_before[p, k] * inverse, p_after[p, k] * inverse
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _gather_adjoint(target, p_template, p_gradient, index, size, g_own, g_above, g_unit, g_parents):
     """Gradients of the unit's and the parents' positions; those of the parents add up over their children."""
     g_rest, g_now, g_before, g_target = g_unit
@@ -66,7 +67,7 @@ def _gather_adjoint(target, p_template, p_gradient, index, size, g_own, g_above,
             gp_after[p, k] += g_above[i, AFTER + k] * inverse
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _nodes(own, above, size, dt, gravity, density, attributes, rest_inputs, from_coarse, nodes):
     x = AFTER if from_coarse else NOW
     for i in range(own.shape[0]):
@@ -85,7 +86,7 @@ def _nodes(own, above, size, dt, gravity, density, attributes, rest_inputs, from
             nodes[i, column + 1 + k] = attributes[i, k]
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _nodes_adjoint(g_nodes, dt, rest_inputs, from_coarse, g_own, g_above, g_density, g_attributes):
     x = AFTER if from_coarse else NOW
     for i in range(g_nodes.shape[0]):
@@ -110,7 +111,7 @@ def _nodes_adjoint(g_nodes, dt, rest_inputs, from_coarse, g_own, g_above, g_dens
             g_attributes[i, k] = g[column + 1 + k]
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True, inline="always")
+@numba.njit(fastmath=ORDERED, **HELPER)
 def _angle(a0, a1, a2, b0, b1, b2):
     """Cosine and sine of the angle between a and b, both 0 where one of them vanishes; and what they are made of."""
     dot = a0 * b0 + a1 * b1 + a2 * b2
@@ -121,7 +122,7 @@ def _angle(a0, a1, a2, b0, b1, b2):
     return dot * inverse, across * inverse, inverse, across, aa, bb, k0, k1, k2
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _edges(own, above, source, destination, dt, rest_inputs, from_coarse, cos_sin, edges):
     x = AFTER if from_coarse else NOW
     for e in range(source.shape[0]):
@@ -154,7 +155,7 @@ def _edges(own, above, source, destination, dt, rest_inputs, from_coarse, cos_si
             out[column] = (a0 * b0 + a1 * b1 + a2 * b2) - (p0 * q0 + p1 * q1 + p2 * q2)
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True, inline="always")
+@numba.njit(fastmath=ORDERED, **HELPER)
 def _angle_adjoint(a0, a1, a2, b0, b1, b2, parts, g_cos, g_sin, gd, gs, gc, x):
     """Adds the gradient of cosine and sine of the angle between a = d - c and b = s - c."""
     cos, sin, inverse, across, aa, bb, k0, k1, k2 = parts
@@ -178,7 +179,7 @@ def _angle_adjoint(a0, a1, a2, b0, b1, b2, parts, g_cos, g_sin, gd, gs, gc, x):
     gc[x + 2] -= u2 + v2
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _edges_adjoint(own, above, source, destination, dt, rest_inputs, from_coarse, cos_sin, g_edges, g_own, g_above):
     x = AFTER if from_coarse else NOW
     g_now, g_rest = np.empty(3, np.float32), np.empty(3, np.float32)
@@ -227,7 +228,7 @@ def _edges_adjoint(own, above, source, destination, dt, rest_inputs, from_coarse
             _inner_adjoint(p0, p1, p2, q0, q1, q2, -g[column], gd, gs, gc, REST)
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True, inline="always")
+@numba.njit(fastmath=ORDERED, **HELPER)
 def _inner_adjoint(a0, a1, a2, b0, b1, b2, g, gd, gs, gc, x):
     """Adds the gradient of the product of a = d - c and b = s - c."""
     for k, a, b in ((0, a0, b0), (1, a1, b1), (2, a2, b2)):

@@ -11,12 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gausim.ops.compiled import FINITE_MATH_OFF, array
+from gausim.ops.compiled import array
 from gausim.ops.deformation import POLAR_ITERATIONS
 from gausim.ops.deformation_compiled import polar_rotations
+from gausim.ops.jit import HELPER, KERNEL, ORDERED
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True, inline="always")
+@numba.njit(fastmath=ORDERED, **HELPER)
 def _product(a, b, out):
     """A B of 3x3 matrices."""
     for i in range(3):
@@ -24,7 +25,7 @@ def _product(a, b, out):
             out[i, k] = a[i, 0] * b[0, k] + a[i, 1] * b[1, k] + a[i, 2] * b[2, k]
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True, inline="always")
+@numba.njit(fastmath=ORDERED, **HELPER)
 def _add_product_adjoint(a, b, g, g_a, g_b):
     """Adds G B^T and A^T G, the gradients of A and B where G is that of A B."""
     for i in range(3):
@@ -33,7 +34,7 @@ def _add_product_adjoint(a, b, g, g_a, g_b):
             g_b[i, k] += a[0, i] * g[0, k] + a[1, i] * g[1, k] + a[2, i] * g[2, k]
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _advance(own, turn, target, centre, template, gradient, rotation, index, accumulated, turned, after):
     for i in range(index.shape[0]):
         p, a = index[i], accumulated[i]
@@ -45,7 +46,7 @@ def _advance(own, turn, target, centre, template, gradient, rotation, index, acc
             after[i, k] = c[k] + (a[k, 0] * x + a[k, 1] * y + a[k, 2] * z)
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _advance_adjoint(own, turn, target, template, gradient, rotation, index, accumulated, grads, found):
     g_accumulated, g_turned, g_after = grads
     g_own, g_turn, g_target, g_centre, g_template, g_gradient, g_rotation = found
@@ -91,7 +92,7 @@ class Advance(torch.autograd.Function):
         return (*(torch.from_numpy(f) for f in found), None)
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _carry(points, centre, after, gradient, index, carried):
     for k in range(points.shape[0]):
         c = index[k]
@@ -105,7 +106,7 @@ def _carry(points, centre, after, gradient, index, carried):
         carried[k, 2] = after[c, 2] + (g[2, 0] * x + g[2, 1] * y + g[2, 2] * z)
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _carry_adjoint(points, centre, gradient, index, grad, g_centre, g_after, g_gradient):
     for k in range(points.shape[0]):
         c = index[k]
@@ -126,7 +127,7 @@ def _carry_adjoint(points, centre, gradient, index, grad, g_centre, g_after, g_g
             g_centre[c, i] = -(g[0, i] * a[0] + g[1, i] * a[1] + g[2, i] * a[2])
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _deform_template(accumulated, turned, template, polar, rows, total, rotation):
     """Gradients and rotations of the units after the template's, written to their ``rows``; identities elsewhere."""
     for n in range(total.shape[0]):
@@ -141,7 +142,7 @@ def _deform_template(accumulated, turned, template, polar, rows, total, rotation
             total[rows[c]], rotation[rows[c]] = accumulated[c], turned[c]
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _deform_template_adjoint(accumulated, template, polar, rows, g_total, g_rotation, found):
     """``g_total`` is the gradient of each unit's total gradient, ``g_rotation`` that of the padded rotations."""
     g_accumulated, g_turned, g_template = found

@@ -12,12 +12,13 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from gausim.ops.jit import HELPER, KERNEL
 from gausim.ops.kdtree import STACK, node_range
 
 BRUTE_FORCE = 64  # pairs of points that are compared one by one rather than through their nodes' boxes
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _farthest_of_ranges(points, a_low, a_high, b_low, b_high):
     best = 0.0
     for i in range(a_low, a_high):
@@ -28,7 +29,7 @@ def _farthest_of_ranges(points, a_low, a_high, b_low, b_high):
     return best
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _box_reach(boxes, a, b):
     """Squared distance of the farthest corners of two nodes' boxes."""
     total = 0.0
@@ -38,7 +39,7 @@ def _box_reach(boxes, a, b):
     return total
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _farthest_of_nodes(depth, points, boxes, a, b, square, stack):
     """Squared distance of the farthest points of two nodes, by branch and bound; any value above ``square`` will do."""
     count = points.shape[1]
@@ -66,7 +67,7 @@ def _farthest_of_nodes(depth, points, boxes, a, b, square, stack):
     return best
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**KERNEL)
 def cross_squares(depth, points, boxes, ends, nodes, pairs, square):
     """Squared distance of the farthest points of each pair of groups (see ``kdtree.compact_nodes``).
 
@@ -88,7 +89,7 @@ def cross_squares(depth, points, boxes, ends, nodes, pairs, square):
     return squares
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _rows(count, pairs, squares, square):
     """Adjacency of the pairs within ``square``: starts, sizes, neighbours, squared distances, twins.
 
@@ -116,7 +117,7 @@ def _rows(count, pairs, squares, square):
     return starts, sizes, neighbours, weights, twins
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _remove(row, at, starts, sizes, neighbours, weights, twins):
     """Removes an entry; the last one of the row takes its place."""
     sizes[row] -= 1
@@ -126,7 +127,7 @@ def _remove(row, at, starts, sizes, neighbours, weights, twins):
         twins[twins[at]] = at
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _merge(keep, gone, marks, starts, sizes, neighbours, weights, twins):
     """Complete linkage: the union is as far from a third as the farther of the two, and close only if both are."""
     for at in range(starts[gone], starts[gone] + sizes[gone]):
@@ -144,7 +145,7 @@ def _merge(keep, gone, marks, starts, sizes, neighbours, weights, twins):
     sizes[gone] = 0
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**KERNEL)
 def complete_linkage(count, pairs, squares, square):
     """Clusters ``count`` units so that no pair of a cluster is farther apart than sqrt(``square``).
 

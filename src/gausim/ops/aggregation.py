@@ -12,10 +12,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gausim.ops.compiled import FINITE_MATH_OFF, array, fits
+from gausim.ops.compiled import array, fits
+from gausim.ops.jit import KERNEL, ORDERED
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _sum(values, weights, index, total):
     for i in range(values.shape[0]):
         c, w = index[i], weights[i]
@@ -24,7 +25,7 @@ def _sum(values, weights, index, total):
         total[c, 2] += w * values[i, 2]
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _sum_adjoint(values, weights, index, grad, grad_values, grad_weights):
     for i in range(values.shape[0]):
         c, w = index[i], weights[i]

@@ -14,9 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-# What of fastmath leaves numbers that are not finite as they are and sums in the order in which they are written.
-FINITE_MATH_OFF = {"contract", "arcp", "nsz"}
-
 _switched_on = True
 
 

@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gausim.ops.compiled import FINITE_MATH_OFF, array
+from gausim.ops.compiled import array
+from gausim.ops.jit import HELPER, KERNEL, ORDERED
 
 ONE, TWO, HALF, THIRD = np.float32(1), np.float32(2), np.float32(0.5), np.float32(1 / 3)
 SMALLEST_NORM = np.float32(1e-12)  # torch.nn.functional.normalize
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **HELPER)
 def _rotation(output, i, column, quat, matrix):
     """Unit quaternion and matrix of the numbers ``column`` .. + 3 of row ``i``; returns one over their length."""
     w, x, y, z = output[i, column] + ONE, output[i, column + 1], output[i, column + 2], output[i, column + 3]
@@ -32,7 +33,7 @@ def _rotation(output, i, column, quat, matrix):
     return inverse
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **HELPER)
 def _rotation_adjoint(quat, inverse, g, grad, i, column):
     """Gradient of the four numbers from the gradient ``g`` of the matrix."""
     w, x, y, z = quat[0], quat[1], quat[2], quat[3]
@@ -53,7 +54,7 @@ def _rotation_adjoint(quat, inverse, g, grad, i, column):
     grad[i, column + 3] = (gz - along * z) * inverse
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **HELPER)
 def _stretches(output, i, limit, conserve, stretch):
     mean = np.float32(0)
     for k in range(3):
@@ -70,7 +71,7 @@ def _stretches(output, i, limit, conserve, stretch):
         stretch[k] = math.exp(stretch[k])
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _gradients(output, limit, conserve, gradient, rotation):
     quat, stretch = np.empty(4, np.float32), np.empty(3, np.float32)
     u, v = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
@@ -85,7 +86,7 @@ def _gradients(output, limit, conserve, gradient, rotation):
                 gradient[i, a, b] = p0 * stretch[0] + p1 * stretch[1] + p2 * stretch[2]
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _gradients_adjoint(output, limit, conserve, grad_gradient, grad_rotation, grad):
     qu, qv, stretch = np.empty(4, np.float32), np.empty(4, np.float32), np.empty(3, np.float32)
     u, v = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
@@ -136,7 +137,7 @@ class GradientFromOutput(torch.autograd.Function):
         return torch.from_numpy(grad), None, None
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def polar_rotations(matrices, iterations, rotations):
     """Newton's iteration R <- (R + R^-T) / 2 for every matrix, written to ``rotations``."""
     for i in range(matrices.shape[0]):
@@ -158,7 +159,7 @@ def polar_rotations(matrices, iterations, rotations):
         r[2, 0], r[2, 1], r[2, 2] = g, h, k
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _bound(matrices, least, unit, bounded, factors):
     """Matrices, scaled by their ``factors``; a factor of 0 stands for the identity in place of the matrix."""
     for i in range(matrices.shape[0]):
@@ -177,7 +178,7 @@ def _bound(matrices, least, unit, bounded, factors):
                     bounded[i, a, b] = factors[i] * m[a, b]
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=ORDERED, **KERNEL)
 def _bound_adjoint(bounded, factors, unit, g, grad):
     """From d det = det tr(M^-1 dM), so that of B = det^(-1/3) M, itself of determinant 1, dB has -(1/3) tr(..) B."""
     for i in range(bounded.shape[0]):

@@ -7,12 +7,14 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from gausim.ops.jit import HELPER, KERNEL
+
 # numba freezes constants and called functions into its cached code and looks only at the file that holds the caller:
 # after changing what other files import from here, delete their cache (__pycache__/*.nb?).
 STACK = 96  # entries of a traversal's stack: more than twice the depth of any tree that fits in memory
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _split(values, order, low, high, middle):
     """Quickselect (Hoare): afterwards no value of order[low:middle] exceeds one of order[middle:high]."""
     left, right = low, high - 1
@@ -36,7 +38,7 @@ def _split(values, order, low, high, middle):
             return
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**KERNEL)
 def build(points, leaf):
     """Builds the tree of ``points`` (3, n), n >= 1, with at most ``leaf`` >= 2 points in a leaf.
 
@@ -72,7 +74,7 @@ def build(points, leaf):
     return depth, order, ordered, boxes
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def node_range(node, depth, count):
     """First and one past the last point (in tree order) of a node."""
     level = 0
@@ -82,7 +84,7 @@ def node_range(node, depth, count):
     return (j * count) >> level, ((j + 1) * count) >> level
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _box_gap(boxes, node, own):
     """Squared distance between the boxes of two nodes of one tree."""
     total = 0.0
@@ -92,7 +94,7 @@ def _box_gap(boxes, node, own):
     return total
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**KERNEL)
 def close_pairs(depth, points, boxes, square, capacity):
     """All pairs i < j (in tree order) of points (3, n) in float64 whose squared distance is at most ``square``.
 
@@ -130,7 +132,7 @@ def close_pairs(depth, points, boxes, square, capacity):
     return pairs[:, :found], True
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**KERNEL)
 def compact_nodes(depth, count, boxes, diagonal):
     """The largest nodes whose box diagonal is at most ``diagonal``, and the single points of leaves that exceed it.
 

@@ -9,18 +9,19 @@ import math
 import numba
 import numpy as np
 
+from gausim.ops.jit import HELPER, KERNEL
 from gausim.ops.kdtree import STACK, build
 
 LEAF = 20  # points in a leaf; 8 to 24 cost the same within 3 %
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _bits(square):
     """The bit pattern of a float32 >= 0; it orders as the number does."""
     return np.int64(np.float32(square).view(np.int32))
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _gap(boxes, node, x, y, z):
     """Squared distance from a point to a node's box; never above that of a point inside, rounding included."""
     zero = x - x
@@ -30,7 +31,7 @@ def _gap(boxes, node, x, y, z):
     return np.float32(dx * dx + dy * dy + dz * dz)
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _scan(points, order, low, high, query, best):
     """Inserts the points of a leaf into ``best`` (k,): ascending keys (float32 squared distance, index)."""
     x, y, z = points[0, query], points[1, query], points[2, query]
@@ -46,7 +47,7 @@ def _scan(points, order, low, high, query, best):
             best[at] = key
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _search(depth, points, order, boxes, query, leaf, best, stack, gaps):
     """Nearest points of ``query``, which lies in ``leaf``: its own leaf first, then the siblings on the way up."""
     count = points.shape[1]
@@ -73,7 +74,7 @@ def _search(depth, points, order, boxes, query, leaf, best, stack, gaps):
         path >>= 1
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _write_ascending(best, limit, chosen, row):
     """Writes the indices of the keys below ``limit`` to ``row`` in ascending order (by rank: no branches)."""
     found = 0
@@ -88,7 +89,7 @@ def _write_ascending(best, limit, chosen, row):
     return found
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _search_limit(points, query, reach, bound):
     """A key above those of the k nearest points of ``query``: ``bound``, or nearer where that is known.
 
@@ -104,7 +105,7 @@ def _search_limit(points, query, reach, bound):
     return min(bound, (_bits(far * far) + 1) << 32)
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**HELPER)
 def _member(points, square, table, counts):
     """Fills ``table`` (n, k) with the neighbours of one member's points (3, n), ``counts`` (n,) with their number."""
     count, k = table.shape
@@ -124,7 +125,7 @@ def _member(points, square, table, counts):
             counts[order[query]] = _write_ascending(best, limit, chosen, table[order[query]])
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**KERNEL)
 def member_edges(points, starts, squares, k):
     """Edges (source, destination) from the at most k nearest points below a distance, within each member.
 
@@ -154,7 +155,7 @@ def member_edges(points, starts, squares, k):
     return edges
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**KERNEL)
 def merge_edges(a, b, union):
     """Union or intersection of two edge sets (2, E) sorted by destination, then source.
 

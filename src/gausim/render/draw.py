@@ -10,8 +10,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import Cameras, ConfigError, GaussianScene, Rendered, Renderer, Trajectory
+from gausim.ops.compiled import fits
 from gausim.ops.covariance import covariance_from_scales, transport_covariance
 from gausim.ops.spherical_harmonics import spherical_harmonics_basis
+from gausim.render.cpu.appearance import deformed_appearance
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +70,13 @@ def draw(
     *,
     background: Float[Tensor, " 3"] | None = None,
     mask: Bool[Tensor, " K"] | None = None,
+    depth: bool = False,
 ) -> Rendered:
     """Draws B deformed states of one scene in every camera (METHOD section 2).
 
     Kernel k of unit c has covariance G_c S_k G_c^T and the colour of its spherical harmonics at Q_c^T d, d the unit
-    vector from the camera to the kernel. Differentiable in ``positions``, ``gradients`` and ``rotations``.
+    vector from the camera to the kernel. Differentiable in ``positions``, ``gradients`` and ``rotations``, and in the
+    tensors of a SceneAppearance. For float32 on the CPU both are compiled, as the CPU renderer is; elsewhere torch's.
 
     Args:
         renderer: what draws.
@@ -84,6 +88,7 @@ def draw(
         cameras: V views.
         background: colour behind the kernels; black when absent.
         mask: draw only these kernels; goes with a GaussianScene (a SceneAppearance has chosen its own).
+        depth: draw the depth as well (core.Rendered).
 
     Raises:
         ConfigError: a mask beside a SceneAppearance.
@@ -96,17 +101,25 @@ def draw(
     if look.index is not None:
         positions, unit_of_kernel = positions.index_select(1, look.index), unit_of_kernel[look.index]
     states, views = positions.shape[0], cameras.viewmats.shape[0]
-    rest = look.covars.expand(states, -1, -1, -1)
-    covars = transport_covariance(rest, gradients.index_select(1, unit_of_kernel))
+    centers = cameras.centers.to(positions)
+    if fits(positions, gradients, rotations, look.covars, look.sh, centers):
+        covars, colors = deformed_appearance(
+            positions, gradients, rotations, unit_of_kernel, look.covars, look.sh, centers
+        )
+    else:
+        rest = look.covars.expand(states, -1, -1, -1)
+        covars = transport_covariance(rest, gradients.index_select(1, unit_of_kernel))
+        colors = view_colors(look, positions, rotations, unit_of_kernel, centers)
     return renderer(
         positions,
         covars,
-        view_colors(look, positions, rotations, unit_of_kernel, cameras.centers.to(positions)),
+        colors,
         look.opacities.expand(states, -1),
         cameras.viewmats.to(positions).expand(states, views, 4, 4),
         cameras.Ks.to(positions).expand(states, views, 3, 3),
         (cameras.width, cameras.height),
         background=background,
+        depth=depth,
     )
 
 

@@ -7,7 +7,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from gausim.render.cpu.projection import FINITE_MATH_OFF, RECORD
+from gausim.ops.jit import FINITE_MATH_OFF, HELPER, KERNEL
+from gausim.render.cpu.projection import RECORD
 from gausim.render.cpu.simd import (
     LANES,
     lane_numbers,
@@ -26,7 +27,7 @@ TILE_HEIGHT = 16  # [pixels]
 HALF, SEVEN, WIDTH, ZERO = np.float32(0.5), np.float32(7), np.float32(TILE_WIDTH), np.float32(0)
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=FINITE_MATH_OFF, **HELPER)
 def strip_rows(extent, first_strip, low_row, high_row, rows):
     """First and last pixel row within [low_row, high_row] that an ellipse touches in each of 16 column strips.
 
@@ -48,7 +49,7 @@ def strip_rows(extent, first_strip, low_row, high_row, rows):
     store(rows, LANES, maximum(minimum(last, high_row), low_row - HALF - HALF))
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=FINITE_MATH_OFF, **HELPER)
 def collect_band(records, extents, order, spans, row_of, row_low, row_high, strips):
     """Copies the records of the kernels that may touch a band, near to far; ``order`` and ``spans`` by depth_order.
 
@@ -83,7 +84,7 @@ def collect_band(records, extents, order, spans, row_of, row_low, row_high, stri
     return band_records, chosen[:m], reach, begins[: strips + 1]
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=FINITE_MATH_OFF, **KERNEL)
 def bin_band(records, extents, order, spans, row_of, row_low, row_high, strips):
     """Lists for every tile of a band the kernels that touch it, near to far.
 

@@ -9,10 +9,8 @@ import math
 import numba
 import numpy as np
 
+from gausim.ops.jit import FINITE_MATH_OFF, HELPER, KERNEL
 from gausim.render.cpu.simd import LANES, load, splat, store
-
-# All of fastmath but nnan and ninf: what overflows here must not turn into an undefined index later.
-FINITE_MATH_OFF = {"contract", "reassoc", "arcp", "nsz", "afn"}
 
 # Raster record, float32: integer and fractional part of the mean, x then y (so that offsets inside a tile stay exact
 # far from the image's origin), -A/16, -B/8, -C/16 of the inverse covariance, opacity, colour, the exponent below which
@@ -30,7 +28,7 @@ ALPHA_MIN = 1.0 / 255.0
 CLAMP_MARGIN = 0.3  # gsplat clamps x/z and y/z to the field of view widened by this fraction
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**KERNEL)
 def count_unusable(means, covars, colors, opacities, low, high):
     """Number of kernels that are not finite or whose opacity lies outside 0..1 (no fastmath: it would see no NaN)."""
     unusable = 0
@@ -43,7 +41,7 @@ def count_unusable(means, covars, colors, opacities, low, high):
     return unusable
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=FINITE_MATH_OFF, **HELPER)
 def screen_covariance(means, covars, viewmat, K, k, width, height, frame):
     """Camera-space mean, M = J R and S = M Sigma M^T + 0.3 I of kernel ``k``, written to ``frame`` (float64, 22).
 
@@ -88,7 +86,7 @@ def screen_covariance(means, covars, viewmat, K, k, width, height, frame):
     frame[11] = b0 * w0 + b1 * w1 + b2 * w2 + DILATION
 
 
-@numba.njit(nogil=True, fastmath=FINITE_MATH_OFF, error_model="numpy", cache=True)
+@numba.njit(fastmath=FINITE_MATH_OFF, **KERNEL)
 def project_kernels(
     means, covars, colors, opacities, viewmat, K, width, height, near, low, high, records, extents, spans, depth
 ):
@@ -136,7 +134,7 @@ def project_kernels(
         extents[k, 6], extents[k, 7] = t / c, 1.0 / (det * c * c)
 
 
-@numba.njit(nogil=True, error_model="numpy", cache=True)
+@numba.njit(**KERNEL)
 def depth_order(depth, spans):
     """Kernels with a depth that is not negative, near to far, and their rows of ``spans`` in this order.
 
@@ -170,7 +168,7 @@ def depth_order(depth, spans):
     return order[:n], sorted_spans
 
 
-@numba.njit(nogil=True, fastmath=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, **HELPER)
 def gather_sums(low, high, depth, spans, band_of, row_of, offsets, sums, totals):
     """Adds up the bands' sums of the kernels ``low .. high - 1``, in the order of the bands, into ``totals``.
 
@@ -185,7 +183,7 @@ def gather_sums(low, high, depth, spans, band_of, row_of, offsets, sums, totals)
         store(flat, (k - low) * LANES, found)
 
 
-@numba.njit(nogil=True, fastmath=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, **KERNEL)
 def project_adjoint(
     means, covars, opacities, viewmat, K, width, height, low, high, depth, spans, band_of, row_of, offsets, sums,
     grad_means, grad_covars, grad_opacities, grad_colors,

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from gausim.ops.jit import HELPER, KERNEL
 from gausim.render.cpu.binning import TILE_HEIGHT, TILE_WIDTH
 from gausim.render.cpu.simd import (
     LANES,
@@ -46,7 +47,7 @@ BACKWARD_FLOPS = (
 )  # .., t, w, gap, behind, s, s dy, three s sums, three w v
 
 
-@numba.njit(nogil=True, fastmath=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, **HELPER)
 def forward_tile(records, entries, begin, end, left, top, alpha_max, buf, depth):
     """Composites entries ``begin..end`` into ``buf`` = [T | last | R | G | B | D], one value per pixel each.
 
@@ -99,7 +100,7 @@ def forward_tile(records, entries, begin, end, left, top, alpha_max, buf, depth)
     return end
 
 
-@numba.njit(nogil=True, fastmath=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, **HELPER)
 def backward_tile(records, entries, begin, end, left, top, alpha_max, buf, sums, depth):
     """Adds the tile's contribution to ``sums`` (rows * SUMS); ``buf`` = [T | last | vr | vg | vb | vd | behind].
 
@@ -152,7 +153,7 @@ def backward_tile(records, entries, begin, end, left, top, alpha_max, buf, sums,
         store(sums, g * SUMS, load(sums, g * SUMS) + lane_sums(parts))
 
 
-@numba.njit(nogil=True, fastmath=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, **KERNEL)
 def forward_band(records, entries, start, row_low, background, alpha_max, rgb, alpha, depth, final, last, used):
     """Draws one band into ``rgb`` (H, W, 3), ``alpha`` (H, W) and, unless it is None, ``depth`` (H, W).
 
@@ -182,7 +183,7 @@ def forward_band(records, entries, start, row_low, background, alpha_max, rgb, a
                     depth[y, x] = buf[5 * PIXELS + i]
 
 
-@numba.njit(nogil=True, fastmath=True, error_model="numpy", cache=True)
+@numba.njit(fastmath=True, **KERNEL)
 def backward_band(
     records, entries, start, row_low, background, alpha_max, grad_rgb, grad_alpha, grad_depth, final, last, used, sums,
     behind,

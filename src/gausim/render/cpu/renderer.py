@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import threading
 from typing import Any
 
 import numpy as np
@@ -12,12 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import ConfigError, Rendered
+from gausim.ops.announce import announced
+from gausim.ops.pool import shared_pool
 from gausim.render.cpu.batch import Array, Batch, Images
-from gausim.render.cpu.pool import WorkerPool
-
-logger = logging.getLogger(__name__)
-
-ANNOUNCE_AFTER = 1.0  # [s]; loading the compiled kernels from numba's cache takes about 0.2 s
 
 
 def _array(tensor: Tensor) -> Array:
@@ -95,7 +90,6 @@ class CpuRenderer:
         if not 0 < alpha_max < 1:
             raise ConfigError(f"render.alpha_max: expected a value between 0 and 1, got {alpha_max}.")
         self.threads, self.near, self.alpha_max = threads, near, alpha_max
-        self._pool = WorkerPool(threads or torch.get_num_threads())
 
     def __call__(
         self,
@@ -126,33 +120,16 @@ class CpuRenderer:
         behind = torch.from_numpy(np.zeros(3, np.float32)) if background is None else background.to(means)
         inputs["background"] = behind
         keep = torch.is_grad_enabled() and any(value.requires_grad for value in inputs.values())
-        with _announced():
+        with announced("the CPU renderer"):
             images = _Render.apply(
-                *inputs.values(), self._workers(), keep, depth, viewmats, Ks, size, self.near, self.alpha_max
+                *inputs.values(),
+                shared_pool(self.threads or torch.get_num_threads()),
+                keep,
+                depth,
+                viewmats,
+                Ks,
+                size,
+                self.near,
+                self.alpha_max,
             )
         return Rendered(*images)
-
-    def _workers(self) -> WorkerPool:
-        threads = self.threads or torch.get_num_threads()
-        if self._pool.threads != threads:
-            self._pool = WorkerPool(threads)
-        return self._pool
-
-
-class _announced:
-    """Says once per process that kernels are being compiled, if the first call takes long."""
-
-    done = False
-
-    def __enter__(self) -> None:
-        self.timer = None
-        if not _announced.done:
-            _announced.done = True
-            text = "Compiling the CPU renderer (once, some seconds; numba keeps the result for later runs)."
-            self.timer = threading.Timer(ANNOUNCE_AFTER, logger.warning, (text,))
-            self.timer.daemon = True
-            self.timer.start()
-
-    def __exit__(self, *_: object) -> None:
-        if self.timer is not None:
-            self.timer.cancel()

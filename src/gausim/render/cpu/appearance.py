@@ -1,0 +1,126 @@
+"""Covariances and colours of deformed kernels as one torch operation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gausim.ops.announce import announced
+from gausim.ops.pool import shared_pool
+from gausim.render.cpu.shading import shade, shade_adjoint
+from gausim.render.cpu.simd import LANES
+
+# Cuts of one call, independent of the number of threads, so that gradients are too.
+FORWARD_TASKS = 8
+BACKWARD_TASKS = 4  # each has gradients of all units of its own
+
+
+def deformed_appearance(
+    positions: Float[Tensor, "B n 3"],
+    gradients: Float[Tensor, "B N 3 3"],
+    rotations: Float[Tensor, "B N 3 3"],
+    unit_of_kernel: Int[Tensor, " n"],
+    covars: Float[Tensor, "n 3 3"],
+    sh: Float[Tensor, "n basis 3"],
+    centers: Float[Tensor, "V 3"],
+) -> tuple[Float[Tensor, "B n 3 3"], Float[Tensor, "B V n 3"]]:
+    """Covariances G S G^T and colours max(0, 0.5 + sum_b sh_b Y_b(Q^T d)) (METHOD section 2), float32 on the CPU.
+
+    Differentiable in all but the camera centres. Works on torch.get_num_threads() threads; the result does not depend
+    on their number.
+
+    Args:
+        positions: kernel means of B states [scene units].
+        gradients: accumulated deformation gradients G of the N units.
+        rotations: their accumulated rotations Q.
+        unit_of_kernel: the unit of each kernel.
+        covars: rest covariances S [scene units^2].
+        sh: colour coefficients of degree 0..3.
+        centers: of V cameras [scene units].
+    """
+    pool = shared_pool(torch.get_num_threads())
+    with announced("the colours of deformed kernels"):
+        return _Shade.apply(positions, gradients, rotations, covars, sh, unit_of_kernel, centers, pool)
+
+
+def _lanes(rows: Tensor) -> Any:
+    """(n, ...) as (blocks, numbers per kernel, LANES), the last block padded with zeros."""
+    flat = rows.detach().reshape(rows.shape[0], -1).numpy()
+    blocks = -(-flat.shape[0] // LANES)
+    padded = np.zeros((blocks * LANES, flat.shape[1]), np.float32)
+    padded[: flat.shape[0]] = flat
+    return np.ascontiguousarray(padded.reshape(blocks, LANES, -1).transpose(0, 2, 1))
+
+
+def _rows(lanes: Any, like: Tensor) -> Tensor:
+    """The sum over states of (B, blocks, numbers, LANES), in the shape of ``like`` (n, ...)."""
+    total = lanes.sum(0).transpose(0, 2, 1)
+    return torch.from_numpy(total.reshape(-1, total.shape[2])[: like.shape[0]]).reshape(like.shape)
+
+
+def _array(tensor: Tensor) -> Any:
+    return tensor.detach().contiguous().numpy()
+
+
+def _cuts(blocks: int, tasks: int, states: int) -> list[tuple[int, int]]:
+    parts = max(1, -(-tasks // states))
+    edges = [i * blocks // parts for i in range(parts + 1)]
+    return list(zip(edges, edges[1:], strict=False))
+
+
+class _Shade(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, positions: Tensor, gradients: Tensor, rotations: Tensor, covars: Tensor, sh: Tensor, *rest: Any
+    ) -> Any:
+        unit, centers, pool = rest
+        states, count = positions.shape[:2]
+        inputs = [_array(x) for x in (positions, gradients, rotations)]
+        fixed = _array(unit), _lanes(covars), _lanes(sh), round(sh.shape[1] ** 0.5) - 1, _array(centers)
+        out_covars = np.empty((states, count, 3, 3), np.float32)
+        out_colors = np.empty((states, centers.shape[0], count, 3), np.float32)
+        cuts = _cuts(fixed[1].shape[0], FORWARD_TASKS, states)
+
+        def task(item: tuple[int, tuple[int, int]]) -> None:
+            b, part = item
+            shade(*part, *(x[b] for x in inputs), *fixed, out_covars[b], out_colors[b])
+
+        pool.run(task, [(b, part) for b in range(states) for part in cuts])
+        if any(ctx.needs_input_grad[:5]):
+            ctx.save_for_backward(positions, gradients, rotations, covars, sh)
+            ctx.inputs, ctx.fixed, ctx.pool = inputs, fixed, pool
+        return torch.from_numpy(out_covars), torch.from_numpy(out_colors)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, grad_covars: Tensor, grad_colors: Tensor) -> Any:
+        positions, gradients, _, covars, sh = ctx.saved_tensors
+        states, fixed, needed = positions.shape[0], ctx.fixed, ctx.needs_input_grad
+        given = _array(grad_covars), _array(grad_colors)
+        cuts = _cuts(fixed[1].shape[0], BACKWARD_TASKS, states)
+        moved = np.empty(positions.shape, np.float32)
+        of_units = np.zeros((2, states, len(cuts), *gradients.shape[1:]), np.float32)
+        of_rest = np.empty((states, *fixed[1].shape), np.float32) if needed[3] else None
+        of_sh = np.empty((states, *fixed[2].shape), np.float32) if needed[4] else None
+
+        def task(item: tuple[int, int]) -> None:
+            b, part = item
+            shade_adjoint(
+                *cuts[part], *(x[b] for x in ctx.inputs), *fixed, *(x[b] for x in given), moved[b],
+                *of_units[:, b, part], *(None if x is None else x[b] for x in (of_rest, of_sh)),
+            )  # fmt: skip
+
+        ctx.pool.run(task, [(b, part) for b in range(states) for part in range(len(cuts))])
+        units = of_units[:, :, 0] if len(cuts) == 1 else of_units.sum(2)
+        return (
+            torch.from_numpy(moved) if needed[0] else None,
+            torch.from_numpy(units[0]) if needed[1] else None,
+            torch.from_numpy(units[1]) if needed[2] else None,
+            None if of_rest is None else _rows(of_rest, covars),
+            None if of_sh is None else _rows(of_sh, sh),
+            None, None, None,
+        )  # fmt: skip

@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import runpy
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from gausim.benchmark.harness import Options
+from gausim.benchmark.train import peak_saved_bytes, run
+from gausim.data.curriculum import Curriculum
+from gausim.data.datamodule import ReadyDataModule
+from gausim.engine.module import GausSimModule
+from gausim.losses import Objective
+from gausim.models.elastic import ElasticTemplate
+from gausim.models.initial_state import ModalInitialStates
+from gausim.models.simulator import GausSim
+from gausim.render.cpu import CpuRenderer
+
+TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
+
+
+def test_peak_counts_what_is_held_at_one_time() -> None:
+    x = torch.rand(1000, requires_grad=True)
+
+    def together() -> None:
+        (x.exp().sum() + x.sin().exp().sum()).backward()
+
+    def in_turn() -> None:
+        for _ in range(5):
+            x.exp().sum().backward()
+
+    assert peak_saved_bytes(in_turn) == 4000  # the result of exp, once
+    assert peak_saved_bytes(together) == 3 * 4000  # x for sin, and both results of exp
+
+
+@pytest.mark.parametrize("backprop_steps", [0, 1])
+def test_rows_of_the_training_benchmark(backprop_steps: int, tmp_path: Path) -> None:
+    toy = TOY["write_toy_object"](tmp_path / "toy", frames=8)
+    data = ReadyDataModule(toy.root, curriculum=Curriculum(t_max=3), batch_size=2)
+    scenes = [item.scene() for item in data.objects]
+    template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=4)
+    model = GausSim(scenes, [24.0], radii=(0.3, 0.7), edges="rest", hidden=8, layers=1, template=template)
+    module = GausSimModule(
+        model=model, initial_states=ModalInitialStates(model, (0, 0)), scene_of_sequence=(0, 0),
+        renderer=CpuRenderer(threads=1), objective=Objective(backprop_steps=backprop_steps),
+    )  # fmt: skip
+    before = {name: value.detach().clone() for name, value in module.named_parameters()}
+    rows = run(Options(torch.device("cpu"), quick=True, rounds=1), module, data)
+    found = {(row.metric, row.reference): row.value for row in rows}
+    assert {row.case for row in rows} == {"toy: 2 sequences x 2 views x 32x32, T=3"}
+    metrics = {row.metric for row in rows}
+    assert {"throughput", "optimiser step", "speed-up", "held for the backward pass, at most", "rest"} <= metrics
+    shares = [row.value for row in rows if row.unit == "1"]
+    assert sum(shares) == pytest.approx(1.0)
+    assert found["throughput", None] == pytest.approx(6e3 / found["optimiser step", None])
+    assert all(row.value > 0 for row in rows if row.unit in ("x", "ms", "MiB") and "further" not in row.metric)
+    assert all(torch.equal(before[name], value) for name, value in module.named_parameters())
+    assert module.renderer.__class__ is CpuRenderer and module.objective.static_probability is None
