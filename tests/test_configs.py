@@ -141,7 +141,7 @@ def test_a_sweep_gives_every_seed_its_directory(tmp_path: Path, monkeypatch: pyt
     [
         ["model.simulator.layers=2,3"],
         ["loss=default,paper", "seed=3,4"],
-        ["trainer.max_minutes=1,2", "ablation=none,mass_off", "model=gausim,gausim_paper"],
+        ["trainer.max_minutes=1,2", "ablation=none,no_mass", "model=gausim,gausim_paper"],
         ["data.root=a/b,a/../b,a_b"],
         ["name=rose,tulip"],
         ["experiment=bunny,bunny_paper", "name=rose"],

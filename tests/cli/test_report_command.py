@@ -22,7 +22,7 @@ def test_the_whole_report(sweep, capsys):
     files = ["report.html", "report.md", "tables.tex", "numbers.csv"]
     assert sorted(p.name for p in (sweep / "report").iterdir()) == sorted(files)
     assert all(f"wrote {sweep / 'report' / name}" in shown.out for name in files)
-    assert "5 runs: 3 evaluated, 1 unfinished, 1 failed" in shown.out and "pictures of toy_bunny" in shown.err
+    assert "5 runs: 3 evaluated, 1 failed, 1 unfinished" in shown.out and "pictures of toy_bunny" in shown.err
     page = (sweep / "report" / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 4 and page.count("data:video/mp4;base64,") == 1
     # Made again, the report does not take itself for a run and comes out the same (but for the video's encoder).
@@ -32,7 +32,7 @@ def test_the_whole_report(sweep, capsys):
 
 
 def test_several_places_without_pictures(sweep, tmp_path, capsys):
-    folders = [str(sweep / "full"), str(sweep / "mass_off")]
+    folders = [str(sweep / "full"), str(sweep / "no_mass")]
     out = tmp_path / "elsewhere"
     assert cli.main(["report", *folders, "--out", str(out), "--title", "Mine & yours", "--no-pictures"]) == 0
     page = (out / "report.html").read_text()

@@ -113,3 +113,33 @@ def test_a_checkpoint_of_another_scene_is_refused(arguments: list[str], tmp_path
 def test_help_needs_no_hydra(capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["--help"]) == 0
     assert "usage: gausim train" in capsys.readouterr().out
+
+
+def test_a_run_may_be_evaluated_when_it_is_trained(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    import subprocess
+
+    calls: list[list[str]] = []
+    status = [1]
+
+    def run(command: list[str], *, env: dict[str, str]) -> object:
+        calls.append(command[1:])
+        assert env["OMP_NUM_THREADS"] == "1"
+        return subprocess.CompletedProcess(command, status[0])
+
+    monkeypatch.setattr(subprocess, "run", run)
+    asked = [*arguments, "trainer.max_epochs=1", "evaluate=true"]
+    with pytest.raises(RunError, match=r"trained, but its evaluation failed with exit status 1.*same command"):
+        command.main(asked)
+    made = weights(Path("outputs/toy/seed_0"))
+    status[0] = 0
+    assert command.main(asked) == 0  # the finished run is evaluated, not trained again and not refused
+    assert calls == 2 * [["-m", "gausim.cli.main", "evaluate", "outputs/toy/seed_0"]] or calls[0][-1].endswith("seed_0")
+    assert all(torch.equal(value, made[name]) for name, value in weights(Path("outputs/toy/seed_0")).items())
+    evaluated = Path("outputs/toy/seed_0/evaluation/metrics.json")
+    evaluated.parent.mkdir()
+    evaluated.write_text("{}")
+    with pytest.raises(RunError, match="finished"):
+        command.main(asked)
+    with pytest.raises(RunError, match="finished"):
+        command.main([*asked, "loss.static_weight=2"])
+    assert len(calls) == 2

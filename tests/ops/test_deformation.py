@@ -20,7 +20,7 @@ def test_mass_on_gives_determinant_one_for_large_outputs(scale: float, dtype: to
     assert (gradient - torch.eye(3, dtype=dtype)).abs().amax((-1, -2)).min() > 1e-2  # no trivial identity
 
 
-def test_mass_off_leaves_the_product_of_the_clamped_stretches() -> None:
+def test_without_mass_conservation_leaves_the_product_of_the_clamped_stretches() -> None:
     output = _outputs(4.0)
     gradient, _ = gradient_from_output(output, conserve_mass=False)
     expected = output[:, 8:].clamp(-5, 5).sum(-1)

@@ -111,8 +111,8 @@ def write_sweep(root: Path) -> Path:
     """Full method with two seeds, three ablations: one measured, one failed, one killed."""
     for seed, error in ((0, 1.0), (1, 1.2)):
         evaluate(write_run(root / "full" / f"seed_{seed}", config(seed)), make_curves(error))
-    evaluate(write_run(root / "mass_off" / "seed_0", config(conserve_mass=False)), make_curves(1.5))
+    evaluate(write_run(root / "no_mass" / "seed_0", config(conserve_mass=False)), make_curves(1.5))
     failed = write_run(root / "no_hierarchy" / "seed_0", config(predicted_levels=[0]), finished=False)
     (failed / "FAILED").write_text("Traceback\nRuntimeError: out of memory\n")
-    write_run(root / "momentum_off" / "seed_0", config(conserve_momentum=False), finished=False)
+    write_run(root / "no_momentum" / "seed_0", config(conserve_momentum=False), finished=False)
     return root

@@ -31,19 +31,19 @@ def test_every_state_of_a_run_is_told_apart(sweep):
     (sweep / ".hydra" / "config.yaml").write_text("seed: 0\n")
     assert states(sweep) == {
         "dead": "failed", "full/seed_0": "evaluated", "full/seed_1": "evaluated", "later/seed_0": "not evaluated",
-        "mass_off/seed_0": "evaluated", "momentum_off/seed_0": "unfinished", "no_hierarchy/seed_0": "failed",
+        "no_mass/seed_0": "evaluated", "no_momentum/seed_0": "unfinished", "no_hierarchy/seed_0": "failed",
     }  # fmt: skip
     details = {run.name: run.detail for run in find_runs([sweep])}
     assert details["no_hierarchy/seed_0"] == "RuntimeError: out of memory"
-    assert "epoch 3" in details["momentum_off/seed_0"] and "before training" in details["dead"]
+    assert "epoch 3" in details["no_momentum/seed_0"] and "before training" in details["dead"]
     assert "gausim evaluate" in details["later/seed_0"]
 
 
 def test_runs_are_found_once_and_the_report_is_not_searched(sweep):
     write_run(sweep / "report" / "copy", config(name="copy"))
     assert len(find_runs([sweep, sweep / "full", sweep / "full" / "seed_0"], skip=sweep / "report")) == 5
-    names = [run.name for run in find_runs([sweep / "full", sweep / "mass_off"])]
-    assert names == ["full/seed_0", "full/seed_1", "mass_off/seed_0"]
+    names = [run.name for run in find_runs([sweep / "full", sweep / "no_mass"])]
+    assert names == ["full/seed_0", "full/seed_1", "no_mass/seed_0"]
     assert [run.name for run in find_runs([sweep / "full" / "seed_1"])] == ["seed_1"]
 
 
@@ -85,6 +85,17 @@ def test_rows_are_named_after_what_was_configured(sweep):
     ]  # fmt: skip
     # The failed run has no summary: its object is known from the runs on the same data.
     assert study.objects == ("toy_bunny",) and all(g.objects == ("toy_bunny",) for g in study.groups)
+
+
+def test_variations_stand_in_the_papers_order_whatever_their_directories_are_called(tmp_path):
+    varied = {
+        "a": config(predicted_levels=[0]), "b": config(conserve_mass=False, conserve_momentum=False),
+        "c": config(conserve_momentum=False), "d": config(conserve_mass=False), "e": config(),
+    }  # fmt: skip
+    for name, settings in varied.items():
+        write_run(tmp_path / name, settings, finished=False)
+    found = [g.variation for g in make_study(find_runs([tmp_path])).groups]
+    assert found == ["full", "w/o mass", "w/o mass, w/o momentum", "w/o momentum", "w/o hierarchy"]
 
 
 def test_rows_with_one_name_are_told_apart_by_what_differs(tmp_path):
@@ -132,7 +143,7 @@ def test_why_there_is_no_number(sweep):
     assert [r.name for r in found[3].runs] == ["no_hierarchy/seed_0"]
     assert cell(groups[0], "toy_bunny", "seen", "train", "lpips").status == "no weights"
     # Of seeds that all lack the number, the worst state is shown.
-    failed = write_run(sweep / "momentum_off" / "seed_1", config(1, conserve_momentum=False), finished=False)
+    failed = write_run(sweep / "no_momentum" / "seed_1", config(1, conserve_momentum=False), finished=False)
     (failed / "FAILED").write_text("")
     (group,) = [g for g in make_study(find_runs([sweep])).groups if g.variation == "w/o momentum"]
     assert cell(group, "toy_bunny", "seen", "train", "l2").status == "failed" and len(group.runs) == 2
@@ -140,7 +151,7 @@ def test_why_there_is_no_number(sweep):
 
 
 def test_numbers_of_another_type_are_no_numbers(sweep):
-    path = sweep / "mass_off" / "seed_0" / "evaluation" / "metrics.json"
+    path = sweep / "no_mass" / "seed_0" / "evaluation" / "metrics.json"
     summary = json.loads(path.read_text())
     summary["objects"]["toy_bunny"]["rows"]["gausim"]["seen"]["train"]["l2"] = {"mean": "<b>1</b>", "std": True}
     summary["objects"]["toy_bunny"]["rows"]["gausim"]["unseen"] = 3

@@ -199,7 +199,7 @@ def test_the_page_stands_alone_and_every_number_leads_to_its_run(sweep):
         assert not link.startswith("../") or (out / link).exists(), link
     assert "11.00 ± 5.52" in page.bold and "15.00 ± 7.50" not in page.bold
     assert "c0ffeec0ffee" in page.text and "da7ada7ada7a" in page.text and "5ce7e5ce7e5c" in page.text
-    assert "conserve_mass: false" in page.text and "5 runs: 3 evaluated, 1 unfinished, 1 failed" in page.text
+    assert "conserve_mass: false" in page.text and "5 runs: 3 evaluated, 1 failed, 1 unfinished" in page.text
 
 
 EVIL = "<script>alert(1)</script>&\"'|`$x_1\\input{/etc/passwd}%"
@@ -260,7 +260,7 @@ def test_markdown_tables_have_one_cell_per_column(sweep):
 def test_csv_round_trip(sweep):
     out, _ = report(sweep)
     rows = list(csv.DictReader(io.StringIO((out / "numbers.csv").read_text())))
-    path = sweep / "mass_off" / "seed_0" / "evaluation" / "metrics.json"
+    path = sweep / "no_mass" / "seed_0" / "evaluation" / "metrics.json"
     summary = json.loads(path.read_text())["objects"]["toy_bunny"]["rows"]["gausim"]
     own = {(r["split"], r["views"], r["metric"]): r for r in rows if r["row"] == "gausim w/o mass"}
     assert len(own) == sum(len(cells) for views in summary.values() for cells in views.values()) > 20

@@ -59,6 +59,7 @@ class RootConfig:
         ablation: what the chosen ablation records about itself.
         experiment: what the chosen experiment records about itself.
         seed: of every random generator.
+        evaluate: whether the run is evaluated once it is trained (`gausim evaluate`), for reports.
         name: of the run; its directory is `${paths.output_root}/${name}/seed_${seed}`.
         task_name: what is being done, for logs and dashboards.
     """
@@ -75,6 +76,7 @@ class RootConfig:
     ablation: Any = None
     experiment: Any = None
     seed: int = 0
+    evaluate: bool = False
     name: str = MISSING
     task_name: str = "train"
 

@@ -23,8 +23,8 @@ Learns an object's dynamics from multi-view videos. Every setting is a key of co
   gausim train                                  the embedded synthetic set, the default model
   gausim train experiment=bunny seed=1          a prepared experiment
   gausim train data=object data.root=PATH       an object of your own
-  gausim train ablation=momentum_off            without the momentum loss
-  gausim train -m ablation=none,mass_off seed=0,1,2
+  gausim train ablation=no_momentum            without the momentum loss
+  gausim train -m ablation=none,no_mass seed=0,1,2 evaluate=true
   gausim train trainer.max_minutes=30 trainer.threads=2
   gausim train --cfg job                        print the whole configuration, run nothing
 
@@ -74,18 +74,52 @@ def train(cfg: DictConfig) -> float | None:
     folder = _config.run_dir()
     run = RunDirectory(folder if folder.name == f"seed_{cfg.seed}" else folder / f"seed_{cfg.seed}")
     with run.writing():
-        return _train(cfg, run)
+        if cfg.evaluate and not cfg.trainer.overwrite and run.awaits_evaluation(_plain(cfg)):
+            objective = run.last_epoch().get("excess_static")
+        else:
+            objective = _train(cfg, run)
+        if cfg.evaluate:
+            _evaluate(run)
+        return objective
+
+
+def _plain(cfg: DictConfig) -> dict[str, Any]:
+    from omegaconf import OmegaConf
+
+    return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+
+
+def _evaluate(run: RunDirectory) -> None:
+    """`gausim evaluate RUN` in a process of its own, so that its times and memory are those of a prediction alone.
+
+    Raises:
+        RunError: it failed; the trained run is unharmed.
+    """
+    import os
+    import subprocess
+
+    import torch
+    from lightning.pytorch.utilities import rank_zero_only
+
+    from gausim.core import RunError
+
+    if getattr(rank_zero_only, "rank", 0):
+        return
+    command = [sys.executable, "-m", "gausim.cli.main", "evaluate", str(run.path)]
+    status = subprocess.run(command, env={**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}).returncode
+    if status:
+        raise RunError(
+            f"{run.path}: trained, but its evaluation failed with exit status {status} (its message stands above). "
+            "Give the same command again to evaluate it, or use `gausim evaluate`."
+        )
 
 
 def _train(cfg: DictConfig, run: RunDirectory) -> float | None:
     from lightning.pytorch import seed_everything
-    from omegaconf import OmegaConf
 
     from gausim.cli._run import build
 
-    resume = run.prepare(
-        cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True)), overwrite=cfg.trainer.overwrite
-    )
+    resume = run.prepare(_plain(cfg), overwrite=cfg.trainer.overwrite)
     seed_everything(cfg.seed, workers=True, verbose=False)
     module, datamodule = build(cfg)
     trainer = make(cfg, run)
@@ -96,7 +130,8 @@ def _train(cfg: DictConfig, run: RunDirectory) -> float | None:
     # Counted by `processed`: of a run that is resumed after its last save, `current_epoch` lags behind.
     epochs = cast(Any, trainer.fit_loop.epoch_progress.current).processed
     run.finish({"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary})
-    print(f"\nrun: {run.path}\nnext: gausim evaluate {run.path}\n      gausim simulate {run.path}", flush=True)
+    following = "" if cfg.evaluate else f"gausim evaluate {run.path}\n      "
+    print(f"\nrun: {run.path}\nnext: {following}gausim simulate {run.path}", flush=True)
     return module.summary.get("excess_static")
 
 

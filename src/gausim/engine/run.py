@@ -26,6 +26,7 @@ from gausim.engine.loggers import WANDB_ID
 from gausim.engine.memory import keep_freed_memory
 
 CONFIG, FINISHED, LOCK = "config.yaml", "FINISHED", ".lock"
+EVALUATION = "evaluation/metrics.json"
 DAMAGED_CHECKPOINT = "last.damaged.ckpt"
 # What may differ when a run is resumed: where it is kept, how it is shown and what computes it, not what is learned.
 FREE_KEYS = (
@@ -33,6 +34,7 @@ FREE_KEYS = (
     "logger",
     "callbacks",
     "task_name",
+    "evaluate",
     "trainer.threads",
     "trainer.accelerator",
     "trainer.devices",
@@ -161,6 +163,28 @@ class RunDirectory:
                 "or under another name."
             )
         return None
+
+    def awaits_evaluation(self, config: Mapping[str, Any]) -> bool:
+        """Whether this very configuration is trained to its end here, and was not evaluated since."""
+        finished, measured = self.path / FINISHED, self.path / EVALUATION
+        if not self.is_finished or changed_keys(self.config(), config):
+            return False
+        return not measured.is_file() or measured.stat().st_mtime < finished.stat().st_mtime
+
+    def last_epoch(self) -> dict[str, float]:
+        """The last epoch's means of a finished run.
+
+        Raises:
+            RunError: its marker cannot be read.
+        """
+        path = self.path / FINISHED
+        try:
+            return dict(json.loads(path.read_text())["last_epoch"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise RunError(
+                f"{path}: expected facts of a finished run ({type(error).__name__}). Train anew with "
+                "trainer.overwrite=true."
+            ) from error
 
     def finish(self, facts: Mapping[str, Any]) -> None:
         """Marks the run as finished, with a few facts about it."""

@@ -21,7 +21,7 @@ CONFIG, FINISHED, FAILED, EPOCHS = "config.yaml", "FINISHED", "FAILED", "epochs.
 _TRACES = (FINISHED, FAILED, EPOCHS, "last.ckpt")
 _KEYS_OF_A_RUN = {"model", "data", "seed"}
 # Keys that do not change what is computed, or that only tell seeds apart.
-_FREE = ("paths", "logger", "callbacks", "task_name", "seed", "data.seed", "trainer")
+_FREE = ("paths", "logger", "callbacks", "task_name", "evaluate", "seed", "data.seed", "trainer")
 # A refusal instead of a hang on a file that no run writes.
 _LARGEST_CONFIG = 1 << 20
 

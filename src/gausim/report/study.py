@@ -14,6 +14,8 @@ from gausim.report.summary import MOTION_ENERGY
 
 FULL = "full"
 NOT_MEASURED = "not measured"
+# The order of rows and columns: the paper's, then what it does not have.
+_ORDER = ("jointly", "w/o mass", "w/o momentum", "w/o hierarchy")
 # At most so many differing settings are put into a row's name.
 _KEYS_IN_NAMES = 3
 # Of runs that all lack a number, the state that is shown first.
@@ -127,11 +129,17 @@ def make_study(runs: Sequence[RunRecord]) -> Study:
         for method, row in _methods(same)
     ]
     families = list(dict.fromkeys(g.family for g in groups))
-    groups.sort(key=lambda g: (families.index(g.family), g.variation != FULL))
+    groups.sort(key=lambda g: (families.index(g.family), _place(g.variation)))
     # Dictionaries keep the order and drop what comes twice.
     known = dict.fromkeys(o for g in groups for run in g.evaluated for o in (run.summary or {})["objects"])
     every = known | dict.fromkeys(o for g in groups for o in g.objects)
     return Study(tuple(runs), tuple(groups), tuple(every), tuple(_notes(groups)))
+
+
+def _place(variation: str) -> list[int]:
+    """What a variation is sorted by: nothing varied first, then the paper's order, then the order of the runs."""
+    parts = variation.split(" (")[0].split(", ") if variation != FULL else []
+    return [_ORDER.index(part) if part in _ORDER else len(_ORDER) for part in parts]
 
 
 def _methods(same: Sequence[RunRecord]) -> list[tuple[str | None, str]]:
