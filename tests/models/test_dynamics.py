@@ -104,7 +104,7 @@ def test_numbers_that_are_not_finite_stop_the_rollout_and_name_the_frame(
         ({"predicted_levels": ()}, "coarse to fine"),
         ({"predicted_levels": (3, 1)}, "names level 3, but model.radii has 2 levels"),
         ({"graph_radii": (0.5,)}, "1 values for 2 predicted levels"),
-        ({"edges": "both"}, "'both'; expected one of rest, union, intersection"),
+        ({"edges": "both"}, "'both'; expected one of rest, current, union, intersection"),
         ({"angle": "degrees"}, "'degrees'; expected one of cos_sin, inner"),
         ({"clustering": "kmeans"}, "'kmeans'; expected one of ball,.* complete_linkage"),
     ],

@@ -20,7 +20,7 @@ def _moved(scene, model, make_state, join_states, amount: float = 0.1):
     return batch, join_states(states)
 
 
-@pytest.mark.parametrize("rule", ["rest", "union", "intersection"])
+@pytest.mark.parametrize("rule", ["rest", "current", "union", "intersection"])
 def test_rules_are_set_operations_within_members(make_scene, make_model, make_state, join_states, rule) -> None:
     scene = make_scene(90)
     model = make_model(scene, graph_radii=(0.8, 0.25))
@@ -34,14 +34,14 @@ def test_rules_are_set_operations_within_members(make_scene, make_model, make_st
         rest |= _pairs(still)
         current |= _pairs(radius_edges(positions[span], radii[1], 6) + span.start)
     assert rest - current and current - rest and rest & current
-    expected = {"rest": rest, "union": rest | current, "intersection": rest & current}[rule]
+    expected = {"rest": rest, "current": current, "union": rest | current, "intersection": rest & current}[rule]
     found = EdgeSet(rule).of(level, positions)
     assert _pairs(found) == expected and found.shape[1] == len(expected)
     order = found[1] * level.count + found[0]
     assert bool((order.diff() > 0).all())
 
 
-@pytest.mark.parametrize("rule", ["union", "intersection"])
+@pytest.mark.parametrize("rule", ["current", "union", "intersection"])
 def test_fixed_edges_are_the_same_edges_and_dummies_behind_them(
     make_scene, make_model, make_state, join_states, rule
 ) -> None:
@@ -88,7 +88,7 @@ def test_dummy_edges_change_nothing_for_real_units(make_scene, make_model, make_
 
 
 def test_options_out_of_range_are_refused() -> None:
-    with pytest.raises(ConfigError, match="edges is 'nearest'; expected one of rest, union, intersection"):
+    with pytest.raises(ConfigError, match="edges is 'nearest'; expected one of rest, current, union, intersection"):
         EdgeSet("nearest")
     with pytest.raises(ConfigError, match="edge_bucket is -1; expected 0"):
         EdgeSet("rest", -1)

@@ -10,8 +10,8 @@ def _feed(model, *, top: float, below: float) -> None:
     """Random gradients of these sizes instead of the network's; pinned units keep the identity."""
     generator = torch.Generator().manual_seed(0)
 
-    def predict(level, unit, above, target, *, top_size=top, below_size=below, top):
-        size = top_size if top else below_size
+    def predict(level, unit, above, target, *, position):
+        size = below if position else top
         noise = torch.randn(level.count, 3, 3, generator=generator, dtype=torch.float64)
         value = torch.eye(3) + size * noise * ~level.pinned[:, None, None]
         return value, value

@@ -201,8 +201,8 @@ class GausSimModule(LightningModule):
         )
 
     def _descend(self, losses: Tensor, momentum: Tensor, steps: int, tally: Tally, *, measure: bool) -> None:
-        """Backward of one stretch; the mean over steps and sequences, whatever the stretch's length."""
-        per = 1.0 / (steps * losses.shape[1])
+        """Backward of one stretch; the mean over sequences, whatever the stretch's length."""
+        per = self.objective.step_weight(steps) / losses.shape[1]
         images_term = self.objective.image_weight * per * losses.sum()
         momentum_term = self.objective.momentum_weight * per * momentum.sum()
         weighted = momentum_term.requires_grad and self.objective.momentum_weight > 0

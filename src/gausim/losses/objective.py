@@ -14,10 +14,11 @@ class Objective:
 
     Attributes:
         image: loss between a predicted and a true image.
-        image_weight: of the image loss (mean over views and steps).
+        image_weight: of the image loss (mean over views).
         static_weight: of the static loss.
         static_probability: how often a batch carries it; None is 1 / T.
-        momentum_weight: of the momentum loss (mean over steps).
+        momentum_weight: of the momentum loss.
+        over_steps: ``mean`` or ``sum`` of image and momentum losses over the steps of a rollout.
         backprop_steps: gradients stop every so many steps; 0 lets them through the whole rollout.
         checkpoint_steps: keep of each step of a rollout its input only and compute it once more in the backward pass;
             same gradients in less memory, for about a third more time of the dynamics.
@@ -32,6 +33,7 @@ class Objective:
     static_weight: float = 1.0
     static_probability: float | None = None
     momentum_weight: float = 1.0
+    over_steps: str = "mean"
     backprop_steps: int = 1
     checkpoint_steps: bool = False
     input_noise: float = 0.0
@@ -46,8 +48,14 @@ class Objective:
         ]
         if negative or self.explosion <= 0:
             raise ConfigError(f"loss: expected {', '.join(negative) or 'explosion'} not to be negative, got {self}.")
+        if self.over_steps not in ("mean", "sum"):
+            raise ConfigError(f"loss.over_steps: expected mean or sum, got '{self.over_steps}'.")
         if self.static_probability is not None and not 0 <= self.static_probability <= 1:
             raise ConfigError(f"loss.static_probability: expected null or 0..1, got {self.static_probability}.")
+
+    def step_weight(self, steps: int) -> float:
+        """What the losses of one of ``steps`` predicted steps count."""
+        return 1.0 / steps if self.over_steps == "mean" else 1.0
 
     def static_chance(self, steps: int) -> float:
         """Probability that a batch of ``steps`` predicted steps also carries the static loss."""

@@ -11,7 +11,7 @@ from gausim.core import ConfigError
 from gausim.models.batch import LevelBatch
 from gausim.ops.neighbours import combine_edges, combine_tables, neighbour_table
 
-EDGE_RULES = ("rest", "union", "intersection")
+EDGE_RULES = ("rest", "current", "union", "intersection")
 
 
 class EdgeSet:
@@ -25,7 +25,7 @@ class EdgeSet:
         """Sets the options.
 
         Args:
-            rule: neighbours at ``rest``, or their ``union`` or ``intersection`` with those of the current state.
+            rule: neighbours at ``rest``, those of the ``current`` state, or the ``union`` or ``intersection`` of both.
             bucket: the number of edges of a level is filled up to a multiple of this; 0 leaves it as it is.
 
         Raises:
@@ -41,15 +41,19 @@ class EdgeSet:
         """Edges of a level whose units are at ``positions`` [scene units], without those of the dummy node."""
         if self.rule == "rest":
             return level.rest_edges
-        return combine_edges(level.rest_edges, level.current_edges(positions), level.count, rule=self.rule)
+        current = level.current_edges(positions)
+        if self.rule == "current":
+            return current
+        return combine_edges(level.rest_edges, current, level.count, rule=self.rule)
 
     def fixed(self, level: LevelBatch, positions: Float[Tensor, "N 3"]) -> Int[Tensor, "2 E"]:
         """The same edges, and as many of the dummy node as there might be more; not for the rule ``rest``.
 
         E is the same for all positions, and nothing is read back to the host.
         """
-        current = neighbour_table(positions, level.member, level.device_radii, level.max_neighbours)
-        source, valid = combine_tables(level.rest_table, current, rule=self.rule)
+        source, valid = neighbour_table(positions, level.member, level.device_radii, level.max_neighbours)
+        if self.rule != "current":
+            source, valid = combine_tables(level.rest_table, (source, valid), rule=self.rule)
         count = level.count
         destination = torch.arange(count, device=source.device)[:, None].expand_as(source)
         code = torch.where(valid, destination * (count + 1) + source, count * (count + 2)).flatten().sort().values

@@ -70,6 +70,9 @@ class GausSim(nn.Module):
         attributes: int = 4,
         hidden: int = 128,
         layers: int = 16,
+        norm: str = "pre",
+        activation: str = "silu",
+        share_levels: bool = True,
         precision: str = "fp32",
         checkpoint: bool = False,
         compile: bool = False,
@@ -93,13 +96,16 @@ class GausSim(nn.Module):
             clustering: ``ball`` or ``complete_linkage``.
             graph_radii: edge lengths per predicted level, same order [fractions of the diagonal].
             max_neighbours: edges per unit.
-            edges: ``rest`` space only, or its ``union`` / ``intersection`` with the current state's neighbours.
+            edges: neighbours in ``rest`` space, in the ``current`` state, or the ``union`` / ``intersection`` of both.
             angle: ``cos_sin`` or ``inner`` (relative angle of an edge).
             rest_inputs: also give displacements and rest-space edge vectors to the network.
             coarse_inputs: read positions below the top level from the coarse prediction.
             attributes: material attributes per kernel.
             hidden: width of the network.
             layers: message-passing layers.
+            norm: LayerNorm ``pre`` or ``post`` in them.
+            activation: ``silu`` or ``relu``.
+            share_levels: one network serves every predicted level; else each has its own (normalisers are shared).
             precision: ``fp32`` or ``bf16`` products in the network's layers.
             checkpoint: the network keeps little for the backward pass and computes the rest once more.
             compile: compile the network's layers at the first step.
@@ -133,18 +139,24 @@ class GausSim(nn.Module):
         self.attributes = nn.ParameterList(torch.zeros(n, attributes) for n in counts)
         self.node_normaliser = RunningNormaliser(self.options.node_normalised, floor=normaliser_floor)
         self.edge_normaliser = RunningNormaliser(self.options.edge_normalised, floor=normaliser_floor)
-        self.network = MeshGraphNet(
-            node_features=self.options.node_normalised + 1 + attributes,
-            edge_features=self.options.edge_size,
-            outputs=11,
-            hidden=hidden,
-            layers=layers,
-            precision=precision,
-            checkpoint=checkpoint,
-            compile=compile,
-        )
-        if zero_output:
-            initialise_zero(self.network.decoder)
+        networks = [
+            MeshGraphNet(
+                node_features=self.options.node_normalised + 1 + attributes,
+                edge_features=self.options.edge_size,
+                outputs=11,
+                hidden=hidden,
+                layers=layers,
+                norm=norm,
+                activation=activation,
+                precision=precision,
+                checkpoint=checkpoint,
+                compile=compile,
+            )
+            for _ in (self.predicted_levels[:1] if share_levels else self.predicted_levels)
+        ]
+        for network in networks if zero_output else ():
+            initialise_zero(network.decoder)
+        self.network: nn.Module = networks[0] if share_levels else nn.ModuleList(networks)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by role: networks, per-scene densities and attributes, and the rest of the template."""
@@ -226,7 +238,7 @@ class GausSim(nn.Module):
         for position, (level, unit, target) in enumerate(zip(batch.levels, units, targets, strict=True)):
             if position:
                 above = replace(above, index=level.parent)
-            gradient, rotation = self._predict(level, unit, above, target, top=position == 0)
+            gradient, rotation = self._predict(level, unit, above, target, position=position)
             predicted.append(gradient)
             accumulated, turned, after = advance(gradient, rotation, target, above)
             if position and self.conserve_momentum:
@@ -246,10 +258,11 @@ class GausSim(nn.Module):
         return self.edges.rule != "rest" and positions.device.type == "cuda" and not self.training
 
     def _predict(
-        self, level: LevelBatch, unit: Units, above: Solved, target: Tensor, *, top: bool
+        self, level: LevelBatch, unit: Units, above: Solved, target: Tensor, *, position: int
     ) -> tuple[Tensor, Tensor]:
         """The network's gradient and rotation of each unit of a level; the identity for pinned units."""
-        coarse = self.options.coarse_inputs and not top
+        network = self.network[position] if isinstance(self.network, nn.ModuleList) else self.network
+        coarse = self.options.coarse_inputs and position > 0
         fixed = self._fixes_shapes(unit.now)
         edge_index = (self.edges.fixed if fixed else self.edges.of)(level, unit.now)
         # Edges of the dummy node stand behind all others; their features are never seen, those of any node will do.
@@ -262,7 +275,7 @@ class GausSim(nn.Module):
         if fixed or self.edges.bucket:
             nodes, edges = fill(nodes, 1), fill(edges, extra)
             edge_index = fill_edges(edge_index, level.count, extra)
-        output = self.network(nodes, edges, edge_index)[: level.count]
+        output = network(nodes, edges, edge_index)[: level.count]
         return gradient_from_output(output * (self.output_scale * level.free), conserve_mass=self.conserve_mass)
 
     def dynamics(self, scene_id: int = 0) -> SceneDynamics:

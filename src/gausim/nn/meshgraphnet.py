@@ -16,9 +16,10 @@ from torch.utils.checkpoint import checkpoint as recomputed
 from gausim.core import ConfigError
 from gausim.nn.edge_update import EdgeWeights, edge_update
 from gausim.nn.linear import Linear
-from gausim.nn.mlp import mlp
+from gausim.nn.mlp import ACTIVATIONS, mlp
 
 PRECISIONS = ("fp32", "bf16")
+NORMS = ("pre", "post")
 
 
 class _Message(nn.Module):
@@ -45,11 +46,35 @@ class _Message(nn.Module):
         return nodes + self.node(torch.cat((normed, received), -1)), edges
 
 
+class _PlainMessage(nn.Module):
+    """The layer of other choices than pre-norm and SiLU, in plain operations of torch.
+
+    With norm "post" the updates are normalised instead of what they are computed from (Pfaff et al. 2021).
+    """
+
+    def __init__(self, hidden: int, *, norm: str, activation: str) -> None:
+        super().__init__()
+        self.post = norm == "post"
+        self.edge_norm, self.node_norm = nn.LayerNorm(hidden), nn.LayerNorm(hidden)
+        self.edge = mlp((3 * hidden, hidden, hidden), activation)
+        self.node = mlp((2 * hidden, hidden, hidden), activation)
+
+    def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor, bf16: bool) -> tuple[Tensor, Tensor]:
+        source, destination = edge_index
+        seen = nodes if self.post else self.node_norm(nodes)
+        own = edges if self.post else self.edge_norm(edges)
+        joined = torch.cat((own, seen.index_select(0, source), seen.index_select(0, destination)), -1)
+        update = self.edge(joined)
+        edges = edges + (self.edge_norm(update) if self.post else update)
+        received = torch.zeros_like(nodes).index_add(0, destination, edges)
+        update = self.node(torch.cat((seen, received), -1))
+        return nodes + (self.node_norm(update) if self.post else update), edges
+
+
 class MeshGraphNet(nn.Module):
     """Encoder, ``layers`` message-passing layers, decoder hidden -> hidden/2 -> hidden/4 -> outputs.
 
-    One set of weights serves every level of the hierarchy (METHOD section 3). How it computes (``precision``,
-    ``checkpoint``, ``compile``) changes no parameter: checkpoints fit every choice.
+    How it computes (``precision``, ``checkpoint``, ``compile``) changes no parameter: checkpoints fit every choice.
 
     Fixed shapes: a caller that pads its graph appends one dummy node, of zero features, behind the N real ones, and
     edges N -> N of zero features. Messages travel along edges only, so the first N rows of the output, and all
@@ -64,6 +89,8 @@ class MeshGraphNet(nn.Module):
         outputs: int,
         hidden: int = 128,
         layers: int = 16,
+        norm: str = "pre",
+        activation: str = "silu",
         precision: str = "fp32",
         checkpoint: bool = False,
         compile: bool = False,
@@ -76,6 +103,8 @@ class MeshGraphNet(nn.Module):
             outputs: number of outputs per node.
             hidden: width of all hidden layers.
             layers: message-passing layers.
+            norm: LayerNorm ``pre`` (of what a residual update reads) or ``post`` (of the update).
+            activation: ``silu`` or ``relu``; anything but pre-norm and SiLU runs without the blocked kernels.
             precision: ``fp32``, or ``bf16``: the products of the message-passing layers in bfloat16, all streams, sums,
                 encoders and the decoder in float32. An autocast around the network means ``bf16`` too.
             checkpoint: keep only the streams before every few layers (2 of 16) and recompute the rest in the backward
@@ -85,17 +114,22 @@ class MeshGraphNet(nn.Module):
                 only the nodes are compiled.
 
         Raises:
-            ConfigError: unknown precision.
+            ConfigError: unknown precision, norm or activation.
         """
         super().__init__()
-        if precision not in PRECISIONS:
-            raise ConfigError(f"model.simulator.precision is '{precision}'; expected one of {', '.join(PRECISIONS)}.")
+        for name, given, known in (
+            ("precision", precision, PRECISIONS),
+            ("norm", norm, NORMS),
+            ("activation", activation, tuple(ACTIVATIONS)),
+        ):
+            if given not in known:
+                raise ConfigError(f"model.simulator.{name} is '{given}'; expected one of {', '.join(known)}.")
         self.precision, self.checkpointed, self.compiled = precision, checkpoint, compile
-        self.node_encoder = mlp((node_features, hidden, hidden))
-        self.edge_encoder = mlp((edge_features, hidden, hidden))
-        self.processor = nn.ModuleList(_Message(hidden) for _ in range(layers))
-        self.norm = nn.LayerNorm(hidden)
-        self.decoder = mlp((hidden, hidden // 2, hidden // 4, outputs))
+        self.node_encoder = mlp((node_features, hidden, hidden), activation)
+        self.edge_encoder = mlp((edge_features, hidden, hidden), activation)
+        self.processor = nn.ModuleList(_layer(hidden, norm, activation) for _ in range(layers))
+        self.norm = nn.LayerNorm(hidden) if norm == "pre" else nn.Identity()
+        self.decoder = mlp((hidden, hidden // 2, hidden // 4, outputs), activation)
 
     def forward(
         self, node_features: Float[Tensor, "N Cn"], edge_features: Float[Tensor, "E Ce"], edge_index: Int[Tensor, "2 E"]
@@ -133,6 +167,12 @@ class MeshGraphNet(nn.Module):
                 _run, segment, nodes, edges, edge_index, bf16, use_reentrant=False, preserve_rng_state=False
             )
         return nodes
+
+
+def _layer(hidden: int, norm: str, activation: str) -> nn.Module:
+    if (norm, activation) == ("pre", "silu"):
+        return _Message(hidden)
+    return _PlainMessage(hidden, norm=norm, activation=activation)
 
 
 def _run(

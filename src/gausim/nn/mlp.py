@@ -8,12 +8,14 @@ from torch import nn
 
 from gausim.nn.linear import Linear
 
+ACTIVATIONS: dict[str, type[nn.Module]] = {"silu": nn.SiLU, "relu": nn.ReLU}
 
-def mlp(sizes: Sequence[int]) -> nn.Sequential:
-    """Linear layers of the given sizes with SiLU between them (none after the last)."""
+
+def mlp(sizes: Sequence[int], activation: str = "silu") -> nn.Sequential:
+    """Linear layers of the given sizes with an activation (of ``ACTIVATIONS``) between them, none after the last."""
     layers: list[nn.Module] = []
     for i, (a, b) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
-        layers += ([nn.SiLU()] if i else []) + [Linear(a, b)]
+        layers += ([ACTIVATIONS[activation]()] if i else []) + [Linear(a, b)]
     return nn.Sequential(*layers)
 
 

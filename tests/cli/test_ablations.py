@@ -1,0 +1,153 @@
+"""Every file of conf/ablation switches off what it says, in both models, and what is left can be trained."""
+
+from __future__ import annotations
+
+import math
+import runpy
+from pathlib import Path
+
+import pytest
+import torch
+
+from gausim.cli._config import compose, conf_dir
+from gausim.cli._run import build
+from gausim.core import SimState
+from gausim.data.dataset import SampleKey, SequenceSample, TrainingDataset
+from gausim.engine.module import GausSimModule
+
+write_toy_object = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["write_toy_object"]
+ABLATIONS = sorted(path.stem for path in (conf_dir() / "ablation").glob("*.yaml"))
+MODELS = ["gausim", "gausim_paper"]
+TINY = (
+    "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]", "render=reference",
+    "data.curriculum.t_max=3", "data.batch_size=2", "seed=1",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_toy_object(tmp_path_factory.mktemp("data") / "toy").root
+
+
+def fresh(toy: Path, ablation: str, model: str) -> tuple[GausSimModule, list[SequenceSample]]:
+    """An untrained module and a batch for it."""
+    torch.manual_seed(0)
+    module, datamodule = build(compose("train", [f"data.root={toy}", *TINY, f"model={model}", f"ablation={ablation}"]))
+    dataset = TrainingDataset(datamodule.index)
+    return module, [dataset[SampleKey(i, 3)] for i in range(2)]
+
+
+def train(module: GausSimModule, samples: list[SequenceSample], steps: int) -> list[dict[str, float]]:
+    """Makes a few steps of the optimiser; returns what they logged."""
+    optimizer, draws = module.configure_optimizers(), torch.Generator().manual_seed(0)
+    return [module.optimise(samples, optimizer, draws) for _ in range(steps)]
+
+
+def random_step(module: GausSimModule):
+    """One step from a random state with weights far from their start."""
+    simulator = module.model
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for p in simulator.parameter_groups()["network"]:
+            p.add_(0.5 * torch.randn(p.shape, generator=generator))
+    simulator.output_scale = 1.0
+    batch = simulator.batch([0])
+    shift = 0.05 * torch.randn(2, *batch.rest.shape, generator=generator)
+    return simulator.step(batch, SimState(batch.rest + shift[0], batch.rest + shift[1]))
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("ablation", ABLATIONS)
+def test_every_ablation_can_be_trained_in_both_models(toy: Path, ablation: str, model: str) -> None:
+    module, samples = fresh(toy, ablation, model)
+    start = {n: p.detach().clone() for n, p in module.named_parameters()}
+    (stats,) = train(module, samples, 1)
+    assert all(math.isfinite(value) for value in stats.values())
+    assert compose("train", [f"ablation={ablation}"]).ablation.name == ablation
+    moved = {n for n, p in module.named_parameters() if not torch.equal(p, start[n])}
+    assert any(n.startswith("initial_states.") for n in moved) or (ablation, model) == ("no_network", "gausim_paper")
+    assert any(n.startswith("model.network.") for n in moved) == (ablation != "no_network")
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_no_mass_leaves_det_F_free_in_the_head_and_in_the_template(toy: Path, model: str) -> None:
+    errors = {}
+    for ablation in ("none", "no_mass", "no_mass_no_momentum", "no_hierarchy", "no_mass_no_hierarchy"):
+        module, _ = fresh(toy, ablation, model)
+        step = random_step(module)
+        own = max(float((torch.linalg.det(f.detach()) - 1).abs().max()) for f in step.predicted)
+        errors[ablation] = own, float((torch.linalg.det(step.gradients.detach()) - 1).abs().max())
+        module.model.output_scale = 0.0  # what is left is the template's
+        errors[ablation] += (float((torch.linalg.det(random_rest(module)) - 1).abs().max()),)
+    for ablation in ("none", "no_hierarchy"):
+        assert max(errors[ablation]) < 1e-4, errors
+    for ablation in ("no_mass", "no_mass_no_momentum", "no_mass_no_hierarchy"):
+        own, whole, template = errors[ablation]
+        assert min(own, whole) > 0.05, errors
+        assert (template > 1e-3) == (model == "gausim"), errors
+
+
+def random_rest(module: GausSimModule) -> torch.Tensor:
+    """Gradients of a step of a network that predicts nothing."""
+    batch = module.model.batch([0])
+    generator = torch.Generator().manual_seed(0)
+    shift = 0.05 * torch.randn(2, *batch.rest.shape, generator=generator)
+    return module.model.step(batch, SimState(batch.rest + shift[0], batch.rest + shift[1])).gradients.detach()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_no_momentum_computes_no_such_loss(toy: Path, model: str) -> None:
+    for ablation, present in (("none", True), ("no_mass", True), ("no_momentum", False), ("no_hierarchy", False)):
+        module, samples = fresh(toy, ablation, model)
+        stats = train(module, samples, 2)
+        step = random_step(module)
+        assert step.momentum.requires_grad == present and (float(step.momentum.detach()) > 1e-6) == present
+        assert all(("momentum_share" in entry) == present for entry in stats[:1])
+        assert (stats[-1]["loss_momentum"] > 0) == present
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_no_hierarchy_predicts_every_kernel_from_its_root(toy: Path, model: str) -> None:
+    module, _ = fresh(toy, "no_hierarchy", model)
+    simulator = module.model
+    batch, hierarchy = simulator.batch([0]), simulator.hierarchies[0]
+    (level,) = batch.levels
+    assert level.count == hierarchy.levels[0].count == 36
+    assert torch.equal(level.parent, hierarchy.levels[0].root) and bool(hierarchy.levels[0].pinned[level.parent].all())
+    assert hierarchy.predictions(simulator.predicted_levels) == 36 - int(batch.pinned.sum())
+    assert [g.shape for g in random_step(module).predicted] == [(36, 3, 3)]
+
+
+def test_joint_keeps_the_objects_that_an_experiment_leaves_out() -> None:
+    config = compose("train", ["experiment=demo_tiny"])
+    assert list(config.data.names) and config.ablation.name == "none"
+    for name in (name for name in ABLATIONS if name.startswith("joint")):
+        joint = compose("train", ["experiment=demo_tiny", f"ablation={name}"])
+        assert joint.data.names is None and joint.ablation.name == name
+
+
+def test_combinations_set_what_their_parts_set() -> None:
+    for name in (n for n in ABLATIONS if "_no_" in n):
+        parts = name.replace("joint_", "joint ").replace("_no_", " no_").split()
+        merged = compose("train", [f"ablation={name}"])
+        for part in parts:
+            alone, plain = compose("train", [f"ablation={part}"]), compose("train", [])
+            changed = {k for k in alone.model.simulator if alone.model.simulator[k] != plain.model.simulator[k]}
+            assert changed or part == "joint"
+            assert all(merged.model.simulator[k] == alone.model.simulator[k] for k in changed)
+
+
+def test_the_sum_over_steps_is_T_times_the_mean(toy: Path) -> None:
+    gradients = {}
+    for ablation in ("none", "sum_over_steps"):
+        config = ["loss.static_weight=0", "optimizer.clip_norm=0", "model=gausim_paper", f"ablation={ablation}"]
+        torch.manual_seed(0)
+        module, datamodule = build(compose("train", [f"data.root={toy}", *TINY, *config]))
+        samples = [TrainingDataset(datamodule.index)[SampleKey(i, 3)] for i in range(2)]
+        module.optimise(samples, module.configure_optimizers(), torch.Generator().manual_seed(0))
+        gradients[ablation] = {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}
+    assert gradients["none"].keys() == gradients["sum_over_steps"].keys()
+    for name, value in gradients["none"].items():
+        size = float(value.abs().max())
+        torch.testing.assert_close(gradients["sum_over_steps"][name], 3 * value, rtol=1e-4, atol=1e-4 * size)
+    assert any(bool(value.any()) for value in gradients["none"].values())
