@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -47,7 +48,8 @@ def test_a_finished_run_is_refused_and_overwriting_keeps_foreign_files(tmp_path:
     with pytest.raises(RunError, match="this run is finished"):
         run.prepare(CONFIG)
     assert run.prepare(CONFIG, overwrite=True) is None
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["config.yaml", "notes.txt"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["config.yaml", "events.jsonl", "notes.txt"]
+    assert "finished" not in (tmp_path / "events.jsonl").read_text()
 
 
 def test_no_run_here_is_told(tmp_path: Path) -> None:
@@ -66,3 +68,33 @@ def test_settings_out_of_range_are_refused() -> None:
             RunCheckpoint(**wrong)
     with pytest.raises(ConfigError, match=r"trainer\.devices"):
         make_trainer(max_epochs=1, devices=2)
+
+
+def test_an_error_leaves_its_last_line_and_is_gone_when_tried_again(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    run.prepare(CONFIG)
+    with pytest.raises(ZeroDivisionError), run.noting_failure():
+        1 / 0  # noqa: B018
+    assert run.has_failed and run.failure() == "ZeroDivisionError: division by zero"
+    assert "Traceback" in (tmp_path / "FAILED").read_text()
+    with pytest.raises(RunError), run.noting_failure():
+        raise RunError("two\nlines")
+    assert run.failure() == "RunError: two lines" and "Traceback" not in (tmp_path / "FAILED").read_text()
+    with pytest.raises(KeyboardInterrupt), run.noting_failure():
+        run.prepare(CONFIG)
+        raise KeyboardInterrupt
+    assert not run.has_failed
+    events = [json.loads(line)["event"] for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    assert events == ["started", "failed", "failed", "started"]
+
+
+def test_what_a_finished_run_says_is_checked(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    with pytest.raises(RunError, match="FINISHED"):
+        run.facts()
+    run.finish({"epochs": 3, "last_epoch": {"steps": 2.0}})
+    assert run.facts() == {"epochs": 3, "last_epoch": {"steps": 2.0}}
+    for wrong in ("[]", '{"epochs": 3}', "{"):
+        (tmp_path / "FINISHED").write_text(wrong)
+        with pytest.raises(RunError, match="FINISHED: expected facts of a finished run"):
+            run.facts()

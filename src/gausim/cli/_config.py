@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ import hydra
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException
+from hydra.types import RunMode
 from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -43,6 +44,17 @@ REFUSED_MODULES = (
 
 
 @dataclass
+class SweepConfig:
+    """What the jobs of a sweep do about runs that are there already.
+
+    Attributes:
+        retry_failed: train those again that an error ended; otherwise they are left out.
+    """
+
+    retry_failed: bool = False
+
+
+@dataclass
 class RootConfig:
     """Schema of the root keys of a training configuration: a misspelt root key fails instead of being ignored.
 
@@ -58,6 +70,7 @@ class RootConfig:
         paths: where data is read and runs are written.
         ablation: what the chosen ablation records about itself.
         experiment: what the chosen experiment records about itself.
+        sweep: what the jobs of a sweep do about runs that are there already.
         seed: of every random generator.
         evaluate: whether the run is evaluated once it is trained (`gausim evaluate`), for reports.
         name: of the run; its directory is `${paths.output_root}/${name}/seed_${seed}`.
@@ -75,6 +88,7 @@ class RootConfig:
     paths: Any = MISSING
     ablation: Any = None
     experiment: Any = None
+    sweep: SweepConfig = field(default_factory=SweepConfig)
     seed: int = 0
     evaluate: bool = False
     name: str = MISSING
@@ -89,8 +103,21 @@ def folder_name(text: str) -> str:
     return f"{plain[: LONGEST_FOLDER_NAME - 9]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
+def job_threads(most: int) -> int:
+    """Returns the threads of one job: `most`, or its share of the cores where a sweep runs several at a time."""
+    if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
+        return most
+    launcher = HydraConfig.get().launcher
+    if "cpus_per_task" in launcher:  # submitit: what the scheduler grants
+        return min(most, int(launcher.cpus_per_task or 1))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    jobs = int(launcher.get("n_jobs") or 1)  # joblib; negative: all cores but so many
+    return min(most, max(1, cores // (jobs if jobs > 0 else max(1, cores + 1 + jobs))))
+
+
 ConfigStore.instance().store(name="base_schema", node=RootConfig, provider="gausim")
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+OmegaConf.register_new_resolver("job_threads", job_threads, replace=True)
 
 
 def conf_dir() -> Path:
@@ -132,6 +159,18 @@ def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
         return hydra.compose(config_name, overrides=list(overrides))
 
 
+class Job:
+    """What Hydra calls for every job. Of this module, so that a process that is sent one has our resolvers too."""
+
+    def __init__(self, task: Callable[[DictConfig], float | None]) -> None:
+        """Keeps the function that does the work."""
+        self._task = task
+
+    def __call__(self, config: DictConfig) -> float | None:
+        """Does it."""
+        return self._task(config)
+
+
 def run_hydra(config_name: str, task: Callable[[DictConfig], float | None], argv: Sequence[str]) -> int:
     """Runs a task under Hydra: overrides, `-m`, `--cfg job`, `--help` and the rest of Hydra's own options.
 
@@ -147,7 +186,9 @@ def run_hydra(config_name: str, task: Callable[[DictConfig], float | None], argv
         ConfigError: an unknown key, group or option, or a value missing.
         GausSimError: whatever the task raises on purpose.
     """
-    runner = hydra.main(version_base=HYDRA_VERSION_BASE, config_path=str(conf_dir()), config_name=config_name)(task)
+    runner = hydra.main(version_base=HYDRA_VERSION_BASE, config_path=str(conf_dir()), config_name=config_name)(
+        Job(task)
+    )
     saved_argv, saved_flag = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     # Hydra reads sys.argv; with its full errors on it raises them, which are then told in our way, instead of exiting.
     sys.argv = [saved_argv[0], *argv]
@@ -169,6 +210,11 @@ def run_dir() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
+def in_sweep() -> bool:
+    """Returns whether the running job is one of a sweep (`-m`)."""
+    return HydraConfig.get().mode == RunMode.MULTIRUN
+
+
 @contextmanager
 def _readable_errors(config_name: str) -> Iterator[None]:
     """Turns Hydra's and OmegaConf's complaints into ConfigError, with the keys that were perhaps meant."""
@@ -181,6 +227,8 @@ def _readable_errors(config_name: str) -> Iterator[None]:
         cause = str(error.__cause__).strip() if error.__cause__ else ""
         if cause and cause not in message:
             message = f"{message}\n{cause}"
+        if "hydra/launcher/" in message:
+            message += "\njoblib, submitit_local and submitit_slurm come with `pip install 'gausim[sweep]'`."
         raise ConfigError(f"{config_name}.yaml: {message}{_close_keys(config_name, message)}") from error
 
 

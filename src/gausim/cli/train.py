@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from lightning.pytorch import Trainer
     from omegaconf import DictConfig
 
@@ -23,13 +25,16 @@ Learns an object's dynamics from multi-view videos. Every setting is a key of co
   gausim train                                  the embedded synthetic set, the default model
   gausim train experiment=bunny seed=1          a prepared experiment
   gausim train data=object data.root=PATH       an object of your own
-  gausim train ablation=no_momentum            without the momentum loss
-  gausim train -m ablation=none,no_mass seed=0,1,2 evaluate=true
+  gausim train ablation=no_momentum             without the momentum loss
+  gausim train -m ablation=none,no_mass seed=0,1,2 evaluate=true     a sweep: all combinations
+  gausim train -m seed=0,1,2,3 hydra/launcher=joblib                 several jobs at a time (also submitit_slurm)
+  gausim train -m hydra/sweeper=optuna 'optimizer.network_lr=tag(log,interval(1e-4,1e-2))'      a search
   gausim train trainer.max_minutes=30 trainer.threads=2
   gausim train --cfg job                        print the whole configuration, run nothing
 
 A run goes to OUTPUT_ROOT/NAME/seed_SEED (paths.output_root, name, seed). Started again, it resumes from its last
-checkpoint; once finished it is refused, unless trainer.overwrite=true."""
+checkpoint; once finished it is refused, unless trainer.overwrite=true. A sweep (-m) that is started again leaves out
+what is finished, resumes what is not, and tries again what failed if sweep.retry_failed=true."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -62,25 +67,32 @@ def main(argv: Sequence[str]) -> int:
 def train(cfg: DictConfig) -> float | None:
     """Trains one run; returns its last loss above the floor as a fraction of the static prediction's.
 
+    In a sweep none of these stops the other jobs: it is told, and told again in the summary at the end.
+
     Raises:
-        RunError: the run is finished already, was started with another configuration, is being trained by another
-            process, has no whole checkpoint, or its directory cannot be written.
+        RunError: the run is finished already, was started with another configuration, has no whole checkpoint, or its
+            directory cannot be written.
+        BusyError: it is being trained by another process.
         DivergenceError: a number is no longer finite.
     """
-    from gausim.cli import _config
+    from gausim.cli import _config, _sweep
     from gausim.engine.run import RunDirectory
 
-    # Hydra's directory of a single job has the run's name only, a sweep's jobs have the seed in it already.
-    folder = _config.run_dir()
-    run = RunDirectory(folder if folder.name == f"seed_{cfg.seed}" else folder / f"seed_{cfg.seed}")
+    run = RunDirectory(_config.run_dir())
+    if _config.in_sweep():
+        return _sweep.do_job(cfg, run, _train_and_evaluate)
     with run.writing():
-        if cfg.evaluate and not cfg.trainer.overwrite and run.awaits_evaluation(_plain(cfg)):
-            objective = run.last_epoch().get("excess_static")
-        else:
-            objective = _train(cfg, run)
-        if cfg.evaluate:
-            _evaluate(run)
-        return objective
+        return _train_and_evaluate(cfg, run)
+
+
+def _train_and_evaluate(cfg: DictConfig, run: RunDirectory) -> float | None:
+    if cfg.evaluate and not cfg.trainer.overwrite and run.awaits_evaluation(_plain(cfg)):
+        objective = run.facts()["last_epoch"].get("excess_static")
+    else:
+        objective = _train(cfg, run)
+    if cfg.evaluate:
+        _evaluate(run)
+    return objective
 
 
 def _plain(cfg: DictConfig) -> dict[str, Any]:
@@ -115,11 +127,16 @@ def _evaluate(run: RunDirectory) -> None:
 
 
 def _train(cfg: DictConfig, run: RunDirectory) -> float | None:
+    resume = run.prepare(_plain(cfg), overwrite=cfg.trainer.overwrite)
+    with run.noting_failure():
+        return _learn(cfg, run, resume)
+
+
+def _learn(cfg: DictConfig, run: RunDirectory, resume: Path | None) -> float | None:
     from lightning.pytorch import seed_everything
 
     from gausim.cli._run import build
 
-    resume = run.prepare(_plain(cfg), overwrite=cfg.trainer.overwrite)
     seed_everything(cfg.seed, workers=True, verbose=False)
     module, datamodule = build(cfg)
     trainer = make(cfg, run)

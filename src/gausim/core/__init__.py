@@ -1,13 +1,14 @@
 """Types, errors and contracts that every other room builds on."""
 
 from gausim.core.camera import Cameras
-from gausim.core.errors import ConfigError, DataError, DivergenceError, GausSimError, RunError, SceneError
+from gausim.core.errors import BusyError, ConfigError, DataError, DivergenceError, GausSimError, RunError, SceneError
 from gausim.core.protocols import Dynamics, Forces, Rendered, Renderer
 from gausim.core.scene import GaussianScene
 from gausim.core.state import SimState, Trajectory
 
 __all__ = [
     "Cameras",
+    "BusyError",
     "ConfigError",
     "DataError",
     "DivergenceError",

@@ -21,5 +21,9 @@ class RunError(GausSimError):
     """A run directory or checkpoint cannot be used as asked (finished, of another scene, of another config)."""
 
 
+class BusyError(RunError):
+    """Another process works in the run directory, which is left to it."""
+
+
 class DivergenceError(GausSimError):
     """Training or simulation left the finite numbers; the message names the step and the term that broke."""

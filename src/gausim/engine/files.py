@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gausim.core import RunError
+from gausim.core import BusyError, RunError
 
 try:
     import fcntl
@@ -93,7 +93,7 @@ def sole_writer(lock: Path) -> Iterator[None]:
     """Keeps other processes out of a directory until the block, or this process, ends, however it ends.
 
     Raises:
-        RunError: another process is in it.
+        BusyError: another process is in it.
     """
     lock.parent.mkdir(parents=True, exist_ok=True)
     with lock.open("a+") as file:
@@ -102,7 +102,7 @@ def sole_writer(lock: Path) -> Iterator[None]:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             file.seek(0)
-            raise RunError(
+            raise BusyError(
                 f"{lock.parent}: another process ({file.read().strip() or 'unknown'}) is training here. Wait for it or "
                 "end it; then the same command continues."
             ) from error

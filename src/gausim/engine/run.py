@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import shutil
+import traceback
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +21,22 @@ from lightning.pytorch.callbacks import ProgressBar
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
-from gausim.core import ConfigError, RunError
+from gausim.core import ConfigError, GausSimError, RunError
 from gausim.engine.callbacks import EPOCHS, ExactResume, TimeBudget
 from gausim.engine.checkpoint import LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, AtomicCheckpointIO, check_resumable
 from gausim.engine.files import remove_leftovers, sole_writer, unwritable, write_durably
 from gausim.engine.loggers import WANDB_ID
 from gausim.engine.memory import keep_freed_memory
 
-CONFIG, FINISHED, LOCK = "config.yaml", "FINISHED", ".lock"
-EVALUATION = "evaluation/metrics.json"
+CONFIG, FINISHED, FAILED, LOCK = "config.yaml", "FINISHED", "FAILED", ".lock"
+EVALUATION, EVENTS = "evaluation/metrics.json", "events.jsonl"
 DAMAGED_CHECKPOINT = "last.damaged.ckpt"
 # What may differ when a run is resumed: where it is kept, how it is shown and what computes it, not what is learned.
 FREE_KEYS = (
     "paths",
     "logger",
     "callbacks",
+    "sweep",
     "task_name",
     "evaluate",
     "trainer.threads",
@@ -43,7 +47,17 @@ FREE_KEYS = (
     "trainer.overwrite",
 )
 # What `overwrite` removes; anything else in the directory is not ours.
-OWN_FILES = (CONFIG, FINISHED, LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, DAMAGED_CHECKPOINT, EPOCHS, WANDB_ID)
+OWN_FILES = (
+    CONFIG,
+    FINISHED,
+    FAILED,
+    EVENTS,
+    LAST_CHECKPOINT,
+    PREVIOUS_CHECKPOINT,
+    DAMAGED_CHECKPOINT,
+    EPOCHS,
+    WANDB_ID,
+)
 OWN_FOLDERS = ("panels", "snapshots", "tensorboard", "csv", "wandb")
 
 
@@ -73,6 +87,33 @@ class RunDirectory:
         """Whether the run came to its end."""
         return (self.path / FINISHED).is_file()
 
+    @property
+    def has_failed(self) -> bool:
+        """Whether an error ended the run, and nobody has tried again since."""
+        return (self.path / FAILED).is_file()
+
+    def facts(self) -> dict[str, Any]:
+        """What a finished run says about itself.
+
+        Raises:
+            RunError: it is not finished, or its marker cannot be read.
+        """
+        path = self.path / FINISHED
+        try:
+            loaded = dict(json.loads(path.read_text()))
+            loaded["last_epoch"] = dict(loaded["last_epoch"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise RunError(
+                f"{path}: expected facts of a finished run ({type(error).__name__}). Train anew with "
+                "trainer.overwrite=true."
+            ) from error
+        return loaded
+
+    def failure(self) -> str:
+        """The error that ended a failed run, in one line."""
+        lines = (self.path / FAILED).read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "unknown"
+
     def config(self) -> dict[str, Any]:
         """The resolved configuration of the run.
 
@@ -95,7 +136,8 @@ class RunDirectory:
         """The block that trains: no other process may, and what the disk refuses becomes a RunError.
 
         Raises:
-            RunError: another process trains here, or the directory cannot be written.
+            BusyError: another process trains here.
+            RunError: the directory cannot be written.
         """
         try:
             if getattr(rank_zero_only, "rank", 0):  # the other ranks of a run belong to its first
@@ -127,16 +169,50 @@ class RunDirectory:
                 f"{self.path}: this run is finished. Give the new one another name (name=NAME) or seed, or remove the "
                 "old one with trainer.overwrite=true."
             )
-        if (self.path / CONFIG).is_file():
-            changed = changed_keys(self.config(), config)
-            if changed and self.has_checkpoint:
-                raise RunError(
-                    f"{self.path}: the run here was started with another configuration; changed: {', '.join(changed)}. "
-                    "Restore these keys to resume it, give the new run another name, or set trainer.overwrite=true."
-                )
+        if self.has_checkpoint:
+            self.check_unchanged(config)
         resume = self._whole_checkpoint()
         write_durably(self.path / CONFIG, yaml.safe_dump(dict(config), sort_keys=False).encode())
+        (self.path / FAILED).unlink(missing_ok=True)
+        self.record("resumed" if resume else "started")
         return resume
+
+    def check_unchanged(self, config: Mapping[str, Any]) -> None:
+        """Compares the configuration of the run here with one that meets it.
+
+        Raises:
+            RunError: they differ in a key that changes what is learned.
+        """
+        changed = changed_keys(self.config(), config) if (self.path / CONFIG).is_file() else []
+        if changed:
+            raise RunError(
+                f"{self.path}: the run here was started with another configuration; changed: {', '.join(changed)}. "
+                "Restore these keys to resume it, give the new run another name, or set trainer.overwrite=true."
+            )
+
+    def record(self, event: str) -> None:
+        """Adds a line to the run's history: what happened, when, and in which process."""
+        line = {"time": _now(), "event": event, "host": platform.node(), "process": os.getpid()}
+        with (self.path / EVENTS).open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    @contextmanager
+    def noting_failure(self) -> Iterator[None]:
+        """The block that trains, once the run is prepared: an error that ends it is kept in ``FAILED``."""
+        try:
+            yield
+        except Exception as error:
+            if not getattr(rank_zero_only, "rank", 0):
+                with suppress(OSError):  # the disk may be what failed; the error itself matters more
+                    self._note(error)
+            raise
+
+    def _note(self, error: Exception) -> None:
+        # An error meant for people explains itself; of any other the way to it is wanted. The last line says which.
+        trace = "" if isinstance(error, GausSimError) else "".join(traceback.format_exception(error)) + "\n"
+        head = f"time: {_now()}\nhost: {platform.node()}\nprocess: {os.getpid()}\n\n"
+        write_durably(self.path / FAILED, f"{head}{trace}{one_line(error)}\n".encode())
+        self.record("failed")
 
     def _whole_checkpoint(self) -> Path | None:
         """The last checkpoint, or the one before it where the last is damaged (which is then set aside)."""
@@ -171,24 +247,10 @@ class RunDirectory:
             return False
         return not measured.is_file() or measured.stat().st_mtime < finished.stat().st_mtime
 
-    def last_epoch(self) -> dict[str, float]:
-        """The last epoch's means of a finished run.
-
-        Raises:
-            RunError: its marker cannot be read.
-        """
-        path = self.path / FINISHED
-        try:
-            return dict(json.loads(path.read_text())["last_epoch"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise RunError(
-                f"{path}: expected facts of a finished run ({type(error).__name__}). Train anew with "
-                "trainer.overwrite=true."
-            ) from error
-
     def finish(self, facts: Mapping[str, Any]) -> None:
         """Marks the run as finished, with a few facts about it."""
         write_durably(self.path / FINISHED, (json.dumps(dict(facts), indent=1) + "\n").encode())
+        self.record("finished")
 
     def _clear(self) -> None:
         for name in OWN_FILES:
@@ -196,6 +258,15 @@ class RunDirectory:
         for name in OWN_FOLDERS:
             if (self.path / name).is_dir():
                 shutil.rmtree(self.path / name)
+
+
+def one_line(error: BaseException) -> str:
+    """An error's type and message in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def changed_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:

@@ -21,7 +21,7 @@ CONFIG, FINISHED, FAILED, EPOCHS = "config.yaml", "FINISHED", "FAILED", "epochs.
 _TRACES = (FINISHED, FAILED, EPOCHS, "last.ckpt")
 _KEYS_OF_A_RUN = {"model", "data", "seed"}
 # Keys that do not change what is computed, or that only tell seeds apart.
-_FREE = ("paths", "logger", "callbacks", "task_name", "evaluate", "seed", "data.seed", "trainer")
+_FREE = ("paths", "logger", "callbacks", "sweep", "task_name", "evaluate", "seed", "data.seed", "trainer")
 # A refusal instead of a hang on a file that no run writes.
 _LARGEST_CONFIG = 1 << 20
 
@@ -174,8 +174,9 @@ def _read_run(folder: Path, name: str) -> RunRecord:
 
 def _state(folder: Path, config: Path) -> tuple[str, str]:
     if (folder / FAILED).is_file():
-        with (folder / FAILED).open(errors="replace") as file:
-            lines = file.read(4000).strip().splitlines()
+        with (folder / FAILED).open("rb") as file:  # a long traceback may stand above the line that matters
+            file.seek(max(0, (folder / FAILED).stat().st_size - 4000))
+            lines = file.read().decode(errors="replace").strip().splitlines()
         return FAILURE, lines[-1] if lines else ""
     if (folder / FINISHED).is_file():
         return NOT_EVALUATED, f"gausim evaluate {folder}"

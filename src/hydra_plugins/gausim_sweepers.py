@@ -1,0 +1,41 @@
+"""Hydra finds sweepers in this namespace only. Every Hydra program loads this file, so the work is in `gausim.cli`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from hydra.plugins.sweeper import Sweeper
+
+if TYPE_CHECKING:
+    from hydra.types import HydraContext, TaskFunction
+    from omegaconf import DictConfig
+
+    from gausim.cli._sweep import Sweep
+
+
+class GridSweeper(Sweeper):
+    """All combinations of the given values; goes on where it was killed (`hydra/sweeper=grid`)."""
+
+    def __init__(self, max_batch_size: int | None = None, params: dict[str, Any] | None = None) -> None:
+        """Keeps the settings.
+
+        Args:
+            max_batch_size: most jobs that are handed to the launcher at a time; None hands over all.
+            params: what is swept, key to comma-separated values, beside the command line.
+        """
+        self._batch, self._params = max_batch_size, params
+        self._sweep: Sweep | None = None
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """Builds the launcher."""
+        from gausim.cli._sweep import Sweep
+
+        self.hydra_context, self.config = hydra_context, config
+        self._sweep = Sweep(config, hydra_context, task_function)
+
+    def sweep(self, arguments: list[str]) -> None:
+        """Trains what the overrides ask for."""
+        from gausim.cli._sweep import run_grid
+
+        assert self._sweep is not None
+        run_grid(self._sweep, arguments, self._params, self._batch)

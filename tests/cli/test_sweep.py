@@ -1,0 +1,203 @@
+"""A sweep that dies, fails or meets another process is continued by its own command; every run is completed once."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import runpy
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pytest
+from hydra.core.hydra_config import HydraConfig
+
+from gausim.cli import _config
+from gausim.cli import train as command
+from gausim.core import ConfigError
+from gausim.engine.checkpoint import digest, read_checkpoint
+from gausim.engine.files import sole_writer
+
+TESTS = Path(__file__).parents[1]
+write_toy_object = runpy.run_path(str(TESTS / "toy_object.py"))["write_toy_object"]
+TINY = (
+    "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
+    "data.curriculum.t_max=2", "data.repeats=2", "trainer=cpu", "trainer.threads=1", "trainer.max_epochs=2",
+    "trainer.progress=false", "render=reference", "callbacks.panels=null", "logger=none",
+)  # fmt: skip
+FINISH = "gausim.engine.run.RunDirectory.finish"
+
+Do = Callable[..., "tuple[int, str]"]
+
+
+@pytest.fixture(scope="module")
+def do(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Do]:
+    """Runs `gausim train -m` in a process of its own: name, overrides, and how it dies."""
+    folder = tmp_path_factory.mktemp("sweeps")
+    toy = write_toy_object(folder / "toy", frames=8).root
+    program = [sys.executable, str(TESTS / "engine" / "killed_runs.py")]
+    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdin is not None and server.stdout is not None
+
+        def order(name: str, *overrides: str, **death: Any) -> tuple[int, str]:
+            argv = ["-m", *TINY, f"data.root={toy}", f"paths.output_root={folder}", f"name={name}", *overrides]
+            server.stdin.write(json.dumps({"argv": argv, **death}) + "\n")
+            server.stdin.flush()
+            found = json.loads(server.stdout.readline())
+            return found["status"], found["output"]
+
+        order.folder = folder  # type: ignore[attr-defined]
+        yield order
+        server.stdin.close()
+
+
+def runs_of(do: Do, name: str) -> list[Path]:
+    return sorted((do.folder / name).rglob("seed_*"))  # type: ignore[attr-defined]
+
+
+def history(run: Path) -> list[str]:
+    return [json.loads(line)["event"] for line in (run / "events.jsonl").read_text().splitlines()]
+
+
+def steps(run: Path) -> int:
+    assert not (run / "FAILED").exists()
+    return json.loads((run / "FINISHED").read_text())["optimizer_steps"]
+
+
+def test_a_killed_sweep_goes_on_where_it_was(do: Do) -> None:
+    status, _ = do("cut", "seed=0,1,2", die=[{"target": FINISH, "match": "", "count": 2, "when": "before"}])
+    assert status == -9
+    first, second = runs_of(do, "cut")
+    status, output = do("cut", "seed=0,1,2")
+    assert status == 0, output
+    assert f"left out, finished before: {first}" in output and f"left out, finished before: {second}" not in output
+    assert "sweep of 3 jobs: 2 trained, 1 finished before" in output
+    expected = [["started", "finished"], ["started", "resumed", "finished"], ["started", "finished"]]
+    assert [history(run) for run in runs_of(do, "cut")] == expected
+    assert [steps(run) for run in runs_of(do, "cut")] == [8, 8, 8]
+    status, output = do("cut", "seed=0,1,2")
+    assert status == 0 and "sweep of 3 jobs: 3 finished before" in output, output
+    assert [history(run) for run in runs_of(do, "cut")] == expected
+
+
+def test_a_job_that_fails_stops_no_other_and_is_tried_again_on_demand(do: Do, tmp_path: Path) -> None:
+    late = tmp_path / "late"
+    swept = (f"data.root={late},{do.folder}/toy", "seed=0")  # type: ignore[attr-defined]
+    status, output = do("mixed", *swept)
+    assert status == 2 and "sweep of 2 jobs: 1 trained, 1 failed" in output, output
+    failed, trained = sorted(runs_of(do, "mixed"), key=lambda run: (run / "FINISHED").exists())
+    last = (failed / "FAILED").read_text().splitlines()[-1]
+    assert last.startswith("DataError: ") and str(late) in last and f"{failed}: {last}" in output
+    assert "Traceback" not in output
+    write_toy_object(late, frames=8)
+    status, output = do("mixed", *swept)
+    assert status == 2 and "1 finished before, 1 failed" in output and "left out, failed before" in output, output
+    assert history(failed) == ["started", "failed"]
+    status, output = do("mixed", *swept, "sweep.retry_failed=true")
+    assert status == 0 and "1 trained, 1 finished before" in output, output
+    assert steps(failed) == steps(trained) == 8 and history(failed)[2:] == ["started", "finished"]
+
+
+def test_what_another_process_trains_is_left_to_it(do: Do) -> None:
+    status, output = do("shared", "seed=0")
+    assert status == 0, output
+    (run,) = runs_of(do, "shared")
+    (run / "FINISHED").unlink()
+    with sole_writer(run / ".lock"):
+        status, output = do("shared", "seed=0,1")
+    assert status == 0 and f"left out, {run}: another process" in output, output
+    assert "1 trained, 1 trained by another process" in output
+    assert history(run) == ["started", "finished"]
+
+
+def test_a_finished_run_of_another_configuration_is_not_passed_off_as_this_one(do: Do) -> None:
+    assert do("changed", "seed=0")[0] == 0
+    (run,) = runs_of(do, "changed")
+    config = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(config.replace("max_epochs: 2", "max_epochs: 3"))
+    status, output = do("changed", "seed=0")
+    assert status == 2 and "changed: trainer.max_epochs" in output, output
+    assert not (run / "FAILED").exists() and steps(run) == 8  # the run itself is unharmed
+
+
+@pytest.mark.parametrize(
+    ("swept", "message"),
+    [
+        ("experiment=glob(nothing_*)", "expected at least one value"),
+        ("optimizer.network_lr=interval(0.1,1)", "hydra/sweeper=optuna"),
+        ("ablation=none,nope", "nope"),
+        ("hydra/launcher=nope", r"pip install 'gausim\[sweep\]'"),
+    ],
+)
+def test_what_cannot_be_swept_is_told_before_anything_runs(
+    swept: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=message):
+        command.main(["-m", swept])
+    assert not list(tmp_path.rglob("seed_*"))
+
+
+def test_threads_are_shared_among_the_jobs_of_a_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    def threads(cores: int, *overrides: str) -> int:
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+        with hydra.initialize_config_dir(str(_config.conf_dir()), version_base="1.3"):
+            config = hydra.compose("train", ["hydra.mode=MULTIRUN", *overrides], return_hydra_config=True)
+        monkeypatch.setattr(HydraConfig.instance(), "cfg", config)
+        return config.trainer.threads
+
+    joblib = "hydra/launcher=joblib"
+    assert threads(2) == threads(64) == 2
+    assert threads(2, joblib) == 1 and threads(64, joblib, "hydra.launcher.n_jobs=-2") == 1  # a core each
+    assert threads(2, joblib, "hydra.launcher.n_jobs=2") == 1 and threads(8, joblib, "hydra.launcher.n_jobs=4") == 2
+    assert threads(2, joblib, "hydra.launcher.n_jobs=8") == 1
+    assert threads(64, "hydra/launcher=submitit_slurm") == 1
+    assert threads(64, "hydra/launcher=submitit_slurm", "hydra.launcher.cpus_per_task=8") == 2
+    assert threads(2, joblib, "trainer.threads=5") == 5
+
+
+def learned(run: Path) -> str:
+    return digest(read_checkpoint(run / "last.ckpt")["state_dict"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", [("hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
+                                      ("hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=1")])  # fmt: skip
+def test_jobs_side_by_side_leave_what_one_after_another_would(do: Do, launcher: tuple[str, str]) -> None:
+    name = launcher[0].split("=")[1]
+    assert do("in_turn", "seed=0,1")[0] == 0
+    status, output = do(name, "seed=0,1", *launcher)
+    assert status == 0 and "sweep of 2 jobs: 2 trained" in output, output
+    status, output = do(name, "seed=0,1,2", *launcher)
+    assert status == 0 and "sweep of 3 jobs: 1 trained, 2 finished before" in output, output
+    assert [history(run) for run in runs_of(do, name)] == 3 * [["started", "finished"]]
+    assert [learned(run) for run in runs_of(do, name)[:2]] == [learned(run) for run in runs_of(do, "in_turn")]
+
+
+@pytest.mark.slow
+def test_a_sweep_of_six_killed_five_times_completes_every_run_once(do: Do) -> None:
+    swept = ("seed=0,1,2,3,4,5", "render=cpu", "data.repeats=5", "trainer.max_epochs=6")
+    status, output = do("undisturbed", *swept)
+    assert status == 0, output
+    moments, kills, told = random.Random(1), 0, Counter[str]()
+    while kills < 5:
+        every = f"callbacks.checkpoint.every_steps={moments.choice((1, 3, 7))}"
+        status, output = do("disturbed", *swept, every, kill_after=moments.uniform(1.0, 4.0))
+        assert status == -9, f"ended by itself ({status}) after {kills} kills: lengthen the runs\n{output}"
+        kills += 1
+        told.update(line for line in output.splitlines() if line.startswith("run: "))
+    status, output = do("disturbed", *swept)
+    assert status == 0, output
+    told.update(line for line in output.splitlines() if line.startswith("run: "))
+    assert "finished before" in output
+    runs = runs_of(do, "disturbed")
+    assert told == Counter(f"run: {run}" for run in runs) and len(runs) == 6  # each came to its end once
+    for run, whole in zip(runs, runs_of(do, "undisturbed"), strict=True):
+        events = history(run)
+        assert events.count("finished") == 1 and events[-1] == "finished" and events.count("started") >= 1
+        assert steps(run) == steps(whole) == 60 and learned(run) == learned(whole)
