@@ -56,7 +56,7 @@ def _single(network: MeshGraphNet, inputs: Graph) -> Graph:
 @pytest.fixture(params=["blocks", "one block", "autograd"])
 def path(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
     """The ways the edges are computed, whatever their number."""
-    monkeypatch.setattr(edge_update, "BLOCK", 16 if request.param == "blocks" else 1024)
+    monkeypatch.setattr(edge_update, "BLOCK", 16 if request.param == "blocks" else 1 << 17)
     monkeypatch.setattr(edge_update, "FEW", 10**6 if request.param == "autograd" else 0)
     name: str = request.param
     return name

@@ -17,8 +17,9 @@ from gausim.engine.rollout import States, ViewGroup
 from gausim.losses.image import ImageLoss
 from gausim.render.draw import SceneAppearance, draw
 
-# Pixels that are drawn and compared together: on a CPU a few images stay in its cache, on a GPU they keep it busy.
-CPU_PIXELS, GPU_PIXELS = 65_536, 4_000_000
+# Pixels that are drawn and compared together: enough for each call to be cut by state and not within an image, and to
+# keep a GPU busy; few enough for the images to be a small part of the memory.
+CPU_PIXELS, GPU_PIXELS = 1_000_000, 4_000_000
 
 
 class Chunk(NamedTuple):

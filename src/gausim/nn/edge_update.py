@@ -11,10 +11,9 @@ from torch.autograd.function import once_differentiable
 
 from gausim.nn.linear import product
 
-# Edges per block and thread on the CPU: at width 128 these are 512 KiB, so that what one operation writes the next
-# still finds in the core's second-level cache. A GPU takes all edges at once: each launch costs it more than the
-# memory traffic.
-BLOCK = 1024
+# Numbers per block of edges and thread on the CPU: 512 KiB, so that what one operation writes the next still finds in
+# the core's second-level cache. A GPU takes all edges at once: each launch costs it more than the memory traffic.
+BLOCK = 1 << 17
 # With fewer edges than this, the number of operations is what costs, and autograd's own are fewer.
 FEW = 200
 NORM_EPS = 1e-5  # of torch.nn.LayerNorm
@@ -89,8 +88,13 @@ def _blocked(
 
 
 def _blocks(edges: Tensor) -> list[slice]:
-    size = BLOCK * torch.get_num_threads() if edges.device.type == "cpu" else max(len(edges), 1)
-    return [slice(start, start + size) for start in range(0, len(edges), size)]
+    count = len(edges)
+    if edges.device.type == "cpu":  # blocks of equal size: a short last one would cost as many calls as a full one
+        whole = max(1, BLOCK * torch.get_num_threads() // edges.shape[1])
+        size = -(-count // max(1, round(count / whole)))
+    else:
+        size = count
+    return [slice(start, start + size) for start in range(0, count, max(size, 1))]
 
 
 def _normed(edges: Tensor, weights: EdgeWeights) -> tuple[Tensor, Tensor, Tensor]:
