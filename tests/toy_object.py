@@ -30,6 +30,11 @@ class ToyObject:
     first_unseen: int = 8
     fps: float = 24.0
     amplitudes: dict[str, float] = field(default_factory=lambda: dict(AMPLITUDES))
+    cameras: Cameras | None = None
+
+    @property
+    def views(self) -> Cameras:
+        return self.cameras if self.cameras is not None else cameras()
 
     def truth(self, sequence: str, frames: int | None = None) -> Trajectory:
         count = frames or self.frames
@@ -71,10 +76,14 @@ def cameras() -> Cameras:
 
 
 def write_toy_object(root: Path, *, frames: int = 20) -> ToyObject:
-    toy = ToyObject(root, toy_scene(), frames=frames)
+    return write_object(ToyObject(root, toy_scene(), frames=frames))
+
+
+def write_object(toy: ToyObject) -> ToyObject:
+    root, names = toy.root, toy.views.names
     root.mkdir(parents=True)
-    facts = {"name": "toy", "fps": 24, "views": VIEWS, "train_views": VIEWS[:2], "heldout_views": VIEWS[2:],
-             "train_frames": [0, toy.first_unseen]}  # fmt: skip
+    facts = {"name": toy.scene.name, "fps": toy.fps, "views": names, "train_views": names[:2],
+             "heldout_views": names[2:], "train_frames": [0, toy.first_unseen]}  # fmt: skip
     (root / "dataset.json").write_text(json.dumps(facts))
     save_scene(toy.scene, root / "scene.ply")
     np.savez(root / "rest_points.npz", points=toy.scene.means.numpy())
@@ -85,20 +94,20 @@ def write_toy_object(root: Path, *, frames: int = 20) -> ToyObject:
 
 def _write_sequence(toy: ToyObject, name: str) -> None:
     folder, trajectory = toy.root / "sequences" / name, toy.truth(name)
-    images = rgba(toy.scene, trajectory)
+    images = rgba(toy.scene, trajectory, toy.views)
     entries = []
-    for v, view in enumerate(VIEWS):
+    for v, view in enumerate(toy.views.names):
         (folder / view).mkdir(parents=True)
         for f in range(toy.frames):
             write_rgba(folder / view / f"{f:04d}.png", images[f, v])
             entries.append({"file_path": f"{view}/{f:04d}.png", "camera": view, "frame": f})
-    every = cameras().select([v for v in range(len(VIEWS)) for _ in range(toy.frames)])
+    every = toy.views.select([v for v in range(len(toy.views.names)) for _ in range(toy.frames)])
     write_transforms(folder / "transforms.json", every, entries, fps=toy.fps)
     np.savez(folder / "ground_truth.npz", displacement=(trajectory.positions - toy.scene.means).numpy())
 
 
-def rgba(scene: GaussianScene, trajectory: Trajectory) -> Tensor:
+def rgba(scene: GaussianScene, trajectory: Trajectory, views: Cameras | None = None) -> Tensor:
     drawn = draw(ReferenceRenderer(), scene, trajectory.positions, trajectory.gradients, trajectory.rotations,
-                 trajectory.unit_of_kernel, cameras())  # fmt: skip
+                 trajectory.unit_of_kernel, views or cameras())  # fmt: skip
     straight = drawn.rgb / drawn.alpha.clamp_min(1e-6)[..., None]
     return (torch.cat((straight, drawn.alpha[..., None]), -1).clamp(0, 1) * 255).round().to(torch.uint8)

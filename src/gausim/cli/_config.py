@@ -72,6 +72,8 @@ class RootConfig:
         experiment: what the chosen experiment records about itself.
         sweep: what the jobs of a sweep do about runs that are there already.
         seed: of every random generator.
+        init_from: run whose network, with the statistics of its inputs, this one starts from; null starts anew.
+        freeze: keep that network as it is, so that only what a scene has of its own is learned.
         evaluate: whether the run is evaluated once it is trained (`gausim evaluate`), for reports.
         name: of the run; its directory is `${paths.output_root}/${name}/seed_${seed}`.
         task_name: what is being done, for logs and dashboards.
@@ -90,6 +92,8 @@ class RootConfig:
     experiment: Any = None
     sweep: SweepConfig = field(default_factory=SweepConfig)
     seed: int = 0
+    init_from: str | None = None
+    freeze: bool = False
     evaluate: bool = False
     name: str = MISSING
     task_name: str = "train"

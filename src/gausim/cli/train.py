@@ -139,6 +139,7 @@ def _learn(cfg: DictConfig, run: RunDirectory, resume: Path | None) -> float | N
 
     seed_everything(cfg.seed, workers=True, verbose=False)
     module, datamodule = build(cfg)
+    _take_over(cfg, module, resumed=resume is not None)
     trainer = make(cfg, run)
     _introduce(trainer, module, datamodule, run, resumed=resume is not None)
     trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
@@ -150,6 +151,25 @@ def _learn(cfg: DictConfig, run: RunDirectory, resume: Path | None) -> float | N
     following = "" if cfg.evaluate else f"gausim evaluate {run.path}\n      "
     print(f"\nrun: {run.path}\nnext: {following}gausim simulate {run.path}", flush=True)
     return module.summary.get("excess_static")
+
+
+def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None:
+    """Loads the network of another run (a resumed run has its own in its checkpoint), and freezes it if asked to.
+
+    Raises:
+        ConfigError: no run is named, a network is to be frozen that nothing was loaded into, or it has another shape.
+    """
+    from gausim.core import ConfigError
+    from gausim.engine.transfer import load_shared
+
+    if cfg.init_from == "":
+        raise ConfigError("init_from: name the trained run whose network this one starts from (init_from=RUN).")
+    if cfg.freeze and cfg.init_from is None:
+        raise ConfigError("freeze: a network at random would stay so. Name a trained run (init_from=RUN).")
+    if cfg.init_from is not None and not resumed:
+        load_shared(module.simulator, cfg.init_from, _plain(cfg)["model"])
+    if cfg.freeze:
+        module.simulator.freeze()
 
 
 def make(cfg: DictConfig, run: RunDirectory) -> Trainer:

@@ -212,15 +212,18 @@ class WeightAverage:
         self._values = dict(state["values"])
 
 
+def averaged_weights(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The weights of a checkpoint by name, the averaged ones where there are any."""
+    return {**checkpoint["state_dict"], **checkpoint["gausim"]["average"]["values"]}
+
+
 def load_weights(module: nn.Module, checkpoint: dict[str, Any], *, averaged: bool = True) -> None:
     """Loads the weights of a checkpoint into a module, the averaged ones where there are any.
 
     Raises:
         RunError: the checkpoint has other parameters than the module.
     """
-    weights = dict(checkpoint["state_dict"])
-    if averaged:
-        weights.update(checkpoint["gausim"]["average"]["values"])
+    weights = averaged_weights(checkpoint) if averaged else dict(checkpoint["state_dict"])
     try:
         module.load_state_dict(weights)
     except RuntimeError as error:

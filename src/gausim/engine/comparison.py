@@ -53,8 +53,8 @@ class Comparison:
         batch: SceneBatch,
         groups: Sequence[ViewGroup],
         looks: Sequence[SceneAppearance],
-        frames: Sequence[UInt8[Tensor, "T V H W 4"]],
-        rest: Sequence[Float[Tensor, "V H W 3"]],
+        frames: Sequence[UInt8[Tensor, "T _ _ _ 4"]],
+        rest: Sequence[Float[Tensor, "_ _ _ 3"]],
     ) -> None:
         """Binds what stays the same over a rollout.
 
@@ -64,7 +64,8 @@ class Comparison:
             batch: the disjoint graph.
             groups: the members by scene and cameras.
             looks: appearance of each group's scene.
-            frames: the true frames 1..T of each member, straight-alpha 8-bit RGBA.
+            frames: the true frames 1..T of each member, straight-alpha 8-bit RGBA; members of different groups may
+                differ in views and image size.
             rest: images of the rest state of each member.
         """
         self._renderer, self._loss, self._batch = renderer, loss, batch

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
-from torch.nn import Parameter
+from torch.nn import Module, Parameter
 
 from gausim.core import GaussianScene, SimState
 
@@ -81,6 +81,14 @@ class Simulator(Protocol):
 
     def step(self, batch: Any, state: SimState, force: Tensor | None = None, prepared: Any = None) -> Any:
         """Predicts the next frame of all members; ``prepared`` is made for this step alone when None."""
+        ...
+
+    def shared(self) -> dict[str, Module]:
+        """What all scenes have in common, by its name within the simulator: networks, statistics of their inputs."""
+        ...
+
+    def freeze(self) -> None:
+        """Keeps what :meth:`shared` names as it is from now on."""
         ...
 
     def parameter_groups(self) -> dict[str, list[Parameter]]:

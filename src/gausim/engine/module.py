@@ -104,7 +104,7 @@ class GausSimModule(LightningModule):
         missing = [n for n, p in self.named_parameters() if p.requires_grad and id(p) not in grouped]
         if missing:
             raise ConfigError(f"optimizer: parameters in no group: {missing}. Add them to parameter_groups().")
-        return self.settings.build(groups)
+        return self.settings.build({name: [p for p in own if p.requires_grad] for name, own in groups.items()})
 
     # ------------------------------------------------------------------------------------------------ one step
 
@@ -206,19 +206,20 @@ class GausSimModule(LightningModule):
         images_term = self.objective.image_weight * per * losses.sum()
         momentum_term = self.objective.momentum_weight * per * momentum.sum()
         weighted = momentum_term.requires_grad and self.objective.momentum_weight > 0
-        if measure and weighted and self.share_every and self.global_step % self.share_every == 0:
-            tally.share = self._share(images_term, momentum_term)
+        network = [p for p in self.simulator.parameter_groups()["network"] if p.requires_grad]
+        if measure and weighted and network and self.share_every and self.global_step % self.share_every == 0:
+            tally.share = self._share(images_term, momentum_term, network)
         self._backward(images_term + momentum_term if weighted else images_term)
         tally.images.append(losses.detach())
         tally.momentum.append(momentum.detach())
 
-    def _share(self, images: Tensor, momentum: Tensor) -> Tensor:
+    @staticmethod
+    def _share(images: Tensor, momentum: Tensor, network: list[nn.Parameter]) -> Tensor:
         """Norm of the momentum loss's gradient of the network over the sum of both norms."""
-        network = self.simulator.parameter_groups()["network"]
         norms = []
         for term in (images, momentum):
             grads = torch.autograd.grad(term, network, retain_graph=True, allow_unused=True)
-            norms.append(torch.nn.utils.get_total_norm([g for g in grads if g is not None]))
+            norms.append(torch.nn.utils.get_total_norm([g for g in grads if g is not None]).to(images))
         return norms[1] / (norms[0] + norms[1]).clamp_min(1e-30)
 
     def _static(self, samples: list[SequenceSample], draws: torch.Generator, tally: Tally) -> None:

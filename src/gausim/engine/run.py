@@ -271,10 +271,15 @@ def _now() -> str:
 
 def changed_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Dotted keys whose values differ between two configurations, those aside that a resumed run may change."""
+    different = differing_keys(old, new)
+    return [k for k in different if not any(k == free or k.startswith(f"{free}.") for free in FREE_KEYS)]
+
+
+def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Dotted keys whose values differ between two nested mappings."""
     first, second = dict(_flatten(old)), dict(_flatten(new))
     keys = sorted(set(first) | set(second))
-    different = [k for k in keys if k not in first or k not in second or first[k] != second[k]]
-    return [k for k in different if not any(k == free or k.startswith(f"{free}.") for free in FREE_KEYS)]
+    return [k for k in keys if k not in first or k not in second or first[k] != second[k]]
 
 
 def _flatten(value: Any, prefix: str = "") -> list[tuple[str, Any]]:

@@ -168,6 +168,16 @@ class GausSim(nn.Module):
             "template": [p for p in self.template.parameters() if id(p) not in known],
         }
 
+    def shared(self) -> dict[str, nn.Module]:
+        """What all scenes have in common, by name: the network and the normalisers of its inputs."""
+        names = ("network", "node_normaliser", "edge_normaliser")
+        return {name: self.get_submodule(name) for name in names}
+
+    def freeze(self) -> None:
+        """Keeps what :meth:`shared` names as it is: its weights do not learn, its statistics gather nothing more."""
+        self.network.requires_grad_(False)
+        self.node_normaliser.frozen = self.edge_normaliser.frozen = True
+
     def batch(self, scene_ids: Sequence[int]) -> SceneBatch:
         """The disjoint union for one sequence of each of these scenes (cached)."""
         device = self.log_density[0].device

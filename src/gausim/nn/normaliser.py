@@ -11,8 +11,8 @@ class RunningNormaliser(nn.Module):
     """Normalises the first ``size`` features by statistics gathered in training; the others pass unchanged.
 
     Statistics are buffers (part of the checkpoint), accumulate in float64 over at most ``max_updates`` calls in
-    training mode and are frozen in evaluation mode. The standard deviation is floored because x_{-1} = X makes every
-    velocity zero at the start.
+    training mode and stay as they are in evaluation mode, or for good where ``frozen`` is set. The standard deviation
+    is floored because x_{-1} = X makes every velocity zero at the start.
     """
 
     count: Tensor
@@ -24,6 +24,7 @@ class RunningNormaliser(nn.Module):
         """``floor`` is the smallest standard deviation, in the features' own units."""
         super().__init__()
         self.size, self.floor, self.max_updates = size, floor, max_updates
+        self.frozen = False
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
         self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
@@ -32,7 +33,7 @@ class RunningNormaliser(nn.Module):
     def forward(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
         """(x - mean) / std of the first ``size`` columns."""
         head, tail = features[:, : self.size], features[:, self.size :]
-        if self.training and head.shape[0] and int(self.updates) < self.max_updates:
+        if self.training and not self.frozen and head.shape[0] and int(self.updates) < self.max_updates:
             self._accumulate(head.detach().double())
         count = self.count.clamp_min(1.0)
         mean = self.total / count
