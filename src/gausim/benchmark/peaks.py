@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from gausim.benchmark.harness import Options, medians, torch_threads
+from gausim.ops.pool import WorkerPool
 
 # Independent accumulators: enough vectors of any width to hide the latency of a fused multiply-add.
 LANES = 192
@@ -56,16 +57,20 @@ def _make_fma_loop():
 _fma_loop = _make_fma_loop()
 
 
-def fma_peak() -> float:
-    """Fused multiply-adds per second of one thread, times two [FLOP/s]."""
-    values, scale, shift = np.ones(LANES, np.float32), np.float32(0.9999), np.float32(1e-4)
-    _fma_loop(values, scale, shift, 1)
-    best = float("inf")
+def fma_peak(threads: int = 1) -> float:
+    """Fused multiply-adds per second of that many threads together, times two [FLOP/s]."""
+    scale, shift = np.float32(0.9999), np.float32(1e-4)
+
+    def loop(rounds: int) -> None:
+        _fma_loop(np.ones(LANES, np.float32), scale, shift, rounds)
+
+    loop(1)
+    best, pool = float("inf"), WorkerPool(threads)
     for _ in range(TRIES):
         start = time.perf_counter()
-        _fma_loop(values, scale, shift, ROUNDS)
+        pool.run(loop, [ROUNDS] * threads)
         best = min(best, time.perf_counter() - start)
-    return 2.0 * LANES * ROUNDS / best
+    return 2.0 * LANES * ROUNDS * threads / best
 
 
 def gemm_peak(options: Options) -> float:

@@ -134,29 +134,29 @@ class Batch:
             np.empty(shape, np.float32),
             np.empty(shape, np.float32) if depth else None,
         )
-        rows, kernels = self.band_rows, self._kernel_ranges(len(self.pairs))
+        bands, kernels = range(len(self.band_rows)), self.kernel_ranges(len(self.pairs))
 
         def draw(item: tuple[int, int, int]) -> None:
             b, v, index = item
-            view = self.views[b, v]
-            band = self._draw_band(view, index, rows[index], images.of(b, v))
-            view.bands[index] = band if keep else None
+            band = self.bin(b, v, index)
+            self.composite(band, images.of(b, v))
+            self.views[b, v].bands[index] = band if keep else None
 
         def draw_image(item: tuple[int, int]) -> None:
             for low, high in kernels:
-                self._project((*item, low, high))
-            self._sort(item)
-            for index in range(len(rows)):
+                self.project((*item, low, high))
+            self.sort(item)
+            for index in bands:
                 draw((*item, index))
             self.views[item].forget()
 
-        self.views = {item: self._empty_view(len(rows)) for item in self.pairs}
+        self.make_views()
         if len(self.pairs) >= TASKS:
             pool.run(draw_image, self.pairs)
             return images
-        pool.run(self._project, [(*item, *part) for item in self.pairs for part in kernels])
-        pool.run(self._sort, self.pairs)
-        pool.run(draw, [(*item, i) for item in self.pairs for i in range(len(rows))])
+        pool.run(self.project, [(*item, *part) for item in self.pairs for part in kernels])
+        pool.run(self.sort, self.pairs)
+        pool.run(draw, [(*item, i) for item in self.pairs for i in bands])
         for view in self.views.values():
             view.forget()
         return images
@@ -165,27 +165,21 @@ class Batch:
         """Gradients of the inputs from those of the images."""
         states, views = self.viewmats.shape[:2]
         count, bands = self.means.shape[1], range(len(self.band_rows))
-        result = Gradients(
-            np.zeros((states, count, 3), np.float32),
-            np.zeros((states, count, 3, 3), np.float32),
-            np.empty((states, views, count, 3), np.float32),
-            np.zeros((states, count), np.float32),
-            np.zeros((states, views, len(bands), 3), np.float64) if background else None,
-        )
+        result = self.make_gradients(background=background)
 
         def composite(item: tuple[int, int, int]) -> None:
-            self._composite(item, grads, result.background)
+            self.composite_adjoint(item, grads, result.background)
 
         def finish(part: tuple[int, int, int]) -> None:
             for v in range(views):
-                self._finish(v, part, result)
+                self.project_adjoint(v, part, result)
 
         def state(b: int) -> None:
             for v in range(views):
                 self.views[b, v].make_sums()
                 for i in bands:
                     composite((b, v, i))
-                self._finish(v, (b, 0, count), result)
+                self.project_adjoint(v, (b, 0, count), result)
                 self.views[b, v].sums = None
 
         if states >= TASKS:  # what is summed up stays in the cache
@@ -194,31 +188,49 @@ class Batch:
             for view in self.views.values():
                 view.make_sums()
             pool.run(composite, [(*item, i) for item in self.pairs for i in bands])
-            pool.run(finish, [(b, *part) for b in range(states) for part in self._kernel_ranges(states)])
+            pool.run(finish, [(b, *part) for b in range(states) for part in self.kernel_ranges(states)])
             for view in self.views.values():
                 view.sums = None
         if result.background is None:
             return result
         return result._replace(background=result.background.sum((0, 1, 2)).astype(np.float32))
 
-    def _kernel_ranges(self, shared_by: int) -> list[tuple[int, int]]:
+    def make_gradients(self, *, background: bool) -> Gradients:
+        """Zeros to add to; the background's are of each band."""
+        (states, views), count = self.viewmats.shape[:2], self.means.shape[1]
+        return Gradients(
+            np.zeros((states, count, 3), np.float32),
+            np.zeros((states, count, 3, 3), np.float32),
+            np.empty((states, views, count, 3), np.float32),
+            np.zeros((states, count), np.float32),
+            np.zeros((states, views, len(self.band_rows), 3), np.float64) if background else None,
+        )
+
+    def kernel_ranges(self, shared_by: int) -> list[tuple[int, int]]:
         """Cuts the kernels of one view or state so that all of them make about TASKS tasks."""
         count, parts = self.means.shape[1], _parts(shared_by)
         cuts = [i * count // parts for i in range(parts + 1)]
         return [(low, high) for low, high in zip(cuts, cuts[1:], strict=False) if high > low]
 
-    def _empty_view(self, bands: int) -> View:
-        count = self.means.shape[1]
-        return View(
-            depth=np.empty(count, np.float32),
-            row_of=np.empty((bands, count), np.int32),
-            records=np.empty((count, RECORD), np.float32),
-            extents=np.empty((count, EXTENT), np.float32),
-            spans=np.empty((count, 2), np.int32),
-            bands=[None] * bands,
-        )
+    def make_views(self) -> None:
+        """Makes room for what the forward pass finds."""
+        count, bands = self.means.shape[1], len(self.band_rows)
+        for item in self.pairs:
+            self.views[item] = View(
+                depth=np.empty(count, np.float32),
+                row_of=np.empty((bands, count), np.int32),
+                records=np.empty((count, RECORD), np.float32),
+                extents=np.empty((count, EXTENT), np.float32),
+                spans=np.empty((count, 2), np.int32),
+                bands=[None] * bands,
+            )
 
-    def _project(self, part: tuple[int, int, int, int]) -> None:
+    def project(self, part: tuple[int, int, int, int]) -> None:
+        """Projects kernels ``low .. high - 1`` of state b into view v; ``part`` = (b, v, low, high).
+
+        Raises:
+            DivergenceError: one of them is not finite or its opacity lies outside 0..1.
+        """
         b, v, low, high = part
         view = self.views[b, v]
         kernels = self.means[b], self.covars[b], self.colors[b, v], self.opacities[b]
@@ -233,26 +245,30 @@ class Batch:
             view.records, view.extents, view.spans, view.depth,
         )  # fmt: skip
 
-    def _sort(self, item: tuple[int, int]) -> None:
+    def sort(self, item: tuple[int, int]) -> None:
+        """Orders the kernels of a view by depth."""
         self.views[item].order = depth_order(self.views[item].depth, self.views[item].spans)
 
-    def _draw_band(
-        self, view: View, index: int, rows: tuple[int, int], images: tuple[Array, Array, Array | None]
-    ) -> Band:
+    def bin(self, b: int, v: int, index: int) -> Band:
+        """Lists the kernels of every tile of a band."""
+        view, rows = self.views[b, v], self.band_rows[index]
         assert view.order is not None
-        strips = -(-self.width // TILE_WIDTH)
         records, entries, start = bin_band(
-            view.records, view.extents, *view.order, view.row_of[index], *rows, strips
+            view.records, view.extents, *view.order, view.row_of[index], *rows, -(-self.width // TILE_WIDTH)
         )  # fmt: skip
         tiles = start.shape[0] - 1
         final, last = np.empty((tiles, PIXELS), np.float32), np.empty((tiles, PIXELS), np.float32)
-        used = np.empty(tiles, np.int64)
-        forward_band(
-            records, entries, start, rows[0], self.background, self.alpha_max, *images, final, last, used
-        )  # fmt: skip
-        return Band(rows[0], records, entries, start, final, last, used)
+        return Band(rows[0], records, entries, start, final, last, np.empty(tiles, np.int64))
 
-    def _composite(self, item: tuple[int, int, int], grads: Images, background: Array | None) -> None:
+    def composite(self, band: Band, images: tuple[Array, Array, Array | None]) -> None:
+        """Draws a band into the images of its view."""
+        forward_band(
+            band.records, band.entries, band.start, band.row_low, self.background, self.alpha_max, *images, band.final,
+            band.last, band.used,
+        )  # fmt: skip
+
+    def composite_adjoint(self, item: tuple[int, int, int], grads: Images, background: Array | None) -> None:
+        """Sums up what the gradients of a band's pixels say about its kernels; ``item`` = (b, v, band)."""
         b, v, index = item
         view = self.views[b, v]
         band, sums, offsets = view.bands[index], view.sums, view.offsets
@@ -264,7 +280,8 @@ class Batch:
             None if background is None else background[item],
         )  # fmt: skip
 
-    def _finish(self, v: int, part: tuple[int, int, int], grads: Gradients) -> None:
+    def project_adjoint(self, v: int, part: tuple[int, int, int], grads: Gradients) -> None:
+        """Takes the sums of a view's bands back to kernels ``low .. high - 1``; ``part`` = (b, low, high)."""
         b, low, high = part
         view = self.views[b, v]
         project_adjoint(

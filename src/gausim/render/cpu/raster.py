@@ -41,10 +41,9 @@ ZERO, ONE = np.float32(0), np.float32(1)
 
 # Arithmetic per pixel and entry in the loops over pairs of rows, a fused multiply-add counted as two; comparisons,
 # selections, loads and stores not at all. For the share of the machine's peak in ``gausim benchmark render``.
-FORWARD_FLOPS = 1 + 5 + 10 + 3 + 1 + 2 + 6  # dy, u, p, p^8, o p, t alpha and t - that, three colours
-BACKWARD_FLOPS = (
-    1 + 5 + 10 + 3 + 1 + 2 + 1 + 6 + 2 + 1 + 1 + 3 + 6
-)  # .., t, w, gap, behind, s, s dy, three s sums, three w v
+FORWARD_FLOPS = 1 + 4 + 10 + 3 + 1 + 2 + 6  # dy, u, p, p^8, o p, t alpha and t - that, three colours
+# dy, u, p, p^8, o p, t / (1 - alpha), w, gap, behind, s, s dy, sums of s, s dy and s dy dy, sums of w v
+BACKWARD_FLOPS = 1 + 4 + 10 + 3 + 1 + 2 + 1 + 6 + 2 + 1 + 1 + 4 + 6
 
 
 @numba.njit(fastmath=True, **HELPER)

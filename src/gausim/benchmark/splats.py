@@ -1,0 +1,116 @@
+"""Random Gaussians and cameras that the cases of the renderer draw."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gausim.core import GaussianScene, Rendered, Renderer
+from gausim.ops.covariance import covariance_from_scales
+from gausim.ops.deformation import polar_rotation
+from gausim.render.draw import SceneAppearance
+
+SPREAD = 0.4  # standard deviation of the means [scene units]
+DISTANCE = 2.5  # of the cameras from the middle [scene units]
+FOCAL = 1.2  # [image widths]
+TURN = 0.7  # angle between two cameras [rad]
+
+
+class Splats(NamedTuple):
+    """One state in V views: the arguments of a renderer."""
+
+    means: Float[Tensor, "1 K 3"]
+    covars: Float[Tensor, "1 K 3 3"]
+    colors: Float[Tensor, "1 V K 3"]
+    opacities: Float[Tensor, "1 K"]
+    background: Float[Tensor, " 3"]
+    viewmats: Float[Tensor, "1 V 4 4"]
+    Ks: Float[Tensor, "1 V 3 3"]
+    size: tuple[int, int]
+
+    def to(self, device: torch.device) -> Splats:
+        """The same on a device."""
+        moved = {name: value.to(device) for name, value in self._asdict().items() if name != "size"}
+        return self._replace(**moved)
+
+    @torch.no_grad()
+    def forward(self, renderer: Renderer) -> Rendered:
+        """Images without a graph."""
+        return self._draw(renderer)
+
+    def both(self, renderer: Renderer, weights: Float[Tensor, "1 V H W 3"]) -> tuple[Tensor, ...]:
+        """Gradients of the images, summed under ``weights``, with respect to the first five fields."""
+        names = self._fields[:5]
+        leaves = {name: getattr(self, name).detach().requires_grad_() for name in names}
+        images = self._replace(**leaves)._draw(renderer)
+        return torch.autograd.grad([images.rgb], list(leaves.values()), [weights])
+
+    def _draw(self, renderer: Renderer) -> Rendered:
+        kernels = self.means, self.covars, self.colors, self.opacities
+        return renderer(*kernels, self.viewmats, self.Ks, self.size, background=self.background)
+
+    def weights(self) -> Float[Tensor, "1 V H W 3"]:
+        """Gradients of the images, as random as the scene."""
+        width, height = self.size
+        generator = torch.Generator().manual_seed(1)
+        shape = (*self.viewmats.shape[:2], height, width, 3)
+        return torch.rand(shape, generator=generator).to(self.means.device)
+
+
+def splats(count: int, width: int, height: int, views: int = 1) -> Splats:
+    """A cloud of ``count`` kernels before cameras that turn around it.
+
+    Means are normal, scales log-normal about 0.5 / sqrt(count), so that clouds of any count cover about the same
+    share of an image; orientations and colours are random, opacities uniform.
+    """
+    g = torch.Generator().manual_seed(0)
+    log_scales = 0.5 * torch.randn(1, count, 3, generator=g) + math.log(0.5 / count**0.5)
+    angles = TURN * torch.arange(views, dtype=torch.float32)
+    viewmats = torch.eye(4).repeat(1, views, 1, 1)
+    viewmats[0, :, 0, 0], viewmats[0, :, 0, 2] = angles.cos(), angles.sin()
+    viewmats[0, :, 2, 0], viewmats[0, :, 2, 2] = -angles.sin(), angles.cos()
+    viewmats[0, :, 2, 3] = DISTANCE
+    focal = FOCAL * width
+    intrinsics = torch.tensor([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
+    return Splats(
+        means=SPREAD * torch.randn(1, count, 3, generator=g),
+        covars=covariance_from_scales(log_scales, torch.randn(1, count, 4, generator=g)),
+        colors=torch.rand(1, views, count, 3, generator=g),
+        opacities=torch.rand(1, count, generator=g),
+        background=torch.tensor([0.1, 0.5, 0.9]),
+        viewmats=viewmats,
+        Ks=intrinsics.repeat(1, views, 1, 1),
+        size=(width, height),
+    )
+
+
+class Deformed(NamedTuple):
+    """One deformed state of a scene and four cameras: what colours and covariances are made of."""
+
+    positions: Float[Tensor, "1 K 3"]
+    gradients: Float[Tensor, "1 N 3 3"]
+    rotations: Float[Tensor, "1 N 3 3"]
+    unit_of_kernel: Int[Tensor, " K"]
+    look: SceneAppearance
+    centers: Float[Tensor, "V 3"]
+
+
+def deformed(count: int, units: int, views: int, degree: int) -> Deformed:
+    """Random kernels, deformation gradients near one and colours of spherical harmonics of that degree."""
+    g = torch.Generator().manual_seed(0)
+    gradients = torch.eye(3) + 0.1 * torch.randn(1, units, 3, 3, generator=g)
+    scene = GaussianScene.create(
+        means=SPREAD * torch.randn(count, 3, generator=g),
+        log_scales=0.5 * torch.randn(count, 3, generator=g) + math.log(0.5 / count**0.5),
+        quats=torch.randn(count, 4, generator=g),
+        opacity_logits=torch.randn(count, generator=g),
+        sh=0.3 * torch.randn(count, (degree + 1) ** 2, 3, generator=g),
+    )
+    look, centers = SceneAppearance.of(scene), torch.randn(views, 3, generator=g)
+    centers = DISTANCE * torch.nn.functional.normalize(centers, dim=-1)
+    unit = torch.randint(0, units, (count,), generator=g)
+    return Deformed(scene.means[None], gradients, polar_rotation(gradients), unit, look, centers)
