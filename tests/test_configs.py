@@ -28,7 +28,7 @@ OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1]
 # They set keys of other groups or of Hydra, and so build nothing of their own under their name.
 NOT_BUILT = ("hydra", "paths")
 # They change other groups under `@package _global_`: everything is built with them.
-GLOBAL = ("experiment", "ablation", "budget")
+GLOBAL = ("experiment", "ablation", "budget", "sweep")
 SPECIAL = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
 
 

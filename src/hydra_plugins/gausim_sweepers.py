@@ -39,3 +39,26 @@ class GridSweeper(Sweeper):
 
         assert self._sweep is not None
         run_grid(self._sweep, arguments, self._params, self._batch)
+
+
+class OptunaSweeper(Sweeper):
+    """A search by Optuna that goes on where it was killed (`hydra/sweeper=optuna`)."""
+
+    def __init__(self, **settings: Any) -> None:
+        """Keeps the settings; `gausim.cli._optuna.SearchSettings` explains them."""
+        self._settings = settings
+        self._sweep: Sweep | None = None
+
+    def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
+        """Builds the launcher."""
+        from gausim.cli._sweep import Sweep
+
+        self.hydra_context, self.config = hydra_context, config
+        self._sweep = Sweep(config, hydra_context, task_function)
+
+    def sweep(self, arguments: list[str]) -> None:
+        """Trains one trial after another."""
+        from gausim.cli._optuna import Search, SearchSettings
+
+        assert self._sweep is not None
+        Search(self._sweep, SearchSettings(**self._settings)).run(arguments)

@@ -6,12 +6,9 @@ import json
 import os
 import random
 import runpy
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import hydra
 import pytest
@@ -23,13 +20,10 @@ from gausim.core import ConfigError
 from gausim.engine.checkpoint import digest, read_checkpoint
 from gausim.engine.files import sole_writer
 
-TESTS = Path(__file__).parents[1]
-write_toy_object = runpy.run_path(str(TESTS / "toy_object.py"))["write_toy_object"]
-TINY = (
-    "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
-    "data.curriculum.t_max=2", "data.repeats=2", "trainer=cpu", "trainer.threads=1", "trainer.max_epochs=2",
-    "trainer.progress=false", "render=reference", "callbacks.panels=null", "logger=none",
-)  # fmt: skip
+SHARED = runpy.run_path(str(Path(__file__).with_name("sweeps.py")))
+sweeper, dying, history, write_toy_object = (
+    SHARED[name] for name in ("sweeper", "dying", "history", "write_toy_object")
+)
 FINISH = "gausim.engine.run.RunDirectory.finish"
 
 Do = Callable[..., "tuple[int, str]"]
@@ -37,31 +31,12 @@ Do = Callable[..., "tuple[int, str]"]
 
 @pytest.fixture(scope="module")
 def do(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Do]:
-    """Runs `gausim train -m` in a process of its own: name, overrides, and how it dies."""
-    folder = tmp_path_factory.mktemp("sweeps")
-    toy = write_toy_object(folder / "toy", frames=8).root
-    program = [sys.executable, str(TESTS / "engine" / "killed_runs.py")]
-    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
-        assert server.stdin is not None and server.stdout is not None
-
-        def order(name: str, *overrides: str, **death: Any) -> tuple[int, str]:
-            argv = ["-m", *TINY, f"data.root={toy}", f"paths.output_root={folder}", f"name={name}", *overrides]
-            server.stdin.write(json.dumps({"argv": argv, **death}) + "\n")
-            server.stdin.flush()
-            found = json.loads(server.stdout.readline())
-            return found["status"], found["output"]
-
-        order.folder = folder  # type: ignore[attr-defined]
+    with sweeper(tmp_path_factory.mktemp("sweeps")) as order:
         yield order
-        server.stdin.close()
 
 
 def runs_of(do: Do, name: str) -> list[Path]:
     return sorted((do.folder / name).rglob("seed_*"))  # type: ignore[attr-defined]
-
-
-def history(run: Path) -> list[str]:
-    return [json.loads(line)["event"] for line in (run / "events.jsonl").read_text().splitlines()]
 
 
 def steps(run: Path) -> int:
@@ -70,7 +45,7 @@ def steps(run: Path) -> int:
 
 
 def test_a_killed_sweep_goes_on_where_it_was(do: Do) -> None:
-    status, _ = do("cut", "seed=0,1,2", die=[{"target": FINISH, "match": "", "count": 2, "when": "before"}])
+    status, _ = do("cut", "seed=0,1,2", **dying(FINISH, 2))
     assert status == -9
     first, second = runs_of(do, "cut")
     status, output = do("cut", "seed=0,1,2")

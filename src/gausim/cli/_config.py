@@ -29,7 +29,7 @@ HYDRA_VERSION_BASE = "1.3"
 LONGEST_FOLDER_NAME = 120
 # What a configuration may name in `_target_`. A configuration comes with data and runs from other people, so it must
 # not be able to call whatever the interpreter can import.
-ALLOWED_PACKAGES = ("gausim", "torch", "lightning", "torchmetrics", "kornia")
+ALLOWED_PACKAGES = ("gausim", "torch", "lightning", "torchmetrics", "kornia", "optuna.samplers", "optuna.pruners")
 ALLOWED_TARGETS = ("builtins.dict", "builtins.list")
 # Inside the allowed packages these load code, read pickles or start programs.
 REFUSED_MODULES = (

@@ -10,13 +10,16 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn
 from hydra.types import HydraContext, TaskFunction
+from lightning.pytorch import Callback
 from omegaconf import DictConfig, OmegaConf
 
+from gausim.cli._config import in_sweep
 from gausim.core.errors import BusyError, ConfigError, GausSimError, RunError
 from gausim.engine.run import RunDirectory, one_line
 
@@ -95,6 +98,27 @@ def _left_out(cfg: DictConfig, run: RunDirectory) -> JobResult | None:
     return None
 
 
+def judges(cfg: DictConfig) -> list[Callback]:
+    """What may end the running job early: the pruner of its search, where there is one.
+
+    Raises:
+        ConfigError: it trains on several devices.
+    """
+    if not HydraConfig.initialized() or not in_sweep():
+        return []
+    sweeper = HydraConfig.get().sweeper
+    if sweeper.get("pruner") is None or sweeper.get("trial") is None:
+        return []
+    if str(cfg.trainer.devices) != "1":
+        raise ConfigError(
+            f"hydra.sweeper.pruner: expected trainer.devices=1, got {cfg.trainer.devices}. Train without a pruner "
+            "(hydra.sweeper.pruner=null)."
+        )
+    from gausim.cli._optuna import pruning_judge
+
+    return [pruning_judge()]
+
+
 def _finished(run: RunDirectory, state: str) -> JobResult:
     facts = run.facts()
     return JobResult.of(facts["last_epoch"].get(OBJECTIVE), PRUNED if facts.get("pruned") else state, run)
@@ -157,7 +181,10 @@ class Sweep:
         told = ", ".join(f"{counts[s]} {s}" for s in (TRAINED, PRUNED, FINISHED_BEFORE, BUSY) if counts[s])
         failed = {r.directory: r for r in self.results if r.state in (FAILED, FAILED_BEFORE)}
         told = ", ".join(part for part in (told, f"{len(failed)} failed" if failed else "") if part)
-        print(f"\nsweep of {len(self.results)} jobs: {told}\nnext: gausim report {self.folder}", flush=True)
+        print(
+            f"\nsweep of {len(self.results)} jobs: {told or 'nothing left to do'}\nnext: gausim report {self.folder}",
+            flush=True,
+        )
         if failed:
             lines = [f"\n  {r.directory}: {r.detail}" for r in failed.values()]
             raise RunError(

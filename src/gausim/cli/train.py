@@ -90,7 +90,7 @@ def _train_and_evaluate(cfg: DictConfig, run: RunDirectory) -> float | None:
         objective = run.facts()["last_epoch"].get("excess_static")
     else:
         objective = _train(cfg, run)
-    if cfg.evaluate:
+    if cfg.evaluate and not run.was_pruned:
         _evaluate(run)
     return objective
 
@@ -136,6 +136,7 @@ def _learn(cfg: DictConfig, run: RunDirectory, resume: Path | None) -> float | N
     from lightning.pytorch import seed_everything
 
     from gausim.cli._run import build
+    from gausim.engine.judge import EpochJudge
 
     seed_everything(cfg.seed, workers=True, verbose=False)
     module, datamodule = build(cfg)
@@ -147,7 +148,9 @@ def _learn(cfg: DictConfig, run: RunDirectory, resume: Path | None) -> float | N
         raise KeyboardInterrupt
     # Counted by `processed`: of a run that is resumed after its last save, `current_epoch` lags behind.
     epochs = cast(Any, trainer.fit_loop.epoch_progress.current).processed
-    run.finish({"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary})
+    pruned = any(isinstance(callback, EpochJudge) and callback.stopped for callback in cast(Any, trainer).callbacks)
+    facts = {"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary}
+    run.finish({**facts, **({"pruned": True} if pruned else {})})
     following = "" if cfg.evaluate else f"gausim evaluate {run.path}\n      "
     print(f"\nrun: {run.path}\nnext: {following}gausim simulate {run.path}", flush=True)
     return module.summary.get("excess_static")
@@ -175,8 +178,9 @@ def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None
 def make(cfg: DictConfig, run: RunDirectory) -> Trainer:
     """The trainer of a configuration, with its callbacks and with loggers that write into the run."""
     from gausim.cli._config import instantiate
+    from gausim.cli._sweep import judges
 
-    callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node]
+    callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node] + judges(cfg)
     loggers = [instantiate(node, save_dir=str(run.path)) for node in (cfg.logger or {}).values() if node]
     return instantiate(cfg.trainer, run_dir=run.path, callbacks=callbacks, loggers=loggers)
 

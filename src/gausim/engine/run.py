@@ -92,6 +92,11 @@ class RunDirectory:
         """Whether an error ended the run, and nobody has tried again since."""
         return (self.path / FAILED).is_file()
 
+    @property
+    def was_pruned(self) -> bool:
+        """Whether a search ended the run early."""
+        return self.is_finished and bool(self.facts().get("pruned"))
+
     def facts(self) -> dict[str, Any]:
         """What a finished run says about itself.
 
@@ -243,7 +248,7 @@ class RunDirectory:
     def awaits_evaluation(self, config: Mapping[str, Any]) -> bool:
         """Whether this very configuration is trained to its end here, and was not evaluated since."""
         finished, measured = self.path / FINISHED, self.path / EVALUATION
-        if not self.is_finished or changed_keys(self.config(), config):
+        if not self.is_finished or self.was_pruned or changed_keys(self.config(), config):
             return False
         return not measured.is_file() or measured.stat().st_mtime < finished.stat().st_mtime
 
