@@ -52,6 +52,8 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from gausim.ops.clustering import CLUSTERINGS
+
     parser = argparse.ArgumentParser(prog="gausim inspect", description=HELP)
     add = parser.add_argument
     add("scene", metavar="SCENE", help="3DGS scene (PLY)")
@@ -63,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--radii", type=float, nargs="+", default=list(DEFAULT_RADII), metavar="R",
         help="largest cluster diameter per level, fine to coarse, as fractions of the diagonal of the simulated "
         "kernels' bounding box; default {:g} {:g}, as in the model configurations".format(*DEFAULT_RADII))  # fmt: skip
-    add("--clustering", default=DEFAULT_CLUSTERING, choices=("ball", "complete_linkage"),
+    add("--clustering", default=DEFAULT_CLUSTERING, choices=tuple(CLUSTERINGS),
         help="clustering method; default %(default)s, as in the model configurations")  # fmt: skip
     add("--up", choices=("x", "y", "z", "-x", "-y", "-z"),
         help="axis drawn upwards (write --up=-y); default away from the pins, else z")  # fmt: skip
