@@ -84,7 +84,7 @@ def _blocked(
     if torch.is_grad_enabled():
         new, received = _EdgeUpdate.apply(edges, source, destination, edge_index, low, *weights)
         return new, received
-    return edges, _update(edges, source, destination, edge_index, weights, low, edges, None)
+    return _update(edges, source, destination, edge_index, weights, low, keep=False)[:2]
 
 
 def _blocks(edges: Tensor) -> list[slice]:
@@ -112,27 +112,37 @@ def _update(
     edge_index: Tensor,
     weights: EdgeWeights,
     low: torch.dtype,
-    new: Tensor,
-    kept: Tensor | None,
-) -> Tensor:
-    """Fills ``new`` (may be ``edges``) and, unless None, ``kept`` with the argument of silu; returns the sums."""
+    *,
+    keep: bool,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """New edges (written over ``edges`` unless ``keep``), their sums, and the argument of silu if ``keep``."""
     source, destination = source.to(low).contiguous(), destination.to(low).contiguous()
     first, first_bias, second, second_bias = (w.to(low) for w in weights[2:])
     received = torch.zeros_like(source, dtype=edges.dtype)
+    kept, new = list[Tensor](), list[Tensor]()
     for block in _blocks(edges):
         start, end = edge_index[0, block], edge_index[1, block]
         ends = source.index_select(0, start).add_(destination.index_select(0, end))
         hidden = product(_normed(edges[block], weights)[0].to(low), first, first_bias, ends)
-        if kept is not None:
-            kept[block] = hidden
-        message = nn.functional.silu(hidden, inplace=True)
-        updated = new[block]
+        message = nn.functional.silu(hidden, inplace=not keep)
         if low == edges.dtype:
-            updated.copy_(product(message, second, second_bias, edges[block]))
+            updated = product(message, second, second_bias, edges[block])
         else:
-            torch.add(edges[block], product(message, second, second_bias), out=updated)
+            updated = edges[block] + product(message, second, second_bias)
         received.index_add_(0, end, updated)
-    return received
+        if keep:
+            kept.append(hidden)
+            new.append(updated)
+        else:
+            edges[block] = updated
+    return (_joined(new, edges), received, _joined(kept, edges.to(low))) if keep else (edges, received, None)
+
+
+def _joined(blocks: list[Tensor], empty: Tensor) -> Tensor:
+    """The blocks one after the other; ``empty`` where there are none."""
+    if len(blocks) == 1:  # no copy
+        return blocks[0]
+    return torch.cat(blocks) if blocks else empty
 
 
 class _EdgeUpdate(torch.autograd.Function):
@@ -146,8 +156,9 @@ class _EdgeUpdate(torch.autograd.Function):
         low: torch.dtype,
         *weights: Tensor,
     ) -> tuple[Tensor, Tensor]:
-        new, hidden = torch.empty_like(edges), torch.empty_like(edges, dtype=low)
-        received = _update(edges, source, destination, edge_index, EdgeWeights(*weights), low, new, hidden)
+        new, received, hidden = _update(
+            edges, source, destination, edge_index, EdgeWeights(*weights), low, keep=True
+        )  # fmt: skip
         ctx.save_for_backward(edges, edge_index, hidden, *weights)
         ctx.node_type = source.dtype
         return new, received
