@@ -42,3 +42,11 @@ def test_core_needs_no_gpu_dashboard_or_viewer() -> None:
         "hydra",
         "kornia",
     }
+
+
+def test_training_without_a_dashboard_imports_none() -> None:
+    rooms = "import gausim.cli._run, gausim.engine.run, gausim.engine.panels, gausim.engine.loggers"
+    loggers = "import gausim.engine.wandb_log, gausim.engine.mlflow_log"
+    made = "gausim.engine.wandb_log.WandbLog('nowhere').finalize('success')"
+    modules = imported_by(f"{rooms}; {loggers}; {made}")
+    assert "lightning" in modules and not modules & {"wandb", "mlflow"}

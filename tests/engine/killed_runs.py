@@ -24,7 +24,8 @@ import torch
 import gausim.cli._run
 import gausim.cli.train
 import gausim.engine.loggers
-import gausim.engine.panels  # noqa: F401
+import gausim.engine.panels
+import gausim.engine.wandb_log  # noqa: F401
 from gausim.cli.main import main
 from gausim.engine.module import GausSimModule
 

@@ -119,9 +119,25 @@ def job_threads(most: int) -> int:
     return min(most, max(1, cores // (jobs if jobs > 0 else max(1, cores + 1 + jobs))))
 
 
+def job_group(name: str) -> str:
+    """Returns what dashboards list a run under: NAME/ABLATION/MODEL, of which seeds and settings are variants."""
+    if not HydraConfig.initialized():
+        return name  # composed without a job; nobody has chosen anything
+    choices = HydraConfig.get().runtime.choices
+    return "/".join([name, *(str(choices.get(group) or "none") for group in ("ablation", "model"))])
+
+
+def job_name(seed: int) -> str:
+    """Returns what dashboards call a run within its group: of a sweep, its overrides and its seed."""
+    hydra_config = HydraConfig.get() if HydraConfig.initialized() else None
+    sweeps = hydra_config is not None and hydra_config.mode == RunMode.MULTIRUN
+    overrides = folder_name(hydra_config.job.override_dirname) if hydra_config is not None and sweeps else ""
+    return "/".join([*([overrides] if overrides else []), f"seed_{seed}"])
+
+
 ConfigStore.instance().store(name="base_schema", node=RootConfig, provider="gausim")
-OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
-OmegaConf.register_new_resolver("job_threads", job_threads, replace=True)
+for resolver in (folder_name, job_threads, job_group, job_name):
+    OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
 
 
 def conf_dir() -> Path:

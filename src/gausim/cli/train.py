@@ -142,6 +142,8 @@ def _learn(cfg: DictConfig, run: RunDirectory, resume: Path | None) -> float | N
     module, datamodule = build(cfg)
     _take_over(cfg, module, resumed=resume is not None)
     trainer = make(cfg, run)
+    for logger in trainer.loggers:
+        logger.log_hyperparams(_plain(cfg))
     _introduce(trainer, module, datamodule, run, resumed=resume is not None)
     trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
     if trainer.interrupted:

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import csv
 import io
-import uuid
+import tempfile
 from argparse import Namespace
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
+import yaml
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
+from PIL import Image
 
 from gausim.engine.files import write_durably
-
-if TYPE_CHECKING:
-    from lightning.pytorch.loggers import WandbLogger
-
-WANDB_ID = "wandb_id"
+from gausim.engine.media import Media
+from gausim.io.video import read_video, video_rate, write_gif
 
 
 @runtime_checkable
@@ -71,6 +70,11 @@ class CsvLog(Logger):
             whole = [row for row in self._rows() if None not in row and None not in row.values()]
             self._rewrite([row for row in whole if int(row["step"] or 0) <= step])
 
+    def rows(self) -> list[tuple[int, dict[str, float]]]:
+        """Steps and numbers of the whole table, in the order in which they were logged."""
+        found = ((row.pop("step"), row) for row in self._rows())
+        return [(int(step or 0), {k: float(v) for k, v in row.items() if v}) for step, row in found]
+
     def _rows(self) -> list[dict[str, Any]]:
         if not self.path.is_file():
             return []
@@ -87,11 +91,20 @@ class CsvLog(Logger):
 
 
 class TensorBoardLog(TensorBoardLogger):
-    """TensorBoard's events in one folder; those of steps that a resumed run does again are marked as void."""
+    """TensorBoard's events in one folder; those of steps that a resumed run does again are marked as void.
+
+    Videos are animated GIFs under IMAGES, tables and the configuration are under TEXT.
+    """
 
     def __init__(self, save_dir: str | Path, *, name: str = "tensorboard") -> None:
         """The events go to ``save_dir/name``."""
         super().__init__(save_dir, name=name, version="")
+
+    @rank_zero_only
+    def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
+        """Shows the configuration."""
+        text = yaml.safe_dump(dict(params), sort_keys=False)
+        self.experiment.add_text("config", "    " + text.replace("\n", "\n    "))  # indented text is code in Markdown
 
     @rank_zero_only
     def resume_at(self, step: int) -> None:
@@ -101,23 +114,51 @@ class TensorBoardLog(TensorBoardLogger):
         restart = Event(step=step + 1, session_log=SessionLog(status=SessionLog.START))
         self.experiment.file_writer.add_event(restart)
 
+    @rank_zero_only
+    def log_media(self, media: Media) -> None:
+        """Shows the media of one step."""
+        for name in media.names:
+            self._image(f"{name}/video", _gif(media.video(name)), media.step)
+            for kind, path in media.pictures(name).items():
+                self._image(f"{name}/{kind}", path.read_bytes(), media.step)
+            self._image(f"{name}/errors", error_plot(media, name), media.step)
+        columns, rows = media.objects()
+        lines = ["| " + " | ".join(cells) + " |" for cells in (columns, ["---"] * len(columns), *rows)]
+        self.experiment.add_text("objects", "\n".join(lines), media.step)
 
-def wandb_logger(
-    save_dir: str | Path, *, project: str = "gausim", name: str | None = None, offline: bool = True
-) -> WandbLogger:
-    """Lightning's Weights & Biases logger under one id per run directory, kept there in ``wandb_id``.
+    def _image(self, tag: str, encoded: bytes, step: int) -> None:
+        from tensorboard.compat.proto.summary_pb2 import Summary
 
-    Args:
-        save_dir: the run directory.
-        project: of Weights & Biases.
-        name: what the run is called there.
-        offline: write to ``save_dir/wandb`` only; ``wandb sync`` uploads all parts of a resumed run as one.
-    """
-    from lightning.pytorch.loggers import WandbLogger
+        height, width = _size(encoded)
+        image = Summary.Image(encoded_image_string=encoded, height=height, width=width, colorspace=3)
+        self.experiment.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
 
-    path = Path(save_dir) / WANDB_ID
-    if not path.is_file():
-        write_durably(path, uuid.uuid4().hex[:12].encode())
-    return WandbLogger(
-        name=name, save_dir=save_dir, id=path.read_text(), project=project, offline=offline, resume="allow"
-    )
+
+def error_plot(media: Media, name: str) -> bytes:
+    """The errors of a sequence by frame, as PNG."""
+    from matplotlib.figure import Figure
+
+    columns, rows = media.errors(name)
+    figure = Figure(figsize=(5.0, 2.8), dpi=100, layout="constrained")
+    axes = figure.subplots()
+    for column, (label, style) in enumerate(zip(columns[1:], ("-", "--"), strict=False), 1):
+        axes.plot([int(row[0]) for row in rows], [float(row[column] or "nan") for row in rows], style, label=label)
+    axes.set(xlabel="frame", ylabel="l2 x 1000", ylim=(0, None))
+    axes.set_title(f"{name}, step {media.step}", fontsize=9, parse_math=False)
+    axes.legend(fontsize=8)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    return stream.getvalue()
+
+
+def _gif(video: Path) -> bytes:
+    """TensorBoard plays no other videos."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "video.gif"
+        write_gif(path, read_video(video), video_rate(video))
+        return path.read_bytes()
+
+
+def _size(encoded: bytes) -> tuple[int, int]:
+    with Image.open(io.BytesIO(encoded)) as image:
+        return image.height, image.width

@@ -255,10 +255,12 @@ class GausSimModule(LightningModule):
         batch = self.simulator.batch([sample.scene_id])
         look, units = self.looks.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
         frames = [self._rest_image([sample], 0, batch)[None]]
-        for _, made in windows(self.simulator, batch, self.initial([sample], batch), sample.steps, 1):
-            states = States.of(made).tensors()
-            frames.append(draw(self.renderer, look, *states, units, sample.cameras).rgb)
-        self.train(was_training)
+        try:
+            for _, made in windows(self.simulator, batch, self.initial([sample], batch), sample.steps, 1):
+                states = States.of(made).tensors()
+                frames.append(draw(self.renderer, look, *states, units, sample.cameras).rgb)
+        finally:
+            self.train(was_training)
         return torch.cat(frames)
 
     # ------------------------------------------------------------------------------------------------ numbers

@@ -7,6 +7,8 @@ draw from the global ones, and a resumed run must find them where they were.
 from __future__ import annotations
 
 import random
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -39,3 +41,13 @@ def restore_random_state(state: dict[str, Any]) -> None:
     torch.set_rng_state(state["torch"])
     if state["cuda"] and torch.cuda.is_available() and torch.cuda.device_count() == len(state["cuda"]):
         torch.cuda.set_rng_state_all(state["cuda"])
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """A block after which the generators stand where they stood, whatever it drew: what only shows must not change."""
+    state = random_state()
+    try:
+        yield
+    finally:
+        restore_random_state(state)

@@ -25,8 +25,9 @@ from gausim.core import ConfigError, GausSimError, RunError
 from gausim.engine.callbacks import EPOCHS, ExactResume, TimeBudget
 from gausim.engine.checkpoint import LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, AtomicCheckpointIO, check_resumable
 from gausim.engine.files import remove_leftovers, sole_writer, unwritable, write_durably
-from gausim.engine.loggers import WANDB_ID
 from gausim.engine.memory import keep_freed_memory
+from gausim.engine.mlflow_log import MLFLOW_ID
+from gausim.engine.wandb_log import WANDB_ID
 
 CONFIG, FINISHED, FAILED, LOCK = "config.yaml", "FINISHED", "FAILED", ".lock"
 EVALUATION, EVENTS = "evaluation/metrics.json", "events.jsonl"
@@ -57,6 +58,7 @@ OWN_FILES = (
     DAMAGED_CHECKPOINT,
     EPOCHS,
     WANDB_ID,
+    MLFLOW_ID,
 )
 OWN_FOLDERS = ("panels", "snapshots", "tensorboard", "csv", "wandb")
 

@@ -97,6 +97,22 @@ def read_video(path: Path | str) -> Iterator[np.ndarray]:
         raise DataError(f"{path}: cannot be decoded as video ({error}). Check the file.") from error
 
 
+def video_rate(path: Path | str) -> float:
+    """Frames per second of the first video stream.
+
+    Raises:
+        DataError: the file is missing, holds no video or cannot be read.
+    """
+    try:
+        with av.open(str(path)) as container:
+            rate = container.streams.video[0].average_rate if container.streams.video else None
+    except (FFmpegError, OSError) as error:
+        raise DataError(f"{path}: cannot be read as video ({error}). Check the file.") from error
+    if not rate:
+        raise DataError(f"{path}: holds no video stream with a frame rate.")
+    return float(rate)
+
+
 def write_gif(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> int:
     """Writes (H, W, 3) uint8 RGB frames as an endless GIF with one palette for all; returns their number.
 

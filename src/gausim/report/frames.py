@@ -30,7 +30,13 @@ def error_colors(truth: np.ndarray, prediction: np.ndarray) -> np.ndarray:
 
 
 def video_frame(
-    truth: np.ndarray | None, prediction: np.ndarray, frame: int, timeline: Timeline, title: str
+    truth: np.ndarray | None,
+    prediction: np.ndarray,
+    frame: int,
+    timeline: Timeline,
+    title: str,
+    *,
+    height: int = PANEL_HEIGHT,
 ) -> np.ndarray:
     """One frame of a comparison: ground truth | prediction | error, labels above, the time line below.
 
@@ -40,10 +46,11 @@ def video_frame(
         frame: its number.
         timeline: of the whole video.
         title: what is shown (sequence and view).
+        height: smaller images are enlarged to so many rows.
     """
     missing = np.full_like(prediction, _PAPER[0])
     error = missing if truth is None else error_colors(truth, prediction)
-    zoom = max(1.0, PANEL_HEIGHT / prediction.shape[0])
+    zoom = max(1.0, height / prediction.shape[0])
     panels = [_enlarge(p, zoom) for p in (missing if truth is None else truth, prediction, error)]
     labels = ["ground truth" if truth is not None else "no ground truth", "prediction", f"error 0..{ERROR_RANGE:g}"]
     labelled = [np.concatenate((label_bar(text, p.shape[1]), p)) for text, p in zip(labels, panels, strict=True)]

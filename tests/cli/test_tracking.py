@@ -1,0 +1,118 @@
+"""Dashboards as `gausim train` uses them: names from the sweep, one end per job, and no trace in what is learned."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from gausim.cli import train as command
+from gausim.engine import panels
+from gausim.engine.checkpoint import read_checkpoint
+from gausim.engine.module import GausSimModule
+
+TESTS = Path(__file__).parents[1]
+write_toy_object = runpy.run_path(str(TESTS / "toy_object.py"))["write_toy_object"]
+FakeWandb = runpy.run_path(str(TESTS / "engine" / "test_dashboards.py"))["FakeWandb"]
+TINY = (
+    "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
+    "data.curriculum.t_max=2", "data.batch_size=2", "trainer.max_epochs=2", "trainer.accelerator=cpu",
+    "trainer.progress=false", "trainer.threads=1", "trainer.log_every_n_steps=1", "render=reference", "name=toy",
+    "callbacks.panels.every_epochs=1",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_toy_object(tmp_path_factory.mktemp("data") / "toy").root
+
+
+@pytest.fixture
+def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "wandb", FakeWandb)
+    FakeWandb.runs.clear()
+    return [f"data.root={toy}", *TINY]
+
+
+def test_a_sweep_names_its_jobs_and_ends_each_once(arguments: list[str]) -> None:
+    swept = ["logger=wandb", "ablation=none,momentum_off", "loss.static_weight=1,2", "seed=3"]
+    assert command.main(["-m", *arguments, *swept]) == 0
+    given = [run.given for run in FakeWandb.runs]
+    assert [g["group"] for g in given] == ["toy/none/gausim_paper"] * 2 + ["toy/momentum_off/gausim_paper"] * 2
+    assert len({g["name"] for g in given[:2]}) == 2 and all(g["name"].endswith("/seed_3") for g in given)
+    assert [run.exits for run in FakeWandb.runs] == [[0]] * 4
+    assert given[2]["config"]["model"]["simulator"]["conserve_momentum"] is False
+    assert len({g["id"] for g in given}) == 4
+    rows = FakeWandb.runs[0].rows
+    names = {name for _, row in rows for name in row}
+    assert {"train/grad_network", "train/steps", "epoch/loss_image", "objects/toy/l2", "media/objects"} <= names
+    assert "media/toy_seq_000/video" in names
+
+
+def test_a_job_that_fails_ends_its_run_as_failed(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(self: GausSimModule) -> None:
+        raise MemoryError("out of memory")
+
+    monkeypatch.setattr(GausSimModule, "on_train_epoch_end", fail)
+    with pytest.raises(MemoryError):
+        command.main([*arguments, "logger=wandb"])
+    (run,) = FakeWandb.runs
+    assert run.exits == [1] and run.given["name"] == "seed_0" and run.given["group"] == "toy/none/gausim_paper"
+
+
+def weights(run: str) -> dict[str, torch.Tensor]:
+    return read_checkpoint(Path("outputs") / run / "seed_0" / "last.ckpt")["state_dict"]
+
+
+def test_what_is_shown_does_not_change_what_is_learned(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    step, clip = GausSimModule.training_step, panels._clip
+
+    def careless_step(self: GausSimModule, *args: object) -> None:
+        step(self, *args)  # type: ignore[arg-type]
+        with torch.no_grad():
+            self.simulator.parameter_groups()["network"][0].add_(1e-3 * torch.rand(()))
+
+    def careless_clip(*args: object) -> object:
+        np.random.rand(), torch.rand(7)
+        return clip(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(GausSimModule, "training_step", careless_step)
+    monkeypatch.setattr(panels, "_clip", careless_clip)
+    command.main([*arguments, "name=shown", "logger=wandb"])
+    command.main([*arguments, "name=hidden", "logger=none", "callbacks.panels=null"])
+    shown, hidden = weights("shown"), weights("hidden")
+    for name, value in shown.items():
+        torch.testing.assert_close(hidden[name], value, rtol=0, atol=0)
+
+
+def test_panels_see_training_frames_and_the_first_training_camera_only(arguments: list[str]) -> None:
+    command.main(arguments)
+    run = Path("outputs/toy/seed_0")
+    events = EventAccumulator(str(run / "tensorboard")).Reload()
+    assert [e.step for e in events.Images("toy_seq_000/video")] == [1, 2]
+    assert {"objects/toy/l2", "objects/toy/ratio_static", "train/grad_network"} <= set(events.Tags()["scalars"])
+    head, line = (run / "panels" / "step_000002" / "objects.csv").read_text().splitlines()
+    row = dict(zip(head.split(","), line.split(","), strict=True))
+    assert (row["object"], row["sequence"], row["camera"], row["T"]) == ("toy", "seq_000", "cam_0", "2")
+    assert float(row["l2 x1000"]) == pytest.approx(1000 * events.Scalars("objects/toy/l2")[1].value, rel=1e-3)
+    assert float(row["l2 / static"]) == pytest.approx(float(row["l2 x1000"]) / float(row["static x1000"]), rel=1e-2)
+    frames = (run / "panels" / "step_000002" / "toy_seq_000.errors.csv").read_text().splitlines()
+    assert len(frames) == 1 + 3  # frames 0..t_max, whatever T is
+
+
+def test_a_panel_that_cannot_be_drawn_is_left_out(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def explode(self: GausSimModule, sample: object) -> torch.Tensor:
+        return torch.full((3, 1, 32, 32, 3), torch.nan)
+
+    monkeypatch.setattr(GausSimModule, "predict_images", explode)
+    assert command.main(arguments) == 0
+    assert "no panel of toy at step 1: the predicted images are not finite" in capsys.readouterr().out
+    assert list(Path("outputs/toy/seed_0/panels").glob("step_*")) == []
