@@ -21,6 +21,7 @@ from gausim.data.objects import ObjectData
 from gausim.engine import cost
 from gausim.engine.cost import CostMeter
 from gausim.engine.evaluation import default_metrics, evaluate_object, write_evaluation
+from gausim.engine.memory import keep_freed_memory
 from gausim.engine.provenance import code_provenance, data_provenance, file_hash
 from gausim.engine.recorder import PictureRecorder
 from gausim.metrics.lpips import expected_shapes
@@ -117,6 +118,20 @@ def test_memory_that_a_prediction_takes_is_seen():
     meter.predict(lambda: np.ones(30_000_000).sum(), 1)  # 240 MB, let go at once
     memory = meter.summary()["memory"]
     assert 200e6 < memory["added_bytes"] < 400e6 and memory["peak_bytes"] > memory["added_bytes"]
+
+
+@pytest.mark.skipif(not cost._RESET.exists() or torch.cuda.is_available(), reason="needs Linux's /proc, without CUDA")
+def test_memory_that_was_freed_before_hides_nothing():
+    def blocks(count: int) -> float:
+        return float(sum(x.sum() for x in [np.ones(125_000) for _ in range(count)]))  # 1 MB each
+
+    assert keep_freed_memory()
+    blocks(200)
+    meter = CostMeter()
+    for count in (150, 60, 80):
+        meter.predict(lambda count=count: blocks(count), 1)
+    memory = meter.summary()["memory"]
+    assert 130e6 < memory["first_added_bytes"] < 200e6 and 65e6 < memory["added_bytes"] < 110e6
 
 
 def test_memory_is_unknown_where_nothing_tells(monkeypatch, tmp_path):

@@ -73,7 +73,8 @@ def make_curves(
     record = {
         "efficiency": {"gausim": {
             "seconds_per_frame": {"mean": 0.01 * error, "std": 0.001}, "frames": 118, "seconds_per_image": 0.002,
-            "device": "cpu", "threads": 1, "memory": {"kind": "process", "peak_bytes": 2.1e9, "added_bytes": 3e6},
+            "device": "cpu", "threads": 1, "memory": {
+                "kind": "process, resident", "peak_bytes": 2.1e9, "added_bytes": 3e6 * error, "first_added_bytes": 2e7},
             "levels": {"counts": [200, 20, 4], "predicted": [2, 1], "predictions": 20, "kernels": 200}}},
         "sources": {"root": "/data/toy", "scene": {"file": "scene.ply", "sha256": "5ce7e" * 12},
                     "manifest": {"file": "dataset.json", "sha256": "da7a" * 16}},

@@ -150,8 +150,10 @@ def test_the_change_against_full_is_measured_in_spreads(tmp_path):
 def test_the_efficiency_table(sweep):
     rows = texts(sheets(sweep)["efficiency"])
     assert rows["gausim"] == [
-        "200 → 20 → 4", "0.100", "0.0110 ± 0.0010", "2.00", "2.10 GB", "cpu, 1 threads",
+        "200 → 20 → 4", "0.100", "0.0110 ± 0.0010", "2.00", "+ 3.6 MB", "cpu, 1 threads",
     ]  # fmt: skip
+    memory = sheets(sweep)["efficiency"].lines[0].entries[4]
+    assert memory.extra == "first + 20 MB; process 2.10 GB"
     assert rows["gausim w/o hierarchy"][0] == "failed"
     assert rows["GausSim w/o hierarchy (paper)"][2] == "0.36"
 

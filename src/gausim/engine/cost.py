@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import statistics
 import time
 from collections.abc import Callable
@@ -10,21 +11,26 @@ from typing import Any, TypeVar
 
 import torch
 
+from gausim.engine.memory import give_back_freed_memory
+
 T = TypeVar("T")
+CUDA, RESIDENT = "CUDA allocated", "process, resident"
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
 
 class CostMeter:
     """Collects the costs of one method over sequences.
 
-    Memory is what CUDA allocates where the model lives there, else the peak resident size of the process (Linux), each
-    with what the prediction added to what was there before it.
+    Memory is what CUDA allocates where the model lives there, else what the process has resident (Linux), in which
+    libraries and decoded videos outweigh any prediction. So what one prediction adds to what was there before is
+    counted too, after memory that was freed earlier has been given back and could not hide it. The first prediction
+    also builds what stays (the graph, compiled code) and is counted apart.
     """
 
     def __init__(self) -> None:
         self._seconds: list[float] = []
         self._frames = 0
-        self._peak, self._added = 0, 0
+        self._peak, self._added = 0, list[int]()
         self._kind: str | None = None
         self._drawing, self._images = 0.0, 0
 
@@ -40,8 +46,9 @@ class CostMeter:
         self._frames += frames
         peak = torch.cuda.max_memory_allocated() if cuda else _resident("VmHWM")
         if before is not None and peak is not None:
-            self._kind = "CUDA allocated" if cuda else "process, resident"
-            self._peak, self._added = max(self._peak, peak), max(self._added, peak - before)
+            self._kind = CUDA if cuda else RESIDENT
+            self._peak = max(self._peak, peak)
+            self._added.append(peak - before)
         return result
 
     def draw(self, make: Callable[[], T], images: int) -> T:
@@ -57,15 +64,21 @@ class CostMeter:
     def summary(self) -> dict[str, Any]:
         """Plain data for ``metrics.json``; the first sequence warms up and counts only where it is the only one."""
         timed = self._seconds[1:] or self._seconds
-        memory = {"kind": self._kind, "peak_bytes": self._peak, "added_bytes": self._added} if self._kind else None
         return {
             "seconds_per_frame": {"mean": statistics.fmean(timed), "std": statistics.pstdev(timed)},
             "frames": self._frames,
             "seconds_per_image": self._drawing / self._images if self._images else None,
-            "memory": memory,
+            "memory": self._memory(),
             "device": torch.cuda.get_device_name() if torch.cuda.is_initialized() else "cpu",
             "threads": torch.get_num_threads(),
         }
+
+    def _memory(self) -> dict[str, Any] | None:
+        if not self._added:
+            return None
+        first, *others = self._added
+        added = {"added_bytes": max(others or [first]), "first_added_bytes": first}
+        return {"kind": self._kind, "peak_bytes": self._peak, **added}
 
 
 def _begin(cuda: bool) -> int | None:
@@ -74,6 +87,8 @@ def _begin(cuda: bool) -> int | None:
         torch.cuda.synchronize()
         torch.cuda.reset_peak_memory_stats()
         return torch.cuda.memory_allocated()
+    gc.collect()
+    give_back_freed_memory()
     try:
         _RESET.write_text("5")  # proc(5): resets the peak resident size
     except OSError:

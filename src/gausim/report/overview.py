@@ -132,10 +132,11 @@ def efficiency_sheet(study: Study) -> Sheet:
     heads = ("units per level", "N_F / N_K", "s per frame", "ms per image", "peak memory", "on")
     caption = (
         "N_F / N_K: predicted deformation gradients over kernels. Seconds per predicted frame without drawing (mean ± "
-        "standard deviation over sequences, the first warms up), milliseconds to draw one image. Memory: what CUDA "
-        "allocated, else the peak resident size of the whole evaluating process, libraries and videos included; small: "
-        "what the prediction added. Compare rows of one machine only. Grey: the paper's, on Mothorchids, whose seconds "
-        "are those of a whole forward pass."
+        "standard deviation over sequences, the first warms up), milliseconds to draw one image. Memory: on a GPU the "
+        "most that CUDA had allocated; on a CPU what the prediction of a sequence adds at most to the memory of the "
+        "process, small: of the first sequence, which also builds the graph and loads compiled code, and the whole "
+        "process, libraries and videos included. Compare rows of one machine only. Grey: the paper's, on Mothorchids, "
+        "whose seconds are those of a whole forward pass."
     )
     return Sheet("efficiency", "Efficiency", caption, (("", heads),), tuple(lines), "method")
 
@@ -153,8 +154,6 @@ def _costs(costs: Sequence[tuple[RunRecord, dict[str, Any]]], runs: tuple[RunRec
     seconds = [x for _, c in costs if (x := _in(c, "seconds_per_frame", "mean")) is not None]
     spreads = [x for _, c in costs if (x := _in(c, "seconds_per_frame", "std")) is not None]
     drawing = [x for _, c in costs if (x := number(c.get("seconds_per_image"))) is not None]
-    peak = [x for _, c in costs if (x := _in(c, "memory", "peak_bytes")) is not None]
-    added = [x for _, c in costs if (x := _in(c, "memory", "added_bytes")) is not None]
     extra = f"± {spread:.4f}, {len(seconds)} seeds" if (spread := deviation(seconds)) is not None else ""
     mean = f"{_mean(seconds):.4f}" + (f" ± {_mean(spreads):.4f}" if spreads else "") if seconds else NOTHING
     device = f"{first.get('device', '?')}, {first.get('threads', '?')} threads"
@@ -163,10 +162,26 @@ def _costs(costs: Sequence[tuple[RunRecord, dict[str, Any]]], runs: tuple[RunRec
         (f"{share:.3f}" if share is not None else NOTHING, ""),
         (mean, extra),
         (f"{1e3 * _mean(drawing):.2f}" if drawing else NOTHING, ""),
-        (f"{max(peak) / _GIGA:.2f} GB" if peak else NOTHING, f"+ {max(added) / _MEGA:.0f} MB" if added else ""),
+        _memory([c for _, c in costs]),
         (device, ""),
     )
     return tuple(Entry(text, small, missing=text == NOTHING, runs=used) for text, small in texts)
+
+
+def _memory(costs: Sequence[dict[str, Any]]) -> tuple[str, str]:
+    """What is printed large and small of the memory: of a GPU the peak, of a process what a prediction adds to it."""
+    peak, added, first = (
+        max((x for c in costs if (x := _in(c, "memory", f"{key}bytes")) is not None), default=None)
+        for key in ("peak_", "added_", "first_added_")
+    )
+    if peak is None or added is None:
+        return NOTHING, ""
+    memory = costs[0].get("memory")
+    if isinstance(memory, dict) and str(memory.get("kind", "")).startswith("CUDA"):
+        return f"{peak / _GIGA:.2f} GB", f"+ {added / _MEGA:.0f} MB"
+    if first is None:  # earlier versions: freed memory hid what was added
+        return f"{peak / _GIGA:.2f} GB", "whole process"
+    return f"+ {added / _MEGA:.1f} MB", f"first + {first / _MEGA:.0f} MB; process {peak / _GIGA:.2f} GB"
 
 
 def _ratio(levels: Any) -> float | None:

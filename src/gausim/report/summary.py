@@ -13,8 +13,8 @@
         "floor": {KEY: CELL},                         the reconstruction against frame 0 of every training view
         "rows": {ROW: {SPLIT: {GROUP: {KEY: CELL}}}}, GROUP: train | heldout (views), points (3D)
         "efficiency": {METHOD: {"seconds_per_frame": {"mean", "std"}, "frames", "seconds_per_image", "device",
-            "threads", "memory": {"kind", "peak_bytes", "added_bytes"}, "levels": {"counts", "predicted",
-            "predictions", "kernels"}}},              memory and levels null where unknown
+            "threads", "memory": {"kind", "peak_bytes", "added_bytes", "first_added_bytes"}, "levels": {"counts",
+            "predicted", "predictions", "kernels"}}}, memory and levels null where unknown
         "sources": {"root", "scene": {"file", "sha256"}, "masks": {...}, "manifest": {...}},
         "absent": {KEY: why}                          metrics that could not be computed
      }}}
