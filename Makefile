@@ -13,10 +13,12 @@ STAMP := $(VENV)/.installed
 WORKERS ?= 2
 DATA ?= data/synthetic
 RUN ?= outputs/demo/seed_0
+# What a report is about: runs, sweeps, or folders of them.
+DIRS ?= $(if $(filter-out file,$(origin RUN)),$(RUN),outputs)
 ARGS ?=
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install test test-slow lint format data demo train evaluate simulate clean
+.PHONY: help install test test-slow lint format data demo train evaluate simulate report benchmark clean
 
 help: ## Show this text
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -60,6 +62,12 @@ evaluate: install ## Evaluate a run: make evaluate RUN=outputs/demo/seed_0
 
 simulate: install ## Write the videos and figures of a run: make simulate RUN=outputs/demo/seed_0
 	$(BIN)/gausim simulate $(RUN) $(ARGS)
+
+report: install ## Tables, figures and videos: make report DIRS="outputs/a outputs/b" (RUN=DIR for one)
+	$(BIN)/gausim report $(DIRS) $(ARGS)
+
+benchmark: install ## Measure: make benchmark ARGS=step (alone: every case at tiny sizes, to see that it works)
+	$(BIN)/gausim benchmark $(or $(ARGS),all --quick)
 
 demo: data ## From nothing to a simulator that foresees: install, make data, train, evaluate, simulate
 	test -e outputs/demo/seed_0/FINISHED || $(BIN)/gausim train experiment=demo

@@ -41,10 +41,10 @@ def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> lis
 
 
 def test_a_sweep_names_its_jobs_and_ends_each_once(arguments: list[str]) -> None:
-    swept = ["logger=wandb", "ablation=none,momentum_off", "loss.static_weight=1,2", "seed=3"]
+    swept = ["logger=wandb", "ablation=none,no_momentum", "loss.static_weight=1,2", "seed=3"]
     assert command.main(["-m", *arguments, *swept]) == 0
     given = [run.given for run in FakeWandb.runs]
-    assert [g["group"] for g in given] == ["toy/none/gausim_paper"] * 2 + ["toy/momentum_off/gausim_paper"] * 2
+    assert [g["group"] for g in given] == ["toy/none/gausim_paper"] * 2 + ["toy/no_momentum/gausim_paper"] * 2
     assert len({g["name"] for g in given[:2]}) == 2 and all(g["name"].endswith("/seed_3") for g in given)
     assert [run.exits for run in FakeWandb.runs] == [[0]] * 4
     assert given[2]["config"]["model"]["simulator"]["conserve_momentum"] is False

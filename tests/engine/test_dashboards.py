@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import runpy
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -159,12 +160,22 @@ def test_a_server_that_does_not_answer_is_a_named_error(fake: type[FakeWandb], t
         WandbLog(tmp_path, offline=False).resume_at(0)
 
 
+def wait_for_the_end(folder: Path) -> dict[str, Any]:
+    """A process of its own writes the file, and may still be at it."""
+    for _ in range(600):
+        found = read_offline_run(folder)
+        if found["exits"]:
+            return found
+        time.sleep(0.1)
+    raise AssertionError(f"{folder}: the run has no end after a minute")
+
+
 def test_a_real_offline_run_holds_everything_also_after_a_resume(tmp_path: Path) -> None:
     pytest.importorskip("wandb")
     train_a_part(tmp_path, 0, range(1, 7), status="failed")
     train_a_part(tmp_path, 4, range(5, 9), status="success")
     (folder,) = (tmp_path / "wandb").glob("offline-run-*")
-    found = read_offline_run(folder)
+    found = wait_for_the_end(folder)
     assert found["run"].run_id == (tmp_path / WANDB_ID).read_text() and found["run"].run_group == "g/none/m"
     assert found["run"].display_name == "seed_3" and found["config"]["model"] == {"layers": 2}
     assert found["exits"] == [0]

@@ -156,6 +156,12 @@ def _shown(study: Study, name: str, problems: list[str]) -> Iterator[Shown]:
     sets: dict[tuple[object, ...], list[tuple[str, Pictures, np.ndarray]]] = {}
     for group in study.groups:
         for run, _ in group.entries(name)[:1]:
+            if not _file(run, "pictures.npz").is_file():
+                problems.append(
+                    f"{group.label}: its evaluation kept no pictures (an earlier version did it). "
+                    f"Call `gausim evaluate {run.path}` again."
+                )
+                continue
             try:
                 kept = [p for p in load_pictures(_file(run, "pictures.npz")) if p.object == name]
             except GausSimError as error:

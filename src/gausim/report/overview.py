@@ -11,6 +11,7 @@ from gausim.report.runs import RunRecord
 from gausim.report.sheets import (
     METHOD,
     NOTHING,
+    OLD_EVALUATION,
     PAPER,
     SPLITS,
     TABLES,
@@ -23,7 +24,7 @@ from gausim.report.sheets import (
     metric_sheet,
     split_title,
 )
-from gausim.report.study import FULL, Cell, Group, Study, cell, deviation, number
+from gausim.report.study import FULL, NOT_MEASURED, Cell, Group, Study, cell, deviation, number
 from gausim.report.summary import MOTION_ENERGY
 
 # What ablations are compared by: (metric, views).
@@ -138,13 +139,15 @@ def efficiency_sheet(study: Study) -> Sheet:
         "process, libraries and videos included. Compare rows of one machine only. Grey: the paper's, on Mothorchids, "
         "whose seconds are those of a whole forward pass."
     )
+    if any(e.text == NOT_MEASURED for line in lines for e in line.entries):
+        caption += f" {OLD_EVALUATION}"
     return Sheet("efficiency", "Efficiency", caption, (("", heads),), tuple(lines), "method")
 
 
 def _costs(costs: Sequence[tuple[RunRecord, dict[str, Any]]], runs: tuple[RunRecord, ...]) -> tuple[Entry, ...]:
     if not costs:
         states = {r.status for r in runs if r.summary is None}
-        text = next(iter(sorted(states)), "not measured")
+        text = next(iter(sorted(states)), NOT_MEASURED)
         return (Entry(text, missing=True, runs=runs), *(Entry(NOTHING, missing=True) for _ in range(5)))
     used = tuple(r for r, _ in costs)
     first = costs[0][1]

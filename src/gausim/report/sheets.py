@@ -10,7 +10,7 @@ from gausim.metrics.lpips import HOW_TO_GET_WEIGHTS, NO_WEIGHTS
 from gausim.report import paper
 from gausim.report.curves import ERROR_3D
 from gausim.report.runs import RunRecord
-from gausim.report.study import Cell, Group, Study, Value, cell, dig, pooled
+from gausim.report.study import NOT_MEASURED, Cell, Group, Study, Value, cell, dig, pooled
 from gausim.report.summary import MOTION_ENERGY
 
 METHOD, REFERENCE, PAPER = "method", "reference", "paper"
@@ -37,6 +37,7 @@ TABLES = (
 _LPIPS = {"label": "LPIPS", "scale": 100.0, "unit": "1e-2", "higher_is_better": False}
 NOTHING = "–"
 FLOOR = "reconstruction (floor)"
+OLD_EVALUATION = "Not measured: by an evaluation of an earlier version; call `gausim evaluate RUN` again."
 
 
 @dataclass(frozen=True)
@@ -158,6 +159,8 @@ def _caption(metric: str, views: str, info: dict[str, Any], lines: Sequence[Line
         parts.append("Grey: the paper's own figures, of its own recordings, cameras and image sizes.")
     if metric == "lpips" and any(NO_WEIGHTS in e.text for line in lines for e in line.entries):
         parts.append(f"No weights: `{HOW_TO_GET_WEIGHTS}` gets them; then evaluate again.")
+    if any(e.text == NOT_MEASURED for line in lines for e in line.entries):
+        parts.append(OLD_EVALUATION)
     return " ".join(parts)
 
 

@@ -192,17 +192,37 @@ def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
 def _distinct(
     labels: list[tuple[str, str, str]], members: list[tuple[RunRecord, ...]], objects: list[tuple[str, ...]]
 ) -> list[tuple[str, str, str]]:
-    """Adds to labels that two configurations on one object share what tells them apart: the run's name, or settings."""
+    """Adds to labels that two configurations on one object share what tells them apart: the run's name, or settings.
+
+    Of several full configurations the one that the ablations are variations of keeps the plain label.
+    """
     taken = Counter((label, o) for (label, _, _), names in zip(labels, objects, strict=True) for o in names)
+    plain = {_reference(family, labels, members) for _, family, _ in labels}
     result = []
     for i, (label, family, variation) in enumerate(labels):
-        if all(taken[label, o] < 2 for o in objects[i]):
+        if i in plain or all(taken[label, o] < 2 for o in objects[i]):
             result.append((label, family, variation))
             continue
         rivals = [m[0] for j, m in enumerate(members) if labels[j][0] == label and j != i]
         tag = _difference(members[i][0], rivals)
         result.append((f"{label} ({tag})", family, tag if variation == FULL else f"{variation} ({tag})"))
     return result
+
+
+def _reference(
+    family: str, labels: Sequence[tuple[str, str, str]], members: Sequence[tuple[RunRecord, ...]]
+) -> int | None:
+    """The full configuration that differs least from the family's ablations; None without any, or in a tie."""
+    full = [i for i, label in enumerate(labels) if label[1:] == (family, FULL)]
+    ablated = [members[i][0].settings for i, label in enumerate(labels) if label[1] == family and i not in full]
+    if not ablated:
+        return None
+    distances = []
+    for i in full:
+        own = members[i][0].settings
+        distances.append(sum(own.get(k) != other.get(k) for other in ablated for k in {*own, *other}))
+    nearest = [i for i, d in zip(full, distances, strict=True) if d == min(distances)]
+    return nearest[0] if len(nearest) == 1 else None
 
 
 def _difference(run: RunRecord, rivals: Sequence[RunRecord]) -> str:

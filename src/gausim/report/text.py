@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import re
 from collections.abc import Sequence
 
@@ -105,6 +106,9 @@ def _latex_table(sheet: Sheet, sources: Sources) -> list[str]:
     if any(group for group, _ in sheet.columns):
         groups = [rf"\multicolumn{{{len(subs)}}}{{c}}{{\textbf{{{latex_escape(g)}}}}}" for g, subs in sheet.columns]
         lines.append(" & ".join(["", *groups]) + r" \\")
+        ends = list(itertools.accumulate(len(subs) for _, subs in sheet.columns))
+        starts = [end - len(subs) for end, (_, subs) in zip(ends, sheet.columns, strict=True)]
+        lines.append(" ".join(rf"\cmidrule(lr){{{s + 2}-{e + 1}}}" for s, e in zip(starts, ends, strict=True)))
     subs = [latex_escape(sub) for _, names in sheet.columns for sub in names]
     lines += [" & ".join([latex_escape(sheet.stub), *subs]) + r" \\", r"\midrule"]
     before = None

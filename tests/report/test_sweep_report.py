@@ -1,0 +1,95 @@
+"""A sweep as `gausim train -m` leaves it: NAME/ABLATION/MODEL/OVERRIDES/seed_S, some jobs failed, some missing."""
+
+from __future__ import annotations
+
+import csv
+import runpy
+from pathlib import Path
+
+import pytest
+
+from gausim.report.overview import make_sheets
+from gausim.report.runs import find_runs
+from gausim.report.sheets import Sheet
+from gausim.report.study import make_study
+from gausim.report.write import write_report
+
+MADE = runpy.run_path(str(Path(__file__).with_name("report_runs.py")))
+config, write_run, evaluate, make_curves = (MADE[n] for n in ("config", "write_run", "evaluate", "make_curves"))
+OFF = {
+    "none": {}, "no_mass": {"conserve_mass": False}, "no_momentum": {"conserve_momentum": False},
+    "no_hierarchy": {"predicted_levels": [0]},
+}  # fmt: skip
+
+
+def job(root: Path, ablation: str, seed: int, layers: int = 2) -> Path:
+    folder = root / ablation / "gausim" / f"experiment=tiny,model.simulator.layers={layers}" / f"seed_{seed}"
+    settings = config(seed, layers=layers, **OFF[ablation])
+    settings["ablation"] = {"name": ablation}
+    return write_run(folder, settings, finished=False)
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Path:
+    root = tmp_path / "outputs" / "tiny"
+    for ablation, error in (("none", 1.0), ("no_mass", 1.5), ("no_momentum", 0.9)):
+        for seed in (1, 2, 3):
+            run = job(root, ablation, seed)
+            if (ablation, seed) == ("no_momentum", 2):
+                (run / "FAILED").write_text("Traceback ...\ngausim.core.errors.DivergenceError: step 3 is not finite\n")
+            else:
+                (run / "FINISHED").write_text("{}")
+                evaluate(run, make_curves(error + 0.1 * seed))
+    for seed in (1, 2):
+        (job(root, "no_hierarchy", seed) / "FAILED").write_text("torch.OutOfMemoryError: 80 GB\n")
+    for seed in (1, 2):
+        (job(root, "none", seed, layers=4) / "FINISHED").write_text("{}")
+    return root
+
+
+def sheets(root: Path) -> dict[str, Sheet]:
+    return {sheet.key: sheet for sheet in make_sheets(make_study(find_runs([root])))}
+
+
+def test_the_ablation_table_pools_seeds_and_shows_what_is_missing(sweep: Path) -> None:
+    ablations = sheets(sweep)["ablation_toy_bunny_gausim"]
+    ((family, variations),) = ablations.columns
+    assert family == "gausim"
+    columns = {name: i for i, name in enumerate(variations)}
+    assert variations == ("full", "w/o mass", "w/o momentum", "w/o hierarchy", "layers=4")
+    line = next(line for line in ablations.lines if line.label == "l2: Unseen 34")
+    shown = {name: line.entries[i] for name, i in columns.items()}
+    # Means over the two sequences: 10e-3 times 1.1, 1.2, 1.3; deviation of the seeds 1e-3.
+    assert shown["full"].text == "12.00 ± 6.01" and shown["full"].extra == "± 1.00, 3 seeds"
+    assert shown["w/o momentum"].text == "11.00 ± 5.52" and shown["w/o momentum"].extra == "± 1.41, 2 seeds"
+    assert shown["w/o hierarchy"].text == "failed" and shown["w/o hierarchy"].missing
+    assert shown["layers=4"].text == "not evaluated"
+    assert [name for name, e in shown.items() if e.best] == ["w/o momentum"]
+    change = next(line for line in ablations.lines if line.label == "l2: Unseen 34, against full")
+    # 17 against 12, each with a deviation of 1 over three seeds: 5 / sqrt(2 / 3).
+    assert change.entries[columns["w/o mass"]].text == "+41.7 %"
+    assert change.entries[columns["w/o mass"]].extra == "+6.1 σ"
+
+
+def test_failures_are_told_and_every_number_links_to_its_runs(sweep: Path, tmp_path: Path) -> None:
+    study, _ = write_report([sweep], tmp_path / "out", pictures=False)
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "step 3 is not finite" in page and "80 GB" in page
+    assert any("w/o momentum: 1 of 3 runs have no numbers" in note for note in study.notes)
+    rows = list(csv.DictReader((tmp_path / "out" / "numbers.csv").open()))
+    (row,) = [r for r in rows if (r["row"], r["split"], r["views"], r["metric"]) == (
+        "gausim w/o momentum", "unseen", "train", "l2")]  # fmt: skip
+    assert row["seeds"] == "2" and len(row["runs"].split(";")) == 2 and "seed_2" not in row["runs"]
+    assert all(row[key] for key in ("config", "commit", "scene_sha256", "manifest_sha256"))
+    assert {r["status"] for r in rows if r["row"] == "gausim w/o hierarchy"} == {"failed"}
+
+
+def test_efficiency_stands_side_by_side_with_and_without_hierarchy(sweep: Path) -> None:
+    for seed in (1, 2):
+        run = sweep / "no_hierarchy" / "gausim" / "experiment=tiny,model.simulator.layers=2" / f"seed_{seed}"
+        (run / "FAILED").unlink()
+        (run / "FINISHED").write_text("{}")
+        evaluate(run, make_curves(4.0))
+    lines = {line.label: [e.text for e in line.entries] for line in sheets(sweep)["efficiency"].lines}
+    assert lines["gausim"][2:5] == ["0.0120 ± 0.0010", "2.00", "+ 3.9 MB"]
+    assert lines["gausim w/o hierarchy"][2:5] == ["0.0400 ± 0.0010", "2.00", "+ 12.0 MB"]
