@@ -77,7 +77,7 @@ def test_runs_without_pictures_leave_the_others_theirs(tmp_path):
     page = (root / "report" / "report.html").read_text()
     assert page.count("data:image") == 4 and page.count("data:video") == 1
     notes = re.findall(r'<p class="note">(.*?)</p>', page, re.S)
-    assert any("gausim:" in n and "pictures.npz" in n for n in notes)
+    assert any("gausim:" in n and "kept no pictures" in n and "gausim evaluate" in n for n in notes)
     assert any("gausim w/o mass:" in n and "metrics.npz" in n for n in notes)
 
 
