@@ -214,7 +214,7 @@ def test_a_second_process_is_kept_out_and_leftovers_of_a_killed_one_are_removed(
         (run.path / ".last.ckpt.4711.tmp").write_bytes(b"torn")
         (run.path / ".notes.tmp").write_bytes(b"mine")
         run.prepare({"seed": 0})
-    assert sorted(p.name for p in run.path.iterdir()) == [".lock", ".notes.tmp", "config.yaml"]
+    assert sorted(p.name for p in run.path.iterdir()) == [".lock", ".notes.tmp", "config.yaml", "events.jsonl"]
     with RunDirectory(tmp_path / "run").writing():
         pass
 
