@@ -28,6 +28,7 @@ RATES = (
     "model.simulator.layers=range(1,3)",
 )
 FINISH = "gausim.engine.run.RunDirectory.finish"
+STEP = "gausim.engine.module.GausSimModule.training_step"
 
 Do = Callable[..., "tuple[int, str]"]
 
@@ -145,11 +146,11 @@ def test_hydras_notation_becomes_optunas_distributions(text: str, expected: Base
 @pytest.mark.slow
 def test_six_trials_two_at_a_time_killed_once_are_those_of_an_undisturbed_search(do: Do) -> None:
     six = (*RATES, "hydra.sweeper.n_trials=6", "hydra.sweeper.n_jobs=2", "hydra.sweeper.sampler.n_startup_trials=2",
-           "render=cpu", "data.repeats=5", "trainer.max_epochs=6")  # fmt: skip
+           "data.repeats=5", "trainer.max_epochs=6")  # fmt: skip
     status, output = do("undisturbed", *six)
     assert status == 0, output
-    status, output = do("disturbed", *six, kill_after=random.Random(3).uniform(3.0, 5.0))
-    assert status == -9, f"ended by itself: lengthen the trials\n{output}"
+    status, output = do("disturbed", *six, **dying(STEP, random.Random(3).randint(70, 290)))  # of 360 steps
+    assert status == -9, output
     storage = f"sqlite:///{do.folder}/disturbed/optuna.db"  # type: ignore[attr-defined]
     before = optuna.load_study(storage=storage, study_name="study").trials
     assert 0 < len(before) <= 6 and any(t.state.name == "RUNNING" for t in before)

@@ -72,6 +72,9 @@ def test_settings_out_of_range_are_refused() -> None:
 
 def test_an_error_leaves_its_last_line_and_is_gone_when_tried_again(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path)
+    with pytest.raises(ZeroDivisionError), run.noting_failure():
+        1 / 0  # noqa: B018
+    assert not run.has_failed  # nothing was begun
     run.prepare(CONFIG)
     with pytest.raises(ZeroDivisionError), run.noting_failure():
         1 / 0  # noqa: B018

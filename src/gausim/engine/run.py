@@ -73,6 +73,7 @@ class RunDirectory:
     def __init__(self, path: Path | str) -> None:
         """Names the directory; :meth:`prepare` makes it."""
         self.path = Path(path)
+        self._prepared = False
 
     @property
     def checkpoint(self) -> Path:
@@ -182,6 +183,7 @@ class RunDirectory:
         write_durably(self.path / CONFIG, yaml.safe_dump(dict(config), sort_keys=False).encode())
         (self.path / FAILED).unlink(missing_ok=True)
         self.record("resumed" if resume else "started")
+        self._prepared = True
         return resume
 
     def check_unchanged(self, config: Mapping[str, Any]) -> None:
@@ -205,11 +207,14 @@ class RunDirectory:
 
     @contextmanager
     def noting_failure(self) -> Iterator[None]:
-        """The block that trains, once the run is prepared: an error that ends it is kept in ``FAILED``."""
+        """The block that trains: an error that ends it is kept in ``FAILED``.
+
+        One before the run was prepared, as that it is finished, says nothing about the run and is not kept.
+        """
         try:
             yield
         except Exception as error:
-            if not getattr(rank_zero_only, "rank", 0):
+            if self._prepared and not getattr(rank_zero_only, "rank", 0):
                 with suppress(OSError):  # the disk may be what failed; the error itself matters more
                     self._note(error)
             raise
