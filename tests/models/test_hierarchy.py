@@ -12,7 +12,7 @@ from gausim.ops.covariance import kernel_volumes
 RADII = (0.15, 0.35, 0.7)
 
 
-@pytest.mark.parametrize("clustering", ["ball", "complete_linkage"])
+@pytest.mark.parametrize("clustering", ["agglomerative", "ball", "complete_linkage"])
 def test_every_unit_has_one_parent_of_its_own_kind_and_volumes_add_up(make_scene, clustering) -> None:
     scene = make_scene(120, dtype=torch.float64)
     hierarchy = build_hierarchy(scene, radii=RADII, clustering=clustering)
@@ -53,7 +53,7 @@ def test_masses_add_up_level_by_level_with_random_densities(make_scene, make_mod
                 assert torch.allclose(found[c], weighted)
 
 
-@pytest.mark.parametrize("clustering", ["ball", "complete_linkage"])
+@pytest.mark.parametrize("clustering", ["agglomerative", "ball", "complete_linkage"])
 def test_cluster_diameters_are_bounded_by_fractions_of_the_diagonal(make_scene, clustering) -> None:
     scene = make_scene(120, dtype=torch.float64)
     hierarchy = build_hierarchy(scene, radii=RADII, clustering=clustering)
@@ -91,7 +91,7 @@ def test_root_is_the_nearest_pinned_kernel(make_scene) -> None:
             assert int(level.root[c]) == int(distance.argmin())
 
 
-@pytest.mark.parametrize("clustering", ["ball", "complete_linkage"])
+@pytest.mark.parametrize("clustering", ["agglomerative", "ball", "complete_linkage"])
 def test_permuting_kernels_permutes_the_clusters(make_scene, permuted, clustering) -> None:
     scene = make_scene(90, dtype=torch.float64)
     order = torch.randperm(90, generator=torch.Generator().manual_seed(0))

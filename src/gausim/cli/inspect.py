@@ -15,7 +15,7 @@ HELP = "Print a scene's kernels and hierarchy and draw its clusters."
 
 # The hierarchy of the model configurations (conf/model), which take a while to compose.
 DEFAULT_RADII = (0.13, 0.4)
-DEFAULT_CLUSTERING = "ball"
+DEFAULT_CLUSTERING = "agglomerative"
 
 
 def main(argv: list[str]) -> int:

@@ -67,13 +67,14 @@ class Hierarchy:
         return sum(int((~self.levels[level].pinned).sum()) for level in predicted)
 
 
-def build_hierarchy(scene: GaussianScene, *, radii: Sequence[float], clustering: str = "ball") -> Hierarchy:
+def build_hierarchy(scene: GaussianScene, *, radii: Sequence[float], clustering: str = "agglomerative") -> Hierarchy:
     """Clusters the simulated kernels level by level.
 
     Args:
         scene: the rest scene; at least one kernel must be pinned.
         radii: largest cluster diameter per level 1..L, as fractions of the bounding-box diagonal.
-        clustering: ``ball`` (near linear) or ``complete_linkage`` (the reference).
+        clustering: ``agglomerative`` (complete linkage in near-linear memory), ``ball`` (greedy cover; more clusters) or
+            ``complete_linkage`` (of all pairs; the reference).
 
     Raises:
         SceneError: no pinned kernel, or no simulated kernel that is free.

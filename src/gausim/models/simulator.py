@@ -60,7 +60,7 @@ class GausSim(nn.Module):
         *,
         radii: Sequence[float] = (0.1, 0.35),
         predicted_levels: Sequence[int] = (2, 1),
-        clustering: str = "ball",
+        clustering: str = "agglomerative",
         graph_radii: Sequence[float] = (2.0, 0.4),
         max_neighbours: int = 16,
         edges: str = "union",
@@ -93,7 +93,7 @@ class GausSim(nn.Module):
             fps: frames per second of each scene's videos.
             radii: cluster diameters of levels 1..L [fractions of the diagonal].
             predicted_levels: levels whose gradients the network predicts, coarse to fine; [0] is "without hierarchy".
-            clustering: ``ball`` or ``complete_linkage``.
+            clustering: as in :func:`gausim.models.hierarchy.build_hierarchy`.
             graph_radii: edge lengths per predicted level, same order [fractions of the diagonal].
             max_neighbours: edges per unit.
             edges: neighbours in ``rest`` space, in the ``current`` state, or the ``union`` / ``intersection`` of both.
