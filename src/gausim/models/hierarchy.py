@@ -73,8 +73,8 @@ def build_hierarchy(scene: GaussianScene, *, radii: Sequence[float], clustering:
     Args:
         scene: the rest scene; at least one kernel must be pinned.
         radii: largest cluster diameter per level 1..L, as fractions of the bounding-box diagonal.
-        clustering: ``agglomerative`` (complete linkage in near-linear memory), ``ball`` (greedy cover; more clusters) or
-            ``complete_linkage`` (of all pairs; the reference).
+        clustering: ``agglomerative`` (complete linkage in near-linear memory), ``ball`` (a greedy cover; more clusters)
+            or ``complete_linkage`` (of all pairs; the reference).
 
     Raises:
         SceneError: no pinned kernel, or no simulated kernel that is free.
