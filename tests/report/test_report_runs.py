@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from gausim.core import RunError
+from gausim.report.overview import make_sheets
 from gausim.report.runs import find_runs
 from gausim.report.study import cell, make_study
 
@@ -117,6 +118,35 @@ def test_a_joint_run_is_a_row_over_its_objects(tmp_path):
     assert [(g.label, g.objects) for g in study.groups] == [("gausim", ("one",)), ("gausim jointly", ("one", "two"))]
     assert cell(study.groups[1], "two", "seen", "train", "l2").value.mean == pytest.approx(4e-3)
     assert cell(study.groups[0], "two", "seen", "train", "l2").status == ""
+
+
+def test_networks_of_one_object_each_are_one_row_beside_the_joint_one(tmp_path):
+    def on(root, **choices):
+        settings = config(**choices)
+        settings["data"].update(root=root, selections={"pinned": f"z={len(root)}"})
+        return settings
+
+    for seed in (0, 1):
+        for i, name in enumerate(("one", "three")):
+            run = write_run(tmp_path / f"{name}_{seed}", {**on(f"/data/{name}"), "seed": seed})
+            evaluate(run, make_curves(1.0 + i + seed, name=name))
+    write_run(tmp_path / "two_0", on("/data/two"), finished=False)
+    evaluate(write_run(tmp_path / "other", on("/data/one", conserve_mass=False)), make_curves(7.0, name="one"))
+    joint = [make_curves(4.0, name="one"), make_curves(5.0, name="three")]
+    evaluate(write_run(tmp_path / "joint", on("/data")), *joint)
+    study = make_study(find_runs([tmp_path]))
+    assert [(g.label, sorted(g.objects)) for g in study.groups] == [
+        ("gausim", ["one", "three", "two"]), ("gausim jointly", ["one", "three"]), ("gausim w/o mass", ["one"]),
+    ]  # fmt: skip
+    full = study.groups[0]
+    values = [cell(full, name, "seen", "train", "l2").value for name in ("one", "three")]
+    assert [v.mean for v in values] == pytest.approx([3e-3, 5e-3]) and [v.seeds for v in values] == [2, 2]
+    missing = cell(full, "two", "seen", "train", "l2")
+    assert missing.status == "unfinished" and [r.name for r in missing.runs] == ["two_0"]
+    assert not any("more than once" in note for note in study.notes)
+    tables = {sheet.key: sheet for sheet in make_sheets(study)}
+    assert tables["ablation_one_gausim"].columns == (("gausim", ("full", "jointly", "w/o mass")),)
+    assert tables["ablation_three_gausim"].columns == (("gausim", ("full", "jointly")),)
 
 
 def test_runs_on_unknown_data_get_its_directory_as_object(tmp_path):

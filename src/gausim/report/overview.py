@@ -124,7 +124,7 @@ def efficiency_sheet(study: Study) -> Sheet:
                 (r, e[group.method]) for r, e in found if isinstance(e, dict) and isinstance(e.get(group.method), dict)
             ]
             label = group.label if len(study.objects) == 1 else f"{group.label}, {name}"
-            lines.append(Line(label, METHOD, _costs(costs, tuple(group.runs))))
+            lines.append(Line(label, METHOD, _costs(costs, group.of(name))))
     for method, (seconds, memory) in paper.EFFICIENCY.items():
         whole = method == "GausSim (paper)"
         levels = " → ".join(str(n) for n in paper.LEVELS) if whole else NOTHING

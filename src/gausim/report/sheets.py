@@ -238,7 +238,7 @@ def _distinct_lines(
     versions: list[list[list[Cell]]] = []  # object -> version -> cells of its splits
     for name, splits in columns:
         found: dict[tuple[Any, ...], list[Cell]] = {}
-        for single in (replace(g, runs=(r,)) for g in study.groups for r in g.evaluated):
+        for single in (one for g in study.groups for one in g.singles()):
             cells = [find(single, name, split) for split in splits]
             if any(c.value for c in cells):
                 key = tuple(None if c.value is None else float(f"{c.value.mean:.6g}") for c in cells)

@@ -6,7 +6,7 @@ import json
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from gausim.report.runs import BROKEN, EVALUATED, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
@@ -14,12 +14,18 @@ from gausim.report.summary import MOTION_ENERGY
 
 FULL = "full"
 NOT_MEASURED = "not measured"
+# Settings that say which object a run is about.
+_WHICH_OBJECT = ("data.root", "data.names", "data.scene", "data.masks", "data.selections")
 # The order of rows and columns: the paper's, then what it does not have.
 _ORDER = ("jointly", "w/o mass", "w/o momentum", "w/o hierarchy")
 # At most so many differing settings are put into a row's name.
 _KEYS_IN_NAMES = 3
 # Of runs that all lack a number, the state that is shown first.
 _WORST = (FAILURE, BROKEN, UNFINISHED, NOT_EVALUATED)
+
+
+# The runs of a row, by the objects that they are about.
+About = dict[tuple[str, ...], tuple[RunRecord, ...]]
 
 
 @dataclass(frozen=True)
@@ -57,25 +63,47 @@ class Group:
         family: the model's name, without what was varied.
         variation: what was varied, ``full`` for nothing.
         method: row of the summaries.
-        runs: the runs, evaluated ones or not.
-        objects: what they are about.
+        about: the runs, evaluated ones or not, by the objects that they are about. A network per object, each of the
+            same configuration, is one group; so is one network of several objects.
     """
 
     label: str
     family: str
     variation: str
     method: str
-    runs: tuple[RunRecord, ...]
-    objects: tuple[str, ...]
+    about: About
+
+    @property
+    def runs(self) -> tuple[RunRecord, ...]:
+        """All of its runs."""
+        return tuple(run for same in self.about.values() for run in same)
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """All of its objects."""
+        return tuple(name for names in self.about for name in names)
+
+    def of(self, name: str) -> tuple[RunRecord, ...]:
+        """The runs that are about an object; they differ by their seeds."""
+        return next((same for names, same in self.about.items() if name in names), ())
 
     @property
     def evaluated(self) -> list[RunRecord]:
         """Runs that have numbers."""
         return [r for r in self.runs if r.summary is not None]
 
+    def singles(self) -> list[Group]:
+        """Each evaluated run as a group of its own."""
+        return [
+            replace(self, about={names: (run,)})
+            for names, same in self.about.items()
+            for run in same
+            if run.summary is not None
+        ]
+
     def entries(self, name: str) -> list[tuple[RunRecord, dict[str, Any]]]:
         """Evaluated runs and their entries of an object."""
-        return [(r, r.summary["objects"][name]) for r in self.evaluated if r.summary and name in r.summary["objects"]]
+        return [(r, r.summary["objects"][name]) for r in self.of(name) if r.summary and name in r.summary["objects"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,15 +146,13 @@ def make_study(runs: Sequence[RunRecord]) -> Study:
         # A run without a configuration is a row of its own.
         key = json.dumps(run.settings, sort_keys=True) if run.config else str(run.path)
         by_config.setdefault(key, []).append(run)
-    members = [tuple(same) for same in by_config.values()]
-    objects = [_objects(same, runs) for same in members]
-    labels = _distinct(
-        [_names(same[0], len(names)) for same, names in zip(members, objects, strict=True)], members, objects
-    )
+    members = _rows([tuple(same) for same in by_config.values()], runs)
+    named = [_names(next(iter(about.values()))[0], max(map(len, about))) for about in members]
+    labels = _distinct(named, members)
     groups = [
-        Group(label if method is None else f"{label}: {method}", family, variation, method or row, same, names)
-        for (label, family, variation), same, names in zip(labels, members, objects, strict=True)
-        for method, row in _methods(same)
+        Group(label if method is None else f"{label}: {method}", family, variation, method or row, about)
+        for (label, family, variation), about in zip(labels, members, strict=True)
+        for method, row in _methods([run for same in about.values() for run in same])
     ]
     families = list(dict.fromkeys(g.family for g in groups))
     groups.sort(key=lambda g: (families.index(g.family), _place(g.variation)))
@@ -134,6 +160,33 @@ def make_study(runs: Sequence[RunRecord]) -> Study:
     known = dict.fromkeys(o for g in groups for run in g.evaluated for o in (run.summary or {})["objects"])
     every = known | dict.fromkeys(o for g in groups for o in g.objects)
     return Study(tuple(runs), tuple(groups), tuple(every), tuple(_notes(groups)))
+
+
+def _rows(members: Sequence[tuple[RunRecord, ...]], runs: Sequence[RunRecord]) -> list[About]:
+    """Puts runs that differ by the one object that they are about into one row; joint runs are rows of their own."""
+    rows: list[About] = []
+    for same in members:
+        names = _objects(same, runs)
+        fitting = (row for row in rows if len(names) == 1 and _continues(row, names, same[0]))
+        row = next(fitting, None)
+        if row is None:
+            rows.append({names: same})
+        else:
+            row[names] = same
+    return rows
+
+
+def _continues(row: About, names: tuple[str, ...], run: RunRecord) -> bool:
+    """Whether a run on one object belongs to a row of single objects: another object, the same settings besides."""
+    if names in row or any(len(other) > 1 for other in row):
+        return False
+    first = next(iter(row.values()))[0]
+    return bool(run.config) and bool(first.config) and _without_data(first) == _without_data(run)
+
+
+def _without_data(run: RunRecord) -> dict[str, str]:
+    """The settings that do not say which object it is."""
+    return {k: v for k, v in run.settings.items() if not any(k == d or k.startswith(f"{d}.") for d in _WHICH_OBJECT)}
 
 
 def _place(variation: str) -> list[int]:
@@ -189,37 +242,35 @@ def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
     return (family if not varied else f"{family} {variation}"), family, variation
 
 
-def _distinct(
-    labels: list[tuple[str, str, str]], members: list[tuple[RunRecord, ...]], objects: list[tuple[str, ...]]
-) -> list[tuple[str, str, str]]:
+def _distinct(labels: list[tuple[str, str, str]], members: Sequence[About]) -> list[tuple[str, str, str]]:
     """Adds to labels that two configurations on one object share what tells them apart: the run's name, or settings.
 
     Of several full configurations the one that the ablations are variations of keeps the plain label.
     """
+    objects = [[name for names in about for name in names] for about in members]
+    firsts = [next(iter(about.values()))[0] for about in members]
     taken = Counter((label, o) for (label, _, _), names in zip(labels, objects, strict=True) for o in names)
-    plain = {_reference(family, labels, members) for _, family, _ in labels}
+    plain = {_reference(family, labels, firsts) for _, family, _ in labels}
     result = []
     for i, (label, family, variation) in enumerate(labels):
         if i in plain or all(taken[label, o] < 2 for o in objects[i]):
             result.append((label, family, variation))
             continue
-        rivals = [m[0] for j, m in enumerate(members) if labels[j][0] == label and j != i]
-        tag = _difference(members[i][0], rivals)
+        rivals = [run for j, run in enumerate(firsts) if labels[j][0] == label and j != i]
+        tag = _difference(firsts[i], rivals)
         result.append((f"{label} ({tag})", family, tag if variation == FULL else f"{variation} ({tag})"))
     return result
 
 
-def _reference(
-    family: str, labels: Sequence[tuple[str, str, str]], members: Sequence[tuple[RunRecord, ...]]
-) -> int | None:
+def _reference(family: str, labels: Sequence[tuple[str, str, str]], firsts: Sequence[RunRecord]) -> int | None:
     """The full configuration that differs least from the family's ablations; None without any, or in a tie."""
     full = [i for i, label in enumerate(labels) if label[1:] == (family, FULL)]
-    ablated = [members[i][0].settings for i, label in enumerate(labels) if label[1] == family and i not in full]
+    ablated = [firsts[i].settings for i, label in enumerate(labels) if label[1] == family and i not in full]
     if not ablated:
         return None
     distances = []
     for i in full:
-        own = members[i][0].settings
+        own = firsts[i].settings
         distances.append(sum(own.get(k) != other.get(k) for other in ablated for k in {*own, *other}))
     nearest = [i for i, d in zip(full, distances, strict=True) if d == min(distances)]
     return nearest[0] if len(nearest) == 1 else None
@@ -249,10 +300,11 @@ def _notes(groups: Sequence[Group]) -> list[str]:
                 notes.append(f"{group.label}, {name}: the seeds were evaluated on different ranges of frames.")
             if len({json.dumps(s) for e in entries if (s := dig(e, "sources", "scene", "sha256"))}) > 1:
                 notes.append(f"{group.label}, {name}: the seeds were evaluated on different rest scenes.")
-        seeds = Counter(str(r.seed) for r in group.evaluated)
-        twice = [seed for seed, count in seeds.items() if count > 1]
-        if twice:
-            notes.append(f"{group.label}: seed {', '.join(twice)} is there more than once, and counts as often.")
+        for same in group.about.values():
+            seeds = Counter(str(r.seed) for r in same if r.summary is not None)
+            twice = [seed for seed, count in seeds.items() if count > 1]
+            if twice:
+                notes.append(f"{group.label}: seed {', '.join(twice)} is there more than once, and counts as often.")
         missing = len(group.runs) - len(group.evaluated)
         if missing and group.evaluated:
             notes.append(f"{group.label}: {missing} of {len(group.runs)} runs have no numbers.")
@@ -283,9 +335,9 @@ def pooled(group: Group, name: str, find: Callable[[dict[str, Any]], Any], metri
         return Cell(None)
     entries = group.entries(name)
     if not entries:
-        states = {r.status for r in group.runs}
+        states = {r.status for r in group.of(name)}
         worst = next((s for s in _WORST if s in states), NOT_MEASURED)
-        return Cell(None, worst, group.runs)
+        return Cell(None, worst, group.of(name))
     found = [(run, find(entry)) for run, entry in entries]
     # Sequences at rest spoil a mean of ratios; the pooled ratio is what tables show of the energy.
     key = "pooled" if metric == MOTION_ENERGY else "mean"

@@ -186,7 +186,7 @@ def _csv_value(value: Value | None) -> list[object]:
 
 
 def _csv_sources(group: Group, name: str) -> list[str]:
-    runs = [r for r, _ in group.entries(name)] or list(group.runs)
+    runs = [r for r, _ in group.entries(name)] or list(group.of(name))
     hashes = [data_hashes(run, name) for run in runs]
     columns = ([r.name for r in runs], [r.config_hash for r in runs], [commit_of(r) for r in runs],
                [h[0] for h in hashes], [h[1] for h in hashes])  # fmt: skip
