@@ -19,6 +19,8 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from gausim.cli import _config
 from gausim.cli._config import check_targets, compose, conf_dir, instantiate, run_hydra
 from gausim.core.errors import ConfigError, SceneError
+from gausim.engine.launch import Crew
+from gausim.engine.layout import Layout, LocalRanks, RanksStrategy
 
 # Values for what a file leaves to the user (`???`), by "group/option".
 MANDATORY: dict[str, list[str]] = {}
@@ -93,6 +95,12 @@ def test_option_builds(option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     if needs_other_hardware(config):
         pytest.skip(f"{option} asks for trainer.accelerator={config.trainer.accelerator}, which this machine lacks")
     group = option.split("/")[0]
+    if group == "trainer" and config.trainer.devices > 1:
+        crew = Crew(Layout(config.trainer.devices, accelerator="cpu"))
+        crew.environment = LocalRanks(0, config.trainer.devices, port=1)  # as if the others had started
+        made = instantiate(config.trainer, crew=crew, accelerator="cpu")
+        assert made.world_size == config.trainer.devices and isinstance(made.strategy, RanksStrategy)
+        return
     built = {group: config[group]} if group in config and group not in GLOBAL else config
     for node in (built[key] for key in built):
         build(node)

@@ -13,6 +13,7 @@ from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SampleKey, SequenceIndex, TrainingDataset, collate
 from gausim.data.objects import ObjectData
 from gausim.data.sampler import SequenceBatchSampler
+from gausim.engine.ranks import interleave
 
 
 @pytest.fixture(scope="module")
@@ -94,14 +95,22 @@ def test_position_survives_a_resume() -> None:
     assert len(list(resumed)) == 8
 
 
-def test_ranks_share_an_epoch_in_equal_parts() -> None:
-    ranks = [sampler(rank=r, world_size=2) for r in (0, 1)]
-    batches = [list(r) for r in ranks]
-    assert len(batches[0]) == len(batches[1]) == len(ranks[0]) == 4
-    assert all(len(a) == len(b) == 2 for a, b in zip(*batches, strict=True))
-    assert {k.sequence for rank in batches for b in rank for k in b} == set(range(5))
-    together = [{k.sequence for k in a} & {k.sequence for k in b} for a, b in zip(*batches, strict=True)]
-    assert not any(together[:3])  # the last, filled up, may repeat
+@pytest.mark.parametrize("world", [2, 3, 4])
+def test_ranks_divide_the_batches_of_one_rank(world: int) -> None:
+    size = 4
+    alone = list(sampler(batch_size=size))
+    assert [len(batch) for batch in alone] == [4, 4, 4, 3]
+    shares = [list(sampler(batch_size=size, rank=r, world_size=world)) for r in range(world)]
+    assert all(len(share) == len(alone) for share in shares)  # as many steps everywhere
+    for number, batch in enumerate(alone):
+        held = [share[number] for share in shares]
+        assert interleave(held) == batch  # nothing twice, nothing left out
+    assert [len(share[-1]) for share in shares] == {2: [2, 1], 3: [1, 1, 1], 4: [1, 1, 1, 0]}[world]
+
+
+def test_fewer_sequences_per_step_than_ranks_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"data.batch_size: .* each of the 3 ranks, got 2 .*data.batch_size=3"):
+        sampler(batch_size=2, rank=0, world_size=3)
 
 
 def test_samples_of_several_objects_are_numbered_through(two_objects: Path) -> None:

@@ -13,10 +13,11 @@ import random
 import resource
 import select
 import signal
+import subprocess
 import sys
 import tempfile
 import traceback
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -30,8 +31,18 @@ from gausim.cli.main import main
 from gausim.engine.module import GausSimModule
 
 
-def die_at(target: str, match: str, count: int, when: str) -> None:
-    """Ends this process by SIGKILL before or after the count-th call of ``target`` with ``match`` in its arguments."""
+class Started(subprocess.Popen):
+    """Remembers the processes that this one starts: the other ranks of its run."""
+
+    pids: ClassVar[list[int]] = []
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.pids.append(self.pid)
+
+
+def die_at(target: str, match: str, count: int, when: str, rank: int = 0) -> None:
+    """Ends a rank by SIGKILL before or after our count-th call of ``target`` with ``match`` in its arguments."""
     home, name = target.rsplit(".", 1)
     try:
         owner: Any = importlib.import_module(home)
@@ -43,10 +54,10 @@ def die_at(target: str, match: str, count: int, when: str) -> None:
         nonlocal calls
         calls += match in " ".join(map(str, args)) if match else 1
         if when == "before" and calls == count:
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(Started.pids[rank - 1] if rank else os.getpid(), signal.SIGKILL)
         result = original(*args, **kwargs)
         if when == "after" and calls == count:
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(Started.pids[rank - 1] if rank else os.getpid(), signal.SIGKILL)
         return result
 
     setattr(owner, name, dying)
@@ -69,6 +80,7 @@ def child(order: dict[str, Any]) -> int:
     if order.get("limit"):
         resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
     draw_from_global_generators()
+    subprocess.Popen = Started  # type: ignore[misc]
     for point in order.get("die") or []:
         die_at(**point)
     try:

@@ -32,6 +32,12 @@ class Sway(nn.Module):
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         return {"network": [self.keep], "scene": list(self.drift)}
 
+    def shared(self) -> dict[str, nn.Module]:
+        return {}
+
+    def freeze(self) -> None:
+        self.keep.requires_grad_(False)
+
     def batch(self, scene_ids: list[int]) -> SimpleNamespace:
         members, start = [], 0
         for n, i in enumerate(scene_ids):

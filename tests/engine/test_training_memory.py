@@ -78,9 +78,9 @@ def test_checkpointing_the_steps_keeps_the_gradients_and_the_statistics() -> Non
     for name, value in parameters(whole).items():
         if "normaliser" in name:
             torch.testing.assert_close(after[name], value, rtol=1e-6, atol=1e-9)
-    # One step of the static loss and four of the rollout on two levels, each counted once.
-    carried = "loss_static" in first
-    assert int(kept.model.node_normaliser.updates) == 2 * (4 + carried)
+    # The first statistics, one step of the static loss and four of the rollout on two levels, each counted once.
+    carried, units = "loss_static" in first, sum(level.count for level in kept.model.batch([0]).levels)
+    assert int(kept.model.node_normaliser.count) == units * (1 + 4 + carried)
 
 
 def test_checkpointing_the_steps_makes_the_graph_small(one_state_at_once: None) -> None:
@@ -100,7 +100,7 @@ def pair(objective: Objective, drift: float) -> tuple[GausSimModule, GausSimModu
     for module in made:
         with torch.no_grad():
             module.model.drift[0] += drift
-    made[1]._defers = lambda batch: True  # type: ignore[method-assign]
+    made[1]._defers = lambda device: True  # type: ignore[method-assign]
     return made[0], made[1]
 
 
@@ -182,16 +182,16 @@ def test_the_device_is_not_waited_for(backprop_steps: int) -> None:
     module.model.scenes = [scene.to("cuda") for scene in module.model.scenes]
     module.renderer = blobs
     samples, optimizer = [sample(0).to("cuda"), sample(1).to("cuda")], module.configure_optimizers()
-    draws = torch.Generator().manual_seed(0)
+    draws, facts = torch.Generator().manual_seed(0), [s.facts for s in samples]
     module.optimise(samples, optimizer, draws)
     torch.cuda.set_sync_debug_mode("error")
     try:
         optimizer.zero_grad(set_to_none=True)
-        tally = module._rollout(samples, draws)
+        tally = module._rollout(samples, facts, draws)
         norms = module.settings.clip(optimizer)
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    assert len(tally.read(samples, norms, 3.0).images) == 3
+    assert len(tally.fetch(norms).numbers(facts, 3.0).images) == 3
 
 
 @pytest.mark.gpu

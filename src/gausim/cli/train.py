@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
@@ -13,6 +15,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from gausim.data.datamodule import ReadyDataModule
+    from gausim.engine.launch import Crew
     from gausim.engine.module import GausSimModule
     from gausim.engine.run import RunDirectory
 
@@ -30,6 +33,7 @@ Learns an object's dynamics from multi-view videos. Every setting is a key of co
   gausim train -m seed=0,1,2,3 hydra/launcher=joblib                 several jobs at a time (also submitit_slurm)
   gausim train -m hydra/sweeper=optuna 'optimizer.network_lr=tag(log,interval(1e-4,1e-2))'      a search
   gausim train trainer.max_minutes=30 trainer.threads=2
+  gausim train trainer=ddp trainer.devices=4 data.batch_size=8
   gausim train --cfg job                        print the whole configuration, run nothing
 
 A run goes to OUTPUT_ROOT/NAME/seed_SEED (paths.output_root, name, seed). Started again, it resumes from its last
@@ -127,34 +131,69 @@ def _evaluate(run: RunDirectory) -> None:
 
 
 def _train(cfg: DictConfig, run: RunDirectory) -> float | None:
-    resume = run.prepare(_plain(cfg), overwrite=cfg.trainer.overwrite)
-    with run.noting_failure():
-        return _learn(cfg, run, resume)
+    from gausim.engine.launch import Crew
+    from gausim.engine.layout import Layout
+
+    known = [field.name for field in fields(Layout)]
+    layout = Layout(**{str(key): value for key, value in cfg.trainer.items() if key in known})
+    with run.noting_failure(), Crew(layout, [sys.executable, "-m", "gausim.cli._rank"]) as crew:
+        if not crew.is_first:  # a scheduler has started it beside the first
+            return follow(crew)
+        config = _plain(cfg)
+        task = crew.announce(lambda: (config, str(run.path), run.prepare(config, overwrite=cfg.trainer.overwrite)))
+        parts = _parts(cfg, resumed=task[2] is not None)
+        crew.start(task)
+        return _fit(cfg, run, task[2], parts, crew)
 
 
-def _learn(cfg: DictConfig, run: RunDirectory, resume: Path | None) -> float | None:
+def follow(crew: Crew) -> float | None:
+    """Trains as one of the other ranks: what the first one says, into nothing."""
+    from omegaconf import OmegaConf
+
+    from gausim.engine.run import RunDirectory
+
+    config, path, resume = crew.receive()
+    cfg = OmegaConf.create(config)
+    return _fit(cfg, RunDirectory(path), resume, _parts(cfg, resumed=resume is not None), crew)
+
+
+def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataModule]:
     from lightning.pytorch import seed_everything
 
     from gausim.cli._run import build
-    from gausim.engine.judge import EpochJudge
 
     seed_everything(cfg.seed, workers=True, verbose=False)
     module, datamodule = build(cfg)
-    _take_over(cfg, module, resumed=resume is not None)
-    trainer = make(cfg, run)
+    _take_over(cfg, module, resumed=resumed)
+    return module, datamodule
+
+
+def _fit(
+    cfg: DictConfig,
+    run: RunDirectory,
+    resume: Path | None,
+    parts: tuple[GausSimModule, ReadyDataModule],
+    crew: Crew,
+) -> float | None:
+    from gausim.engine.judge import EpochJudge
+
+    module, datamodule = parts
+    trainer = make(cfg, run, crew)
     for logger in trainer.loggers:
         logger.log_hyperparams(_plain(cfg))
-    _introduce(trainer, module, datamodule, run, resumed=resume is not None)
+    if crew.is_first:
+        _introduce(trainer, module, datamodule, run, resumed=resume is not None)
     trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
     if trainer.interrupted:
         raise KeyboardInterrupt
-    # Counted by `processed`: of a run that is resumed after its last save, `current_epoch` lags behind.
-    epochs = cast(Any, trainer.fit_loop.epoch_progress.current).processed
-    pruned = any(isinstance(callback, EpochJudge) and callback.stopped for callback in cast(Any, trainer).callbacks)
-    facts = {"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary}
-    run.finish({**facts, **({"pruned": True} if pruned else {})})
-    following = "" if cfg.evaluate else f"gausim evaluate {run.path}\n      "
-    print(f"\nrun: {run.path}\nnext: {following}gausim simulate {run.path}", flush=True)
+    if crew.is_first:
+        # Counted by `processed`: of a run that is resumed after its last save, `current_epoch` lags behind.
+        epochs = cast(Any, trainer.fit_loop.epoch_progress.current).processed
+        pruned = any(isinstance(callback, EpochJudge) and callback.stopped for callback in cast(Any, trainer).callbacks)
+        facts = {"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary}
+        run.finish({**facts, **({"pruned": True} if pruned else {})})
+        following = "" if cfg.evaluate else f"gausim evaluate {run.path}\n      "
+        print(f"\nrun: {run.path}\nnext: {following}gausim simulate {run.path}", flush=True)
     return module.summary.get("excess_static")
 
 
@@ -177,14 +216,15 @@ def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None
         module.simulator.freeze()
 
 
-def make(cfg: DictConfig, run: RunDirectory) -> Trainer:
-    """The trainer of a configuration, with its callbacks and with loggers that write into the run."""
+def make(cfg: DictConfig, run: RunDirectory, crew: Crew) -> Trainer:
+    """The trainer of a configuration, with its callbacks and, on the first rank, loggers that write into the run."""
     from gausim.cli._config import instantiate
     from gausim.cli._sweep import judges
 
     callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node] + judges(cfg)
-    loggers = [instantiate(node, save_dir=str(run.path)) for node in (cfg.logger or {}).values() if node]
-    return instantiate(cfg.trainer, run_dir=run.path, callbacks=callbacks, loggers=loggers)
+    wanted = (cfg.logger or {}).values() if crew.is_first else ()
+    loggers = [instantiate(node, save_dir=str(run.path)) for node in wanted if node]
+    return instantiate(cfg.trainer, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew)
 
 
 def _introduce(
@@ -196,7 +236,9 @@ def _introduce(
     batches = len(datamodule.train_dataloader())
     epochs = trainer.max_epochs or 0
     device = trainer.strategy.root_device
-    lines = [f"{'resuming' if resumed else 'training'} on {device} ({torch.get_num_threads()} threads): {run.path}"]
+    ranks = f"{trainer.world_size} ranks, " if trainer.world_size > 1 else ""
+    threads = f"({ranks}{torch.get_num_threads()} threads)"
+    lines = [f"{'resuming' if resumed else 'training'} on {device} {threads}: {run.path}"]
     for item, scene in zip(datamodule.objects, module.simulator.scenes, strict=True):
         cameras = item.sequences[0].cameras
         lines.append(

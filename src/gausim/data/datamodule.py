@@ -48,7 +48,7 @@ class ReadyDataModule(LightningDataModule):
             scene: PLY of the rest scene of a single object; ``scene.ply`` in its directory when None.
             masks: npz of its masks; beside the PLY when None.
             selections: what replaces its masks, see :func:`gausim.data.scenes.select_masks`.
-            batch_size: sequences per optimiser step and rank.
+            batch_size: sequences per optimiser step, divided over the ranks.
             repeats: how many times each sequence is shown per epoch.
             curriculum: predicted steps per epoch; METHOD's when None.
             seed: of the order.

@@ -28,6 +28,25 @@ class SampleKey(NamedTuple):
     steps: int
 
 
+@dataclass(frozen=True)
+class SampleFacts:
+    """What ranks tell each other of a sample.
+
+    Attributes:
+        scene_id: index of the object.
+        object_name: its name.
+        sequence_id: running index of the sequence over all objects.
+        sequence_name: its name within the object.
+        steps: predicted steps T.
+    """
+
+    scene_id: int
+    object_name: str
+    sequence_id: int
+    sequence_name: str
+    steps: int
+
+
 @dataclass(frozen=True, eq=False)
 class SequenceSample:
     """One stretch of one sequence, from frame 0 on.
@@ -54,6 +73,11 @@ class SequenceSample:
     def steps(self) -> int:
         """Predicted steps T: frames after the first."""
         return self.frames.shape[0] - 1
+
+    @property
+    def facts(self) -> SampleFacts:
+        """All but the images."""
+        return SampleFacts(self.scene_id, self.object_name, self.sequence_id, self.sequence_name, self.steps)
 
     def to(self, device: torch.device | str) -> SequenceSample:
         """The same sample on another device (Lightning moves batches through this)."""

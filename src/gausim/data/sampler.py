@@ -16,8 +16,11 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
     """Shows every sequence ``repeats`` times per epoch, in batches without a repeated sequence where possible.
 
     Lightning announces the epoch only to ``loader.sampler`` and ``loader.batch_sampler.sampler``; this object is its
-    own ``sampler`` so that it hears of it. Under several ranks it deals out equal shares by itself, so the trainer
-    needs ``use_distributed_sampler=False``.
+    own ``sampler`` so that it hears of it.
+
+    The batches do not depend on the number of ranks: each is divided over them, place r, r + ranks, ... to rank r. All
+    ranks take equally many steps; of a last batch with fewer sequences than ranks some get none, and nothing is shown
+    twice to fill it up. The trainer needs ``use_distributed_sampler=False``.
     """
 
     def __init__(
@@ -31,10 +34,19 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
-        """Deals ``count`` sequences into batches of ``batch_size`` per rank."""
+        """Deals ``count`` sequences into batches of ``batch_size`` over all ranks.
+
+        Raises:
+            ConfigError: a number out of range, or fewer sequences per batch than ranks.
+        """
         if min(count, batch_size, repeats) < 1:
             raise ConfigError(
                 f"data: sequences ({count}), batch_size ({batch_size}) and repeats ({repeats}) must be at least 1."
+            )
+        if batch_size < world_size:
+            raise ConfigError(
+                f"data.batch_size: expected at least one sequence for each of the {world_size} ranks, got {batch_size} "
+                f"per optimiser step. Set data.batch_size={world_size} or a multiple, or trainer.devices={batch_size}."
             )
         self._count, self._batch_size, self._repeats = count, batch_size, repeats
         self._curriculum, self._seed = curriculum, seed
@@ -52,31 +64,26 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
             self.epoch, self.position = epoch, 0
 
     def __len__(self) -> int:
-        """Batches per rank in a whole epoch."""
-        share = self._batch_size * self._world_size
-        return -(-self._count * self._repeats // share)
+        """Batches of a whole epoch."""
+        return -(-self._count * self._repeats // self._batch_size)
 
     def order(self, epoch: int) -> list[int]:
-        """Sequence ids of an epoch over all ranks, before they are dealt out.
+        """Sequence ids of an epoch.
 
         Permutations follow each other; the head of each avoids what the open batch holds already.
         """
         generator = torch.Generator().manual_seed(hash_seed(self._seed, epoch))
-        share = self._batch_size * self._world_size
         order: list[int] = []
         for _ in range(self._repeats):
             permutation = torch.randperm(self._count, generator=generator).tolist()
-            open_batch = set(order[len(order) - len(order) % share :])
+            open_batch = set(order[len(order) - len(order) % self._batch_size :])
             order += [i for i in permutation if i not in open_batch] + [i for i in permutation if i in open_batch]
-        # Ranks must take equally many steps: the last batch is filled up from the epoch's beginning.
-        short = -len(order) % share if self._world_size > 1 else 0
-        return order + (order * (short // len(order) + 1))[:short]
+        return order
 
     def __iter__(self) -> Iterator[list[SampleKey]]:
-        """Yields this rank's batches from the current position on."""
-        steps, order = self._curriculum.steps(self.epoch), self.order(self.epoch)
-        share = self._batch_size * self._world_size
-        batches = [order[i : i + share][self._rank :: self._world_size] for i in range(0, len(order), share)]
+        """Yields this rank's share of each batch from the current position on; it may be empty."""
+        steps, order, size = self._curriculum.steps(self.epoch), self.order(self.epoch), self._batch_size
+        batches = [order[i : i + size][self._rank :: self._world_size] for i in range(0, len(order), size)]
         if self.position >= len(batches):
             self.position = 0
         while self.position < len(batches):

@@ -14,11 +14,12 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, RichProgressBar
 
 from gausim.core import ConfigError
-from gausim.engine.checkpoint import LAST_CHECKPOINT
+from gausim.engine.checkpoint import LAST_CHECKPOINT, digest
 from gausim.engine.files import write_durably
 from gausim.engine.loggers import Resumable
 from gausim.engine.module import GausSimModule
 from gausim.engine.randomness import random_state, restore_random_state
+from gausim.engine.ranks import Ranks
 
 EPOCHS = "epochs.csv"
 
@@ -90,17 +91,26 @@ class ExactResume(Callback):
     def __init__(self) -> None:
         """Nothing to set."""
         self._random: dict[str, Any] | None = None
+        self._ranks = Ranks()
 
     def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Adds the state of the global random generators and whether training ends with this epoch."""
+        """Adds the state of each rank's global random generators and whether training ends with this epoch.
+
+        Raises:
+            RunError: the ranks' weights are no longer the same.
+        """
         epochs: Any = trainer.fit_loop.epoch_progress.current
         at_epoch_end = epochs.processed > epochs.completed
-        checkpoint["resume"] = {"random": random_state(), "over": at_epoch_end and trainer.should_stop}
+        if self._ranks.size > 1:
+            self._ranks.check_alike(digest(checkpoint["state_dict"]), f"weights at step {trainer.global_step}")
+        states = self._ranks.gather(random_state())
+        checkpoint["resume"] = {"random": states, "over": at_epoch_end and trainer.should_stop}
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
         """Takes them; a run that was stopped for good is not trained further."""
         own = checkpoint["resume"]
-        self._random = own["random"]
+        if self._ranks.rank < len(own["random"]):  # one that was not there draws from its seed
+            self._random = own["random"][self._ranks.rank]
         if own["over"]:
             trainer.should_stop = True
 

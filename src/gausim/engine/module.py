@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import torch
@@ -13,16 +13,18 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from gausim.core import ConfigError, DivergenceError, Renderer, SimState
-from gausim.data.dataset import SequenceSample
+from gausim.data.dataset import SampleFacts, SequenceSample
 from gausim.data.sampler import hash_seed
 from gausim.engine.checkpoint import WeightAverage, check_scenes, fingerprints
 from gausim.engine.comparison import Comparison
 from gausim.engine.contracts import InitialVelocities, SceneBatch, Simulator
 from gausim.engine.curriculum import LossGatedCurriculum
+from gausim.engine.exchange import Exchange
 from gausim.engine.optim import OptimizerSettings
+from gausim.engine.ranks import Ranks, interleave
 from gausim.engine.reference import Yardsticks
 from gausim.engine.rollout import Explosions, Looks, States, UnitNoise, Views, describe, windows
-from gausim.engine.tally import Numbers, Tally
+from gausim.engine.tally import Found, Tally
 from gausim.losses.objective import Objective
 from gausim.losses.static import static_loss
 from gausim.render.draw import draw
@@ -38,7 +40,9 @@ BARREN_BATCHES = 20
 class GausSimModule(LightningModule):
     """Trains a simulator: rollout as one graph, drawing, losses, one optimiser step per batch.
 
-    Backward runs after every stretch through which gradients flow, so that memory does not grow with T.
+    Backward runs after every stretch through which gradients flow, so that memory does not grow with T. Under several
+    ranks each computes its share of the sequences; the sums of gradients, statistics and numbers over the ranks are
+    those of one rank that computes them all.
     """
 
     def __init__(
@@ -91,6 +95,8 @@ class GausSimModule(LightningModule):
         self.time_fraction = 0.0
         self._sums: dict[str, list[float]] = {}
         self._warned, self._barren = False, 0
+        self.ranks, self._shown = Ranks(), 0
+        self._exchange = Exchange(self.ranks, model)
 
     @property
     def simulator(self) -> Simulator:
@@ -114,7 +120,7 @@ class GausSimModule(LightningModule):
         factor = self._set_rates(optimizer, batch_idx)
         draws = torch.Generator().manual_seed(hash_seed(self.seed, self.global_step))
         stats = self.optimise(samples, optimizer.optimizer, draws, optimizer.step)
-        self._record({**stats, "lr": self.settings.network_lr * factor}, len(samples))
+        self._record({**stats, "lr": self.settings.network_lr * factor}, self._shown)
 
     def optimise(
         self,
@@ -126,7 +132,7 @@ class GausSimModule(LightningModule):
         """One step of the optimiser with all losses; works without a trainer, too.
 
         Args:
-            samples: the batch.
+            samples: this rank's share of the batch; it may be empty where there are several.
             optimizer: from :meth:`configure_optimizers`.
             draws: of the static loss and the input noise.
             advance: makes the optimiser's step; its own ``step`` when None.
@@ -138,12 +144,30 @@ class GausSimModule(LightningModule):
             DivergenceError: a number is not finite; no parameter has moved.
         """
         optimizer.zero_grad(set_to_none=True)
-        tally = self._rollout(samples, draws)
-        self._static(samples, draws, tally)
-        stats = self._read(samples, tally, self.settings.clip(optimizer))
+        whole = interleave(self.ranks.gather([sample.facts for sample in samples]))
+        self._prime(samples)
+        tally = self._rollout(samples, whole, draws)
+        self._static(whole, draws, tally)
+        weights = [p for p in self.parameters() if p.requires_grad]
+        self._exchange.step(weights, self._network(), tally)
+        stats = self._read(samples, whole, tally.fetch(self.settings.clip(optimizer)))
+        self._exchange.absorb()
         (advance or optimizer.step)()
         self.average.update(self)
+        self._shown = len(whole)
         return stats
+
+    @torch.no_grad()
+    def _prime(self, samples: list[SequenceSample]) -> None:
+        """The first statistics of a new model's inputs: those of the first batch's first frame."""
+        if self._exchange.begun:
+            return
+        self._exchange.begun = True
+        if not self._exchange.has_statistics:
+            if samples:
+                batch = self.simulator.batch([s.scene_id for s in samples])
+                self.simulator.step(batch, self.initial(samples, batch))
+            self._exchange.statistics()
 
     def _backward(self, loss: Tensor) -> None:
         if self._trainer is None:
@@ -156,16 +180,22 @@ class GausSimModule(LightningModule):
         done = self.current_epoch + batch_idx / max(1.0, float(batches))
         return self.settings.set_rates(optimizer.optimizer, max(done, self.time_fraction * epochs), epochs)
 
-    def _rollout(self, samples: list[SequenceSample], draws: torch.Generator) -> Tally:
-        steps = samples[0].steps
-        if any(s.steps != steps for s in samples):
-            raise ConfigError(f"a batch needs sequences of equal length, got {[s.steps for s in samples]} steps.")
-        batch = self.simulator.batch([s.scene_id for s in samples])
-        comparison = self.comparison(samples, batch)
+    def _rollout(self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator) -> Tally:
+        steps = whole[0].steps
+        if any(s.steps != steps for s in whole):
+            raise ConfigError(f"a batch needs sequences of equal length, got {[s.steps for s in whole]} steps.")
+        batch = self.simulator.batch([s.scene_id for s in samples]) if samples else None
         tally, length = Tally(), self.objective.window(steps)
-        explosions = Explosions(batch, self.diagonals, samples, self.objective.explosion, deferred=self._defers(batch))
+        device = next(self.parameters()).device
+        explosions = Explosions(batch, self.diagonals, whole, self.objective.explosion, ranks=self.ranks,
+                                deferred=device if self._defers(device) else None)  # fmt: skip
+        if batch is None:  # hears where the others' rollout ends
+            any(explosions.end(None, start, tally.reach) for start in range(0, steps, length))
+            return tally
+        comparison = self.comparison(samples, batch)
         starts: list[Callable[[SimState], SimState]] = [explosions.restart, *self._noise(batch, draws)]
         initial, kept = self.initial(samples, batch), self.objective.checkpoint_steps
+        per = self.objective.step_weight(steps) / len(whole)
         for start, made in windows(self.simulator, batch, initial, steps, length, starts, checkpoint=kept):
             states = States.of(made)
             if explosions.end(states.positions, start, tally.reach):
@@ -173,19 +203,20 @@ class GausSimModule(LightningModule):
             losses, motion = comparison(explosions.spared(states), start)
             tally.motion.append(motion)
             momentum = explosions.counted(torch.stack([step.momentum for step in made]))
-            self._descend(explosions.counted(losses), momentum, steps, tally, measure=start == 0)
+            self._descend(explosions.counted(losses), momentum, per, tally, measure=start == 0)
         return tally
 
     @staticmethod
-    def _defers(batch: SceneBatch) -> bool:
+    def _defers(device: torch.device) -> bool:
         """Whether reading a number would make the host wait; such reads are put off to the step's end."""
-        return batch.rest.device.type != "cpu"
+        return device.type != "cpu"
 
     def _noise(self, batch: SceneBatch, draws: torch.Generator) -> list[UnitNoise]:
         if self.objective.input_noise == 0:
             return []
         deviations = [self.objective.input_noise * d for d in self.diagonals]
-        return [UnitNoise(batch, self.simulator.scenes, deviations, draws)]
+        places = [self.ranks.rank + i * self.ranks.size for i in range(len(batch.members))]
+        return [UnitNoise(batch, self.simulator.scenes, deviations, draws.initial_seed(), places)]
 
     def comparison(self, samples: list[SequenceSample], batch: SceneBatch) -> Comparison:
         """What draws and compares the predictions of a batch."""
@@ -200,34 +231,30 @@ class GausSimModule(LightningModule):
             [self._rest_image(samples, i, batch) for i in range(len(samples))],
         )
 
-    def _descend(self, losses: Tensor, momentum: Tensor, steps: int, tally: Tally, *, measure: bool) -> None:
+    def _descend(self, losses: Tensor, momentum: Tensor, per: float, tally: Tally, *, measure: bool) -> None:
         """Backward of one stretch; the mean over sequences, whatever the stretch's length."""
-        per = self.objective.step_weight(steps) / losses.shape[1]
         images_term = self.objective.image_weight * per * losses.sum()
         momentum_term = self.objective.momentum_weight * per * momentum.sum()
         weighted = momentum_term.requires_grad and self.objective.momentum_weight > 0
-        network = [p for p in self.simulator.parameter_groups()["network"] if p.requires_grad]
+        network = self._network()
         if measure and weighted and network and self.share_every and self.global_step % self.share_every == 0:
-            tally.share = self._share(images_term, momentum_term, network)
+            tally.pulls = _pull(images_term, network), _pull(momentum_term, network)
         self._backward(images_term + momentum_term if weighted else images_term)
         tally.images.append(losses.detach())
         tally.momentum.append(momentum.detach())
 
-    @staticmethod
-    def _share(images: Tensor, momentum: Tensor, network: list[nn.Parameter]) -> Tensor:
-        """Norm of the momentum loss's gradient of the network over the sum of both norms."""
-        norms = []
-        for term in (images, momentum):
-            grads = torch.autograd.grad(term, network, retain_graph=True, allow_unused=True)
-            norms.append(torch.nn.utils.get_total_norm([g for g in grads if g is not None]).to(images))
-        return norms[1] / (norms[0] + norms[1]).clamp_min(1e-30)
+    def _network(self) -> list[nn.Parameter]:
+        return [p for p in self.simulator.parameter_groups()["network"] if p.requires_grad]
 
-    def _static(self, samples: list[SequenceSample], draws: torch.Generator, tally: Tally) -> None:
-        chance = self.objective.static_chance(samples[0].steps)
+    def _static(self, whole: list[SampleFacts], draws: torch.Generator, tally: Tally) -> None:
+        chance = self.objective.static_chance(whole[0].steps)
         if float(torch.rand((), generator=draws)) >= chance:
             return
-        scene_ids = sorted({s.scene_id for s in samples})
-        batch = self.simulator.batch(scene_ids)
+        scene_ids = sorted({s.scene_id for s in whole})
+        own = scene_ids[self.ranks.rank :: self.ranks.size]
+        if not own:
+            return
+        batch = self.simulator.batch(own)
         step = self.simulator.step(batch, SimState(batch.rest, batch.rest))
         loss = static_loss(step.positions, batch.rest) / len(scene_ids)
         if loss.requires_grad:
@@ -265,48 +292,23 @@ class GausSimModule(LightningModule):
 
     # ------------------------------------------------------------------------------------------------ numbers
 
-    def _read(self, samples: list[SequenceSample], tally: Tally, norms: Mapping[str, Tensor]) -> dict[str, float]:
-        """Fetches all numbers of the step at once, checks them and forms what is logged."""
-        steps, count = samples[0].steps, len(samples)
-        numbers = tally.read(samples, norms, self.objective.explosion)
-        lasted = len(numbers.images)
-        self._barren = 0 if lasted else self._barren + 1
+    def _read(self, samples: list[SequenceSample], whole: list[SampleFacts], found: Found) -> dict[str, float]:
+        """Joins the numbers of all ranks, checks them and forms what is logged."""
+        batch = self.simulator.batch([s.scene_id for s in samples]) if samples else None
+        yards = []
+        for i, sample in enumerate(samples):
+            assert batch is not None
+            look, rest = self.looks.of(sample.scene_id, batch.rest), batch.rest[batch.members[i].kernels]
+            yards.append(self.yardsticks.of(sample, look, rest))
+        shares = self.ranks.gather((found, yards))
+        numbers = Found.join([share[0] for share in shares]).numbers(whole, self.objective.explosion)
+        yards = interleave([share[1] for share in shares])
+        self.yardsticks.learn([s.sequence_id for s in whole], yards)
+        self._barren = 0 if numbers.images else self._barren + 1
         if self._barren >= BARREN_BATCHES:
             far = f"kernels moved beyond {self.objective.explosion} diagonals in {BARREN_BATCHES} batches in a row"
-            raise DivergenceError(describe(0, samples, None, far))
-        stats = {f"grad_{name}": value for name, value in numbers.gradients.items()}
-        if numbers.share is not None:
-            stats["momentum_share"] = numbers.share
-        if numbers.static is not None:
-            stats["loss_static"] = numbers.static
-        stats.update(steps=float(steps), exploded=float(lasted < steps))
-        if lasted:
-            stats["loss_momentum"] = sum(numbers.momentum) / (steps * count)
-            stats["loss_image"] = sum(map(sum, numbers.images)) / (lasted * count)
-            stats.update(self._compare(samples, numbers))
-        return stats
-
-    def _compare(self, samples: list[SequenceSample], numbers: Numbers) -> dict[str, float]:
-        """The prediction's losses and motion against the static prediction's and the truth's."""
-        table = numbers.images
-        batch = self.simulator.batch([s.scene_id for s in samples])
-        floor = static = first = moved = 0.0
-        for i, sample in enumerate(samples):
-            look, rest = self.looks.of(sample.scene_id, batch.rest), batch.rest[batch.members[i].kernels]
-            yard = self.yardsticks.of(sample, look, rest)
-            floor += yard.floor * len(table)
-            static += sum(yard.static[: len(table)])
-            moved += sum(yard.motion[: len(table)])
-            first += yard.static[0]
-        loss = sum(map(sum, table))
-        # Above the floor a static loss can be next to nothing in the first frames; the ratio must stay finite.
-        above = max(static - floor, 1e-3 * static, 1e-12)
-        return {
-            "ratio_static": loss / max(static, 1e-12),
-            "excess_static": (loss - floor) / above,
-            "ratio_first": sum(table[0]) / max(first, 1e-12),
-            "motion_energy": numbers.motion / max(moved, 1e-12),
-        }
+            raise DivergenceError(describe(0, whole, None, far))
+        return numbers.stats(whole[0].steps, len(whole), yards)
 
     def _record(self, stats: dict[str, float], weight: int) -> None:
         self.last_stats = stats
@@ -379,3 +381,9 @@ class GausSimModule(LightningModule):
         curriculum = self._curriculum()
         if curriculum is not None and "curriculum" in own:
             curriculum.load_state_dict(own["curriculum"])
+
+
+def _pull(loss: Tensor, network: Sequence[nn.Parameter]) -> Float[Tensor, " P"]:
+    """Gradient of the network by one term."""
+    grads = torch.autograd.grad(loss, network, retain_graph=True, allow_unused=True, materialize_grads=True)
+    return torch.cat([g.reshape(-1) for g in grads])

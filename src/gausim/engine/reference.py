@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -63,6 +63,10 @@ class Yardsticks:
             known.static += losses[1:]
             known.motion += change
         return known
+
+    def learn(self, sequences: Sequence[int], yards: Sequence[Yardstick]) -> None:
+        """Takes what the ranks found, so that each knows what one rank alone would."""
+        self._known.update(zip(sequences, yards, strict=True))
 
     def state_dict(self) -> dict[int, dict[str, Any]]:
         """What is known of each sequence: measured with other frames at once, the last bits would differ."""

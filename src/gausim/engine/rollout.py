@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import cast
 
@@ -14,10 +14,12 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as torch_checkpoint
 
 from gausim.core import Cameras, DivergenceError, GaussianScene, Renderer, SimState
-from gausim.data.dataset import SequenceSample
+from gausim.data.dataset import SampleFacts, SequenceSample
+from gausim.data.sampler import hash_seed
 from gausim.engine.contracts import SceneBatch, Simulator
 from gausim.engine.contracts import Step as PredictedStep
-from gausim.nn.normaliser import RunningNormaliser
+from gausim.engine.ranks import Ranks, interleave
+from gausim.nn.normaliser import gathering_nothing, normalisers_of
 from gausim.render.draw import SceneAppearance, draw
 
 
@@ -75,38 +77,18 @@ class Frame:
 def checkpointed_step(model: Simulator, batch: SceneBatch, state: SimState) -> Frame:
     """A step of which the graph keeps the input only: it is computed once more in the backward pass.
 
-    It shares nothing with other steps, so that computing it again takes the same way. The running statistics of the
-    inputs are then put back to what the step saw the first time, and restored.
+    It shares nothing with other steps, so that computing it again takes the same way; the running statistics of the
+    inputs do not count it twice.
     """
-    normalisers = [m for m in cast(nn.Module, model).modules() if isinstance(m, RunningNormaliser)]
-    statistics = [buffer for normaliser in normalisers for buffer in normaliser.buffers()]
-    before = [buffer.clone() for buffer in statistics]
-    calls = itertools.count()
+    normalisers, calls = normalisers_of(cast(nn.Module, model)), itertools.count()
 
     def run(positions: Tensor, previous: Tensor) -> tuple[Tensor, ...]:
-        with _rewound(statistics, before) if next(calls) else nullcontext():
+        with gathering_nothing(normalisers) if next(calls) else nullcontext():
             step = model.step(batch, SimState(positions, previous))
         return step.positions, step.gradients, step.rotations, step.momentum
 
     # No random numbers in a step, so no generator is to be put back.
     return Frame(*torch_checkpoint(run, state.positions, state.previous, use_reentrant=False, preserve_rng_state=False))
-
-
-@contextmanager
-def _rewound(tensors: Sequence[Tensor], values: Sequence[Tensor]) -> Iterator[None]:
-    """Gives tensors these values for the length of a block."""
-    now = [tensor.clone() for tensor in tensors]
-    _assign(tensors, values)
-    try:
-        yield
-    finally:
-        _assign(tensors, now)
-
-
-@torch.no_grad()
-def _assign(tensors: Sequence[Tensor], values: Sequence[Tensor]) -> None:
-    for tensor, value in zip(tensors, values, strict=True):
-        tensor.copy_(value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,13 +197,25 @@ class UnitNoise:
     """
 
     def __init__(
-        self, batch: SceneBatch, scenes: Sequence[GaussianScene], deviation: Sequence[float], generator: torch.Generator
+        self,
+        batch: SceneBatch,
+        scenes: Sequence[GaussianScene],
+        deviation: Sequence[float],
+        seed: int,
+        places: Sequence[int],
     ) -> None:
-        """``deviation`` is one standard deviation per scene [scene units]."""
-        device = batch.rest.device
-        if device.type != "cpu":  # numbers drawn on the host would have to be waited for
-            generator = torch.Generator(device).manual_seed(generator.initial_seed())
-        self._batch, self._generator = batch, generator
+        """Every member draws by itself, so that its noise does not depend on which rank computes it.
+
+        Args:
+            batch: whose units are moved.
+            scenes: all of them.
+            deviation: one standard deviation per scene [scene units].
+            seed: of the optimiser step.
+            places: of the members among all sequences of the step.
+        """
+        device = batch.rest.device  # numbers drawn on the host would have to be waited for
+        self._batch = batch
+        self._generators = [torch.Generator(device).manual_seed(hash_seed(seed, place)) for place in places]
         self._scales = []
         for member in batch.members:
             scene = scenes[member.scene_id]
@@ -231,9 +225,9 @@ class UnitNoise:
     def __call__(self, state: SimState) -> SimState:
         """The state with its latest positions moved."""
         parts = []
-        for member, scale in zip(self._batch.members, self._scales, strict=True):
+        for member, scale, own in zip(self._batch.members, self._scales, self._generators, strict=True):
             count = member.units.stop - member.units.start
-            noise = torch.randn(count, 3, generator=self._generator, device=scale.device).to(scale)
+            noise = torch.randn(count, 3, generator=own, device=scale.device).to(scale)
             parts.append(noise[member.unit_of_kernel] * scale)
         return SimState(state.positions + torch.cat(parts), state.previous)
 
@@ -246,7 +240,7 @@ def reach(batch: SceneBatch, diagonals: Sequence[float], positions: Float[Tensor
         return torch.stack(columns, 1)
 
 
-def check_reach(table: Sequence[Sequence[float]], start: int, samples: Sequence[SequenceSample]) -> float:
+def check_reach(table: Sequence[Sequence[float]], start: int, samples: Sequence[SampleFacts]) -> float:
     """The largest entry of what :func:`reach` found in a stretch.
 
     Raises:
@@ -262,35 +256,61 @@ def check_reach(table: Sequence[Sequence[float]], start: int, samples: Sequence[
 class Explosions:
     """Ends a rollout at the stretch in which a kernel moves too far from rest; that stretch is not learned from.
 
-    Where reading a number does not make the host wait, the loop simply stops. Else (``deferred``) it goes on from the
-    rest state, without an influence on anything, and how long the rollout lasted is read at the end of the step.
+    It ends on all ranks at once, as it would for one rank with all sequences. Where reading a number does not make the
+    host wait, the loop simply stops. Else (``deferred``) it goes on from the rest state, without an influence on
+    anything, and how long the rollout lasted is read at the end of the step.
     """
 
     def __init__(
         self,
-        batch: SceneBatch,
+        batch: SceneBatch | None,
         diagonals: Sequence[float],
-        samples: Sequence[SequenceSample],
+        samples: Sequence[SampleFacts],
         limit: float,
         *,
-        deferred: bool,
+        deferred: torch.device | None,
+        ranks: Ranks,
     ) -> None:
-        """``limit`` is what is too far [diagonals of the member's scene]."""
-        self._batch, self._diagonals, self._samples, self._limit = batch, diagonals, samples, limit
-        self._lasts = torch.ones((), dtype=torch.bool, device=batch.rest.device) if deferred else None
+        """Begins a rollout.
 
-    def end(self, positions: Float[Tensor, "T K 3"], start: int, found: list[Tensor]) -> bool:
+        Args:
+            batch: what this rank computes; None for one without sequences.
+            diagonals: of the scenes [scene units].
+            samples: the sequences of the step, over all ranks.
+            limit: what is too far [diagonals of the member's scene].
+            deferred: where reads are put off, the device; else None.
+            ranks: which take part.
+        """
+        self._batch, self._diagonals, self._samples = batch, diagonals, samples
+        self._limit, self._ranks = limit, ranks
+        self._lasts = None if deferred is None else torch.ones((), dtype=torch.bool, device=deferred)
+
+    @property
+    def _rest(self) -> Float[Tensor, "K 3"]:
+        assert self._batch is not None
+        return self._batch.rest
+
+    def end(self, positions: Float[Tensor, "T K 3"] | None, start: int, found: list[Tensor]) -> bool:
         """Looks at a stretch; returns whether to stop, else adds its reach to ``found``.
+
+        A rank without sequences has no positions and learns what the others found.
 
         Raises:
             DivergenceError: a position is not finite (not when deferred).
         """
-        extent = reach(self._batch, self._diagonals, positions)
+        extent = None
+        if self._batch is not None and positions is not None:
+            extent = reach(self._batch, self._diagonals, positions)
         if self._lasts is not None:
-            self._lasts = self._lasts & (extent.amax() <= self._limit)
-        elif check_reach(extent.tolist(), start, self._samples) > self._limit:
-            return True
-        found.append(extent)
+            calm = self._lasts if extent is None else self._lasts & (extent.amax() <= self._limit)
+            self._lasts = self._ranks.everywhere(calm)
+        else:
+            tables = self._ranks.gather([] if extent is None else extent.tolist())
+            whole = [interleave(rows) for rows in zip(*filter(None, tables), strict=True)]
+            if check_reach(whole, start, self._samples) > self._limit:
+                return True
+        if extent is not None:
+            found.append(extent)
         return False
 
     def spared(self, states: States) -> States:
@@ -298,7 +318,7 @@ class Explosions:
         if self._lasts is None:
             return states
         identity = torch.eye(3, dtype=states.gradients.dtype, device=states.gradients.device)
-        rests = (self._batch.rest, identity, identity)
+        rests = (self._rest, identity, identity)
         return States(*(torch.where(self._lasts, x, r) for x, r in zip(states.tensors(), rests, strict=True)))
 
     def counted(self, values: Tensor) -> Tensor:
@@ -309,11 +329,10 @@ class Explosions:
         """The state, or that of rest once the rollout has ended."""
         if self._lasts is None:
             return state
-        rest = self._batch.rest
-        return SimState(*(torch.where(self._lasts, x, rest) for x in (state.positions, state.previous)))
+        return SimState(*(torch.where(self._lasts, x, self._rest) for x in (state.positions, state.previous)))
 
 
-def describe(step: int | None, samples: Sequence[SequenceSample], sample: SequenceSample | None, what: str) -> str:
+def describe(step: int | None, samples: Sequence[SampleFacts], sample: SampleFacts | None, what: str) -> str:
     """The message of a divergence: where, in which sequence and what broke."""
     name = f"{sample.object_name}/{sample.sequence_name}" if sample is not None else ", ".join(
         f"{s.object_name}/{s.sequence_name}" for s in samples

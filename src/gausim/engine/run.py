@@ -25,6 +25,8 @@ from gausim.core import ConfigError, GausSimError, RunError
 from gausim.engine.callbacks import EPOCHS, ExactResume, TimeBudget
 from gausim.engine.checkpoint import LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, AtomicCheckpointIO, check_resumable
 from gausim.engine.files import remove_leftovers, sole_writer, unwritable, write_durably
+from gausim.engine.launch import Crew
+from gausim.engine.layout import RanksStrategy
 from gausim.engine.memory import keep_freed_memory
 from gausim.engine.mlflow_log import MLFLOW_ID
 from gausim.engine.wandb_log import WANDB_ID
@@ -43,6 +45,8 @@ FREE_KEYS = (
     "trainer.threads",
     "trainer.accelerator",
     "trainer.devices",
+    "trainer.num_nodes",
+    "trainer.timeout_minutes",
     "trainer.log_every_n_steps",
     "trainer.progress",
     "trainer.overwrite",
@@ -305,6 +309,8 @@ def make_trainer(
     max_epochs: int,
     accelerator: str = "auto",
     devices: int = 1,
+    num_nodes: int = 1,
+    timeout_minutes: float = 10.0,
     threads: int | None = None,
     precision: str = "32-true",
     max_minutes: float | None = None,
@@ -315,14 +321,17 @@ def make_trainer(
     run_dir: Path | str | None = None,
     callbacks: Sequence[Callback] = (),
     loggers: Sequence[Logger] = (),
+    crew: Crew | None = None,
 ) -> Trainer:
     """The Lightning trainer of a run.
 
     Args:
         max_epochs: epochs of the whole run.
         accelerator: ``auto``, ``cpu`` or ``gpu``.
-        devices: how many; training on several is not offered here.
-        threads: of torch's operators on the CPU; None leaves the process's own number.
+        devices: ranks on each machine; more than one need a crew.
+        num_nodes: machines.
+        timeout_minutes: how long ranks wait for each other; :class:`~gausim.engine.layout.Layout` has it.
+        threads: of torch's operators on the CPU, for each rank; None leaves the process's own number.
         precision: Lightning's name of it.
         max_minutes: time budget; None is without.
         clock: what the budget counts, ``wall`` or ``cpu`` time.
@@ -332,12 +341,17 @@ def make_trainer(
         run_dir: where checkpoints, panels and tables go.
         callbacks: further ones.
         loggers: where numbers go.
+        crew: the ranks, where there are several.
 
     Raises:
-        ConfigError: more than one device.
+        ConfigError: more than one rank without a crew.
     """
-    if devices != 1:
-        raise ConfigError(f"trainer.devices: expected 1, got {devices}. Start one run per device instead.")
+    environment = crew.environment if crew is not None else None
+    if devices * num_nodes != 1 and environment is None:
+        raise ConfigError(
+            f"trainer.devices: expected 1, got {devices} on {num_nodes} machines; several ranks train by `gausim "
+            "train` only, which starts them."
+        )
     if threads is not None:
         torch.set_num_threads(threads)
     keep_freed_memory()
@@ -349,6 +363,8 @@ def make_trainer(
         max_epochs=max_epochs,
         accelerator=accelerator,
         devices=devices,
+        num_nodes=num_nodes,
+        strategy="auto" if environment is None else RanksStrategy(),
         precision=precision,  # type: ignore[arg-type]
         logger=list(loggers) or False,
         callbacks=own,
@@ -359,5 +375,5 @@ def make_trainer(
         limit_val_batches=0,
         use_distributed_sampler=False,  # the sampler deals out shares itself
         default_root_dir=str(run_dir) if run_dir is not None else None,
-        plugins=[AtomicCheckpointIO()],
+        plugins=[AtomicCheckpointIO(), *([] if environment is None else [environment])],
     )

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -10,39 +13,81 @@ from torch import Tensor, nn
 class RunningNormaliser(nn.Module):
     """Normalises the first ``size`` features by statistics gathered in training; the others pass unchanged.
 
-    Statistics are buffers (part of the checkpoint), accumulate in float64 over at most ``max_updates`` calls in
-    training mode and stay as they are in evaluation mode, or for good where ``frozen`` is set. The standard deviation
-    is floored because x_{-1} = X makes every velocity zero at the start.
+    In training mode a call adds what it sees to ``gathered``; :meth:`absorb` makes that part of the statistics. Between
+    two calls of :meth:`absorb` the layer is one fixed function, so that a step of the optimiser is the gradient of one
+    function and can be divided over ranks, whose ``gathered`` are added before. Features pass unchanged as long as
+    there are no statistics.
+
+    Statistics are buffers (part of the checkpoint) in float64. The standard deviation is floored because x_{-1} = X
+    makes every velocity zero at the start.
+
+    Attributes:
+        gathered: number, sum and sum of squares of what was seen since :meth:`absorb`; not part of the checkpoint.
+        frozen: calls in training mode add nothing to it.
     """
 
     count: Tensor
     total: Tensor
     squares: Tensor
     updates: Tensor
+    gathered: Float[Tensor, " G"]
 
     def __init__(self, size: int, *, floor: float = 1e-2, max_updates: int = 100_000) -> None:
-        """``floor`` is the smallest standard deviation, in the features' own units."""
+        """Makes an empty one.
+
+        Args:
+            size: features that are normalised.
+            floor: the smallest standard deviation, in the features' own units.
+            max_updates: calls of :meth:`absorb` after which the statistics stay as they are.
+        """
         super().__init__()
-        self.size, self.floor, self.max_updates = size, floor, max_updates
-        self.frozen = False
+        self.size, self.floor, self.max_updates, self.frozen = size, floor, max_updates, False
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
         self.register_buffer("updates", torch.zeros((), dtype=torch.int64))
         self.register_buffer("total", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("squares", torch.zeros(size, dtype=torch.float64))
+        self.register_buffer("gathered", torch.zeros(1 + 2 * size, dtype=torch.float64), persistent=False)
 
     def forward(self, features: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
         """(x - mean) / std of the first ``size`` columns."""
         head, tail = features[:, : self.size], features[:, self.size :]
-        if self.training and not self.frozen and head.shape[0] and int(self.updates) < self.max_updates:
-            self._accumulate(head.detach().double())
+        if self.training and not self.frozen:
+            self._gather(head.detach().double())
         count = self.count.clamp_min(1.0)
         mean = self.total / count
         std = (self.squares / count - mean * mean).clamp_min(0).sqrt().clamp_min(self.floor)
+        std = torch.where(self.count > 0, std, torch.ones_like(std))
         return torch.cat(((head - mean.to(head)) / std.to(head), tail), 1)
 
     @torch.no_grad()
-    def _accumulate(self, values: Tensor) -> None:
-        self.count += values.shape[0]
-        self.updates += 1
-        self.total += values.sum(0)
-        self.squares += (values * values).sum(0)
+    def _gather(self, values: Tensor) -> None:
+        self.gathered[0] += values.shape[0]
+        self.gathered[1:] += torch.cat((values.sum(0), (values * values).sum(0)))
+
+    @torch.no_grad()
+    def absorb(self) -> None:
+        """Takes what was gathered into the statistics; nothing is read on the host."""
+        counts = (self.gathered[0] > 0) & (self.updates < self.max_updates)
+        number, total, squares = self.gathered.split((1, self.size, self.size))
+        for statistic, seen in ((self.count, number[0]), (self.total, total), (self.squares, squares)):
+            statistic += torch.where(counts, seen, torch.zeros_like(seen))
+        self.updates += counts
+        self.gathered.zero_()
+
+
+def normalisers_of(module: nn.Module) -> list[RunningNormaliser]:
+    """All of them in a module, in its order."""
+    return [m for m in module.modules() if isinstance(m, RunningNormaliser)]
+
+
+@contextmanager
+def gathering_nothing(normalisers: Iterable[RunningNormaliser]) -> Iterator[None]:
+    """The block in which calls leave no trace: what was counted already is computed once more."""
+    held = [(n, n.frozen) for n in normalisers]
+    for normaliser, _ in held:
+        normaliser.frozen = True
+    try:
+        yield
+    finally:
+        for normaliser, before in held:
+            normaliser.frozen = before

@@ -1,0 +1,157 @@
+"""Where a run's ranks stand, and what Lightning is told of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from lightning.fabric.utilities.seed import reset_seed
+from lightning.pytorch.plugins.environments import ClusterEnvironment
+from lightning.pytorch.strategies import DDPStrategy
+from torch import distributed as dist
+
+from gausim.core import ConfigError
+
+LOCALHOST = "127.0.0.1"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How many processes train together, and how they talk.
+
+    Attributes:
+        devices: ranks per machine.
+        num_nodes: machines.
+        accelerator: ``auto``, ``cpu`` or ``gpu``.
+        timeout_minutes: a rank that waits longer than this for the others ends with an error.
+    """
+
+    devices: int = 1
+    num_nodes: int = 1
+    accelerator: str = "auto"
+    timeout_minutes: float = 10.0
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        if not all(isinstance(n, int) and n >= 1 for n in (self.devices, self.num_nodes)) or self.timeout_minutes <= 0:
+            raise ConfigError(
+                "trainer: expected devices >= 1, num_nodes >= 1 (numbers of ranks and machines) and "
+                f"timeout_minutes > 0, got {self.devices!r}, {self.num_nodes!r} and {self.timeout_minutes!r}."
+            )
+
+    @property
+    def size(self) -> int:
+        """All ranks."""
+        return self.devices * self.num_nodes
+
+    @property
+    def on_gpu(self) -> bool:
+        """Whether each rank has a GPU."""
+        return self.accelerator in ("gpu", "cuda") or (self.accelerator == "auto" and torch.cuda.is_available())
+
+    @property
+    def backend(self) -> str:
+        """Of torch.distributed; what the hosts tell each other goes by gloo in any case."""
+        return "cpu:gloo,cuda:nccl" if self.on_gpu else "gloo"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a rank that another process started finds the others.
+
+    Attributes:
+        rank: its number.
+        size: how many there are.
+        port: of the first rank's store on this machine.
+        backend: see :class:`Layout`.
+        timeout: seconds to wait for others.
+    """
+
+    rank: int
+    size: int
+    port: int
+    backend: str
+    timeout: float
+
+    @staticmethod
+    def parse(argv: Sequence[str]) -> Place:
+        """Reads :meth:`argv`."""
+        rank, size, port, backend, timeout = argv
+        return Place(int(rank), int(size), int(port), backend, float(timeout))
+
+    def argv(self) -> list[str]:
+        """As arguments of a program."""
+        return [str(x) for x in (self.rank, self.size, self.port, self.backend, self.timeout)]
+
+
+class LocalRanks(ClusterEnvironment):
+    """Tells Lightning where a rank stands on this machine; no environment variable is read or set."""
+
+    def __init__(self, rank: int, size: int, port: int) -> None:
+        """Keeps the numbers."""
+        self._rank, self._size, self._port = rank, size, port
+
+    @property
+    def creates_processes_externally(self) -> bool:
+        """True: they run already."""
+        return True
+
+    @property
+    def main_address(self) -> str:
+        """This machine."""
+        return LOCALHOST
+
+    @property
+    def main_port(self) -> int:
+        """Of the first rank's store."""
+        return self._port
+
+    @staticmethod
+    def detect() -> bool:
+        """Never chosen by Lightning itself."""
+        return False
+
+    def world_size(self) -> int:
+        """Number of ranks."""
+        return self._size
+
+    def set_world_size(self, size: int) -> None:
+        """Fixed already."""
+
+    def global_rank(self) -> int:
+        """This rank."""
+        return self._rank
+
+    def set_global_rank(self, rank: int) -> None:
+        """Fixed already."""
+
+    def local_rank(self) -> int:
+        """This rank: all are on one machine."""
+        return self._rank
+
+    def node_rank(self) -> int:
+        """The only machine."""
+        return 0
+
+
+class RanksStrategy(DDPStrategy):
+    """Replicas whose module adds up the gradients by itself (:meth:`GausSimModule.optimise`).
+
+    Torch's wrapper would reduce after every stretch of a rollout, wait for ranks that have no sequence, and give a
+    gradient of zero to parameters of sequences that are in no batch.
+    """
+
+    def _configure_launcher(self) -> None:
+        """None: the ranks run already."""
+
+    def setup_distributed(self) -> None:
+        """Takes the process group that :class:`Crew` has set up."""
+        reset_seed()
+        self.set_world_ranks()
+
+    def configure_ddp(self) -> None:
+        """All ranks start from the first one's weights and buffers."""
+        assert self.model is not None
+        for tensor in (*self.model.parameters(), *self.model.buffers()):
+            dist.broadcast(tensor.detach(), src=0)
