@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException
@@ -23,24 +24,11 @@ from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import gausim
+from gausim.cli._targets import check_hydra, check_targets
 from gausim.core.errors import ConfigError, GausSimError
 
 HYDRA_VERSION_BASE = "1.3"
 LONGEST_FOLDER_NAME = 120
-# What a configuration may name in `_target_`. A configuration comes with data and runs from other people, so it must
-# not be able to call whatever the interpreter can import.
-ALLOWED_PACKAGES = ("gausim", "torch", "lightning", "torchmetrics", "kornia", "optuna.samplers", "optuna.pruners")
-ALLOWED_TARGETS = ("builtins.dict", "builtins.list")
-# Inside the allowed packages these load code, read pickles or start programs.
-REFUSED_MODULES = (
-    "gausim.cli",
-    "torch.hub",
-    "torch.jit",
-    "torch.package",
-    "torch.serialization",
-    "torch.utils.collect_env",
-    "torch.utils.cpp_extension",
-)
 
 
 @dataclass
@@ -214,7 +202,7 @@ def run_hydra(config_name: str, task: Callable[[DictConfig], float | None], argv
     sys.argv = [saved_argv[0], *argv]
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
-        with _readable_errors(config_name):
+        with _readable_errors(config_name), _guarded():
             runner()
     finally:
         sys.argv = saved_argv
@@ -233,6 +221,23 @@ def run_dir() -> Path:
 def in_sweep() -> bool:
     """Returns whether the running job is one of a sweep (`-m`)."""
     return HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+@contextmanager
+def _guarded() -> Iterator[None]:
+    """Has the node `hydra` of a configuration checked before Hydra builds its logging, callbacks and launcher of it."""
+    load = ConfigLoaderImpl.load_configuration
+
+    def checked(self: ConfigLoaderImpl, *args: Any, **kwargs: Any) -> DictConfig:
+        config = load(self, *args, **kwargs)
+        check_hydra(config.hydra)
+        return config
+
+    ConfigLoaderImpl.load_configuration = checked  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        ConfigLoaderImpl.load_configuration = load  # type: ignore[method-assign]
 
 
 @contextmanager
@@ -330,52 +335,3 @@ def _blame(error: InstantiationException, where: str) -> Exception:
     if isinstance(last, InstantiationException) or (isinstance(last, TypeError) and _is_wrong_call(last)):
         return ConfigError(f"{where}: {str(error).strip()}")
     return error
-
-
-def check_targets(node: DictConfig | ListConfig) -> None:
-    """Refuses every `_target_` outside the allow-list, however deep, before anything is built.
-
-    A name is judged by where its object really lives: `torch.os.system` begins well, but is not torch's.
-
-    Args:
-        node: the configuration to look through.
-
-    Raises:
-        ConfigError: naming the key and the target.
-    """
-    root = str(node._get_full_key(None) or "")
-    for key, target in _targets(OmegaConf.to_container(node, resolve=True), root):
-        if not _is_allowed(target):
-            raise ConfigError(
-                f"{key}._target_: expected something from {', '.join(ALLOWED_PACKAGES)} or one of "
-                f"{', '.join(ALLOWED_TARGETS)}, got {target!r}. Only these may be built from a configuration."
-            )
-
-
-def _targets(value: Any, key: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, dict):
-        if "_target_" in value:
-            yield key or "configuration", value["_target_"]
-        for name, child in value.items():
-            yield from _targets(child, f"{key}.{name}" if key else str(name))
-    elif isinstance(value, list):
-        for index, child in enumerate(value):
-            yield from _targets(child, f"{key}[{index}]")
-
-
-def _within(name: str, packages: Sequence[str]) -> bool:
-    return any(name == package or name.startswith(f"{package}.") for package in packages)
-
-
-def _is_allowed(target: Any) -> bool:
-    if not isinstance(target, str):
-        return False
-    if target in ALLOWED_TARGETS:
-        return True
-    if not _within(target, ALLOWED_PACKAGES) or _within(target, REFUSED_MODULES):
-        return False
-    try:
-        home = getattr(hydra.utils.get_object(target), "__module__", None)
-    except Exception as error:  # importing the target may fail in any way; the name is what the reader can mend
-        raise ConfigError(f"_target_ {target!r} cannot be found: {error}. Check its spelling.") from error
-    return isinstance(home, str) and _within(home, ALLOWED_PACKAGES) and not _within(home, REFUSED_MODULES)

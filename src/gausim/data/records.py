@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gausim.core import Cameras, DataError
 from gausim.data.images import read_rgba_into
+from gausim.io.npz import read_npz
 from gausim.io.transforms import PosedFrame, read_transforms
 
 # Every tenth still is left out of the reconstruction, to measure it on.
@@ -142,12 +143,12 @@ class SequenceRecord:
 def read_array(path: Path, field: str) -> np.ndarray:
     """One array of an npz file without pickles, or :class:`DataError` that names file and field."""
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return arrays[field]
-    except KeyError:
-        raise DataError(f"{path}: array '{field}' is missing.") from None
-    except (OSError, ValueError) as error:
+        arrays = read_npz(path, [field])
+    except ValueError as error:
         raise DataError(f"{path}: cannot be read as npz ({error}).") from error
+    if field not in arrays:
+        raise DataError(f"{path}: array '{field}' is missing.")
+    return arrays[field]
 
 
 def _frames_of_views(

@@ -137,7 +137,7 @@ class RunDirectory:
             raise RunError(f"{self.path}: no run here ({CONFIG} is missing). Train first (`gausim train name=NAME`).")
         try:
             loaded = yaml.safe_load(path.read_text())
-        except yaml.YAMLError as error:
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
             raise RunError(f"{path}: cannot be read as YAML ({error}).") from error
         if not isinstance(loaded, dict):
             raise RunError(f"{path}: expected a mapping, got {type(loaded).__name__}.")

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gausim.core.errors import SceneError
 from gausim.core.scene import GaussianScene
+from gausim.io.npz import read_npz
 
 MASK_SUFFIX = ".masks.npz"
 MASK_NAMES = ("simulated", "pinned", "foreground")
@@ -140,9 +141,8 @@ def load_masks(scene: GaussianScene, path: Path | str) -> GaussianScene:
     if not path.is_file():
         raise SceneError(f"{path}: no such file. Expected masks written by `gausim inspect SCENE --save-masks`.")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            stored = {n: file[n] for n in file.files}
-    except (ValueError, OSError, EOFError) as error:
+        stored = read_npz(path)
+    except ValueError as error:
         raise SceneError(f"{path}: not a readable npz of plain arrays ({error}). Write the masks again.") from error
     values: dict[str, Tensor] = {}
     for n in MASK_NAMES:

@@ -8,8 +8,6 @@ Energies of frame t belong to the step from t-1 to t and exist for the row ``tru
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from gausim.core import RunError
+from gausim.io.npz import read_npz
 from gausim.report.pictures import Pictures
 
 STATIC = "static"
@@ -116,9 +115,8 @@ def load_curves(path: Path) -> list[ObjectCurves]:
         RunError: the file is missing or not such a file.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+        arrays = read_npz(path)
+    except ValueError as error:
         raise RunError(f"{path}: cannot be read ({error}). Write it with `gausim evaluate RUN`.") from error
     objects = {n.rsplit("/", 1)[0]: _facts(str(a)) for n, a in arrays.items() if n.endswith(f"/{_FACTS}")}
     if not objects:

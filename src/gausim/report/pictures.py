@@ -8,8 +8,6 @@ shows one. Numbers are never computed from them.
 from __future__ import annotations
 
 import json
-import zipfile
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from gausim.core import RunError
+from gausim.io.npz import read_npz
 
 # What stands behind an object whose recording has no background of its own.
 PLAIN = (46, 48, 52)
@@ -76,11 +75,10 @@ def load_pictures(path: Path) -> list[Pictures]:
         RunError: the file is missing or not such a file.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = read_npz(path)
         names = [name.removesuffix("/facts") for name in arrays if name.endswith("/facts")]
         return [_pictures(name, arrays) for name in names]
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zlib.error, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise RunError(f"{path}: cannot be read ({error}). Write it with `gausim evaluate RUN`.") from error
 
 
