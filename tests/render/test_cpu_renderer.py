@@ -15,7 +15,8 @@ import torch
 
 from gausim.core import ConfigError, DivergenceError
 from gausim.render.cpu import CpuRenderer
-from gausim.render.cpu.raster import backward_tile, forward_tile
+from gausim.render.cpu.raster import backward_block, forward_block
+from gausim.render.cpu.simd import vector
 from gausim.render.reference import ReferenceRenderer
 
 CASES = {
@@ -148,12 +149,14 @@ PACKED = {
 
 
 @pytest.mark.skipif(platform.machine() not in PACKED, reason="vector instructions of this processor are not known here")
-@pytest.mark.parametrize("kernel", [forward_tile, backward_tile])
+@pytest.mark.parametrize("kernel", [forward_block, backward_block])
 def test_hot_loops_are_vectorised(kernel: numba.core.registry.CPUDispatcher) -> None:
-    records, entries = numba.float32[:, ::1], numba.int32[::1]
-    numbers = numba.float32[::1]
-    args = (records, entries, numba.int64, numba.int64, numba.float32, numba.float32, numba.float32, numbers)
-    args += (numba.none,) if kernel is forward_tile else (numbers, numba.none)
+    rows, numbers = numba.int32[::1], numba.float32[::1]
+    args = (numbers, rows, numba.int64, numba.int64)
+    if kernel is forward_block:
+        args += (numba.int64, vector, vector, numba.float32, numbers, numba.int64, numba.none)
+    else:
+        args += (vector, vector, numba.float32, numbers, numbers, numbers, numba.none)
     # A fresh compilation: numba does not show the code of functions that it loads from its cache.
     fresh = numba.njit(nogil=True, fastmath=True, error_model="numpy")(kernel.py_func)
     fresh.compile(args)

@@ -9,7 +9,7 @@ import numpy as np
 from gausim.benchmark.splats import Splats
 from gausim.render.cpu.batch import Band, Batch, Images
 from gausim.render.cpu.binning import TILE_HEIGHT, TILE_WIDTH
-from gausim.render.cpu.raster import LANES
+from gausim.render.cpu.raster import BLOCKS, LANES
 
 
 class Stages:
@@ -91,12 +91,7 @@ class Stages:
 
     def evaluated(self) -> int:
         """Pixels for which the two loops evaluate a kernel, over all tiles' entries up to where the tile ends early."""
-        total = 0
-        for band in self.bands:
-            pairs_of_rows = (band.entries & 15) - (band.entries >> 4 & 15) + 1
-            before = np.concatenate(([0], np.cumsum(pairs_of_rows, dtype=np.int64)))
-            total += int((before[band.used] - before[band.start[:-1]]).sum())
-        return total * LANES
+        return LANES * sum(int(band.used[:, :BLOCKS].sum()) for band in self.bands)
 
     def inside(self) -> int:
         """Those of them that lie within the kernel's ellipse, where alpha >= 1/255."""

@@ -19,7 +19,7 @@ from gausim.render.cpu.projection import (
     project_adjoint,
     project_kernels,
 )
-from gausim.render.cpu.raster import PIXELS, SUMS, backward_band, forward_band
+from gausim.render.cpu.raster import BLOCKS, PIXELS, SUMS, backward_band, forward_band
 
 Array = NDArray[Any]
 
@@ -258,7 +258,7 @@ class Batch:
         )  # fmt: skip
         tiles = start.shape[0] - 1
         final, last = np.empty((tiles, PIXELS), np.float32), np.empty((tiles, PIXELS), np.float32)
-        return Band(rows[0], records, entries, start, final, last, np.empty(tiles, np.int64))
+        return Band(rows[0], records, entries, start, final, last, np.empty((tiles, BLOCKS + 1), np.int64))
 
     def composite(self, band: Band, images: tuple[Array, Array, Array | None]) -> None:
         """Draws a band into the images of its view."""

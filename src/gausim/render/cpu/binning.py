@@ -56,15 +56,18 @@ def collect_band(records, extents, order, spans, row_of, row_low, row_high, stri
     ``row_of`` (K,) receives the band-local row of the kernels that are copied.
 
     Returns:
-        band records (m, RECORD), their kernels (m,), the first and one past the last column strip of each (m, 2), and
-        where the list of each strip starts when every kernel is in the lists of all its strips (strips + 1,).
+        band records (m + 1, RECORD), the last of a kernel that touches nothing; kernels of the others (m,); the first
+        and one past the last column strip of each (m, 2); and where the list of each strip starts when every kernel is
+        in the lists of all its strips (strips + 1,).
     """
     chosen = np.empty(order.shape[0], np.int32)
     m = 0
     for i in range(order.shape[0]):
         chosen[m] = order[i]
         m += (spans[i, 0] <= row_high) & (spans[i, 1] >= row_low)  # without a branch, which nothing could predict
-    band_records, reach = np.empty((m, RECORD), np.float32), np.empty((m, 2), np.int32)
+    band_records, reach = np.empty((m + 1, RECORD), np.float32), np.empty((m, 2), np.int32)
+    band_records[m] = ZERO
+    band_records[m, 11] = HALF  # no exponent is that large
     begins = np.zeros(strips + 2, np.int64)
     for i in range(m):
         g = chosen[i]
@@ -92,8 +95,8 @@ def bin_band(records, extents, order, spans, row_of, row_low, row_high, strips):
     looks at every kernel of the strip but takes no branch, which pays while a band is a few tiles high.
 
     Returns:
-        band records (m, RECORD); entries (E,), each ``row << 8 | first pair of pixel rows in the tile << 4 | last``;
-        and where each tile's entries start (tiles + 1,). Tiles are numbered row by row.
+        band records (m + 1, RECORD), see collect_band; entries (E,), each ``row << 8 | first pair of pixel rows in the
+        tile << 4 | last``; and where each tile's entries start (tiles + 1,). Tiles are numbered row by row.
     """
     band_records, chosen, reach, begins = collect_band(
         records, extents, order, spans, row_of, row_low, row_high, strips

@@ -21,6 +21,10 @@ EXTENT = 8
 SLACK = 0.002  # [pixels] added to every extent, far above the rounding error of extents up to some thousand pixels,
 RELATIVE_SLACK = 2e-6  # and in proportion to the extent above that
 
+# Where in a row of sums those of s, s dx, s dx^2, s dy, s dx dy, s dy^2, w v (3) and w v_depth over pixels stand: in
+# the order in which raster.add_sums folds them.
+S, S_X, S_XX, S_Y, S_XY, S_YY = 0, 4, 2, 8, 12, 6
+S_RED, S_GREEN, S_BLUE, S_DEPTH = 1, 9, 14, 5
 AT_ONCE = 64  # kernels whose sums are gathered before they are used
 
 DILATION = 0.3  # [pixels^2], gsplat's and 3DGS's low-pass filter
@@ -203,12 +207,12 @@ def project_adjoint(
         if (k - low) % AT_ONCE == 0:
             gather_sums(k, min(k + AT_ONCE, high), depth, spans, band_of, row_of, offsets, sums, totals)
         total = totals[(k - low) % AT_ONCE]
-        grad_colors[k, 0], grad_colors[k, 1], grad_colors[k, 2] = total[6], total[7], total[8]
+        grad_colors[k, 0], grad_colors[k, 1], grad_colors[k, 2] = total[S_RED], total[S_GREEN], total[S_BLUE]
         if depth[k] < 0.0:
             continue
         screen_covariance(means, covars, viewmat, K, k, width, height, frame)
-        m0, m1, m11 = np.float64(total[0]), np.float64(total[1]), np.float64(total[2])
-        m2, m12, m22 = np.float64(total[3]), np.float64(total[4]), np.float64(total[5])
+        m0, m1, m11 = np.float64(total[S]), np.float64(total[S_X]), np.float64(total[S_XX])
+        m2, m12, m22 = np.float64(total[S_Y]), np.float64(total[S_XY]), np.float64(total[S_YY])
         s00, s01, s11 = frame[9], frame[10], frame[11]
         rdet = 1.0 / (s00 * s11 - s01 * s01)
         a, b, c = s11 * rdet, -s01 * rdet, s00 * rdet
@@ -249,6 +253,6 @@ def project_adjoint(
         cam_y = ey * gv - free_y * ey * rz * j12
         cam_z = -ex * frame[0] * rz * gu - ey * frame[1] * rz * gv
         cam_z += ex * rz * (qx * (1.0 + free_x) * j02 - j00) + ey * rz * (qy * (1.0 + free_y) * j12 - j11)
-        cam_z += total[9]
+        cam_z += total[S_DEPTH]
         for j in range(3):
             grad_means[k, j] += cam_x * viewmat[0, j] + cam_y * viewmat[1, j] + cam_z * viewmat[2, j]
