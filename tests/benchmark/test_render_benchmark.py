@@ -83,19 +83,20 @@ def test_colours_of_both_forms_are_the_same() -> None:
 
 
 def test_pixels_are_counted_as_by_hand() -> None:
-    """Every tile evaluates whole pairs of rows of eight pixels up to where its last pixel closes."""
+    """Every block of two rows of eight pixels evaluates the kernels that reach it, until its last pixel closes."""
     stages = Stages(splats(60, 40, 48))
     evaluated = inside = 0
     for band in stages.bands:
-        for tile in range(len(band.start) - 1):
-            left, top = 8 * (tile % 5), band.row_low + 16 * (tile // 5)
-            for packed in band.entries[band.start[tile] : band.used[tile]]:
+        for tile, p in itertools.product(range(len(band.start) - 1), range(8)):
+            entries = band.entries[band.start[tile] : band.start[tile + 1]]
+            reaching = [packed for packed in entries if (packed >> 4) & 15 <= p <= packed & 15]
+            for packed in reaching[: band.used[tile, p]]:
                 r = band.records[packed >> 8]
-                for pair in range((packed >> 4) & 15, (packed & 15) + 1):
-                    for x, y in itertools.product(range(8), (2 * pair, 2 * pair + 1)):
-                        dx, dy = left + x + 0.5 - (r[0] + r[1]), top + y + 0.5 - (r[2] + r[3])
-                        evaluated += 1
-                        inside += r[4] * dx * dx + r[5] * dx * dy + r[6] * dy * dy >= r[11]
+                for x, y in itertools.product(range(8), range(2)):
+                    dx = 8 * (tile % 5) + x + 0.5 - (r[0] + r[1])
+                    dy = band.row_low + 16 * (tile // 5) + 2 * p + y + 0.5 - (r[2] + r[3])
+                    evaluated += 1
+                    inside += r[4] * dx * dx + r[5] * dx * dy + r[6] * dy * dy >= r[11]
     assert stages.evaluated() == evaluated > 0
     assert stages.inside() == pytest.approx(inside, abs=2) and 0 < inside < evaluated
 

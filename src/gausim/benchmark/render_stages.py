@@ -90,7 +90,7 @@ class Stages:
             self.batch.project_adjoint(0, (0, low, high), grads)
 
     def evaluated(self) -> int:
-        """Pixels for which the two loops evaluate a kernel, over all tiles' entries up to where the tile ends early."""
+        """Pixels for which the two loops evaluate a kernel: sixteen for each that a block of pixels looks at."""
         return LANES * sum(int(band.used[:, :BLOCKS].sum()) for band in self.bands)
 
     def inside(self) -> int:
@@ -99,14 +99,16 @@ class Stages:
 
 
 def _inside(band: Band, strips: int) -> int:
-    """Pixels within the ellipses of a band's entries."""
-    x, y = np.arange(TILE_WIDTH) + np.float32(0.5), np.arange(TILE_HEIGHT) + np.float32(0.5)
+    """Pixels within the ellipses of the kernels that the blocks of a band's tiles looked at."""
+    x, y = np.arange(TILE_WIDTH) + np.float32(0.5), np.arange(2) + np.float32(0.5)
     total = 0
     for tile in range(band.start.shape[0] - 1):
-        entries = band.entries[band.start[tile] : band.used[tile]]
-        r = band.records[entries >> 8][:, :, None, None]
-        dx = x - ((r[:, 0] - TILE_WIDTH * (tile % strips)) + r[:, 1])
-        dy = y[:, None] - ((r[:, 2] - (band.row_low + TILE_HEIGHT * (tile // strips))) + r[:, 3])
-        exponent = dy * (r[:, 6] * dy + r[:, 5] * dx) + r[:, 4] * dx * dx
-        total += int((exponent >= r[:, 11]).sum())
+        entries = band.entries[band.start[tile] : band.used[tile, BLOCKS]]
+        for p in range(BLOCKS):
+            reach = ((entries >> 4 & 15) <= p) & ((entries & 15) >= p)
+            r = band.records[entries[reach][: band.used[tile, p]] >> 8][:, :, None, None]
+            dx = x - ((r[:, 0] - TILE_WIDTH * (tile % strips)) + r[:, 1])
+            dy = y[:, None] - ((r[:, 2] - (band.row_low + TILE_HEIGHT * (tile // strips) + 2 * p)) + r[:, 3])
+            exponent = dy * (r[:, 6] * dy + r[:, 5] * dx) + r[:, 4] * dx * dx
+            total += int((exponent >= r[:, 11]).sum())
     return total
