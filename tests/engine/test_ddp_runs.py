@@ -107,20 +107,23 @@ def test_two_ranks_learn_what_one_does(train: Train, whole: Path) -> None:
 
 
 @pytest.mark.slow
-def test_jobs_of_a_sweep_follow_each_other_with_two_ranks_each(train: Train) -> None:
-    settings = (*TWO, "trainer.max_epochs=2")
-    status, output = train("swept", "-m", "seed=1,2,3", *settings)
+@pytest.mark.parametrize("search", [False, True])
+def test_jobs_of_a_sweep_follow_each_other_with_two_ranks_each(train: Train, search: bool) -> None:
+    settings, name = (*TWO, "trainer.max_epochs=2"), f"swept_{search}"
+    optuna = ("hydra/sweeper=optuna", "hydra.sweeper.n_trials=3", "hydra.sweeper.pruner=null",
+              "optimizer.network_lr=tag(log,interval(1e-4,1e-2))")  # fmt: skip
+    grid = ("optimizer.network_lr=0.001,0.002,0.003",)
+    status, output = train(name, *settings, *(optuna if search else grid), "-m")
     assert status == 0, output
-    assert output.count("2 ranks") == 3 and "Traceback" not in output
-    for seed in (1, 2, 3):
-        job = run_of(train, "swept").parent / "none" / "gausim_paper"
-        runs = list(job.rglob(f"seed_{seed}/FINISHED"))
-        assert len(runs) == 1
-        config = yaml.safe_load((runs[0].parent / "config.yaml").read_text())
-        assert config["seed"] == seed and config["trainer"]["devices"] == 2
-        status, output = train("single", f"seed={seed}", *settings)
+    assert output.count("(2 ranks, ") == 3 and "sweep of 3 jobs: 3 trained" in output and "Traceback" not in output
+    jobs = [marker.parent for marker in (train.folder / name).rglob("FINISHED")]  # type: ignore[attr-defined]
+    rates = {yaml.safe_load((job / "config.yaml").read_text())["optimizer"]["network_lr"] for job in jobs}
+    assert len(jobs) == len(rates) == 3
+    for job in jobs[:2]:  # what a run of its own learns with the job's rate: all ranks had it
+        rate = yaml.safe_load((job / "config.yaml").read_text())["optimizer"]["network_lr"]
+        status, output = train(f"alone_{job.parent.name[-8:]}", *settings, f"optimizer.network_lr={rate}")
         assert status == 0, output
-        assert_same_run(runs[0].parent, run_of(train, "single", seed))
+        assert_same_run(job, run_of(train, f"alone_{job.parent.name[-8:]}"))
 
 
 @pytest.mark.slow
