@@ -52,6 +52,43 @@ def test_agrees_with_lpips_jax(published):
     assert measured(published, predictions, target.expand(3, -1, -1, -1)) == pytest.approx(expected, abs=1e-5)
 
 
+def by_windows(image: np.ndarray, weights: dict[str, np.ndarray]) -> list[np.ndarray]:
+    """AlexNet's features in float64 and numpy alone: every convolution as products of windows."""
+    shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
+    x, found = ((2 * image - 1 - shift) / scale).transpose(2, 0, 1), []
+    windows = np.lib.stride_tricks.sliding_window_view
+    for i, (stride, padding) in enumerate(((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))):
+        if i in (1, 2):
+            x = windows(x, (3, 3), axis=(1, 2))[:, ::2, ::2].max((3, 4))
+        x = np.pad(x, ((0, 0), (padding, padding), (padding, padding)))
+        kernel, bias = weights[f"conv{i}.weight"], weights[f"conv{i}.bias"]
+        view = windows(x, kernel.shape[2:], axis=(1, 2))[:, ::stride, ::stride]
+        x = np.maximum(np.tensordot(kernel, view, ((1, 2, 3), (0, 3, 4))) + bias[:, None, None], 0)
+        found.append(x / (np.sqrt((x**2).sum(0)) + 1e-10))
+    return found
+
+
+def independent(prediction: torch.Tensor, target: torch.Tensor, path: Path) -> float:
+    weights = {name: tensor.double().numpy() for name, tensor in load_file(path).items()}
+    pairs = zip(
+        by_windows(prediction.double().numpy(), weights), by_windows(target.double().numpy(), weights), strict=True
+    )
+    return sum(
+        ((a - b) ** 2 * weights[f"lin{i}.weight"][:, None, None]).sum(0).mean() for i, (a, b) in enumerate(pairs)
+    )
+
+
+@pytest.mark.parametrize("source", ["published", "random"])
+def test_agrees_with_an_independent_computation(source, request, tmp_path):
+    path = request.getfixturevalue("published") if source == "published" else write(tmp_path / "w", random_weights())
+    prediction, target = PAIR()
+    pairs = [(prediction, target), (target.flip(2), target), (target, torch.zeros_like(target))]
+    for first, second in pairs:
+        expected = independent(first[0], second[0], path)
+        assert expected > 1e-3
+        assert measured(path, first, second) == pytest.approx([expected], rel=1e-4)
+
+
 def test_distance_by_hand(tmp_path):
     """One kernel per layer passes the middle of the window on; features are then known without a network."""
     weights = {n: torch.zeros(s) for n, s in expected_shapes().items()}
