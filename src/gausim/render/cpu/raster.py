@@ -70,27 +70,19 @@ def hand_out(entries, begin, end, lists, stride, counts, nobody):
     four. Every entry is written to every list and counts where it belongs: branches would be guessed wrong half of the
     time.
     """
-    n0, n1, n2, n3, n4, n5, n6, n7 = 0, stride, 2 * stride, 3 * stride, 4 * stride, 5 * stride, 6 * stride, 7 * stride
+    for p in range(BLOCKS):
+        counts[p] = p * stride
     for e in range(begin, end):
         packed = entries[e]
         g = packed >> 8
         bits = (2 << (packed & 15)) - (1 << ((packed >> 4) & 15))
-        lists[n0], lists[n1], lists[n2], lists[n3] = g, g, g, g
-        lists[n4], lists[n5], lists[n6], lists[n7] = g, g, g, g
-        n0 += bits & 1
-        n1 += (bits >> 1) & 1
-        n2 += (bits >> 2) & 1
-        n3 += (bits >> 3) & 1
-        n4 += (bits >> 4) & 1
-        n5 += (bits >> 5) & 1
-        n6 += (bits >> 6) & 1
-        n7 += (bits >> 7) & 1
-    counts[0], counts[1], counts[2], counts[3] = n0, n1 - stride, n2 - 2 * stride, n3 - 3 * stride
-    counts[4], counts[5] = n4 - 4 * stride, n5 - 5 * stride
-    counts[6], counts[7] = n6 - 6 * stride, n7 - 7 * stride
+        for p in range(BLOCKS):
+            lists[counts[p]] = g
+            counts[p] += (bits >> p) & 1
     for p in range(BLOCKS):
-        for i in range(p * stride + counts[p], p * stride + counts[p] + 3):
+        for i in range(counts[p], counts[p] + 3):
             lists[i] = nobody
+        counts[p] -= p * stride
 
 
 @numba.njit(fastmath=ORDER, **HELPER)
@@ -360,9 +352,10 @@ def backward_band(
     flat_records = records.reshape(-1)
     work = np.empty(2 * LANES * AT_ONCE, np.float32)
     flat[:] = ZERO
-    stride = 3
+    most = start[0]  # entries of a tile
     for tile in range(start.shape[0] - 1):
-        stride = max(stride, used[tile, BLOCKS] - start[tile] + 3)
+        most = max(most, used[tile, BLOCKS] - start[tile])
+    stride = most + 3
     lists, counts = np.empty(BLOCKS * stride, np.int32), np.empty(BLOCKS, np.int64)
     for tile in range(start.shape[0] - 1):
         if behind is None and used[tile, BLOCKS] == start[tile]:

@@ -100,8 +100,12 @@ def _lower_and(context, builder, sig, args):
 
 
 def _pointer(context, builder, kind, array, index):
-    data = context.make_array(kind)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
+    return builder.bitcast(builder.gep(_member(context, builder, kind, array, "data"), [index]), _VECTOR.as_pointer())
+
+
+def _member(context, builder, kind, array, name):
+    """A field of an array's structure; numba's own proxies would first write all of it to memory, which LLVM undoes."""
+    return context.data_model_manager[kind].get(builder, array, name)
 
 
 @intrinsic
@@ -195,7 +199,7 @@ def spread(typing, array, index):
     """``array[index]`` in every lane; the array as for :func:`load`."""
 
     def emit(context, builder, sig, args):
-        place = builder.gep(context.make_array(sig.args[0])(context, builder, args[0]).data, [args[1]])
+        place = builder.gep(_member(context, builder, sig.args[0], args[0], "data"), [args[1]])
         return _spread(builder, types.float32, builder.load(place))
 
     return vector(array, types.intp), emit
@@ -206,7 +210,7 @@ def spread_four(typing, array, indices, offset):
     """``array[index + offset]`` for each of four indices, a tuple, side by side."""
 
     def emit(context, builder, sig, args):
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        data = _member(context, builder, sig.args[0], args[0], "data")
         places = [builder.add(index, args[2]) for index in cgutils.unpack_tuple(builder, args[1])]
         a, b, c, d = (_spread(builder, types.float32, builder.load(builder.gep(data, [at]))) for at in places)
         return _concatenated(builder, a, b, c, d)
@@ -393,11 +397,10 @@ def load_colours(typing, image, y, x):
 
 def _place(context, builder, kind, args, row):
     """Address of ``image[y + row, x]`` as that of a float32."""
-    array = context.make_array(kind)(context, builder, args[0])
-    strides = cgutils.unpack_tuple(builder, array.strides)
+    strides = cgutils.unpack_tuple(builder, _member(context, builder, kind, args[0], "strides"))
     y = builder.add(args[1], ir.Constant(args[1].type, row))
     offset = builder.add(builder.mul(y, strides[0]), builder.mul(args[2], strides[1]))
-    return cgutils.pointer_add(builder, array.data, offset)
+    return cgutils.pointer_add(builder, _member(context, builder, kind, args[0], "data"), offset)
 
 
 def _store_at(builder, place, value):
