@@ -18,14 +18,17 @@ LEVELS = pytest.mark.parametrize(
 def test_union_of_scenes_and_sequences_equals_each_alone(
     make_scene, make_model, make_state, join_states, predicted, graph, elastic
 ) -> None:
-    scenes = [make_scene(70), make_scene(55, seed=1)]
+    scenes = [make_scene(70, dtype=torch.float64), make_scene(55, seed=1, dtype=torch.float64)]
     options = {"template": partial(ElasticTemplate, modes=5, neighbours=6, hidden=4)} if elastic else {}
     model = make_model(
         scenes, predicted_levels=predicted, graph_radii=graph, gravity=(0.0, 1.0, -3.0), output_scale=2.0, **options
     )
     ids = (0, 1, 0)
     states = [make_state(scenes[s], seed=i) for i, s in enumerate(ids)]
-    forces = [torch.randn(scenes[s].count, 3, generator=torch.Generator().manual_seed(i)) for i, s in enumerate(ids)]
+    forces = [
+        torch.randn(scenes[s].count, 3, generator=torch.Generator().manual_seed(i), dtype=torch.float64)
+        for i, s in enumerate(ids)
+    ]
     batch = model.batch(ids)
     assert batch.scene_ids == ids and [m.scene_id for m in batch.members] == [0, 1, 0]
     joint = model.step(batch, join_states(states), torch.cat(forces))
