@@ -13,6 +13,7 @@ from torch import nn
 
 from gausim.core import GaussianScene, RunError
 from gausim.engine.checkpoint import (
+    RESUME_FORMAT,
     AtomicCheckpointIO,
     WeightAverage,
     check_scenes,
@@ -33,7 +34,8 @@ def scene(shift: float = 0.0) -> GaussianScene:
 
 
 def checkpoint(value: float = 1.0) -> dict:
-    own = {"scenes": fingerprints([scene()]), "average": WeightAverage(0.0).state_dict()}
+    own: dict = {"format": RESUME_FORMAT, "scenes": fingerprints([scene()])}
+    own["average"] = WeightAverage(0.0).state_dict()
     return {"state_dict": {"weight": torch.full((2, 3), value)}, "gausim": own}
 
 
@@ -174,12 +176,17 @@ def test_a_damaged_checkpoint_is_told_and_the_one_before_it_serves(how: str, tmp
         run.prepare({"seed": 0})
 
 
-def test_a_checkpoint_of_an_earlier_version_is_read_but_not_resumed(tmp_path: Path) -> None:
-    run = RunDirectory(tmp_path)
+@pytest.mark.parametrize("lacks", ["digest", "format"])
+def test_a_checkpoint_of_another_version_is_read_but_not_resumed(lacks: str, tmp_path: Path) -> None:
+    run, other = RunDirectory(tmp_path), checkpoint(5.0)
     run.prepare({"seed": 0})
-    torch.save(checkpoint(5.0), run.checkpoint)
+    if lacks == "format":
+        del other["gausim"]["format"]
+        AtomicCheckpointIO().save_checkpoint(other, run.checkpoint)
+    else:
+        torch.save(other, run.checkpoint)
     assert float(read_checkpoint(run.checkpoint)["state_dict"]["weight"][0, 0]) == 5.0
-    with pytest.raises(RunError, match="earlier version"):
+    with pytest.raises(RunError, match="another version"):
         run.prepare({"seed": 0})
 
 

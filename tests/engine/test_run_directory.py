@@ -7,7 +7,7 @@ import pytest
 
 from gausim.core import ConfigError, RunError
 from gausim.engine.callbacks import RunCheckpoint, TimeBudget
-from gausim.engine.checkpoint import AtomicCheckpointIO
+from gausim.engine.checkpoint import RESUME_FORMAT, AtomicCheckpointIO
 from gausim.engine.run import RunDirectory, changed_keys, make_trainer
 
 CONFIG = {
@@ -22,7 +22,7 @@ def test_a_fresh_and_an_interrupted_run(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "a")
     assert run.prepare(CONFIG) is None
     assert run.config() == CONFIG
-    AtomicCheckpointIO().save_checkpoint({"state_dict": {}, "gausim": {}}, run.checkpoint)
+    AtomicCheckpointIO().save_checkpoint({"state_dict": {}, "gausim": {"format": RESUME_FORMAT}}, run.checkpoint)
     assert run.prepare(CONFIG) == run.checkpoint
 
 

@@ -18,6 +18,8 @@ from gausim.engine.files import write_durably
 
 LAST_CHECKPOINT, PREVIOUS_CHECKPOINT = "last.ckpt", "last.previous.ckpt"
 DIGEST = "digest"
+# Raise it when a checkpoint holds something new without which a run would not resume bit for bit.
+RESUME_FORMAT = 2
 
 
 class AtomicCheckpointIO(CheckpointIO):
@@ -99,12 +101,13 @@ def check_resumable(path: Path) -> None:
     """Reads a checkpoint to tell whether a run can continue from it.
 
     Raises:
-        RunError: it is damaged, or of a version that saved less than an exact resume needs.
+        RunError: it is damaged, or of a version that saved other things than an exact resume needs.
     """
-    if DIGEST not in read_checkpoint(path):
+    checkpoint = read_checkpoint(path)
+    if DIGEST not in checkpoint or checkpoint["gausim"].get("format") != RESUME_FORMAT:
         raise RunError(
-            f"{path}: written by an earlier version of gausim, which did not save all that a resumed run needs. Finish "
-            "it with that version, or train anew (trainer.overwrite=true)."
+            f"{path}: written by another version of gausim, which did not save what a resumed run needs here. Finish "
+            "it with that version, or train anew (trainer.overwrite=true). It can still be evaluated."
         )
 
 

@@ -15,7 +15,7 @@ from torch.optim import Optimizer
 from gausim.core import ConfigError, DivergenceError, Renderer, SimState
 from gausim.data.dataset import SampleFacts, SequenceSample
 from gausim.data.sampler import hash_seed
-from gausim.engine.checkpoint import WeightAverage, check_scenes, fingerprints
+from gausim.engine.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes, fingerprints
 from gausim.engine.comparison import Comparison
 from gausim.engine.contracts import InitialVelocities, SceneBatch, Simulator
 from gausim.engine.curriculum import LossGatedCurriculum
@@ -357,7 +357,8 @@ class GausSimModule(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Adds the scenes' fingerprints, the averaged weights, the curriculum's state and the epoch's numbers."""
-        own: dict[str, Any] = {"scenes": fingerprints(self.simulator.scenes), "average": self.average.state_dict()}
+        own: dict[str, Any] = {"format": RESUME_FORMAT, "scenes": fingerprints(self.simulator.scenes)}
+        own["average"] = self.average.state_dict()
         own["epoch"] = {"sums": self._sums, "summary": self.summary, "warned": self._warned, "barren": self._barren}
         own["yardsticks"] = self.yardsticks.state_dict()
         curriculum = self._curriculum()
