@@ -11,7 +11,8 @@ import torch
 from gausim.baselines.static import StaticDynamics
 from gausim.core import DataError, RunError, SimState, Trajectory
 from gausim.data.objects import ObjectData
-from gausim.engine.evaluation import attach_points, evaluate_object, write_evaluation
+from gausim.engine.evaluation import evaluate_object, write_evaluation
+from gausim.engine.points import attach_points
 from gausim.render.reference import ReferenceRenderer
 from gausim.report.curves import load_curves
 from gausim.report.summary import load_summary, summarise

@@ -164,7 +164,7 @@ def test_one_read_per_optimiser_step(backprop_steps: int, monkeypatch: pytest.Mo
     from gausim.ops.compiled import torch_only
 
     _, module = pair(Objective(backprop_steps=backprop_steps, input_noise=0.01), 0.01)
-    module.renderer = module.yardsticks._renderer = blobs
+    module.images.renderer = blobs
     module.settings = OptimizerSettings(optimizer=torch.optim.SGD, ema_decay=0.9)  # Adam counts steps on the host
     optimizer, batch = module.configure_optimizers(), [sample(0), sample(1)]
     module.optimise(batch, optimizer, torch.Generator().manual_seed(0))  # cameras and yardsticks are read once
@@ -180,7 +180,7 @@ def test_one_read_per_optimiser_step(backprop_steps: int, monkeypatch: pytest.Mo
 def test_the_device_is_not_waited_for(backprop_steps: int) -> None:
     module = sway_module(Objective(backprop_steps=backprop_steps, static_weight=0.0)).cuda()
     module.model.scenes = [scene.to("cuda") for scene in module.model.scenes]
-    module.renderer = blobs
+    module.images.renderer = blobs
     samples, optimizer = [sample(0).to("cuda"), sample(1).to("cuda")], module.configure_optimizers()
     draws, facts = torch.Generator().manual_seed(0), [s.facts for s in samples]
     module.optimise(samples, optimizer, draws)
@@ -200,7 +200,7 @@ def test_a_step_on_the_device_is_that_of_the_cpu() -> None:
     for device in ("cpu", "cuda"):
         module = sway_module(Objective(backprop_steps=0, static_weight=0.0)).to(device)
         module.model.scenes = [scene.to(device) for scene in module.model.scenes]
-        module.renderer = module.yardsticks._renderer = ReferenceRenderer()
+        module.images.renderer = ReferenceRenderer()
         optimizer = module.configure_optimizers()
         found.append(module.optimise([sample(0).to(device)], optimizer, torch.Generator().manual_seed(0)))
     for name, value in found[0].items():

@@ -79,10 +79,11 @@ def test_mode_gradients_of_an_affine_motion_are_its_matrix() -> None:
     assert error.max() < 0.1 and np.median(error) < 0.01
 
 
-@pytest.fixture
-def elastic(make_scene) -> ElasticScene:
+@pytest.fixture(params=["full", "rayleigh"])
+def elastic(make_scene, request) -> ElasticScene:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
-    scene = ElasticScene(hierarchy, 1, modes=9, neighbours=8, period=12.0, hidden=0, amplitude=0.02)
+    own = {"modes": 9, "neighbours": 8, "period": 12.0, "hidden": 0, "amplitude": 0.02, "damping": request.param}
+    scene = ElasticScene(hierarchy, 1, **own)
     return scene.double().requires_grad_(False)
 
 
@@ -148,9 +149,9 @@ def test_discrete_energy_never_grows_for_random_mixing(elastic: ElasticScene, se
 
 def test_single_precision_rollout_stays_bounded_for_2000_steps(make_scene) -> None:
     hierarchy = build_hierarchy(make_scene(90), radii=(0.2, 0.5))
-    scene = ElasticScene(hierarchy, 1, modes=9, neighbours=8, period=6.0, hidden=0, amplitude=0.02).requires_grad_(
-        False
-    )
+    scene = ElasticScene(
+        hierarchy, 1, modes=9, neighbours=8, period=6.0, hidden=0, amplitude=0.02, damping="full"
+    ).requires_grad_(False)
     generator = torch.Generator().manual_seed(7)
     _shake(scene.double(), generator)
     scene.float()

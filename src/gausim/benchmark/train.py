@@ -159,7 +159,7 @@ class _Case:
 
     def comparison(self) -> Comparison:
         batch = self.module.simulator.batch([s.scene_id for s in self.samples])
-        return self.module.comparison(self.samples, batch)
+        return self.module.images.comparison(self.samples, batch)
 
     def stretches(self) -> list[tuple[int, States]]:
         """The states of the rollout, cut off from it."""
@@ -180,11 +180,11 @@ def _recorded(case: _Case) -> Iterator[tuple[_Recorder, list[tuple[Tensor, Tenso
         compared.append((prediction.clone(), target.clone()))
         return inner(prediction, target)
 
-    module.renderer, loss.value_and_gradient = recorder, compare  # type: ignore[method-assign]
+    module.images.renderer, loss.value_and_gradient = recorder, compare  # type: ignore[method-assign]
     try:
         yield recorder, compared
     finally:
-        module.renderer = recorder.renderer
+        module.images.renderer = recorder.renderer
         del loss.value_and_gradient
 
 

@@ -49,6 +49,7 @@ class RootConfig:
     Attributes:
         data: the data module: which set, views, frames and batches.
         model: the dynamics.
+        supervision: what predictions are compared with; the videos unless it names something else.
         loss: the terms and their weights.
         optimizer: the optimiser (partial, it awaits the parameters) and its schedule.
         render: the renderer.
@@ -69,6 +70,7 @@ class RootConfig:
 
     data: Any = MISSING
     model: Any = MISSING
+    supervision: Any = None
     loss: Any = MISSING
     optimizer: Any = MISSING
     render: Any = MISSING

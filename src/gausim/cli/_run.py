@@ -58,6 +58,9 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
     scenes = [item.scene() for item in objects]
     model = instantiate(config.model.simulator, scenes=scenes, fps=[item.fps for item in objects])()
     scene_of_sequence = [scene_id for scene_id, _ in datamodule.index.entries]
+    supervision = None
+    if config.get("supervision"):
+        supervision = instantiate(config.supervision, scenes=scenes, truth=datamodule.index.ground_truth)()
     states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
     module = GausSimModule(
         model=model,
@@ -66,6 +69,7 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
         renderer=instantiate(config.render),
         objective=instantiate(config.loss),
         optimizer=instantiate(config.optimizer),
+        supervision=supervision,
         seed=int(config.seed),
     )
     return module, datamodule

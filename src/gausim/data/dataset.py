@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 
 from gausim.core import Cameras, ConfigError, DataError
 from gausim.data.objects import ObjectData
-from gausim.data.records import SequenceRecord
+from gausim.data.records import GroundTruth, SequenceRecord
 
 
 class SampleKey(NamedTuple):
@@ -118,6 +118,11 @@ class SequenceIndex:
             cameras=record.cameras_of(views),
             fps=record.fps,
         )
+
+    def ground_truth(self, sequence: int) -> GroundTruth | None:
+        """True motion of a sequence, or None where it is unknown."""
+        scene_id, record = self.entries[sequence]
+        return self.objects[scene_id].ground_truth(record)
 
 
 class TrainingDataset(Dataset):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gausim.baselines.linear_ar import LinearAR2, fit_linear_ar2
@@ -23,6 +23,7 @@ from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth, SequenceRecord
 from gausim.engine.cost import CostMeter
+from gausim.engine.points import attach_points
 from gausim.engine.provenance import code_provenance, data_provenance
 from gausim.engine.recorder import PictureRecorder
 from gausim.metrics import (
@@ -135,13 +136,6 @@ def write_evaluation(folder: Path, objects: list[ObjectCurves], run: dict[str, A
     summary = write_summary(folder / "metrics.json", objects, run, provenance=code_provenance())
     (folder / "table.md").write_text(markdown(summary))
     return summary
-
-
-def attach_points(scene: GaussianScene, points: Float[Tensor, "P 3"]) -> Int[Tensor, " P"]:
-    """The nearest simulated kernel of every rest-space point, whose unit it follows."""
-    candidates = scene.simulated.nonzero()[:, 0]
-    chunks = points.to(scene.means).split(1024)
-    return torch.cat([candidates[torch.cdist(p, scene.means[candidates]).argmin(1)] for p in chunks])
 
 
 def _chosen(data: ObjectData, names: Sequence[str] | None) -> list[SequenceRecord]:

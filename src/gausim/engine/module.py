@@ -16,14 +16,14 @@ from gausim.core import ConfigError, DivergenceError, Renderer, SimState
 from gausim.data.dataset import SampleFacts, SequenceSample
 from gausim.data.sampler import hash_seed
 from gausim.engine.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes, fingerprints
-from gausim.engine.comparison import Comparison
 from gausim.engine.contracts import InitialVelocities, SceneBatch, Simulator
 from gausim.engine.curriculum import LossGatedCurriculum
 from gausim.engine.exchange import Exchange
 from gausim.engine.optim import OptimizerSettings
 from gausim.engine.ranks import Ranks, interleave
 from gausim.engine.reference import Yardsticks
-from gausim.engine.rollout import Explosions, Looks, States, UnitNoise, Views, describe, windows
+from gausim.engine.rollout import Explosions, States, UnitNoise, describe, windows
+from gausim.engine.supervision import ImageSupervision, Supervision
 from gausim.engine.tally import Found, Tally
 from gausim.losses.objective import Objective
 from gausim.losses.static import static_loss
@@ -54,6 +54,7 @@ class GausSimModule(LightningModule):
         renderer: Renderer,
         objective: Objective | None = None,
         optimizer: OptimizerSettings | None = None,
+        supervision: Supervision | None = None,
         seed: int = 0,
         share_every: int = 50,
     ) -> None:
@@ -63,9 +64,10 @@ class GausSimModule(LightningModule):
             model: the simulator (see :class:`gausim.engine.contracts.Simulator`).
             initial_states: one parameter per training sequence, in their order.
             scene_of_sequence: the scene of each training sequence.
-            renderer: draws the predictions.
+            renderer: draws the predictions, for training on images and for the pictures.
             objective: what is minimised; METHOD's when None.
             optimizer: who learns how fast; METHOD's when None.
+            supervision: what predictions are compared with; the images when None.
             seed: of the static loss's draws and the input noise, together with the step's number.
             share_every: optimiser steps between measurements of the momentum loss's share of the gradient; 0 is never.
 
@@ -75,7 +77,6 @@ class GausSimModule(LightningModule):
         super().__init__()
         self.automatic_optimization = False
         self.model, self.initial_states = model, initial_states
-        self.renderer = renderer
         self.objective = objective if objective is not None else Objective()
         self.settings = optimizer if optimizer is not None else OptimizerSettings()
         self.scene_of_sequence = tuple(scene_of_sequence)
@@ -86,9 +87,9 @@ class GausSimModule(LightningModule):
                 f"{len(self.scene_of_sequence)} sequences; expected one each."
             )
         self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
-        self.looks = Looks(self.simulator.scenes)
-        self.views = Views()
-        self.yardsticks = Yardsticks(renderer, self.objective.image, self.views)
+        self.images = ImageSupervision(self.simulator.scenes, renderer, self.objective.image)
+        self.supervision = self.images if supervision is None else supervision
+        self.yardsticks = Yardsticks(self.supervision)
         self.average = WeightAverage(self.settings.ema_decay)
         self.summary: dict[str, float] = {}
         self.last_stats: dict[str, float] = {}
@@ -97,6 +98,11 @@ class GausSimModule(LightningModule):
         self._warned, self._barren = False, 0
         self.ranks, self._shown = Ranks(), 0
         self._exchange = Exchange(self.ranks, model)
+
+    @property
+    def renderer(self) -> Renderer:
+        """What draws the predictions."""
+        return self.images.renderer
 
     @property
     def simulator(self) -> Simulator:
@@ -192,7 +198,7 @@ class GausSimModule(LightningModule):
         if batch is None:  # hears where the others' rollout ends
             any(explosions.end(None, start, tally.reach) for start in range(0, steps, length))
             return tally
-        comparison = self.comparison(samples, batch)
+        comparison = self.supervision.comparison(samples, batch)
         starts: list[Callable[[SimState], SimState]] = [explosions.restart, *self._noise(batch, draws)]
         initial, kept = self.initial(samples, batch), self.objective.checkpoint_steps
         per = self.objective.step_weight(steps) / len(whole)
@@ -217,19 +223,6 @@ class GausSimModule(LightningModule):
         deviations = [self.objective.input_noise * d for d in self.diagonals]
         places = [self.ranks.rank + i * self.ranks.size for i in range(len(batch.members))]
         return [UnitNoise(batch, self.simulator.scenes, deviations, draws.initial_seed(), places)]
-
-    def comparison(self, samples: list[SequenceSample], batch: SceneBatch) -> Comparison:
-        """What draws and compares the predictions of a batch."""
-        groups = self.views.groups(samples)
-        return Comparison(
-            self.renderer,
-            self.objective.image,
-            batch,
-            groups,
-            [self.looks.of(group.scene_id, batch.rest) for group in groups],
-            [sample.frames[1:] for sample in samples],
-            [self._rest_image(samples, i, batch) for i in range(len(samples))],
-        )
 
     def _descend(self, losses: Tensor, momentum: Tensor, per: float, tally: Tally, *, measure: bool) -> None:
         """Backward of one stretch; the mean over sequences, whatever the stretch's length."""
@@ -269,23 +262,18 @@ class GausSimModule(LightningModule):
         previous = torch.cat([states.previous(s.sequence_id) for s in samples])
         return SimState(batch.rest, previous.to(batch.rest))
 
-    def _rest_image(self, samples: Sequence[SequenceSample], place: int, batch: SceneBatch) -> Float[Tensor, "V H W 3"]:
-        sample = samples[place]
-        look = self.looks.of(sample.scene_id, batch.rest)
-        return self.yardsticks.rest_image(sample, look, batch.rest[batch.members[place].kernels])
-
     @torch.no_grad()
     def predict_images(self, sample: SequenceSample) -> Float[Tensor, "F V H W 3"]:
         """Images of frames 0..T of one training sequence, in evaluation mode."""
         was_training = self.training
         self.eval()
         batch = self.simulator.batch([sample.scene_id])
-        look, units = self.looks.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
-        frames = [self._rest_image([sample], 0, batch)[None]]
+        look, units = self.images.looks.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
+        frames = [self.images.rest_image(sample, batch.rest)[None]]
         try:
             for _, made in windows(self.simulator, batch, self.initial([sample], batch), sample.steps, 1):
                 states = States.of(made).tensors()
-                frames.append(draw(self.renderer, look, *states, units, sample.cameras).rgb)
+                frames.append(draw(self.images.renderer, look, *states, units, sample.cameras).rgb)
         finally:
             self.train(was_training)
         return torch.cat(frames)
@@ -298,8 +286,7 @@ class GausSimModule(LightningModule):
         yards = []
         for i, sample in enumerate(samples):
             assert batch is not None
-            look, rest = self.looks.of(sample.scene_id, batch.rest), batch.rest[batch.members[i].kernels]
-            yards.append(self.yardsticks.of(sample, look, rest))
+            yards.append(self.yardsticks.of(sample, batch.rest[batch.members[i].kernels]))
         shares = self.ranks.gather((found, yards))
         numbers = Found.join([share[0] for share in shares]).numbers(whole, self.objective.explosion)
         yards = interleave([share[1] for share in shares])

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from gausim.core import Renderer
 from gausim.data.dataset import SequenceSample
-from gausim.data.images import composite
-from gausim.engine.rollout import Views, draw_rest
-from gausim.losses.image import ImageLoss
-from gausim.render.draw import SceneAppearance
+from gausim.engine.supervision import Supervision
 
 
 @dataclass
@@ -22,9 +17,9 @@ class Yardstick:
     """Constants of one sequence, as far as its frames have been seen.
 
     Attributes:
-        floor: image loss of the rest state on frame 0, what the reconstruction itself leaves.
-        static: image loss of the rest state on frames 1, 2, ...
-        motion: sum over pixels of the squared change of the true image from frame t to t + 1.
+        floor: loss of the rest state on frame 0, what the reconstruction itself leaves.
+        static: loss of the rest state on frames 1, 2, ...
+        motion: squared change of the truth from frame t to t + 1 (images: summed over pixels).
     """
 
     floor: float = 0.0
@@ -35,33 +30,21 @@ class Yardstick:
 class Yardsticks:
     """Measures each sequence once; later batches look the numbers up."""
 
-    def __init__(self, renderer: Renderer, loss: ImageLoss, views: Views) -> None:
-        """Keeps what draws, what measures and what tells cameras apart."""
-        self._renderer, self._loss, self._views = renderer, loss, views
-        self._rest: dict[Hashable, Tensor] = {}
+    def __init__(self, supervision: Supervision) -> None:
+        """Keeps what measures."""
+        self._supervision = supervision
         self._known: dict[int, Yardstick] = {}
 
-    def rest_image(self, sample: SequenceSample, look: SceneAppearance, rest: Tensor) -> Tensor:
-        """Images of the rest state in a sample's cameras, (V, H, W, 3); drawn once per scene and set of cameras."""
-        key = self._views.key(sample)
-        if key not in self._rest:
-            self._rest[key] = draw_rest(self._renderer, look, rest, sample.cameras)
-        return self._rest[key]
-
-    def of(self, sample: SequenceSample, look: SceneAppearance, rest: Tensor) -> Yardstick:
-        """The yardstick of a sample's sequence, for at least the sample's frames."""
+    def of(self, sample: SequenceSample, rest: Tensor) -> Yardstick:
+        """The yardstick of a sample's sequence, for at least the sample's frames; ``rest`` is its scene's."""
         known = self._known.setdefault(sample.sequence_id, Yardstick())
         seen = len(known.static)
         if seen < sample.steps:
-            with torch.no_grad():
-                image = self.rest_image(sample, look, rest)
-                frames = composite(sample.frames[seen:].to(image.device))[0]
-                losses = self._loss(image.expand_as(frames), frames).tolist()
-                change = (frames[1:] - frames[:-1]).square().sum((1, 2, 3, 4)).tolist()
+            losses, motion = self._supervision.static(sample, rest, seen)
             if seen == 0:
                 known.floor = losses[0]
             known.static += losses[1:]
-            known.motion += change
+            known.motion += motion
         return known
 
     def learn(self, sequences: Sequence[int], yards: Sequence[Yardstick]) -> None:

@@ -23,6 +23,7 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from gausim.core import ConfigError
 from gausim.models.batch import SceneBatch
 from gausim.models.hierarchy import Hierarchy
 from gausim.models.template import Motion, Template, TemplateState
@@ -40,6 +41,7 @@ MIN_DETERMINANT = 0.2
 SPECTRUM_GAIN, MIXING_GAIN = 2.0, 0.3
 # Nearly undamped at the start: exp(-4) per frame of the velocity.
 INITIAL_LOG_DAMPING = -4.0
+DAMPINGS = ("full", "rayleigh")
 
 
 def spring_network(rest: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
@@ -117,6 +119,7 @@ class ElasticScene(nn.Module):
         period: float,
         hidden: int,
         amplitude: float,
+        damping: str,
     ) -> None:
         """``period`` of the lowest mode [frames] and ``amplitude`` [diagonals] only set the start."""
         super().__init__()
@@ -135,8 +138,9 @@ class ElasticScene(nn.Module):
         self.stiffness = nn.Parameter(torch.zeros(()))
         self.spectrum = nn.Parameter(torch.zeros(count))
         self.mixing = nn.Parameter(torch.zeros(count, count))
-        self.damping = nn.Parameter(torch.zeros(count))
-        self.damping_mixing = nn.Parameter(torch.zeros(count, count))
+        full = damping == "full"
+        self.damping = nn.Parameter(torch.zeros(count if full else 2))
+        self.damping_mixing = nn.Parameter(torch.zeros(count, count)) if full else None
         self.force = mlp((2 * count, hidden, hidden, count)) if hidden else None
         if self.force is not None:
             zero_output(self.force)
@@ -148,9 +152,12 @@ class ElasticScene(nn.Module):
         root = (0.5 * log_stiffness).exp() * self.values.sqrt()
         factor = root[:, None] * (identity + MIXING_GAIN * self.mixing)
         stiffness = factor @ factor.mT
-        root = (0.5 * (INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping)).exp()
-        factor = root[:, None] * (identity + MIXING_GAIN * self.damping_mixing)
-        damping = factor @ factor.mT
+        log_damping = INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping
+        if self.damping_mixing is None:
+            damping = log_damping[0].exp() * identity + log_damping[1].exp() * stiffness
+        else:
+            factor = (0.5 * log_damping).exp()[:, None] * (identity + MIXING_GAIN * self.damping_mixing)
+            damping = factor @ factor.mT
         inverse = torch.linalg.inv(identity + stiffness / 4 + damping / 2)
         return inverse @ (2 * identity - stiffness / 2), inverse @ (identity + stiffness / 4 - damping / 2), inverse
 
@@ -232,6 +239,7 @@ class ElasticTemplate(Template):
         period: float = 8.0,
         hidden: int = 64,
         amplitude: float = 0.02,
+        damping: str = "full",
         conserve_volume: bool = True,
     ) -> None:
         """See the module's text.
@@ -244,13 +252,23 @@ class ElasticTemplate(Template):
             period: initial period of the lowest mode [frames].
             hidden: width of the nonlinear force network, 0 for none.
             amplitude: typical displacement [diagonals], scales that network's inputs.
+            damping: ``full``, a trained matrix, or ``rayleigh``, a K-proportional and a uniform part, two numbers.
             conserve_volume: scale the template's gradients to determinant 1 (METHOD's mass conservation).
         """
         super().__init__()
+        if damping not in DAMPINGS:
+            raise ConfigError(f"model.template.damping is '{damping}'; expected one of {', '.join(DAMPINGS)}.")
         self.conserve_volume = conserve_volume
         self.scenes = nn.ModuleList(
             ElasticScene(
-                h, finest, modes=modes, neighbours=neighbours, period=period, hidden=hidden, amplitude=amplitude
+                h,
+                finest,
+                modes=modes,
+                neighbours=neighbours,
+                period=period,
+                hidden=hidden,
+                amplitude=amplitude,
+                damping=damping,
             )
             for h in hierarchies
         )

@@ -1,0 +1,114 @@
+"""Training on the true motion of points instead of images: the quick lane for trying out ideas about dynamics."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gausim.core import DataError, GaussianScene
+from gausim.data.dataset import SequenceSample
+from gausim.data.records import GroundTruth
+from gausim.engine.contracts import SceneBatch
+from gausim.engine.rollout import States
+from gausim.engine.supervision import StaticFigures
+
+
+def attach_points(scene: GaussianScene, points: Float[Tensor, "P 3"]) -> Int[Tensor, " P"]:
+    """The nearest simulated kernel of every rest-space point, whose unit it follows."""
+    candidates = scene.simulated.nonzero()[:, 0]
+    chunks = points.to(scene.means).split(1024)
+    return torch.cat([candidates[torch.cdist(p, scene.means[candidates]).argmin(1)] for p in chunks])
+
+
+class PointSupervision:
+    """Compares predicted with true positions of the points whose motion a data set knows.
+
+    The loss of a frame is the mean over points of the squared distance, in (per cent of the scene's diagonal)^2.
+    Nothing is drawn. Only frames that the sample holds are looked at: those that training on images would see.
+    """
+
+    def __init__(self, scenes: Sequence[GaussianScene], truth: Callable[[int], GroundTruth | None]) -> None:
+        """Keeps its parts.
+
+        Args:
+            scenes: the rest scenes.
+            truth: true motion of a sequence by its number.
+        """
+        self._scenes, self._read = scenes, truth
+        self._known: dict[int, GroundTruth] = {}
+        self._attached: dict[int, Int[Tensor, " P"]] = {}
+
+    def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> _PointComparison:
+        """What compares the predictions of a batch."""
+        truths = [self._truth(sample) for sample in samples]
+        for sample, truth in zip(samples, truths, strict=True):
+            if sample.scene_id not in self._attached:
+                self._attached[sample.scene_id] = attach_points(self._scenes[sample.scene_id], truth.rest)
+        attached = [self._attached[sample.scene_id].to(batch.rest.device) for sample in samples]
+        scales = [self._scale(sample) for sample in samples]
+        return _PointComparison(batch, [_on(truth, batch.rest) for truth in truths], attached, scales)
+
+    def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
+        """Scores the rest state on frames ``first`` .. T of a sample."""
+        truth = self._truth(sample)
+        positions = truth.positions[first : sample.steps + 1]
+        losses = self._scale(sample) * _squared(positions - truth.rest)
+        return StaticFigures(losses.tolist(), (self._scale(sample) * _squared(positions.diff(dim=0))).tolist())
+
+    def _scale(self, sample: SequenceSample) -> float:
+        return (100 / self._scenes[sample.scene_id].diagonal) ** 2
+
+    def _truth(self, sample: SequenceSample) -> GroundTruth:
+        if sample.sequence_id not in self._known:
+            truth = self._read(sample.sequence_id)
+            if truth is None:
+                raise DataError(
+                    f"{sample.object_name}/{sample.sequence_name}: its true motion is not known (ground_truth.npz and "
+                    "the object's rest points), so it cannot be trained on points. Use supervision=images."
+                )
+            self._known[sample.sequence_id] = truth
+        return self._known[sample.sequence_id]
+
+
+class _PointComparison:
+    """Compares the frames that a rollout predicts with the true points, stretch by stretch."""
+
+    def __init__(
+        self,
+        batch: SceneBatch,
+        truths: Sequence[GroundTruth],
+        attached: Sequence[Int[Tensor, " P"]],
+        scales: Sequence[float],
+    ) -> None:
+        self._batch, self._truths, self._scales = batch, truths, scales
+        self._kernels, self._units, self._offsets = [], [], []
+        for member, truth, kernel in zip(batch.members, truths, attached, strict=True):
+            unit = member.unit_of_kernel.to(kernel.device)
+            self._kernels.append(kernel + member.kernels.start)
+            self._units.append(unit[kernel] + member.units.start)
+            self._offsets.append(truth.rest - batch.rest[self._kernels[-1]])
+        self._last = [truth.rest for truth in truths]
+
+    def __call__(self, states: States, start: int) -> tuple[Float[Tensor, "T S"], Float[Tensor, ""]]:
+        """Loss of each predicted frame and member, and the squared change of the predicted points (summed)."""
+        losses, motion = [], states.positions.new_zeros(())
+        for i, (truth, scale) in enumerate(zip(self._truths, self._scales, strict=True)):
+            turned = states.gradients[:, self._units[i]] @ self._offsets[i][..., None]
+            points = states.positions[:, self._kernels[i]] + turned[..., 0]
+            span = slice(start + 1, start + 1 + len(points))
+            losses.append(scale * _squared(points - truth.positions[span]))
+            with torch.no_grad():
+                motion += scale * _squared(torch.cat((self._last[i][None], points)).diff(dim=0)).sum()
+                self._last[i] = points[-1].detach()
+        return torch.stack(losses, 1), motion
+
+
+def _squared(vectors: Float[Tensor, "T P 3"]) -> Float[Tensor, " T"]:
+    return vectors.square().sum(-1).mean(-1)
+
+
+def _on(truth: GroundTruth, like: Tensor) -> GroundTruth:
+    return GroundTruth(truth.rest.to(like), truth.positions.to(like))
