@@ -107,7 +107,7 @@ def test_a_frozen_network_stays_bit_by_bit_and_a_free_one_learns(
     shared = [name for name in source if name.startswith(SHARED)]
     assert {name.split(".")[1] for name in shared} == {"network", "node_normaliser", "edge_normaliser"}
     start = tune(new, joint[model], tmp_path / "start", "optimizer.network_lr=0", "trainer.max_epochs=1")
-    frozen = tune(new, joint[model], tmp_path / "frozen", "freeze=true")
+    frozen = tune(new, joint[model], tmp_path / "frozen", "freeze=network")
     free = tune(new, joint[model], tmp_path / "free")
     for name in shared:
         assert torch.equal(frozen[name], source[name]), name
@@ -157,7 +157,7 @@ def test_nothing_to_start_from_is_said(stores: tuple[Path, Path], tmp_path: Path
     with pytest.raises(ConfigError, match=r"init_from: name the trained run.*init_from=RUN"):
         command.main(["experiment=finetune", *where])
     with pytest.raises(ConfigError, match=r"freeze: a network at random.*init_from=RUN"):
-        command.main([*where, "freeze=true"])
+        command.main([*where, "freeze=network"])
     with pytest.raises(RunError, match=r"nowhere: no run here"):
         command.main([*where, f"init_from={tmp_path}/nowhere"])
 

@@ -35,8 +35,11 @@ class Sway(nn.Module):
     def shared(self) -> dict[str, nn.Module]:
         return {}
 
-    def freeze(self) -> None:
-        self.keep.requires_grad_(False)
+    def own(self, scene_id: int) -> tuple[str, ...]:
+        return (f"drift.{scene_id}",)
+
+    def freeze(self, *, scenes: bool = False) -> None:
+        (self if scenes else self.keep).requires_grad_(False)
 
     def batch(self, scene_ids: list[int]) -> SimpleNamespace:
         members, start = [], 0

@@ -62,7 +62,8 @@ class RootConfig:
         sweep: what the jobs of a sweep do about runs that are there already.
         seed: of every random generator.
         init_from: run whose network, with the statistics of its inputs, this one starts from; null starts anew.
-        freeze: keep that network as it is, so that only what a scene has of its own is learned.
+        freeze: `network` keeps that network as it is, so that only what a scene has of its own is learned; `model`
+            takes all of the simulator from that run and keeps it, so that only initial states are learned.
         evaluate: whether the run is evaluated once it is trained (`gausim evaluate`), for reports.
         name: of the run; its directory is `${paths.output_root}/${name}/seed_${seed}`.
         task_name: what is being done, for logs and dashboards.
@@ -83,7 +84,7 @@ class RootConfig:
     sweep: SweepConfig = field(default_factory=SweepConfig)
     seed: int = 0
     init_from: str | None = None
-    freeze: bool = False
+    freeze: str | None = None
     evaluate: bool = False
     name: str = MISSING
     task_name: str = "train"

@@ -32,6 +32,9 @@ COMMANDS: dict[str, Command] = {
     "inspect": Command("gausim.cli.inspect", "Print a scene's kernels and hierarchy and draw its clusters."),
     "reconstruct": Command("gausim.cli.reconstruct", "Fit the Gaussians of the rest scene to posed stills."),
     "train": Command("gausim.cli.train", "Learn an object's dynamics from multi-view videos."),
+    "adapt": Command(
+        "gausim.cli.adapt", "Fit how new sequences begin to their first frames, with a trained run as it is."
+    ),
     "evaluate": Command("gausim.cli.evaluate", "Measure a run on seen, unseen and held-out frames."),
     "benchmark": Command(
         "gausim.cli.benchmark",

@@ -84,12 +84,13 @@ def train(cfg: DictConfig) -> float | None:
 
     run = RunDirectory(_config.run_dir())
     if _config.in_sweep():
-        return _sweep.do_job(cfg, run, _train_and_evaluate)
+        return _sweep.do_job(cfg, run, train_run)
     with run.writing():
-        return _train_and_evaluate(cfg, run)
+        return train_run(cfg, run)
 
 
-def _train_and_evaluate(cfg: DictConfig, run: RunDirectory) -> float | None:
+def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
+    """Trains into a run directory that this process holds, and evaluates if the configuration says so."""
     if cfg.evaluate and not cfg.trainer.overwrite and run.awaits_evaluation(_plain(cfg)):
         objective = run.facts()["last_epoch"].get("excess_static")
     else:
@@ -198,22 +199,26 @@ def _fit(
 
 
 def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None:
-    """Loads the network of another run (a resumed run has its own in its checkpoint), and freezes it if asked to.
+    """Takes weights of another run over (a resumed run has its own in its checkpoint), and freezes them if asked to.
 
     Raises:
-        ConfigError: no run is named, a network is to be frozen that nothing was loaded into, or it has another shape.
+        ConfigError: no run is named, something is to be frozen that nothing was loaded into, or it has another shape.
+        RunError: that run is not there, or knows another scene.
     """
     from gausim.core import ConfigError
-    from gausim.engine.transfer import load_shared
+    from gausim.engine.transfer import load_shared, load_simulator
 
     if cfg.init_from == "":
         raise ConfigError("init_from: name the trained run whose network this one starts from (init_from=RUN).")
+    if cfg.freeze not in (None, "network", "model"):
+        raise ConfigError(f"freeze: expected null, network or model, got '{cfg.freeze}'.")
     if cfg.freeze and cfg.init_from is None:
         raise ConfigError("freeze: a network at random would stay so. Name a trained run (init_from=RUN).")
     if cfg.init_from is not None and not resumed:
-        load_shared(module.simulator, cfg.init_from, _plain(cfg)["model"])
+        load = load_simulator if cfg.freeze == "model" else load_shared
+        load(module.simulator, cfg.init_from, _plain(cfg)["model"])
     if cfg.freeze:
-        module.simulator.freeze()
+        module.simulator.freeze(scenes=cfg.freeze == "model")
 
 
 def make(cfg: DictConfig, run: RunDirectory, crew: Crew) -> Trainer:

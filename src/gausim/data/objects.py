@@ -34,6 +34,7 @@ class ObjectData:
         facts: everything else ``dataset.json`` says.
         scene_path: the rest scene's PLY file.
         masks_path: its masks; None means beside the PLY.
+        selections: what replaces them.
     """
 
     def __init__(
@@ -69,7 +70,7 @@ class ObjectData:
         self._check_views(path)
         self.scene_path = Path(scene) if scene is not None else self.root / "scene.ply"
         self.masks_path = Path(masks) if masks is not None else None
-        self._chosen, self._selections = sequences, dict(selections or {})
+        self._chosen, self.selections = sequences, dict(selections or {})
 
     @cached_property
     def sequences(self) -> list[SequenceRecord]:
@@ -137,7 +138,7 @@ class ObjectData:
                 f"{self.scene_path}: no rest scene. Make one with `gausim reconstruct {self.root}`, "
                 "or name one in the data config (scene: path/to/scene.ply)."
             )
-        scene = select_masks(load_scene(self.scene_path, masks=self.masks_path, name=self.name), self._selections)
+        scene = select_masks(load_scene(self.scene_path, masks=self.masks_path, name=self.name), self.selections)
         return require_pinned(scene)
 
     def _check_views(self, path: Path) -> None:

@@ -172,12 +172,13 @@ def check_scenes(checkpoint: dict[str, Any], scenes: Sequence[GaussianScene], so
     trained, given = own["scenes"], fingerprints(scenes)
     if trained != given:
         raise RunError(
-            f"{source} was trained on {_tell(trained)}, but the data holds {_tell(given)}. Give the scene it was "
+            f"{source} was trained on {tell(trained)}, but the data holds {tell(given)}. Give the scene it was "
             "trained on (data.root, data.scene), or train anew under another name."
         )
 
 
-def _tell(prints: Sequence[dict[str, Any]]) -> str:
+def tell(prints: Sequence[dict[str, Any]]) -> str:
+    """Fingerprints in words."""
     return "; ".join(
         f"'{p['name']}' ({p['kernels']} kernels, {p['pinned']} pinned, means {p['means']})" for p in prints
     )  # fmt: skip

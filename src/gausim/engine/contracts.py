@@ -87,8 +87,12 @@ class Simulator(Protocol):
         """What all scenes have in common, by its name within the simulator: networks, statistics of their inputs."""
         ...
 
-    def freeze(self) -> None:
-        """Keeps what :meth:`shared` names as it is from now on."""
+    def own(self, scene_id: int) -> tuple[str, ...]:
+        """What a scene has of its own: prefixes of names in the simulator's state dict."""
+        ...
+
+    def freeze(self, *, scenes: bool = False) -> None:
+        """Keeps what :meth:`shared` names as it is from now on; with ``scenes`` what they have of their own, too."""
         ...
 
     def parameter_groups(self) -> dict[str, list[Parameter]]:

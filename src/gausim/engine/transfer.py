@@ -1,15 +1,15 @@
-"""What a run may take over from another: the network that all scenes share, with the statistics of its inputs."""
+"""What a run may take over from another: the network that scenes share with its statistics, or all of the simulator."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from torch import Tensor
+from torch import Tensor, nn
 
-from gausim.core import ConfigError
-from gausim.engine.checkpoint import averaged_weights, read_checkpoint
+from gausim.core import ConfigError, RunError
+from gausim.engine.checkpoint import averaged_weights, fingerprints, read_checkpoint, tell
 from gausim.engine.contracts import Simulator
 from gausim.engine.run import RunDirectory, differing_keys
 
@@ -38,15 +38,59 @@ def load_shared(simulator: Simulator, run_dir: Path | str, model: Mapping[str, A
     problems = [
         f"{name}.{problem}" for name, part in parts.items() for problem in _mismatches(found[name], part.state_dict())
     ]
+    _refuse(problems, run, "network", differing_keys(trained, model))
+    for name, part in parts.items():
+        part.load_state_dict(found[name])
+
+
+def load_simulator(simulator: Simulator, run_dir: Path | str, model: Mapping[str, Any]) -> None:
+    """Loads all of a trained simulator into one of some of its scenes, which are told by name, size and positions.
+
+    Args:
+        simulator: of scenes that the run was trained on.
+        run_dir: the trained run; its averaged weights are taken where it averaged.
+        model: the configuration of the simulator, to tell what differs.
+
+    Raises:
+        RunError: there is no run or no readable checkpoint, or it was not trained on a scene.
+        ConfigError: its weights are of another shape; nothing was loaded.
+    """
+    run = RunDirectory(run_dir)
+    config = run.config().get("model", {})
+    checkpoint = read_checkpoint(run.checkpoint)
+    there = simulator_weights(checkpoint)
+    trained, given = checkpoint["gausim"]["scenes"], fingerprints(simulator.scenes)
+    found = {
+        name: value for name, value in there.items() if name.startswith(tuple(f"{s}." for s in simulator.shared()))
+    }
+    for scene_id, scene in enumerate(given):
+        if scene not in trained:
+            raise RunError(f"{run.checkpoint} was trained on {tell(trained)}, not on {tell([scene])}.")
+        for old, new in zip(simulator.own(trained.index(scene)), simulator.own(scene_id), strict=True):
+            found |= {new + name[len(old) :]: value for name, value in there.items() if _is_below(name, old)}
+    module = cast(nn.Module, simulator)
+    _refuse(_mismatches(found, module.state_dict()), run, "model", differing_keys(config, model))
+    module.load_state_dict(found)
+
+
+def simulator_weights(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The simulator's weights of a checkpoint by name, the averaged ones where there are any."""
+    return _below(averaged_weights(checkpoint), _PREFIX)
+
+
+def _is_below(name: str, prefix: str) -> bool:
+    """Whether a name is the prefix or lies below it; ``attributes.10`` does not lie below ``attributes.1``."""
+    return name == prefix or (prefix.endswith(".") and name.startswith(prefix))
+
+
+def _refuse(problems: Sequence[str], run: RunDirectory, what: str, differing: Sequence[str]) -> None:
     if problems:
-        changed = [f"model.{key}" for key in differing_keys(trained, model)]
+        changed = [f"model.{key}" for key in differing]
         raise ConfigError(
-            f"init_from: the network of {run.checkpoint} does not fit this model: {'; '.join(problems[:_SHOWN])}"
+            f"init_from: the {what} of {run.checkpoint} does not fit this model: {'; '.join(problems[:_SHOWN])}"
             f"{f' and {len(problems) - _SHOWN} more' if len(problems) > _SHOWN else ''}. "
             f"Set the model as {run.path}/config.yaml has it; what differs: {', '.join(changed) or 'nothing'}."
         )
-    for name, part in parts.items():
-        part.load_state_dict(found[name])
 
 
 def _below(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

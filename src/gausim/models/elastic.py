@@ -279,6 +279,10 @@ class ElasticTemplate(Template):
         assert isinstance(scene, ElasticScene)
         return scene
 
+    def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
+        """Everything of the scene's template."""
+        return (f"{prefix}scenes.{scene_id}.",)
+
     def networks(self) -> list[nn.Parameter]:
         """Weights of the nonlinear forces."""
         forces = (self.scene(i).force for i in range(len(self.scenes)))

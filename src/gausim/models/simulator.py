@@ -173,9 +173,17 @@ class GausSim(nn.Module):
         names = ("network", "node_normaliser", "edge_normaliser")
         return {name: self.get_submodule(name) for name in names}
 
-    def freeze(self) -> None:
-        """Keeps what :meth:`shared` names as it is: its weights do not learn, its statistics gather nothing more."""
-        self.network.requires_grad_(False)
+    def own(self, scene_id: int) -> tuple[str, ...]:
+        """What a scene has of its own: prefixes of names in the state dict."""
+        return f"log_density.{scene_id}", f"attributes.{scene_id}", *self.template.own(scene_id, "template.")
+
+    def freeze(self, *, scenes: bool = False) -> None:
+        """Keeps what :meth:`shared` names as it is: its weights do not learn, its statistics gather nothing more.
+
+        Args:
+            scenes: keep what the scenes have of their own, too.
+        """
+        (self if scenes else self.network).requires_grad_(False)
         self.node_normaliser.frozen = self.edge_normaliser.frozen = True
 
     def batch(self, scene_ids: Sequence[int]) -> SceneBatch:

@@ -52,6 +52,10 @@ class Template(nn.Module, ABC):
         """The template of one batch while parameters do not change; what only depends on them is computed here."""
         return partial(self, batch)
 
+    def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
+        """What a scene has of its own in the template: names in its state dict, each behind ``prefix``."""
+        return ()
+
     def networks(self) -> list[nn.Parameter]:
         """Weights of neural networks in the template; they learn at the pace of a network."""
         return []

@@ -1,0 +1,152 @@
+"""`gausim adapt RUN`: find how new sequences begin, with everything that the run has learned as it is."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+if TYPE_CHECKING:
+    from gausim.data.objects import ObjectData
+
+HELP = "Fit how new sequences begin to their first frames, with a trained run as it is."
+EPILOG = """The result is a run of its own: `gausim evaluate`, `simulate` and `report` take it. What is learned is the
+state before frame 0 of each sequence, nothing else: network, densities, attributes and template stay bit by bit.
+Only frames 0 .. FRAMES - 1 of the training views are looked at.
+
+  gausim adapt outputs/bunny/seed_0 --sequences seq_009 seq_010 seq_011
+  gausim adapt outputs/bunny/seed_0 --data NEW_STORE --frames 3
+  gausim adapt outputs/bunny/seed_0 --data NEW_STORE --set trainer.threads=1 optimizer.initial_lr=0.02"""
+EPOCHS, REPEATS = 60, 4
+
+
+def main(argv: list[str]) -> int:
+    """Runs the command.
+
+    Args:
+        argv: the arguments after the command's name.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        RunError: the run is missing or was not trained on the scene, or the target is finished already.
+        ConfigError: too few frames, or an override that is not of the form KEY=VALUE or names no key.
+        DataError: an object or sequence that is not there, or broken data.
+    """
+    arguments = _parser().parse_args(argv)
+    from omegaconf import OmegaConf
+
+    from gausim.cli.train import train_run
+    from gausim.engine.run import RunDirectory
+
+    source = RunDirectory(arguments.run)
+    config = _config(source.config(), source.path, arguments)
+    run = RunDirectory(arguments.out or _beside(source.path, arguments.frames))
+    with run.writing():
+        train_run(OmegaConf.create(config), run)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="gausim adapt", description=HELP, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
+    add("--data", metavar="STORE", nargs="+", help="directories of the same objects (default: those of the run)")
+    add("--sequences", nargs="+", metavar="NAME", help="only these sequences (default: all)")
+    add("--frames", type=int, default=16, help="frames of each sequence that are looked at (default: 16)")
+    add(
+        "--epochs",
+        type=int,
+        default=EPOCHS,
+        help=f"rounds over the sequences, {REPEATS} steps each (default: {EPOCHS})",
+    )
+    add("--out", metavar="DIR", type=Path, help="run directory to write (default: NAME_adapted_FRAMES beside RUN's)")
+    add(
+        "--set",
+        metavar="KEY=VALUE",
+        nargs="+",
+        default=[],
+        help="settings other than the run's, e.g. trainer.threads=1",
+    )
+    add("--supervision", choices=("images", "points"), help="what is compared (default: as in the run)")
+    return parser
+
+
+def _beside(run: Path, frames: int) -> Path:
+    """outputs/bunny/seed_0 -> outputs/bunny_adapted_16/seed_0: seeds stay seeds of one experiment."""
+    path = run.resolve()
+    return path.parent.with_name(f"{path.parent.name}_adapted_{frames}") / path.name
+
+
+def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) -> dict[str, Any]:
+    """The run's configuration with what adapting changes, then the overrides."""
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    from gausim.core.errors import ConfigError
+
+    if arguments.frames < 2:
+        raise ConfigError(f"--frames: expected at least 2 (frame 0 shows rest only), got {arguments.frames}.")
+    data = {**config["data"], "root": _roots(config, arguments.data), "scene": None, "masks": None, "selections": None}
+    count = len(arguments.sequences or ())
+    data |= {"sequences": arguments.sequences, "repeats": REPEATS}
+    data["batch_size"] = min(4, count) if count else config["data"].get("batch_size", 1)
+    steps = arguments.frames - 1
+    data["curriculum"] = {"_target_": "gausim.data.curriculum.Curriculum", "t_start": steps, "t_max": steps}
+    adapted = {
+        **config,
+        "data": data,
+        "name": f"{config['name']}_adapted_{arguments.frames}",
+        "init_from": str(run.resolve()),
+        "freeze": "model",
+        "evaluate": True,
+        "trainer": {**config["trainer"], "max_epochs": arguments.epochs, "max_minutes": None, "overwrite": False},
+    }
+    if arguments.supervision is not None:
+        target = {"_target_": "gausim.engine.points.PointSupervision", "_partial_": True}
+        adapted["supervision"] = target if arguments.supervision == "points" else {}
+    node = OmegaConf.create(adapted)
+    OmegaConf.set_struct(node, True)
+    try:
+        merged = OmegaConf.merge(node, OmegaConf.from_dotlist(_checked(arguments.set)))
+    except OmegaConfBaseException as error:
+        raise ConfigError(f"--set {' '.join(arguments.set)}: {error}") from error
+    return cast("dict[str, Any]", OmegaConf.to_container(merged))
+
+
+def _checked(overrides: Sequence[str]) -> list[str]:
+    from gausim.core.errors import ConfigError
+
+    wrong = [text for text in overrides if "=" not in text.lstrip("=")]
+    if wrong:
+        raise ConfigError(
+            f"--set {wrong[0]}: expected KEY=VALUE, e.g. trainer.threads=1. `gausim adapt --help` explains."
+        )
+    return list(overrides)
+
+
+def _roots(config: dict[str, Any], stores: Sequence[str] | None) -> list[dict[str, Any]]:
+    """Entries of data.root: the stores' objects that the run knows, each with the rest scene that it was trained on."""
+    from gausim.cli._config import instantiate
+    from gausim.core.errors import DataError
+    from gausim.data.objects import ObjectData, find_objects
+
+    data = {**config["data"], "sequences": None}
+    known: dict[str, ObjectData] = {item.name: item for item in instantiate(data).objects}
+    if stores is None:
+        return [_entry(item.root, item) for item in known.values()]
+    found = [ObjectData(root) for store in stores for root in find_objects(store)]
+    strange = [item.name for item in found if item.name not in known]
+    if strange:
+        raise DataError(f"{' '.join(stores)}: holds {strange}, which the run does not know; it knows {list(known)}.")
+    return [_entry(item.root, known[item.name]) for item in found]
+
+
+def _entry(root: Path, trained: ObjectData) -> dict[str, Any]:
+    own = {"scene": trained.scene_path, "masks": trained.masks_path}
+    paths = {key: None if value is None else str(Path(value).resolve()) for key, value in own.items()}
+    return {"root": str(Path(root).resolve()), **paths, "selections": trained.selections or None}
