@@ -44,7 +44,7 @@ def test_whole_evaluation(run, capsys):
     assert "views never trained on" in captured.out and "not finished" not in captured.err
     folder = run.run_dir / "evaluation"
     names = {p.name for p in folder.iterdir()}
-    assert names == {"metrics.json", "metrics.npz", "pictures.npz", "table.md", "errors_toy.png"}
+    assert names == {"metrics.json", "metrics.npz", "pictures.npz", "table.md", "errors_toy.png", "motion_toy.png"}
     summary = json.loads((folder / "metrics.json").read_text())
     expected = {"name": "toy", "seed": 5, "views": "all", "finished": True, "epoch": 3, "updates": 40}
     assert summary["run"] == expected

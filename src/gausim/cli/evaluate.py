@@ -32,6 +32,7 @@ def main(argv: list[str]) -> int:
     from gausim.cli._foresee import state_of
     from gausim.cli._run import load_run
     from gausim.engine.evaluation import write_evaluation
+    from gausim.report.diagnosis import diagnosis_figure
     from gausim.report.figures import error_figure
 
     run = load_run(arguments.run)
@@ -39,8 +40,11 @@ def main(argv: list[str]) -> int:
     results = _evaluate(run, arguments)
     folder = Path(arguments.out) if arguments.out else _default_folder(run, arguments)
     summary = write_evaluation(folder, results, _facts(run, arguments, state))
+    drawn: list[str] = []
     for curves in results:
         error_figure(curves, folder / f"errors_{curves.facts.name}.png")
+        entry, motion = summary["objects"][curves.facts.name], folder / f"motion_{curves.facts.name}.png"
+        drawn += [motion.name] if diagnosis_figure(curves.facts.name, entry, motion) else []
     if arguments.json:
         print((folder / "metrics.json").read_text(), end="")
         return 0
@@ -51,6 +55,7 @@ def main(argv: list[str]) -> int:
         "pictures.npz",
         "table.md",
         *(f"errors_{c.facts.name}.png" for c in results),
+        *drawn,
     ]:
         print(f"wrote {folder / name}")
     return 0

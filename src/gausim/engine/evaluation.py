@@ -23,6 +23,7 @@ from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth, SequenceRecord
 from gausim.engine.cost import CostMeter
+from gausim.engine.diagnosis import Diagnosis
 from gausim.engine.points import attach_points
 from gausim.engine.provenance import code_provenance, data_provenance
 from gausim.engine.recorder import PictureRecorder
@@ -176,13 +177,16 @@ class _ObjectMeasure:
         self.max_l2 = 0.0
         self._color = torch.zeros(4, dtype=torch.float64)
         self._costs: dict[str, CostMeter] = {}
+        self._diagnosis = Diagnosis(data.fps)
 
     def record(self, methods: Mapping[str, Predict]) -> dict[str, Any]:
-        """Facts of the evaluation beside its figures: costs of every method, hashes of the data, what is absent."""
+        """What is known beside the figures: costs of every method, hashes of the data, what is absent, diagnosis."""
         levels = {name: getattr(predict, "levels", None) for name, predict in methods.items()}
         costs = {name: {**meter.summary(), "levels": levels[name]} for name, meter in self._costs.items()}
         absent = {} if any(m.key == LPIPS.key for m in self.metrics) else {LPIPS.key: NO_WEIGHTS}
-        return {"efficiency": costs, "sources": data_provenance(self.data), "absent": absent}
+        facts = {"efficiency": costs, "sources": data_provenance(self.data), "absent": absent}
+        diagnosis = self._diagnosis.summary()
+        return facts if diagnosis is None else {**facts, "diagnosis": diagnosis}
 
     @property
     def mean_color(self) -> tuple[float, float, float]:
@@ -285,6 +289,8 @@ class _ObjectMeasure:
         displacement = truth.positions - truth.rest
         for name, linear in references.items():
             predicted[name] = truth.rest + linear.rollout(displacement[:2], frames - 1)
+        moving = {name: points for name, points in predicted.items() if name != STATIC}
+        self._diagnosis.add(truth.positions, truth.rest, moving)
         spread = truth.rest.amax(0) - truth.rest.amin(0)
         diagonal = self.data.diagonal or float(spread.norm())
         for name, points in {**predicted, TRUTH: truth.positions}.items():

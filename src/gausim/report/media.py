@@ -19,6 +19,7 @@ from matplotlib.text import Text
 from gausim.core import GausSimError
 from gausim.io.video import write_video
 from gausim.report.curves import ERROR_3D, POINT_ARRAYS, STATIC, ObjectCurves, load_curves
+from gausim.report.diagnosis import diagnosis_plot, read_diagnosis
 from gausim.report.figures import contact_frames
 from gausim.report.frames import Timeline, brighten, label_bar, moving_line, space_time_slice, timeline_bar
 from gausim.report.pictures import Pictures, load_pictures
@@ -69,9 +70,25 @@ def object_figures(study: Study, name: str) -> tuple[list[Exhibit], list[str]]:
     curves = _curves(study, name, problems)
     if curves:
         figures.append(_error_curves(name, curves))
+    figures += _motions(study, name)
     for shown in _shown(study, name, problems):
         figures += [_slices(shown), _grid(shown), _cameras(shown), _video(shown)]
     return figures, problems
+
+
+def _motions(study: Study, name: str) -> list[Exhibit]:
+    """Spectra and phase errors, of the first seed of every row, where the true motion is known."""
+    named = []
+    for group in study.groups:
+        found = [d for _, entry in group.entries(name) if (d := read_diagnosis(entry)) and group.method in d.rows]
+        named += [(group.label, found[0], group.method)] if found else []
+    if not named:
+        return []
+    caption = (
+        "First seed of each row. Left: power of the true and the predicted points over frequency. Right: how far the "
+        "prediction is out of step, over the principal motions; unrelated motions have 104 degrees."
+    )
+    return [Exhibit(f"Spectrum and phase: {name}", caption, "image", _png(diagnosis_plot(named, title=name)))]
 
 
 def _curves(study: Study, name: str, problems: list[str]) -> list[tuple[Group, list[ObjectCurves]]]:

@@ -7,6 +7,7 @@ from typing import Any
 
 from gausim.report import paper
 from gausim.report.curves import ERROR_3D
+from gausim.report.diagnosis import diagnosis_sheets
 from gausim.report.runs import RunRecord
 from gausim.report.sheets import (
     METHOD,
@@ -39,7 +40,8 @@ def make_sheets(study: Study) -> list[Sheet]:
     """Every table that there is something for: the paper's first, then what tells more."""
     found = {pair: metric_sheet(study, *pair) for pair in TABLES}
     first = [found.pop((metric, "train")) for metric in paper.TABLES]
-    sheets = [*first, *ablation_sheets(study), efficiency_sheet(study), *found.values(), contrast_sheet(study)]
+    sheets = [*first, *ablation_sheets(study), efficiency_sheet(study), *found.values()]
+    sheets += [*diagnosis_sheets(study), contrast_sheet(study)]
     return [sheet for sheet in sheets if sheet is not None]
 
 

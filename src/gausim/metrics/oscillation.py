@@ -1,0 +1,103 @@
+"""How a prediction oscillates beside the truth: frequencies, damping, spectrum and phase in the truth's own modes.
+
+Motions are looked at in the principal motions of the true displacements: the few orthogonal shapes that hold most of
+their squared size. A shape seldom is one vibration mode, but it is the same yardstick for all predictions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import hilbert, periodogram
+
+Array = NDArray[np.float64]
+
+
+def principal_motions(displacements: Sequence[NDArray], count: int) -> tuple[Array, Array]:
+    """Shapes that displacements of all sequences are made of.
+
+    Args:
+        displacements: (F, P, 3) from the rest state, per sequence.
+        count: at most so many shapes.
+
+    Returns:
+        (M, 3 P) orthonormal shapes, and the share (M,) of the squared displacement in each, the largest first.
+    """
+    rows = np.concatenate([d.reshape(len(d), -1) for d in displacements]).astype(np.float64)
+    values, vectors = np.linalg.eigh(rows @ rows.T)  # far fewer frames than coordinates
+    total = max(float(values.sum()), np.finfo(float).tiny)
+    chosen = [i for i in np.argsort(values)[::-1][:count] if values[i] > 1e-12 * total]
+    shapes = (vectors[:, chosen] / np.sqrt(values[chosen])).T @ rows
+    return shapes, values[chosen] / total
+
+
+def coordinates(displacement: NDArray, shapes: Array) -> Array:
+    """(F, M) coordinates of a sequence's displacements (F, P, 3) in the shapes."""
+    return displacement.reshape(len(displacement), -1) @ shapes.T
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """One damped oscillation.
+
+    Attributes:
+        frequency: [Hz]; 0 where the motion only decays.
+        damping: share of critical damping; negative where it grows, NaN where the motion does not oscillate.
+    """
+
+    frequency: float
+    damping: float
+
+
+def oscillation(series: Sequence[Array], fps: float) -> Oscillation:
+    """The oscillation z_{t+1} = a z_t + b z_{t-1} that fits a coordinate of all sequences best (least squares).
+
+    Args:
+        series: (F,) values of the coordinate, per sequence.
+        fps: frames per second.
+    """
+    past = np.concatenate([np.stack((s[1:-1], s[:-2]), 1) for s in series])
+    future = np.concatenate([s[2:] for s in series])
+    if not np.abs(past).max(initial=0) > 0:
+        return Oscillation(0.0, float("nan"))
+    a, b = np.linalg.lstsq(past, future, rcond=None)[0]
+    root = complex(np.roots([1.0, -a, -b])[0])
+    if abs(root.imag) < 1e-12 or abs(root) == 0:
+        return Oscillation(0.0, float("nan"))
+    angle, decay = abs(np.angle(root)), -np.log(abs(root))
+    return Oscillation(float(angle * fps / (2 * np.pi)), float(decay / np.hypot(angle, decay)))
+
+
+def spectrum(series: Sequence[Array], fps: float) -> tuple[Array, Array]:
+    """Frequencies (B,) [Hz] and the power (B,) of coordinates (F, M), summed over them, mean over sequences.
+
+    Sequences are cut to the shortest, their means taken off and a Hann window laid over them.
+    """
+    length = min(len(s) for s in series)
+    found = [periodogram(s[:length], fs=fps, window="hann", detrend="constant", axis=0) for s in series]
+    return found[0][0], np.mean([power.sum(1) for _, power in found], axis=0)
+
+
+def phase_error(prediction: Sequence[Array], truth: Sequence[Array]) -> Array:
+    """Root-mean-square difference of phase (F,) [degrees] between coordinates (F, M), 104 where they are unrelated.
+
+    The phase is that of the analytic signal; a coordinate counts in a frame as much as both of its amplitudes.
+    """
+    length = min(len(t) for t in truth)
+    squared, weights = np.zeros(length), np.zeros(length)
+    for p, t in zip(prediction, truth, strict=True):
+        a, b = (hilbert(x[:length] - x[:length].mean(0), axis=0) for x in (p, t))
+        weight = np.abs(a) * np.abs(b)
+        squared += (weight * np.degrees(np.angle(a * b.conj())) ** 2).sum(1)
+        weights += weight.sum(1)
+    return np.sqrt(np.divide(squared, weights, out=np.full(length, np.nan), where=weights > 0))
+
+
+def velocity_cosine(prediction: NDArray, truth: NDArray) -> float:
+    """Cosine of the angle between the first steps x_1 - x_0 of two motions (F, P, 3), over all their coordinates."""
+    a, b = ((x[1] - x[0]).astype(np.float64).ravel() for x in (prediction, truth))
+    size = float(np.linalg.norm(a) * np.linalg.norm(b))
+    return float(a @ b) / size if size > 0 else float("nan")
