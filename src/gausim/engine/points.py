@@ -30,14 +30,21 @@ class PointSupervision:
     Nothing is drawn. Only frames that the sample holds are looked at: those that training on images would see.
     """
 
-    def __init__(self, scenes: Sequence[GaussianScene], truth: Callable[[int], GroundTruth | None]) -> None:
+    def __init__(
+        self,
+        scenes: Sequence[GaussianScene],
+        truth: Callable[[int], GroundTruth | None],
+        *,
+        velocity_weight: float = 0.0,
+    ) -> None:
         """Keeps its parts.
 
         Args:
             scenes: the rest scenes.
             truth: true motion of a sequence by its number.
+            velocity_weight: of the same loss of the steps x_t - x_{t-1}, which counts fast motion more.
         """
-        self._scenes, self._read = scenes, truth
+        self._scenes, self._read, self._velocity_weight = scenes, truth, velocity_weight
         self._known: dict[int, GroundTruth] = {}
         self._attached: dict[int, Int[Tensor, " P"]] = {}
 
@@ -49,14 +56,22 @@ class PointSupervision:
                 self._attached[sample.scene_id] = attach_points(self._scenes[sample.scene_id], truth.rest)
         attached = [self._attached[sample.scene_id].to(batch.rest.device) for sample in samples]
         scales = [self._scale(sample) for sample in samples]
-        return _PointComparison(batch, [_on(truth, batch.rest) for truth in truths], attached, scales)
+        return _PointComparison(
+            batch, [_on(truth, batch.rest) for truth in truths], attached, scales, self._velocity_weight
+        )
 
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
         """Scores the rest state on frames ``first`` .. T of a sample."""
         truth = self._truth(sample)
         positions = truth.positions[first : sample.steps + 1]
-        losses = self._scale(sample) * _squared(positions - truth.rest)
-        return StaticFigures(losses.tolist(), (self._scale(sample) * _squared(positions.diff(dim=0))).tolist())
+        motion = _squared(positions.diff(dim=0))
+        losses = _squared(positions - truth.rest)
+        if self._velocity_weight:
+            before = truth.positions[max(first - 1, 0) : sample.steps]
+            losses = losses + self._velocity_weight * _squared(
+                positions - torch.cat((before[:1], before))[-len(positions) :]
+            )
+        return StaticFigures((self._scale(sample) * losses).tolist(), (self._scale(sample) * motion).tolist())
 
     def _scale(self, sample: SequenceSample) -> float:
         return (100 / self._scenes[sample.scene_id].diagonal) ** 2
@@ -82,8 +97,9 @@ class _PointComparison:
         truths: Sequence[GroundTruth],
         attached: Sequence[Int[Tensor, " P"]],
         scales: Sequence[float],
+        velocity_weight: float,
     ) -> None:
-        self._batch, self._truths, self._scales = batch, truths, scales
+        self._batch, self._truths, self._scales, self._weight = batch, truths, scales, velocity_weight
         self._kernels, self._units, self._offsets = [], [], []
         for member, truth, kernel in zip(batch.members, truths, attached, strict=True):
             unit = member.unit_of_kernel.to(kernel.device)
@@ -99,10 +115,13 @@ class _PointComparison:
             turned = states.gradients[:, self._units[i]] @ self._offsets[i][..., None]
             points = states.positions[:, self._kernels[i]] + turned[..., 0]
             span = slice(start + 1, start + 1 + len(points))
-            losses.append(scale * _squared(points - truth.positions[span]))
-            with torch.no_grad():
-                motion += scale * _squared(torch.cat((self._last[i][None], points)).diff(dim=0)).sum()
-                self._last[i] = points[-1].detach()
+            steps = torch.cat((self._last[i][None], points)).diff(dim=0)
+            loss = _squared(points - truth.positions[span])
+            if self._weight:
+                loss = loss + self._weight * _squared(steps - truth.positions[start : span.stop].diff(dim=0))
+            losses.append(scale * loss)
+            motion += scale * _squared(steps.detach()).sum()
+            self._last[i] = points[-1].detach()
         return torch.stack(losses, 1), motion
 
 

@@ -41,7 +41,7 @@ MIN_DETERMINANT = 0.2
 SPECTRUM_GAIN, MIXING_GAIN = 2.0, 0.3
 # Nearly undamped at the start: exp(-4) per frame of the velocity.
 INITIAL_LOG_DAMPING = -4.0
-DAMPINGS = ("full", "rayleigh")
+DAMPINGS = ("full", "rayleigh", "structural")
 
 
 def spring_network(rest: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
@@ -139,7 +139,7 @@ class ElasticScene(nn.Module):
         self.spectrum = nn.Parameter(torch.zeros(count))
         self.mixing = nn.Parameter(torch.zeros(count, count))
         full = damping == "full"
-        self.damping = nn.Parameter(torch.zeros(count if full else 2))
+        self.damping = nn.Parameter(torch.zeros({"full": count, "rayleigh": 2, "structural": 1}[damping]))
         self.damping_mixing = nn.Parameter(torch.zeros(count, count)) if full else None
         self.force = mlp((2 * count, hidden, hidden, count)) if hidden else None
         if self.force is not None:
@@ -153,7 +153,10 @@ class ElasticScene(nn.Module):
         factor = root[:, None] * (identity + MIXING_GAIN * self.mixing)
         stiffness = factor @ factor.mT
         log_damping = INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping
-        if self.damping_mixing is None:
+        if len(log_damping) == 1:
+            half = root.sqrt()[:, None] * (identity + MIXING_GAIN * self.mixing)
+            damping = 2 * log_damping.exp() * half @ half.mT
+        elif self.damping_mixing is None:
             damping = log_damping[0].exp() * identity + log_damping[1].exp() * stiffness
         else:
             factor = (0.5 * log_damping).exp()[:, None] * (identity + MIXING_GAIN * self.damping_mixing)
