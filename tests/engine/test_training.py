@@ -11,7 +11,7 @@ import torch
 from lightning.pytorch import Trainer
 from torch import Tensor, nn
 
-from gausim.core import DivergenceError, SimState
+from gausim.core import ConfigError, DivergenceError, SimState
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.engine.curriculum import LossGatedCurriculum
@@ -245,3 +245,17 @@ def test_overfitting_one_sequence_drives_its_loss_down_tenfold(tmp_path: Path) -
     module.training_step = record  # type: ignore[method-assign]
     fit(module, [[sample(0, steps=5)]] * 300, tmp_path)
     assert sum(losses[-10:]) / 10 < 0.1 * losses[0]
+
+
+def test_matrix_decay_takes_matrices_of_its_groups_and_nothing_else() -> None:
+    matrix, vector, other = (nn.Parameter(torch.ones(*shape)) for shape in ((2, 2), (2,), (2, 2)))
+    settings = OptimizerSettings(template_lr=0.1, network_lr=0.1, matrix_decay={"template": 0.5})
+    optimizer = settings.build({"template": [matrix, vector], "network": [other]})
+    for parameter in (matrix, vector, other):
+        parameter.grad = torch.zeros_like(parameter)
+    optimizer.step()
+    assert matrix[0, 0].item() == pytest.approx(0.95) and vector[0].item() == other[0, 0].item() == 1
+    assert {group["name"] for group in optimizer.param_groups} == {"template", "network"}
+    assert len(settings.clip(optimizer)) == 2  # groups are clipped by name
+    with pytest.raises(ConfigError, match=r"matrix_decay.*\['nothing'\]"):
+        OptimizerSettings(matrix_decay={"nothing": 1.0})

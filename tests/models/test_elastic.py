@@ -9,7 +9,7 @@ import scipy.linalg
 import torch
 
 from gausim.core import SimState
-from gausim.models.elastic import ElasticScene, ElasticTemplate, mode_gradients, vibration_modes
+from gausim.models.elastic import ElasticScene, ElasticTemplate, mode_gradients, spring_network, vibration_modes
 from gausim.models.hierarchy import build_hierarchy
 from gausim.models.initial_state import ModalInitialStates
 from gausim.models.template import Motion
@@ -79,10 +79,18 @@ def test_mode_gradients_of_an_affine_motion_are_its_matrix() -> None:
     assert error.max() < 0.1 and np.median(error) < 0.01
 
 
-@pytest.fixture(params=["full", "rayleigh"])
+@pytest.fixture(params=["full", "modal", "rayleigh", "structural"])
 def elastic(make_scene, request) -> ElasticScene:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
-    own = {"modes": 9, "neighbours": 8, "period": 12.0, "hidden": 0, "amplitude": 0.02, "damping": request.param}
+    own = {
+        "modes": 9,
+        "neighbours": 8,
+        "period": 12.0,
+        "hidden": 0,
+        "amplitude": 0.02,
+        "damping": request.param,
+        "geometric": None,
+    }
     scene = ElasticScene(hierarchy, 1, **own)
     return scene.double().requires_grad_(False)
 
@@ -150,7 +158,7 @@ def test_discrete_energy_never_grows_for_random_mixing(elastic: ElasticScene, se
 def test_single_precision_rollout_stays_bounded_for_2000_steps(make_scene) -> None:
     hierarchy = build_hierarchy(make_scene(90), radii=(0.2, 0.5))
     scene = ElasticScene(
-        hierarchy, 1, modes=9, neighbours=8, period=6.0, hidden=0, amplitude=0.02, damping="full"
+        hierarchy, 1, modes=9, neighbours=8, period=6.0, hidden=0, amplitude=0.02, damping="full", geometric=None
     ).requires_grad_(False)
     generator = torch.Generator().manual_seed(7)
     _shake(scene.double(), generator)
@@ -223,3 +231,64 @@ def test_parameters_are_grouped_by_role(make_scene, make_model) -> None:
     assert all(any(p is q for q in groups["network"]) for p in model.template.networks())
     assert any(p is model.template.scenes[1].mixing for p in groups["template"])
     assert any(p is model.attributes[1] for p in groups["scene"])
+
+
+def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_order(make_scene) -> None:
+    hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
+    own = {"modes": 9, "neighbours": 8, "period": 6.0, "hidden": 0, "amplitude": 0.02, "damping": "full"}
+    scene = ElasticScene(hierarchy, 1, **own, geometric=1.0).double().requires_grad_(False)
+    springs, level = scene.springs, hierarchy.levels[1]
+    assert springs is not None
+    pairs, blocks = spring_network(level.rest.double().numpy(), 8)
+    rest, phi = level.rest.double(), scene.modes.double()
+    i, j = (torch.from_numpy(p) for p in pairs.T)
+    offset = rest[j] - rest[i]
+    length = offset.norm(dim=-1)
+    stiffness = 0.7 / length**2
+
+    def energy(z: torch.Tensor) -> torch.Tensor:
+        moved = rest + phi @ z
+        stretch = (moved[j] - moved[i]).norm(dim=-1) - length
+        along = ((moved[j] - moved[i] - offset) * offset).sum(-1) / length
+        return 0.5 * (stiffness * (stretch**2 - along**2)).sum()
+
+    first = phi[..., 0]
+    lowest = torch.einsum("ea,eab,eb->", first[j] - first[i], torch.from_numpy(blocks), first[j] - first[i])
+    generator = torch.Generator().manual_seed(3)
+    for size in (0.3, 3.0):
+        z = (size * scene.scale * torch.randn(9, generator=generator, dtype=torch.float64)).requires_grad_()
+        expected = -torch.autograd.grad(energy(z), z)[0] / lowest
+        torch.testing.assert_close(
+            springs(z.detach()[None])[0], expected, rtol=1e-3, atol=1e-4 * float(expected.norm())
+        )
+        z = z.detach()
+    pulls = [float(springs(s * z[None]).norm()) for s in (1e-3, 2e-3)]
+    assert pulls[1] / pulls[0] == pytest.approx(4, rel=0.02) and not bool(springs(0 * z[None]).any())
+    # It takes part in the step with its trained gain.
+    basis = phi.flatten(0, 1)
+    now, before = (s * (basis @ z).view(1, -1, 3) for s in (1.0, 0.9))
+    a, b, h = scene.matrices()
+    stiff = torch.tensor(scene.initial_log_stiffness).exp()
+    torch.testing.assert_close(scene(now, before)[0], a @ z - b @ (0.9 * z) + h @ (stiff * springs(z[None])[0]),
+                               rtol=1e-4, atol=1e-8)  # fmt: skip
+
+
+def test_dampings_are_what_they_are_called(make_scene) -> None:
+    hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
+    own = {"modes": 9, "neighbours": 8, "period": 12.0, "hidden": 0, "amplitude": 0.02, "geometric": None}
+    found = {}
+    for name in ("modal", "rayleigh", "structural"):
+        scene = ElasticScene(hierarchy, 1, **own, damping=name).double().requires_grad_(False)
+        scene.damping.copy_(torch.arange(len(scene.damping)) / 10)
+        a, b, inverse = scene.matrices()
+        identity = torch.eye(9, dtype=torch.float64)
+        damping = torch.linalg.solve(inverse, identity - b) @ identity  # (I + K/4 + D/2) (I - B) = D
+        stiffness = 2 * (2 * identity - torch.linalg.solve(inverse, a))
+        found[name] = damping, stiffness.diagonal(), (-4 + 2 * scene.damping).exp()
+        assert torch.allclose(damping, torch.diag(damping.diagonal()), atol=1e-9)  # without mixing
+    for name, (damping, stiffness, rates) in found.items():
+        if name == "modal":
+            expected = rates
+        else:
+            expected = rates[0] + rates[1] * stiffness if name == "rayleigh" else 2 * rates * stiffness.sqrt()
+        torch.testing.assert_close(damping.diagonal(), expected, rtol=1e-6, atol=1e-9)

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 from torch.nn import Parameter
-from torch.optim import Adam, Optimizer
+from torch.optim import Adam, AdamW, Optimizer
 
 from gausim.core import ConfigError
+
+GROUPS = ("network", "scene", "template", "initial")
 
 
 @runtime_checkable
@@ -80,6 +82,8 @@ class OptimizerSettings:
         schedule: how they change; constant when None.
         clip_norm: gradients are clipped at this norm; 0 does not clip.
         clip_per_group: clip network, scenes and initial states each by themselves instead of all together.
+        matrix_decay: decoupled weight decay (AdamW) of matrices, by group; vectors and scalars never decay. A matrix
+            element that the data say little about returns to zero, where Adam alone would let it wander.
         ema_decay: weights of the run are also averaged with this decay per step, and the average is what evaluation
             loads; 0 does not average.
     """
@@ -92,6 +96,7 @@ class OptimizerSettings:
     schedule: Schedule | None = None
     clip_norm: float = 1.0
     clip_per_group: bool = False
+    matrix_decay: Mapping[str, float] = field(default_factory=dict)
     ema_decay: float = 0.0
 
     def __post_init__(self) -> None:
@@ -101,6 +106,11 @@ class OptimizerSettings:
             or not 0 <= self.ema_decay < 1
         ):
             raise ConfigError(f"optimizer: expected rates and clip_norm >= 0 and ema_decay in [0, 1), got {self}.")
+        wrong = [name for name, value in self.matrix_decay.items() if name not in GROUPS or not value >= 0]
+        if wrong:
+            raise ConfigError(
+                f"optimizer.matrix_decay: expected values >= 0 for some of {', '.join(GROUPS)}, got {wrong}."
+            )
 
     def build(self, groups: Mapping[str, Sequence[Parameter]]) -> Optimizer:
         """The optimiser over the named groups ``network``, ``scene``, ``template`` and ``initial``.
@@ -110,20 +120,20 @@ class OptimizerSettings:
         Raises:
             ConfigError: a group for which there is no learning rate.
         """
-        rates = {
-            "network": self.network_lr,
-            "scene": self.scene_lr,
-            "template": self.scene_lr if self.template_lr is None else self.template_lr,
-            "initial": self.initial_lr,
-        }
+        template = self.scene_lr if self.template_lr is None else self.template_lr
+        rates = dict(zip(GROUPS, (self.network_lr, self.scene_lr, template, self.initial_lr), strict=True))
         if set(groups) - set(rates):
             raise ConfigError(f"optimizer: no learning rate for parameter groups {sorted(set(groups) - set(rates))}.")
-        made = [
-            {"params": list(members), "lr": rates[name], "base_lr": rates[name], "name": name}
-            for name, members in groups.items()
-            if members
-        ]
-        return (self.optimizer or Adam)(made)
+        made: list[dict[str, Any]] = []
+        for name, members in groups.items():
+            decay = self.matrix_decay.get(name, 0.0)
+            matrices = [p for p in members if p.ndim >= 2 and decay]
+            others = [p for p in members if p.ndim < 2 or not decay]
+            for part, own in ((others, 0.0), (matrices, decay)):
+                if part:
+                    made.append({"params": part, "lr": rates[name], "base_lr": rates[name], "name": name})
+                    made[-1] |= {"weight_decay": own} if self.matrix_decay else {}
+        return (self.optimizer or (AdamW if self.matrix_decay else Adam))(made)
 
     def set_rates(self, optimizer: Optimizer, epoch: float, epochs: int) -> float:
         """Sets the learning rates of all groups; returns the schedule's factor."""

@@ -41,7 +41,7 @@ MIN_DETERMINANT = 0.2
 SPECTRUM_GAIN, MIXING_GAIN = 2.0, 0.3
 # Nearly undamped at the start: exp(-4) per frame of the velocity.
 INITIAL_LOG_DAMPING = -4.0
-DAMPINGS = ("full", "rayleigh", "structural")
+DAMPINGS = ("full", "modal", "rayleigh", "structural")
 
 
 def spring_network(rest: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
@@ -101,6 +101,47 @@ def mode_gradients(rest: np.ndarray, modes: np.ndarray, neighbours: int) -> np.n
     return np.einsum("nk,nkim,nka,nab->nibm", weight, difference, offset, np.linalg.inv(moment), optimize=True)
 
 
+class Springs(nn.Module):
+    """The network's springs as they turn and stretch by more than a little, in modal coordinates.
+
+    A spring from d_0 to d = d_0 + Psi z has the energy k (|d| - |d_0|)^2 / 2, linearised k (n . Psi z)^2 / 2 with
+    n = d_0 / |d_0|. The force is minus the gradient of the difference, so it has a potential and vanishes at rest to
+    second order: the linear part is left to the trained matrices.
+    """
+
+    modes: Tensor
+    offset: Tensor
+    length: Tensor
+    stiffness: Tensor
+
+    def __init__(self, rest: np.ndarray, phi: np.ndarray, neighbours: int) -> None:
+        """Springs of :func:`spring_network` between the units, stiffness such that the first mode has the value 1."""
+        super().__init__()
+        pairs, blocks = spring_network(rest, neighbours)
+        difference = phi[pairs[:, 1]] - phi[pairs[:, 0]]
+        first = difference[:, :, 0]
+        lowest = np.einsum("ea,eab,eb->", first, blocks, first)
+        offset = rest[pairs[:, 1]] - rest[pairs[:, 0]]
+        squared = (offset**2).sum(1)
+        self.register_buffer("modes", torch.from_numpy(difference.reshape(-1, phi.shape[-1])).float(), persistent=False)
+        self.register_buffer("offset", torch.from_numpy(offset).float(), persistent=False)
+        self.register_buffer("length", torch.from_numpy(np.sqrt(squared)).float(), persistent=False)
+        stiffness = (1 - TRANSVERSE_STIFFNESS) / (squared * lowest)
+        self.register_buffer("stiffness", torch.from_numpy(stiffness).float(), persistent=False)
+
+    def forward(self, z: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+        """Modal forces beyond the linear ones, in units of the first mode's value."""
+        change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
+        squared = self.length.square()
+        along = (self.offset * change).sum(-1)
+        now = (squared + 2 * along + change.square().sum(-1)).clamp_min(1e-6 * squared).sqrt()
+        # 1 - |d_0| / |d| without the difference of nearly equal numbers.
+        shrink = (2 * along + change.square().sum(-1)) / (now * (now + self.length))
+        beyond = shrink[..., None] * change + (shrink - along / squared)[..., None] * self.offset
+        beyond = self.stiffness[:, None] * beyond
+        return -(beyond.flatten(-2) @ self.modes)
+
+
 class ElasticScene(nn.Module):
     """Modes of one scene and the trained matrices that move them."""
 
@@ -120,6 +161,7 @@ class ElasticScene(nn.Module):
         hidden: int,
         amplitude: float,
         damping: str,
+        geometric: float | None,
     ) -> None:
         """``period`` of the lowest mode [frames] and ``amplitude`` [diagonals] only set the start."""
         super().__init__()
@@ -138,9 +180,11 @@ class ElasticScene(nn.Module):
         self.stiffness = nn.Parameter(torch.zeros(()))
         self.spectrum = nn.Parameter(torch.zeros(count))
         self.mixing = nn.Parameter(torch.zeros(count, count))
-        full = damping == "full"
-        self.damping = nn.Parameter(torch.zeros({"full": count, "rayleigh": 2, "structural": 1}[damping]))
-        self.damping_mixing = nn.Parameter(torch.zeros(count, count)) if full else None
+        numbers = {"full": count, "modal": count, "rayleigh": 2, "structural": 1}
+        self.damping, self._damping = nn.Parameter(torch.zeros(numbers[damping])), damping
+        self.damping_mixing = nn.Parameter(torch.zeros(count, count)) if damping == "full" else None
+        self.springs = None if geometric is None else Springs(rest, phi, neighbours)
+        self.gain = None if geometric is None else nn.Parameter(torch.tensor(float(geometric)))
         self.force = mlp((2 * count, hidden, hidden, count)) if hidden else None
         if self.force is not None:
             zero_output(self.force)
@@ -153,14 +197,16 @@ class ElasticScene(nn.Module):
         factor = root[:, None] * (identity + MIXING_GAIN * self.mixing)
         stiffness = factor @ factor.mT
         log_damping = INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping
-        if len(log_damping) == 1:
-            half = root.sqrt()[:, None] * (identity + MIXING_GAIN * self.mixing)
-            damping = 2 * log_damping.exp() * half @ half.mT
-        elif self.damping_mixing is None:
-            damping = log_damping[0].exp() * identity + log_damping[1].exp() * stiffness
-        else:
+        if self.damping_mixing is not None:
             factor = (0.5 * log_damping).exp()[:, None] * (identity + MIXING_GAIN * self.damping_mixing)
             damping = factor @ factor.mT
+        elif self._damping == "modal":
+            damping = torch.diag(log_damping.exp())
+        elif self._damping == "rayleigh":
+            damping = log_damping[0].exp() * identity + log_damping[1].exp() * stiffness
+        else:
+            factor = root.sqrt()[:, None] * (identity + MIXING_GAIN * self.mixing)
+            damping = 2 * log_damping.exp() * factor @ factor.mT
         inverse = torch.linalg.inv(identity + stiffness / 4 + damping / 2)
         return inverse @ (2 * identity - stiffness / 2), inverse @ (identity + stiffness / 4 - damping / 2), inverse
 
@@ -180,6 +226,9 @@ class PreparedScene:
         # Positions and gradients of a unit side by side: one product gives both.
         self.motions = torch.cat((scene.modes, scene.gradients.flatten(1, 2)), 1).flatten(0, 1)
         self.force, parts = scene.force, [a.mT, -b.mT]
+        if scene.springs is not None and scene.gain is not None:
+            size = (scene.initial_log_stiffness + SPECTRUM_GAIN * scene.stiffness).exp()
+            parts.append(scene.gain * size * h.mT)
         if self.force is not None:
             parts.append(0.1 * scene.scale * h.mT)
             self.still = self.force(a.new_zeros(1, 2 * len(scene.values)))
@@ -189,6 +238,8 @@ class PreparedScene:
         """Modal coordinates at t + 1 from the displacements at t and t - 1 of S sequences."""
         z, previous = (torch.cat((now, before)).flatten(1) @ self.projection).chunk(2)
         parts = [z, previous]
+        if self.scene.springs is not None:
+            parts.append(self.scene.springs(z))
         if self.force is not None:
             parts.append(self.force(torch.cat((z, z - previous), -1) / self.scene.scale) - self.still)
         return torch.cat(parts, -1) @ self.transition
@@ -243,6 +294,7 @@ class ElasticTemplate(Template):
         hidden: int = 64,
         amplitude: float = 0.02,
         damping: str = "full",
+        geometric: float | None = None,
         conserve_volume: bool = True,
     ) -> None:
         """See the module's text.
@@ -255,7 +307,9 @@ class ElasticTemplate(Template):
             period: initial period of the lowest mode [frames].
             hidden: width of the nonlinear force network, 0 for none.
             amplitude: typical displacement [diagonals], scales that network's inputs.
-            damping: ``full``, a trained matrix, or ``rayleigh``, a K-proportional and a uniform part, two numbers.
+            damping: ``full``, a trained matrix; ``modal``, a number per mode; ``rayleigh``, a uniform and a part in
+                proportion to K, two numbers; ``structural``, the same share of critical for all modes, one number.
+            geometric: how much of the springs' nonlinear force there is at the start, trained; None leaves it out.
             conserve_volume: scale the template's gradients to determinant 1 (METHOD's mass conservation).
         """
         super().__init__()
@@ -272,6 +326,7 @@ class ElasticTemplate(Template):
                 hidden=hidden,
                 amplitude=amplitude,
                 damping=damping,
+                geometric=geometric,
             )
             for h in hierarchies
         )
