@@ -247,15 +247,16 @@ def test_overfitting_one_sequence_drives_its_loss_down_tenfold(tmp_path: Path) -
     assert sum(losses[-10:]) / 10 < 0.1 * losses[0]
 
 
-def test_matrix_decay_takes_matrices_of_its_groups_and_nothing_else() -> None:
-    matrix, vector, other = (nn.Parameter(torch.ones(*shape)) for shape in ((2, 2), (2,), (2, 2)))
-    settings = OptimizerSettings(template_lr=0.1, network_lr=0.1, matrix_decay={"template": 0.5})
-    optimizer = settings.build({"template": [matrix, vector], "network": [other]})
-    for parameter in (matrix, vector, other):
+def test_decay_takes_matrices_and_initial_states_of_its_groups_and_nothing_else() -> None:
+    matrix, vector, other, state = (nn.Parameter(torch.ones(*shape)) for shape in ((2, 2), (2,), (2, 2), (2,)))
+    settings = OptimizerSettings(template_lr=0.1, network_lr=0.1, initial_lr=0.1, decay={"template": 0.5, "initial": 1})
+    optimizer = settings.build({"template": [matrix, vector], "network": [other], "initial": [state]})
+    for parameter in (matrix, vector, other, state):
         parameter.grad = torch.zeros_like(parameter)
     optimizer.step()
     assert matrix[0, 0].item() == pytest.approx(0.95) and vector[0].item() == other[0, 0].item() == 1
-    assert {group["name"] for group in optimizer.param_groups} == {"template", "network"}
-    assert len(settings.clip(optimizer)) == 2  # groups are clipped by name
-    with pytest.raises(ConfigError, match=r"matrix_decay.*\['nothing'\]"):
-        OptimizerSettings(matrix_decay={"nothing": 1.0})
+    assert state[0].item() == pytest.approx(0.9)
+    assert {group["name"] for group in optimizer.param_groups} == {"template", "network", "initial"}
+    assert len(settings.clip(optimizer)) == 3  # groups are clipped by name
+    with pytest.raises(ConfigError, match=r"decay.*\['nothing'\]"):
+        OptimizerSettings(decay={"nothing": 1.0})

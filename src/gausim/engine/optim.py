@@ -82,8 +82,8 @@ class OptimizerSettings:
         schedule: how they change; constant when None.
         clip_norm: gradients are clipped at this norm; 0 does not clip.
         clip_per_group: clip network, scenes and initial states each by themselves instead of all together.
-        matrix_decay: decoupled weight decay (AdamW) of matrices, by group; vectors and scalars never decay. A matrix
-            element that the data say little about returns to zero, where Adam alone would let it wander.
+        decay: decoupled weight decay (AdamW) by group: of matrices, and of all initial states. What the data say
+            little about returns to zero, where Adam alone would let it wander.
         ema_decay: weights of the run are also averaged with this decay per step, and the average is what evaluation
             loads; 0 does not average.
     """
@@ -96,7 +96,7 @@ class OptimizerSettings:
     schedule: Schedule | None = None
     clip_norm: float = 1.0
     clip_per_group: bool = False
-    matrix_decay: Mapping[str, float] = field(default_factory=dict)
+    decay: Mapping[str, float] = field(default_factory=dict)
     ema_decay: float = 0.0
 
     def __post_init__(self) -> None:
@@ -106,11 +106,9 @@ class OptimizerSettings:
             or not 0 <= self.ema_decay < 1
         ):
             raise ConfigError(f"optimizer: expected rates and clip_norm >= 0 and ema_decay in [0, 1), got {self}.")
-        wrong = [name for name, value in self.matrix_decay.items() if name not in GROUPS or not value >= 0]
+        wrong = [name for name, value in self.decay.items() if name not in GROUPS or not value >= 0]
         if wrong:
-            raise ConfigError(
-                f"optimizer.matrix_decay: expected values >= 0 for some of {', '.join(GROUPS)}, got {wrong}."
-            )
+            raise ConfigError(f"optimizer.decay: expected values >= 0 for some of {', '.join(GROUPS)}, got {wrong}.")
 
     def build(self, groups: Mapping[str, Sequence[Parameter]]) -> Optimizer:
         """The optimiser over the named groups ``network``, ``scene``, ``template`` and ``initial``.
@@ -126,14 +124,15 @@ class OptimizerSettings:
             raise ConfigError(f"optimizer: no learning rate for parameter groups {sorted(set(groups) - set(rates))}.")
         made: list[dict[str, Any]] = []
         for name, members in groups.items():
-            decay = self.matrix_decay.get(name, 0.0)
-            matrices = [p for p in members if p.ndim >= 2 and decay]
-            others = [p for p in members if p.ndim < 2 or not decay]
-            for part, own in ((others, 0.0), (matrices, decay)):
+            decay = self.decay.get(name, 0.0)
+            decaying = [p for p in members if decay and (p.ndim >= 2 or name == "initial")]
+            known = {id(p) for p in decaying}
+            others = [p for p in members if id(p) not in known]
+            for part, own in ((others, 0.0), (decaying, decay)):
                 if part:
                     made.append({"params": part, "lr": rates[name], "base_lr": rates[name], "name": name})
-                    made[-1] |= {"weight_decay": own} if self.matrix_decay else {}
-        return (self.optimizer or (AdamW if self.matrix_decay else Adam))(made)
+                    made[-1] |= {"weight_decay": own} if self.decay else {}
+        return (self.optimizer or (AdamW if self.decay else Adam))(made)
 
     def set_rates(self, optimizer: Optimizer, epoch: float, epochs: int) -> float:
         """Sets the learning rates of all groups; returns the schedule's factor."""
