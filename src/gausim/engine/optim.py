@@ -124,14 +124,14 @@ class OptimizerSettings:
             raise ConfigError(f"optimizer: no learning rate for parameter groups {sorted(set(groups) - set(rates))}.")
         made: list[dict[str, Any]] = []
         for name, members in groups.items():
-            decay = self.decay.get(name, 0.0)
-            decaying = [p for p in members if decay and (p.ndim >= 2 or name == "initial")]
-            known = {id(p) for p in decaying}
-            others = [p for p in members if id(p) not in known]
-            for part, own in ((others, 0.0), (decaying, decay)):
+            parts: dict[float, list[Parameter]] = {0.0: []}  # what does not decay comes first
+            for p in members:
+                decay = self.decay.get(name, 0.0) if p.ndim >= 2 or name == "initial" else 0.0
+                parts.setdefault(decay, []).append(p)
+            for decay, part in parts.items():
+                own = {"weight_decay": decay} if self.decay else {}
                 if part:
-                    made.append({"params": part, "lr": rates[name], "base_lr": rates[name], "name": name})
-                    made[-1] |= {"weight_decay": own} if self.decay else {}
+                    made.append({"params": part, "lr": rates[name], "base_lr": rates[name], "name": name, **own})
         return (self.optimizer or (AdamW if self.decay else Adam))(made)
 
     def set_rates(self, optimizer: Optimizer, epoch: float, epochs: int) -> float:

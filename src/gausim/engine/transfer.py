@@ -30,15 +30,13 @@ def load_shared(simulator: Simulator, run_dir: Path | str, model: Mapping[str, A
         RunError: there is no run or no readable checkpoint.
         ConfigError: its network is of another shape; nothing was loaded.
     """
-    run = RunDirectory(run_dir)
-    trained = run.config().get("model", {})
-    weights = averaged_weights(read_checkpoint(run.checkpoint))
+    source = _Source(run_dir)
     parts = simulator.shared()
-    found = {name: _below(weights, f"{_PREFIX}{name}.") for name in parts}
+    found = {name: _below(source.weights, f"{name}.") for name in parts}
     problems = [
         f"{name}.{problem}" for name, part in parts.items() for problem in _mismatches(found[name], part.state_dict())
     ]
-    _refuse(problems, run, "network", differing_keys(trained, model))
+    source.refuse(problems, "network", model)
     for name, part in parts.items():
         part.load_state_dict(found[name])
 
@@ -55,42 +53,45 @@ def load_simulator(simulator: Simulator, run_dir: Path | str, model: Mapping[str
         RunError: there is no run or no readable checkpoint, or it was not trained on a scene.
         ConfigError: its weights are of another shape; nothing was loaded.
     """
-    run = RunDirectory(run_dir)
-    config = run.config().get("model", {})
-    checkpoint = read_checkpoint(run.checkpoint)
-    there = simulator_weights(checkpoint)
-    trained, given = checkpoint["gausim"]["scenes"], fingerprints(simulator.scenes)
-    found = {
-        name: value for name, value in there.items() if name.startswith(tuple(f"{s}." for s in simulator.shared()))
-    }
-    for scene_id, scene in enumerate(given):
+    source = _Source(run_dir)
+    there, trained = source.weights, source.scenes
+    shared = tuple(f"{name}." for name in simulator.shared())
+    found = {name: value for name, value in there.items() if name.startswith(shared)}
+    for scene_id, scene in enumerate(fingerprints(simulator.scenes)):
         if scene not in trained:
-            raise RunError(f"{run.checkpoint} was trained on {tell(trained)}, not on {tell([scene])}.")
+            raise RunError(f"{source.run.checkpoint} was trained on {tell(trained)}, not on {tell([scene])}.")
         for old, new in zip(simulator.own(trained.index(scene)), simulator.own(scene_id), strict=True):
             found |= {new + name[len(old) :]: value for name, value in there.items() if _is_below(name, old)}
     module = cast(nn.Module, simulator)
-    _refuse(_mismatches(found, module.state_dict()), run, "model", differing_keys(config, model))
+    source.refuse(_mismatches(found, module.state_dict()), "model", model)
     module.load_state_dict(found)
 
 
-def simulator_weights(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
-    """The simulator's weights of a checkpoint by name, the averaged ones where there are any."""
-    return _below(averaged_weights(checkpoint), _PREFIX)
+class _Source:
+    """A trained run: its simulator's weights by name, averaged where it averaged, and the scenes it knows."""
+
+    def __init__(self, run_dir: Path | str) -> None:
+        self.run = RunDirectory(run_dir)
+        self._model = self.run.config().get("model", {})
+        checkpoint = read_checkpoint(self.run.checkpoint)
+        self.weights = _below(averaged_weights(checkpoint), _PREFIX)
+        self.scenes: list[dict[str, Any]] = checkpoint["gausim"]["scenes"]
+
+    def refuse(self, problems: Sequence[str], what: str, model: Mapping[str, Any]) -> None:
+        """Raises ConfigError if there are problems, with the settings of ``model`` that differ from the run's."""
+        if problems:
+            changed = [f"model.{key}" for key in differing_keys(self._model, model)]
+            raise ConfigError(
+                f"init_from: the {what} of {self.run.checkpoint} does not fit this model: "
+                f"{'; '.join(problems[:_SHOWN])}"
+                f"{f' and {len(problems) - _SHOWN} more' if len(problems) > _SHOWN else ''}. "
+                f"Set the model as {self.run.path}/config.yaml has it; what differs: {', '.join(changed) or 'nothing'}."
+            )
 
 
 def _is_below(name: str, prefix: str) -> bool:
     """Whether a name is the prefix or lies below it; ``attributes.10`` does not lie below ``attributes.1``."""
     return name == prefix or (prefix.endswith(".") and name.startswith(prefix))
-
-
-def _refuse(problems: Sequence[str], run: RunDirectory, what: str, differing: Sequence[str]) -> None:
-    if problems:
-        changed = [f"model.{key}" for key in differing]
-        raise ConfigError(
-            f"init_from: the {what} of {run.checkpoint} does not fit this model: {'; '.join(problems[:_SHOWN])}"
-            f"{f' and {len(problems) - _SHOWN} more' if len(problems) > _SHOWN else ''}. "
-            f"Set the model as {run.path}/config.yaml has it; what differs: {', '.join(changed) or 'nothing'}."
-        )
 
 
 def _below(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -134,9 +134,9 @@ class Springs(nn.Module):
         change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
         squared = self.length.square()
         along = (self.offset * change).sum(-1)
-        now = (squared + 2 * along + change.square().sum(-1)).clamp_min(1e-6 * squared).sqrt()
-        # 1 - |d_0| / |d| without the difference of nearly equal numbers.
-        shrink = (2 * along + change.square().sum(-1)) / (now * (now + self.length))
+        grown = 2 * along + change.square().sum(-1)  # |d|^2 - |d_0|^2
+        now = (squared + grown).clamp_min(1e-6 * squared).sqrt()
+        shrink = grown / (now * (now + self.length))  # 1 - |d_0| / |d| without the difference of nearly equal numbers
         beyond = shrink[..., None] * change + (shrink - along / squared)[..., None] * self.offset
         beyond = self.stiffness[:, None] * beyond
         return -(beyond.flatten(-2) @ self.modes)
@@ -194,7 +194,8 @@ class ElasticScene(nn.Module):
         identity = torch.eye(len(self.values), dtype=self.values.dtype, device=self.values.device)
         log_stiffness = self.initial_log_stiffness + SPECTRUM_GAIN * (self.stiffness + self.spectrum)
         root = (0.5 * log_stiffness).exp() * self.values.sqrt()
-        factor = root[:, None] * (identity + MIXING_GAIN * self.mixing)
+        mixing = identity + MIXING_GAIN * self.mixing
+        factor = root[:, None] * mixing
         stiffness = factor @ factor.mT
         log_damping = INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping
         if self.damping_mixing is not None:
@@ -205,7 +206,7 @@ class ElasticScene(nn.Module):
         elif self._damping == "rayleigh":
             damping = log_damping[0].exp() * identity + log_damping[1].exp() * stiffness
         else:
-            factor = root.sqrt()[:, None] * (identity + MIXING_GAIN * self.mixing)
+            factor = root.sqrt()[:, None] * mixing
             damping = 2 * log_damping.exp() * factor @ factor.mT
         inverse = torch.linalg.inv(identity + stiffness / 4 + damping / 2)
         return inverse @ (2 * identity - stiffness / 2), inverse @ (identity + stiffness / 4 - damping / 2), inverse

@@ -11,14 +11,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from gausim.report.curves import TRUTH
+from gausim.report.figures import METHOD_COLORS, SEEN_SHADE, save_figure
 from gausim.report.runs import RunRecord
 from gausim.report.sheets import METHOD, NOTHING, REFERENCE, Entry, Line, Sheet
 from gausim.report.study import Study, deviation, number
 
 _DPI = 110
-_COLORS = ("#c2410c", "#1d4ed8", "#15803d", "#7e22ce", "#0e7490", "#a16207", "#be185d", "#4d7c0f")
 _GREYS = ("#777777", "#aaaaaa")
-_SEEN_SHADE = "#dde6ee"
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +173,7 @@ def diagnosis_plot(named: Sequence[tuple[str, Diagnosis, str]], *, title: str) -
     power, phase = figure.subplots(1, 2)
     first = named[0][1]
     power.semilogy(first.frequency, _positive(first.rows[TRUTH].spectrum), color="black", linewidth=1.6, label=TRUTH)
-    for color, (label, diagnosis, row) in zip(_COLORS * len(named), named, strict=False):
+    for color, (label, diagnosis, row) in zip(METHOD_COLORS * len(named), named, strict=False):
         motion = diagnosis.rows[row]
         power.semilogy(diagnosis.frequency, _positive(motion.spectrum), color=color, linewidth=1.4, label=label)
         phase.plot(motion.phase_error, color=color, linewidth=1.4)
@@ -182,7 +181,7 @@ def diagnosis_plot(named: Sequence[tuple[str, Diagnosis, str]], *, title: str) -
     for color, row in zip(_GREYS, [r for r in first.rows if r != TRUTH and r not in shown], strict=False):
         power.semilogy(first.frequency, _positive(first.rows[row].spectrum), ":", color=color, linewidth=1.1, label=row)
         phase.plot(first.rows[row].phase_error, ":", color=color, linewidth=1.1)
-    phase.axvspan(-0.5, first.first_unseen - 0.5, color=_SEEN_SHADE, linewidth=0, zorder=0)
+    phase.axvspan(-0.5, first.first_unseen - 0.5, color=SEEN_SHADE, linewidth=0, zorder=0)
     power.set(title="power of the motion", xlabel="frequency [Hz]", ylabel="squared displacement per Hz")
     phase.set(title="phase error [degrees]", xlabel="frame (shaded: seen)", ylim=(0, 130))
     phase.axhline(180 / np.sqrt(3), color="#999999", linewidth=0.8)
@@ -203,5 +202,5 @@ def diagnosis_figure(name: str, entry: Mapping[str, Any], path: Path) -> bool:
     methods = [m for m in entry.get("methods", []) if found is not None and m in found.rows]
     if found is None or not methods:
         return False
-    diagnosis_plot([(m, found, m) for m in methods], title=f"{name}: motion beside the truth").savefig(path)
+    save_figure(diagnosis_plot([(m, found, m) for m in methods], title=f"{name}: motion beside the truth"), path)
     return True

@@ -14,8 +14,8 @@ from gausim.report.curves import ERROR_3D, STATIC, ObjectCurves
 from gausim.report.frames import error_colors, moving_line, space_time_slice
 
 _DPI = 110
-_SEEN_SHADE = "#dde6ee"
-_METHOD_COLORS = ("#c2410c", "#1d4ed8", "#15803d", "#7e22ce")
+SEEN_SHADE = "#dde6ee"
+METHOD_COLORS = ("#c2410c", "#1d4ed8", "#15803d", "#7e22ce", "#0e7490", "#a16207", "#be185d", "#4d7c0f")
 _REFERENCE_COLORS = ("#555555", "#999999", "#bbbbbb")
 
 
@@ -37,7 +37,7 @@ def error_figure(curves: ObjectCurves, path: Path, *, sequence: str | None = Non
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=7)
     figure.suptitle(f"{facts.name}, {sequence or f'mean over {len(facts.sequences)} sequences'}", fontsize=10)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _error_panel(axes: Axes, curves: ObjectCurves, metric: str, group: str, sequence: str | None) -> None:
@@ -53,7 +53,7 @@ def _error_panel(axes: Axes, curves: ObjectCurves, metric: str, group: str, sequ
             warnings.simplefilter("ignore", RuntimeWarning)  # frames that no sequence has
             mean, std = np.nanmean(lines, 0), np.nanstd(lines, 0)
         is_method = row in curves.facts.methods
-        palette, place = (_METHOD_COLORS, curves.facts.methods) if is_method else (_REFERENCE_COLORS, references)
+        palette, place = (METHOD_COLORS, curves.facts.methods) if is_method else (_REFERENCE_COLORS, references)
         color = palette[list(place).index(row) % len(palette)]
         style = "-" if is_method else "--" if row == STATIC else ":"
         axes.plot(mean, style, color=color, label=row, linewidth=1.8 if is_method else 1.2)
@@ -73,7 +73,7 @@ def _lines(curves: ObjectCurves, row: str, metric: str, group: str, sequence: st
 
 
 def _shade_seen(axes: Axes, first_unseen: int) -> None:
-    axes.axvspan(-0.5, first_unseen - 0.5, color=_SEEN_SHADE, zorder=0, label="seen in training")
+    axes.axvspan(-0.5, first_unseen - 0.5, color=SEEN_SHADE, zorder=0, label="seen in training")
 
 
 def slice_figure(
@@ -101,7 +101,7 @@ def slice_figure(
         axes.set(ylabel=name, xlim=(-0.5, len(prediction) - 0.5), yticks=[])
     axes.set_xlabel("frame (foreseen right of the line)")
     figure.suptitle(f"{title}: {line[0]} {line[1]} over time", fontsize=10)
-    _save(figure, path)
+    save_figure(figure, path)
     return line
 
 
@@ -142,7 +142,7 @@ def contact_sheet(
         foreseen = frame >= first_unseen
         grid[0, column].set_title(str(frame), fontsize=8, color="#c2410c" if foreseen else "black")
     figure.suptitle(title, fontsize=10)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def picture_grid(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, *, title: str, columns: int) -> None:
@@ -156,9 +156,10 @@ def picture_grid(images: Sequence[np.ndarray], labels: Sequence[str], path: Path
         axes.imshow(image)
         axes.set_title(label, fontsize=8)
     figure.suptitle(title, fontsize=10)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
+    """Writes a figure and the folder it lies in."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)

@@ -20,15 +20,14 @@ from gausim.core import GausSimError
 from gausim.io.video import write_video
 from gausim.report.curves import ERROR_3D, POINT_ARRAYS, STATIC, ObjectCurves, load_curves
 from gausim.report.diagnosis import diagnosis_plot, read_diagnosis
-from gausim.report.figures import contact_frames
+from gausim.report.figures import METHOD_COLORS, SEEN_SHADE, contact_frames
 from gausim.report.frames import Timeline, brighten, label_bar, moving_line, space_time_slice, timeline_bar
 from gausim.report.pictures import Pictures, load_pictures
 from gausim.report.runs import RunRecord
 from gausim.report.study import Group, Study
 
 _DPI = 100
-_COLORS = ("#c2410c", "#1d4ed8", "#15803d", "#7e22ce", "#0e7490", "#a16207", "#be185d", "#4d7c0f")
-_SEEN_SHADE, _BORDER = "#dde6ee", "#f0962a"
+_BORDER = "#f0962a"
 TRUTH = "ground truth"
 # More predictions than these side by side are too small to see; the tables have them all.
 MOST_METHODS, MOST_VIEWS = 5, 3
@@ -128,11 +127,11 @@ def _error_curves(name: str, curves: Sequence[tuple[Group, list[ObjectCurves]]])
         panels.insert(0, (ERROR_3D, "points"))
     figure = Figure(figsize=(5.4 * len(panels), 3.9), dpi=_DPI, layout="constrained")
     for axes, (metric, views) in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
-        for color, (group, seeds) in zip(_COLORS * len(curves), curves, strict=False):
+        for color, (group, seeds) in zip(METHOD_COLORS * len(curves), curves, strict=False):
             _curve(axes, [(c, group.method) for c in seeds], metric, views, color, group.label)
         _curve(axes, [(first, STATIC)], metric, views, "#555555", STATIC)
         border = first.facts.first_unseen - 0.5
-        axes.axvspan(0, border, color=_SEEN_SHADE, linewidth=0, zorder=0)
+        axes.axvspan(0, border, color=SEEN_SHADE, linewidth=0, zorder=0)
         axes.axvline(border, color=_BORDER, linewidth=1.4)
         title = {"points": "3D error [% of diagonal]", "train": "l2 ×10⁻³, training cameras"}
         axes.set_title(title.get(views, "l2 ×10⁻³, cameras never trained on"), fontsize=9)

@@ -278,12 +278,6 @@ def _unary(name):
 
 
 @intrinsic
-def magnitude(typing, a):
-    """|a|, lane by lane."""
-    return _unary("fabs")
-
-
-@intrinsic
 def square_root(typing, a):
     """Square roots of numbers that are not negative."""
     return _unary("sqrt")
