@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import csv
+import json
 import runpy
 from pathlib import Path
 
 import pytest
 import torch
 
+from gausim.cli import evaluate
 from gausim.cli import train as command
 from gausim.cli._run import load_run
 from gausim.core import ConfigError, RunError
@@ -51,6 +53,26 @@ def test_a_run_leaves_everything_and_loads_again(arguments: list[str], capsys: p
     assert not loaded.module.training and loaded.objects[0].name == "toy"
     for name, value in loaded.module.state_dict().items():
         torch.testing.assert_close(value, weights(run)[name])
+
+
+def test_motion_is_watched_as_evaluation_measures_it_and_training_does_not_notice(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command.main([*arguments, "name=watched", "callbacks.motion.every_epochs=1"]) == 0
+    assert command.main([*arguments, "name=alone", "callbacks.motion=null"]) == 0
+    watched, alone = (Path(f"outputs/{name}/seed_0") for name in ("watched", "alone"))
+    rows = list(csv.DictReader((watched / "motion.csv").open()))
+    assert [(r["epoch"], r["object"]) for r in rows] == [("1", "toy"), ("2", "toy")]
+    assert not (alone / "motion.csv").exists()
+    for name, value in weights(alone).items():
+        assert torch.equal(value, weights(watched)[name]), name
+    assert evaluate.main([str(watched)]) == 0
+    capsys.readouterr()
+    found = json.loads((watched / "evaluation" / "metrics.json").read_text())["objects"]["toy"]
+    own, still = (found["rows"][row]["unseen"]["points"]["error_3d"]["mean"] for row in ("gausim", "static"))
+    assert float(rows[-1]["error_unseen"]) == pytest.approx(own / still, rel=1e-3)
+    row = found["diagnosis"]["rows"]["gausim"]
+    assert float(rows[-1]["error_level_1"]) == pytest.approx(row["level_errors"][0], rel=1e-3)
 
 
 def test_a_finished_run_is_refused_and_can_be_overwritten(arguments: list[str]) -> None:

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from gausim.engine.diagnosis import Diagnosis
+from gausim.metrics.level_error import level_error
 from gausim.report.curves import TRUTH
 from gausim.report.diagnosis import diagnosis_figure, diagnosis_plot, read_diagnosis
 
@@ -53,6 +54,32 @@ def test_what_differs_is_told_and_nothing_else() -> None:
     assert np.isnan(found.rows["still"].cosine) and np.isnan(found.phase("still", seen=True))
     peak = found.frequency[found.rows[TRUTH].spectrum.argmax()]
     assert peak == pytest.approx(2.0, abs=0.3)
+
+
+def test_errors_are_told_by_level() -> None:
+    truth, rest = motion(2.0, 0.05), REST
+    large, small = torch.arange(50) // 10, torch.arange(50) // 2
+    wobble = 0.05 * torch.tensor([1.0, -1.0]).repeat(25)[:, None] * torch.ones(3)
+    diagnosis = Diagnosis(FPS)
+    predicted = truth + wobble  # pairs stay where they are, their points do not
+    own = {"a": [torch.arange(50), small, large]}
+    diagnosis.add(truth, rest, {"a": predicted, "flat": truth}, own)
+    diagnosis.add(truth, rest, {"a": predicted, "flat": truth}, own)
+    row = diagnosis.summary()["rows"]["a"]
+    still = (truth - rest).norm(dim=-1).mean()
+    assert row["level_errors"][0] == pytest.approx(0.05 * math.sqrt(3) / float(still), rel=1e-4)
+    assert row["level_errors"][1] < 1e-5 and row["level_errors"][2] < 1e-5
+    assert "level_errors" not in diagnosis.summary()["rows"]["flat"]
+    found = read_diagnosis({"diagnosis": diagnosis.summary(), "splits": {"seen": [0, 16]}})
+    assert found is not None and found.rows["a"].small > 1e3 * found.rows["a"].large
+    assert np.isnan(found.rows["flat"].small)
+
+
+def test_level_errors_leave_out_points_of_no_unit() -> None:
+    truth, rest = torch.zeros(2, 4, 3), torch.zeros(4, 3)
+    truth[:, :, 0] = torch.tensor([1.0, 2.0, 3.0, 50.0])
+    error, still = level_error(rest.expand_as(truth), truth, rest, torch.tensor([7, 7, 2, -1]))
+    assert error.tolist() == pytest.approx([(1.5 + 3) / 2] * 2) and still.tolist() == error.tolist()
 
 
 def test_without_motion_there_is_nothing_to_say() -> None:

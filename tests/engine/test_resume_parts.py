@@ -13,6 +13,7 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 
 from gausim.engine.callbacks import EpochSummary, RunCheckpoint, TimeBudget
+from gausim.engine.epoch_table import EpochTable
 from gausim.engine.loggers import CsvLog, Resumable, TensorBoardLog
 from gausim.engine.module import GausSimModule
 from gausim.engine.randomness import random_state, restore_random_state
@@ -24,6 +25,19 @@ MODULE = LightningModule()
 def draws() -> list[float]:
     own = [random.random(), random.gauss(0, 1), float(np.random.rand()), float(np.random.randn())]
     return [*own, *torch.rand(2).tolist(), float(torch.randn(()))]
+
+
+def test_rows_of_epochs_done_again_and_torn_ones_are_dropped(tmp_path: Path) -> None:
+    table = EpochTable(tmp_path / "rows.csv", ("epoch", "object", "value"))
+    for epoch in (10, 10, 20, 30):
+        table.append({"epoch": epoch, "object": "a", "value": 1 / 3, "unknown": 5})
+    with (tmp_path / "rows.csv").open("a") as file:
+        file.write("4x,")
+    table.resume_at(20)
+    table.append({"epoch": 30, "object": "b"})
+    assert (tmp_path / "rows.csv").read_text().splitlines() == [
+        "epoch,object,value", "10,a,0.33333", "10,a,0.33333", "20,a,0.33333", "30,b,",
+    ]  # fmt: skip
 
 
 def test_random_generators_go_on_where_they_were(tmp_path: Path) -> None:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 from gausim.core.errors import DataError
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from gausim.cli._run import LoadedRun
     from gausim.core import Dynamics, GaussianScene, Trajectory
     from gausim.data.objects import ObjectData
@@ -100,6 +102,14 @@ class TrainedPrediction:
         counts = [level.count for level in hierarchy.levels]
         predictions = hierarchy.predictions(predicted)
         return {"counts": counts, "predicted": predicted, "predictions": predictions, "kernels": counts[0]}
+
+    @property
+    def units(self) -> tuple[Tensor, ...]:
+        """The unit of every kernel at each level, the small ones first; nothing for a model without a hierarchy."""
+        from gausim.engine.contracts import Hierarchical
+
+        model = self._run.module.model
+        return tuple(model.units_of_kernels(self._item.scene_id)) if isinstance(model, Hierarchical) else ()
 
     def full(self, record: SequenceRecord) -> Trajectory:
         """All predicted frames of a sequence, the recorded ones and those asked for beyond."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 import sys
 import time
@@ -15,7 +13,7 @@ from lightning.pytorch.callbacks import Checkpoint, RichProgressBar
 
 from gausim.core import ConfigError
 from gausim.engine.checkpoint import LAST_CHECKPOINT, digest
-from gausim.engine.files import write_durably
+from gausim.engine.epoch_table import EpochTable, short
 from gausim.engine.loggers import Resumable
 from gausim.engine.module import GausSimModule
 from gausim.engine.randomness import random_state, restore_random_state
@@ -144,11 +142,8 @@ class EpochSummary(Callback):
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Drops rows of epochs that a resumed run does again, and goes on with the clock of a cut epoch."""
         self._began = time.monotonic() - self._elapsed
-        path = Path(trainer.default_root_dir) / EPOCHS
-        if trainer.is_global_zero and path.is_file():
-            with path.open(newline="") as file:
-                rows = list(csv.DictReader(file))[: trainer.current_epoch]  # the last may be torn, but is not of these
-            write_durably(path, self._text(rows, header=True).encode())
+        if trainer.is_global_zero:
+            self._table(trainer).resume_at(trainer.current_epoch)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Writes the row and prints the line.
@@ -160,12 +155,7 @@ class EpochSummary(Callback):
         means.update(epoch=trainer.current_epoch + 1, step=trainer.global_step, seconds=time.monotonic() - self._began)
         if not trainer.is_global_zero:
             return
-        path = Path(trainer.default_root_dir) / EPOCHS
-        path.parent.mkdir(parents=True, exist_ok=True)
-        row = {name: _short(means[name]) if name in means else "" for name in self.COLUMNS}
-        text = self._text([row], header=not path.is_file())
-        with path.open("a", newline="") as file:
-            file.write(text)
+        self._table(trainer).append(means)
         if self._console:
             pl_module.print(self._line(trainer, means))
             sys.stdout.flush()  # where output is piped, the epochs of a long run should show as they end
@@ -189,13 +179,8 @@ class EpochSummary(Callback):
             parts.append(f"exploded {means['exploded']:.0%}")
         return "  ".join([*parts, f"{means['seconds']:.1f} s"])
 
-    def _text(self, rows: list[dict[str, Any]], *, header: bool) -> str:
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, self.COLUMNS, extrasaction="ignore")
-        if header:
-            writer.writeheader()
-        writer.writerows(rows)
-        return text.getvalue()
+    def _table(self, trainer: Trainer) -> EpochTable:
+        return EpochTable(Path(trainer.default_root_dir) / EPOCHS, self.COLUMNS)
 
 
 class TimeBudget(Callback):
@@ -268,8 +253,4 @@ class Progress(RichProgressBar):
         """T, the loss against the static prediction's, and the motion energy."""
         stats = getattr(pl_module, "last_stats", {})
         names = {"steps": "T", "excess_static": "of static", "motion_energy": "motion"}
-        return {label: _short(stats[name]) for name, label in names.items() if name in stats}
-
-
-def _short(value: Any) -> Any:
-    return float(f"{value:.5g}") if isinstance(value, float) else value
+        return {label: short(stats[name]) for name, label in names.items() if name in stats}

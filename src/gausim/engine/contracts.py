@@ -101,6 +101,15 @@ class Simulator(Protocol):
 
 
 @runtime_checkable
+class Hierarchical(Protocol):
+    """A simulator whose kernels belong to units of several levels."""
+
+    def units_of_kernels(self, scene_id: int) -> Sequence[Tensor]:
+        """(K,) the unit of every kernel of the scene at each level above the kernels; -1 for those never simulated."""
+        ...
+
+
+@runtime_checkable
 class InitialVelocities(Protocol):
     """The frame before the first of every training sequence; a torch module with one parameter per sequence."""
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gausim.metrics.level_error import level_error
 from gausim.metrics.oscillation import (
     coordinates,
     oscillation,
@@ -34,9 +35,27 @@ class Diagnosis:
         self._fps = fps
         self._truth: list[NDArray] = []
         self._predicted: dict[str, list[NDArray]] = {}
+        self._levels: dict[str, NDArray] = {}
 
-    def add(self, truth: Tensor, rest: Tensor, predictions: Mapping[str, Tensor]) -> None:
-        """Takes one sequence: true positions (F, P, 3), at rest (P, 3), and as every row predicts them."""
+    def add(
+        self,
+        truth: Tensor,
+        rest: Tensor,
+        predictions: Mapping[str, Tensor],
+        units: Mapping[str, Sequence[Tensor]] | None = None,
+    ) -> None:
+        """Takes one sequence.
+
+        Args:
+            truth: true positions (F, P, 3).
+            rest: at rest (P, 3).
+            predictions: positions as every row predicts them.
+            units: of the rows with a hierarchy: the unit of each point, level by level, the small ones first.
+        """
+        for name, levels in (units or {}).items():
+            pairs = [level_error(predictions[name].to(truth), truth, rest, unit) for unit in levels]
+            sums = np.array([[float(error.sum()), float(still.sum())] for error, still in pairs])
+            self._levels[name] = self._levels.get(name, 0.0) + sums
         every = -(-truth.shape[1] // POINTS)
         self._truth.append(_thin(truth - rest, every))
         for name, points in predictions.items():
@@ -63,6 +82,8 @@ class Diagnosis:
                 row["velocity_cosine"] = _mean(
                     [velocity_cosine(p, t) for p, t in zip(motions, self._truth, strict=True)]
                 )
+            if name in self._levels:
+                row["level_errors"] = [_finite(own / still if still else math.nan) for own, still in self._levels[name]]
             found["frequency"] = frequency.tolist()
             found["rows"][name] = row
         return found

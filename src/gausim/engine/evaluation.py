@@ -57,7 +57,8 @@ from gausim.report.summary import write_summary
 from gausim.report.tables import markdown
 
 # Predicts every frame of a sequence (count frames, frame 0 first) for all kernels of the scene. One that carries an
-# attribute ``levels`` (plain data: counts, predicted, predictions, kernels) has it stored in the summary.
+# attribute ``levels`` (plain data: counts, predicted, predictions, kernels) has it stored in the summary; one that
+# carries ``units`` (the unit of every kernel, level by level) has its error told by level.
 Predict = Callable[[SequenceRecord], Trajectory]
 Rows = dict[str, dict[str, np.ndarray]]
 
@@ -211,7 +212,8 @@ class _ObjectMeasure:
         rows = self._images(record, trajectories, pictures)
         truth = self.data.ground_truth(record)
         if truth is not None:
-            self._points(rows, trajectories, references, truth)
+            units = {name: found for name, predict in methods.items() if (found := getattr(predict, "units", None))}
+            self._points(rows, trajectories, references, truth, units)
         return rows
 
     def _checked(self, name: str, record: SequenceRecord, trajectory: Trajectory) -> Trajectory:
@@ -277,6 +279,7 @@ class _ObjectMeasure:
         trajectories: Mapping[str, Trajectory],
         references: Mapping[str, LinearAR2],
         truth: GroundTruth,
+        units: Mapping[str, Sequence[Tensor]],
     ) -> None:
         """Adds 3D errors and energies to the rows."""
         assert self.attached is not None
@@ -290,7 +293,8 @@ class _ObjectMeasure:
         for name, linear in references.items():
             predicted[name] = truth.rest + linear.rollout(displacement[:2], frames - 1)
         moving = {name: points for name, points in predicted.items() if name != STATIC}
-        self._diagnosis.add(truth.positions, truth.rest, moving)
+        parts = {name: [unit[self.attached] for unit in levels] for name, levels in units.items()}
+        self._diagnosis.add(truth.positions, truth.rest, moving, parts)
         spread = truth.rest.amax(0) - truth.rest.amin(0)
         diagonal = self.data.diagonal or float(spread.norm())
         for name, points in {**predicted, TRUTH: truth.positions}.items():

@@ -29,6 +29,7 @@ from gausim.engine.launch import Crew
 from gausim.engine.layout import RanksStrategy
 from gausim.engine.memory import keep_freed_memory
 from gausim.engine.mlflow_log import MLFLOW_ID
+from gausim.engine.motion_watch import MOTION
 from gausim.engine.wandb_log import WANDB_ID
 
 CONFIG, FINISHED, FAILED, LOCK = "config.yaml", "FINISHED", "FAILED", ".lock"
@@ -61,6 +62,7 @@ OWN_FILES = (
     PREVIOUS_CHECKPOINT,
     DAMAGED_CHECKPOINT,
     EPOCHS,
+    MOTION,
     WANDB_ID,
     MLFLOW_ID,
 )

@@ -26,6 +26,7 @@ from torch import Tensor, nn
 from gausim.core import ConfigError
 from gausim.models.batch import SceneBatch
 from gausim.models.hierarchy import Hierarchy
+from gausim.models.solid import solid_modes
 from gausim.models.template import Motion, Template, TemplateState
 from gausim.nn.mlp import mlp, zero_output
 from gausim.ops.deformation import bounded_deformation
@@ -101,6 +102,14 @@ def mode_gradients(rest: np.ndarray, modes: np.ndarray, neighbours: int) -> np.n
     return np.einsum("nk,nkim,nka,nab->nibm", weight, difference, offset, np.linalg.inv(moment), optimize=True)
 
 
+def projection(modes: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """What takes displacements u of the units to the coordinates of the nearest Phi z under their mass, (N, 3, M)."""
+    weighted = modes * mass[:, None, None]
+    flat = weighted.reshape(-1, modes.shape[-1])
+    gram = flat.T @ modes.reshape(flat.shape)
+    return (flat @ np.linalg.pinv(gram, rcond=1e-6, hermitian=True)).reshape(modes.shape)
+
+
 class Springs(nn.Module):
     """The network's springs as they turn and stretch by more than a little, in modal coordinates.
 
@@ -162,6 +171,7 @@ class ElasticScene(nn.Module):
         amplitude: float,
         damping: str,
         geometric: float | None,
+        solid: float | None,
     ) -> None:
         """``period`` of the lowest mode [frames] and ``amplitude`` [diagonals] only set the start."""
         super().__init__()
@@ -169,12 +179,21 @@ class ElasticScene(nn.Module):
         rest = level.rest.double().numpy()
         mass = level.volume.double().numpy()
         mass = mass / mass.mean()
-        values, phi = vibration_modes(rest, mass, level.pinned.numpy(), modes=modes, neighbours=neighbours)
+        pinned = level.pinned.numpy()
+        if solid is None:
+            values, phi = vibration_modes(rest, mass, pinned, modes=modes, neighbours=neighbours)
+            slopes = mode_gradients(rest, phi, neighbours)
+        else:
+            finer = hierarchy.levels[0]
+            kernels, spacing = finer.rest.double().numpy(), solid * hierarchy.diagonal
+            values, phi, slopes = solid_modes(
+                kernels, finer.pinned.numpy(), rest, mass, pinned, modes=modes, spacing=spacing
+            )
         count = phi.shape[-1]
         self.register_buffer("values", torch.from_numpy(values).float())
         self.register_buffer("modes", torch.from_numpy(phi).float())
-        self.register_buffer("projection", torch.from_numpy(phi * mass[:, None, None]).float())
-        self.register_buffer("gradients", torch.from_numpy(mode_gradients(rest, phi, neighbours)).float())
+        self.register_buffer("projection", torch.from_numpy(projection(phi, mass)).float())
+        self.register_buffer("gradients", torch.from_numpy(slopes).float())
         self.scale = amplitude * hierarchy.diagonal * math.sqrt(len(rest) / count)
         self.initial_log_stiffness = 2 * math.log(2 * math.pi / period)
         self.stiffness = nn.Parameter(torch.zeros(()))
@@ -296,6 +315,7 @@ class ElasticTemplate(Template):
         amplitude: float = 0.02,
         damping: str = "full",
         geometric: float | None = None,
+        solid: float | None = None,
         conserve_volume: bool = True,
     ) -> None:
         """See the module's text.
@@ -311,6 +331,8 @@ class ElasticTemplate(Template):
             damping: ``full``, a trained matrix; ``modal``, a number per mode; ``rayleigh``, a uniform and a part in
                 proportion to K, two numbers; ``structural``, the same share of critical for all modes, one number.
             geometric: how much of the springs' nonlinear force there is at the start, trained; None leaves it out.
+            solid: take the modes of the solid body around the kernels on a grid of this spacing [diagonals]; None takes
+                those of the springs between units.
             conserve_volume: scale the template's gradients to determinant 1 (METHOD's mass conservation).
         """
         super().__init__()
@@ -328,6 +350,7 @@ class ElasticTemplate(Template):
                 amplitude=amplitude,
                 damping=damping,
                 geometric=geometric,
+                solid=solid,
             )
             for h in hierarchies
         )

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gausim.core import ConfigError, Forces, GaussianScene, SimState, Trajectory
@@ -193,6 +193,13 @@ class GausSim(nn.Module):
         if key not in self._batches:
             self._batches[key] = self._builder.build(key[0], device)
         return self._batches[key]
+
+    def units_of_kernels(self, scene_id: int) -> tuple[Int[Tensor, " K"], ...]:
+        """The unit of every kernel of the scene at levels 1..L; -1 for kernels that are never simulated."""
+        hierarchy, count = self.hierarchies[scene_id], self.scenes[scene_id].count
+        none = torch.full((count,), -1)
+        levels = range(1, len(hierarchy.levels))
+        return tuple(none.index_copy(0, hierarchy.kernels, hierarchy.ancestor(0, level)) for level in levels)
 
     def masses(self, batch: SceneBatch) -> tuple[Float[Tensor, " M"], Float[Tensor, " M"]]:
         """Masses m = exp(r) V of the simulated kernels, and r."""

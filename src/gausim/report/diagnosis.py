@@ -30,6 +30,8 @@ class Motion:
         dampings: share of critical; NaN where it does not oscillate.
         phase_error: per frame [degrees]; empty for the truth.
         cosine: of the first velocity to the true one; NaN for the truth.
+        levels: error over the static prediction's of the units of each level, the small ones first; empty where there
+            is no hierarchy.
     """
 
     spectrum: np.ndarray
@@ -37,6 +39,17 @@ class Motion:
     dampings: np.ndarray
     phase_error: np.ndarray
     cosine: float
+    levels: np.ndarray
+
+    @property
+    def small(self) -> float:
+        """Error of the smallest units; NaN without a hierarchy."""
+        return float(self.levels[0]) if len(self.levels) else float("nan")
+
+    @property
+    def large(self) -> float:
+        """Error of the largest units; NaN without a hierarchy."""
+        return float(self.levels[-1]) if len(self.levels) else float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +111,8 @@ def _motion(row: Mapping[str, Any], motions: int, bins: int) -> Motion | None:
         return None
     cosine = number(row.get("velocity_cosine"))
     phase = _numbers(row.get("phase_error"))
-    return Motion(power, frequencies, dampings, phase, float("nan") if cosine is None else cosine)
+    levels = _numbers(row.get("level_errors"))
+    return Motion(power, frequencies, dampings, phase, float("nan") if cosine is None else cosine, levels)
 
 
 def _numbers(values: Any) -> np.ndarray:
@@ -134,12 +148,15 @@ def diagnosis_sheets(study: Study) -> list[Sheet]:
 
 _HEADS = (
     "first velocity, cosine", "frequency error", "damping / true", "phase error, seen", "phase error, unseen",
+    "error, large parts", "error, small parts",
 )  # fmt: skip
 _CAPTION = (
     "In the principal motions of the true points, weighted by their share of the squared displacement. Frequency and "
     "damping: of the oscillation z(t+1) = a z(t) + b z(t-1) that fits all frames best. Phase: root mean square over "
     "motions of the analytic signals' difference; unrelated motions have 104 degrees. A damping ratio above 1 with "
-    "small phase errors tells a motion that dies away in step; below 1 with large ones, a motion out of step."
+    "small phase errors tells a motion that dies away in step; below 1 with large ones, a motion out of step. "
+    "Parts: units of the coarsest and the finest level of the hierarchy, their centres' error over that of rest, in "
+    "all frames."
 )
 
 
@@ -151,6 +168,8 @@ def _entries(found: Sequence[tuple[RunRecord, Diagnosis]], row: str) -> tuple[En
         ([d.damping_ratio(row) for _, d in found], "{:.2f}", 1.0),
         ([d.phase(row, seen=True) for _, d in found], "{:.0f}°", 1.0),
         ([d.phase(row, seen=False) for _, d in found], "{:.0f}°", 1.0),
+        ([d.rows[row].large for _, d in found], "{:.2f}", 1.0),
+        ([d.rows[row].small for _, d in found], "{:.2f}", 1.0),
     )
     entries = []
     for values, form, scale in columns:

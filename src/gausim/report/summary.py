@@ -18,7 +18,8 @@
         "sources": {"root", "scene": {"file", "sha256"}, "masks": {...}, "manifest": {...}},
         "absent": {KEY: why},                         metrics that could not be computed
         "diagnosis": {"share": [...], "frequency": [Hz, ...], "rows": {ROW: {"spectrum", "frequencies": [Hz, ...],
-            "dampings": [...], "phase_error": [degrees, ...], "velocity_cosine": x}}}    where the true motion is known
+            "dampings": [...], "phase_error": [degrees, ...], "velocity_cosine": x,
+            "level_errors": [x, ...]}}}                where the true motion is known
      }}}
 
 A CELL is ``{"mean", "std", "ratio"}``: mean and standard deviation over sequences (of the mean over frames and views
@@ -27,8 +28,9 @@ of splits are exclusive. The cell of ``motion_energy`` has besides ``"pooled"``:
 all sequences, which no single sequence at rest can spoil; its mean and std are over the sequences' own ratios and its
 ratio is null. Undefined numbers are null. ``diagnosis`` looks at the motion in the principal motions of the truth:
 ``share`` of the squared displacement, ``frequencies`` and ``dampings`` (of critical) of each; power per ``frequency``
-over all of them; ``phase_error`` per frame; the truth is a row. ``provenance``, ``efficiency``, ``sources``,
-``absent`` and ``diagnosis`` are not in files of earlier versions.
+over all of them; ``phase_error`` per frame; ``level_errors`` over static's, of the units' centres at each level of a
+hierarchy, the small ones first; the truth is a row. ``provenance``, ``efficiency``, ``sources``, ``absent`` and
+``diagnosis`` are not in files of earlier versions.
 """
 
 from __future__ import annotations

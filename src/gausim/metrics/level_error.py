@@ -1,0 +1,35 @@
+"""Error of a prediction by level of a hierarchy: how well the big parts move, and how well the small ones."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+
+def level_error(
+    prediction: Float[Tensor, "F P 3"],
+    target: Float[Tensor, "F P 3"],
+    rest: Float[Tensor, "P 3"],
+    unit: Int[Tensor, " P"],
+) -> tuple[Float[Tensor, " F"], Float[Tensor, " F"]]:
+    """Mean over units of the distance between the mean of their points and of where these truly are.
+
+    Args:
+        prediction: predicted positions [scene units].
+        target: true positions.
+        rest: positions at rest.
+        unit: the unit of each point at the level; points with -1 count for none.
+
+    Returns:
+        The error of every frame, and that of the rest state.
+    """
+    known = unit >= 0
+    _, index = unit[known].unique(return_inverse=True)
+    count = torch.bincount(index).to(target)[None, :, None]
+
+    def size(difference: Tensor) -> Tensor:
+        total = difference.new_zeros(len(difference), count.shape[1], 3).index_add(1, index, difference[:, known])
+        return (total / count).norm(dim=-1).mean(-1)
+
+    return size(prediction - target), size(rest - target)

@@ -1,0 +1,201 @@
+"""Vibration modes of the body that the kernels bound: linear elasticity on a regular grid around them.
+
+Kernels sit on what cameras see, the surface; what moves is solid. The finite cell method (Parvizian, Duester and Rank
+2007) needs no mesh of it: displacements are quadratic B-splines on a coarse grid, and elastic energy and mass are
+integrated over small cells, those inside the body in full and those just around it at a thousandth or so, which keeps
+the equations well posed. Modes found so are smooth across gaps between kernels and in places that no texture shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+from scipy import ndimage
+from scipy.linalg import eigh
+from scipy.sparse.linalg import eigsh
+
+# Stiffness and density of the cells around the body, as a share of those inside.
+OUTSIDE = 0.01
+# Integration cells per grid spacing.
+SUBDIVISIONS = 2
+# Bodies of rubber and of plant tissue hardly change their volume; 0.3 keeps quadratic splines from locking.
+POISSON = 0.3
+# Pinned kernels are held by springs this much stiffer than a grid cell.
+PIN_STIFFNESS = 1e3
+# Mass is the units'; the inside gets this share of it only to keep the equations well posed. Much more of it would
+# bring modes that the units do not show, and the state of the simulator is what they show.
+INNER_MASS = 1e-3
+# Nodes at the rim with a stiffness below this share of the largest are left out: rounding would move them.
+NO_SUPPORT = 1e-9
+# Grid points within the support of a quadratic B-spline, along one axis.
+SUPPORT = 3
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A regular grid of quadratic B-splines.
+
+    Attributes:
+        origin: of the first node's cell [scene units].
+        spacing: between nodes [scene units].
+        shape: nodes along each axis.
+    """
+
+    origin: np.ndarray
+    spacing: float
+    shape: tuple[int, int, int]
+
+    @property
+    def size(self) -> int:
+        """Number of nodes."""
+        return int(np.prod(self.shape))
+
+    def splines(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nodes (P, 27), weights (P, 27) and gradients (P, 27, 3) [1 / scene units] at points (P, 3)."""
+        place = (points - self.origin) / self.spacing
+        first = np.floor(place - 0.5).astype(np.int64)
+        x = place - first
+        weight = np.stack((0.5 * (1.5 - x) ** 2, 0.75 - (x - 1) ** 2, 0.5 * (x - 0.5) ** 2), -1)
+        slope = np.stack((x - 1.5, 2 - 2 * x, x - 0.5), -1) / self.spacing
+        steps = np.stack(np.meshgrid(*[np.arange(SUPPORT)] * 3, indexing="ij"), -1).reshape(-1, 3)
+        nodes = np.ravel_multi_index(tuple(np.moveaxis(first[:, None] + steps, -1, 0)), self.shape)
+        axes = np.arange(3)
+        factors = weight[:, axes, steps]  # (P, 27, 3)
+        slopes = slope[:, axes, steps]
+        gradients = np.stack([slopes[..., a] * np.delete(factors, a, -1).prod(-1) for a in range(3)], -1)
+        return nodes, factors.prod(-1), gradients
+
+
+def matrix(nodes: np.ndarray, values: np.ndarray, size: int) -> sp.csr_matrix:
+    """Sparse (P, size) matrix with ``values`` (P, 27) at ``nodes`` (P, 27)."""
+    rows = np.repeat(np.arange(len(nodes)), nodes.shape[1])
+    return sp.csr_matrix((values.ravel(), (rows, nodes.ravel())), shape=(len(nodes), size))
+
+
+def inside(occupied: np.ndarray) -> np.ndarray:
+    """Cells of the body: those with kernels and those that kernels enclose along at least two axes."""
+    margin = 2
+    padded = np.pad(occupied, margin)
+    closed = ndimage.binary_closing(padded, iterations=margin)[(slice(margin, -margin),) * 3] | occupied
+    enclosed = np.zeros(occupied.shape, dtype=np.int64)
+    for axis in range(3):
+        before = np.maximum.accumulate(closed, axis=axis)
+        after = np.flip(np.maximum.accumulate(np.flip(closed, axis), axis=axis), axis)
+        enclosed += before & after
+    return occupied | ndimage.binary_fill_holes(closed) | (enclosed >= 2)
+
+
+def cells(points: np.ndarray, spacing: float) -> tuple[Grid, np.ndarray, np.ndarray]:
+    """The grid around kernels (K, 3), centres (Q, 3) and weights (Q,) of the integration cells."""
+    border = 3
+    origin = points.min(0) - border * spacing
+    extent = points.max(0) - origin
+    shape = np.ceil(extent / spacing).astype(np.int64) + border + 1
+    grid = Grid(origin, spacing, (int(shape[0]), int(shape[1]), int(shape[2])))
+    small = spacing / SUBDIVISIONS
+    occupied = np.zeros(np.ceil(extent / small).astype(np.int64) + 2 * SUBDIVISIONS, dtype=bool)
+    occupied[tuple(np.floor((points - origin) / small).astype(np.int64).T)] = True
+    occupied = inside(occupied)
+    near = ndimage.binary_dilation(occupied, iterations=SUBDIVISIONS)
+    centres = (np.argwhere(near) + 0.5) * small + origin
+    return grid, centres, np.where(occupied[near], 1.0, OUTSIDE) * small**3
+
+
+def stiffness(grid: Grid, centres: np.ndarray, weights: np.ndarray) -> list[list[sp.spmatrix]]:
+    """Blocks [a][b] of linear isotropic elasticity with Young's modulus 1."""
+    nodes, _, gradients = grid.splines(centres)
+    slopes = [matrix(nodes, gradients[..., a], grid.size) for a in range(3)]
+    weight = sp.diags(weights)
+    first = POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
+    second = 1 / (2 * (1 + POISSON))
+    laplace = second * sum(s.T @ weight @ s for s in slopes)
+    return [
+        [
+            first * slopes[a].T @ weight @ slopes[b]
+            + second * slopes[b].T @ weight @ slopes[a]
+            + (laplace if a == b else 0 * laplace)
+            for b in range(3)
+        ]
+        for a in range(3)
+    ]
+
+
+def solid_modes(
+    kernels: np.ndarray,
+    held: np.ndarray,
+    rest: np.ndarray,
+    mass: np.ndarray,
+    pinned: np.ndarray,
+    *,
+    modes: int,
+    spacing: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lowest modes of the body around the kernels, at its units.
+
+    Args:
+        kernels: rest positions (K, 3) [scene units].
+        held: which kernels are pinned (K,).
+        rest: rest positions of the units (N, 3) [scene units].
+        mass: of the units (N,).
+        pinned: which units are (N,).
+        modes: how many are wanted; at most three per free unit are given.
+        spacing: of the grid [scene units].
+
+    Returns:
+        Eigenvalues (M,) relative to the first, modes (N, 3, M) of unit norm under the units' mass and zero at pinned
+        units, and their gradients (N, 3, 3, M) [1 / scene units].
+    """
+    grid, centres, weights = cells(kernels, spacing)
+    blocks = stiffness(grid, centres, weights)
+    if held.any():
+        nodes, values, _ = grid.splines(kernels[held])
+        hold = matrix(nodes, values, grid.size)
+        strength = PIN_STIFFNESS * weights.sum() / (held.sum() * spacing**2)
+        for a in range(3):
+            blocks[a][a] = blocks[a][a] + strength * (hold.T @ hold)
+    nodes, values, _ = grid.splines(rest[~pinned])
+    carry = matrix(nodes, values, grid.size)
+    nodes, values, _ = grid.splines(centres)
+    fill = matrix(nodes, values, grid.size)
+    inertia = carry.T @ sp.diags(mass[~pinned] / mass[~pinned].sum()) @ carry
+    inertia = inertia + INNER_MASS * (fill.T @ sp.diags(weights / weights.sum()) @ fill)
+    whole = sp.bmat(blocks).tocsr()
+    used = whole.diagonal() > NO_SUPPORT * whole.diagonal().max()
+    k = whole[used][:, used]
+    m = sp.block_diag([inertia] * 3).tocsr()[used][:, used]
+    count = min(modes, 3 * int((~pinned).sum()))
+    eigenvalues, vectors = lowest(k, m, count)
+    full = np.zeros((3 * grid.size, vectors.shape[1]))
+    full[used] = vectors
+    field = full.reshape(3, grid.size, -1)
+    nodes, values, gradients = grid.splines(rest)
+    at = field[:, nodes]  # (3, N, 27, M)
+    phi = np.einsum("nk,ankm->nam", values, at)
+    slope = np.einsum("nkb,ankm->nabm", gradients, at)
+    phi[pinned] = 0
+    slope[pinned] = 0
+    norm = np.sqrt(np.einsum("nam,n,nam->m", phi, mass, phi))
+    sign = np.sign(
+        np.take_along_axis(phi.reshape(-1, len(norm)), np.abs(phi).reshape(-1, len(norm)).argmax(0)[None], 0)
+    )
+    scale = sign[0] / norm
+    eigenvalues = np.maximum(eigenvalues, 1e-4 * eigenvalues[-1])
+    return eigenvalues / eigenvalues[0], phi * scale, slope * scale
+
+
+def lowest(k: sp.spmatrix, m: sp.spmatrix, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest eigenvalues (M,) and vectors (D, M) of k x = value m x."""
+    size = k.shape[0]
+    count = min(count, size)
+    # The mass may be singular, the stiffness with a little of it is not: 1 / (value + shift) are the largest values of
+    # the inverse problem.
+    shift = 1e-6 * k.diagonal().mean() / m.diagonal().mean()
+    if size <= max(300, 3 * count):
+        inverse, vectors = eigh(m.toarray(), (k + shift * m).toarray())
+        inverse, vectors = inverse[::-1][:count], vectors[:, ::-1][:, :count]
+        return 1 / inverse - shift, vectors
+    values, vectors = eigsh(k.tocsc(), count, M=m.tocsc(), sigma=-shift, v0=np.ones(size))
+    order = np.argsort(values)
+    return values[order], vectors[:, order]
