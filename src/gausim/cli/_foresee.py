@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from gausim.core.errors import DataError
 
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from gausim.data.records import SequenceRecord
 
 METHOD = "gausim"
+# Random pushes of `gausim evaluate --endurance` go on for so many frames.
+PUSHED_FRAMES = 240
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,23 @@ class TrainedPrediction:
     def __call__(self, record: SequenceRecord) -> Trajectory:
         """Exactly the recorded frames of a sequence."""
         return head(self.full(record), record.count)
+
+
+def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
+    """How the first sequence of an object goes on for so many frames: free, and under random pushes from rest."""
+    from gausim.core import SimState
+    from gausim.engine.endurance import RandomPushes, endure
+
+    scene, model, states = scene_of(run, item), cast(Any, run.module.model), cast(Any, run.module.initial_states)
+    dynamics = model.dynamics(item.scene_id)
+    previous = states.previous(item.first_sequence).detach().to(scene.means)
+    free = scene.simulated & ~scene.pinned
+    pushes = RandomPushes(scene.means, dynamics.masses, free, scene.diagonal, item.data.fps, PUSHED_FRAMES)
+    still = SimState(scene.means, scene.means)
+    return {
+        "free": endure(dynamics, SimState(scene.means, previous), scene.means, scene.diagonal, frames),
+        "pushed": endure(dynamics, still, scene.means, scene.diagonal, frames, pushes=pushes),
+    }
 
 
 def head(trajectory: Trajectory, frames: int) -> Trajectory:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from gausim.cli._run import LoadedRun
@@ -29,6 +32,8 @@ def main(argv: list[str]) -> int:
         DataError: an object or sequence that is not there, or broken data.
     """
     arguments = _parser().parse_args(argv)
+    if arguments.endurance is not None and arguments.endurance < 300:
+        raise ConfigError(f"--endurance: expected at least 300 frames, got {arguments.endurance}.")
     from gausim.cli._foresee import state_of
     from gausim.cli._run import load_run
     from gausim.engine.evaluation import write_evaluation
@@ -45,6 +50,8 @@ def main(argv: list[str]) -> int:
         error_figure(curves, folder / f"errors_{curves.facts.name}.png")
         entry, motion = summary["objects"][curves.facts.name], folder / f"motion_{curves.facts.name}.png"
         drawn += [motion.name] if diagnosis_figure(curves.facts.name, entry, motion) else []
+    if arguments.endurance is not None:
+        drawn += _endure(run, arguments, folder)
     if arguments.json:
         print((folder / "metrics.json").read_text(), end="")
         return 0
@@ -72,6 +79,11 @@ def _parser() -> argparse.ArgumentParser:
     add("--sequences", nargs="+", metavar="NAME", help="only these sequences (of every object)")
     add("--views", default="all", choices=("all", "train", "heldout"), help="which cameras (default: all)")
     add("--out", metavar="DIR", help="folder to write; default RUN/evaluation, or RUN/evaluation/partial for a part")
+    add(
+        "--endurance", type=int, metavar="N",
+        help="also roll N frames far, free and under random pushes in the first 240 (at least 300; 1000 is a good "
+        "number); writes endurance.json and a figure per object",
+    )  # fmt: skip
     add("--json", action="store_true", help="print metrics.json instead of tables")
     return parser
 
@@ -98,6 +110,21 @@ def _evaluate(run: LoadedRun, arguments: argparse.Namespace) -> list[ObjectCurve
                 )
             )
     return results
+
+
+def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list[str]:
+    """Writes what long rollouts of each object's first sequence tell; returns the names of the files."""
+    from gausim.cli._foresee import endurance, run_objects
+    from gausim.report.endurance import endurance_figure
+
+    found = {item.data.name: endurance(run, item, arguments.endurance) for item in run_objects(run, arguments.object)}
+    (folder / "endurance.json").write_text(json.dumps(found, indent=1) + "\n")
+    for name, rollouts in found.items():
+        endurance_figure(name, rollouts, folder / f"endurance_{name}.png")
+        for kind, told in rollouts.items():
+            growth, late = told["growth"], told["late"]
+            print(f"{name}, {kind}: highest energy later over before {growth:.3f}, of the last tenth {late:.2g}")
+    return ["endurance.json", *(f"endurance_{name}.png" for name in found)]
 
 
 def _views(data: ObjectData, group: str) -> list[str]:

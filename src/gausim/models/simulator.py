@@ -321,6 +321,14 @@ class SceneDynamics:
         """Binds ``model`` to its scene number ``scene_id``."""
         self.model, self.scene_id = model, scene_id
 
+    @property
+    @torch.no_grad()
+    def masses(self) -> Float[Tensor, " K"]:
+        """Mass of every kernel of the scene, up to a common factor; 0 for those never simulated."""
+        scene, hierarchy = self.model.scenes[self.scene_id], self.model.hierarchies[self.scene_id]
+        own, _ = self.model.masses(self.model.batch((self.scene_id,)))
+        return own.new_zeros(scene.count).index_copy(0, hierarchy.kernels.to(own.device), own)
+
     @torch.no_grad()
     def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
         """Predicts ``steps`` frames; frame 0 is the initial state with identity gradients (METHOD: the rest state).

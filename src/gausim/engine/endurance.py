@@ -1,0 +1,104 @@
+"""Does a simulator stay sane far beyond what it learned: long free motion, and motion under random pushes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gausim.core import Dynamics, SimState
+from gausim.metrics.motion_energy import motion_energy
+
+# Frames that one figure is the mean of.
+WINDOW = 20
+# A push: frames between beginnings, its length in frames, its reach and the shift that it adds per frame [diagonals].
+PUSH_EVERY, PUSH_FRAMES, PUSH_REACH, PUSH_SHIFT = 24, 3, 0.15, 0.002
+
+
+@dataclass(frozen=True, eq=False)
+class RandomPushes:
+    """Pushes at random places in random directions, the same for the same seed.
+
+    Attributes:
+        rest: rest positions [scene units].
+        mass: of the kernels.
+        free: which of them can be pushed.
+        diagonal: of the scene [scene units].
+        fps: frames per second.
+        frames: pushes begin before this frame.
+        seed: of places and directions.
+    """
+
+    rest: Float[Tensor, "K 3"]
+    mass: Float[Tensor, " K"]
+    free: Bool[Tensor, " K"]
+    diagonal: float
+    fps: float
+    frames: int
+    seed: int = 0
+
+    def __call__(self, step: int) -> Float[Tensor, "K 3"] | None:
+        """Force on every kernel [mass scene units / s^2]: one that shifts it by f dt^2 / (2 m) (METHOD section 6)."""
+        number, age = divmod(step, PUSH_EVERY)
+        if step >= self.frames or age >= PUSH_FRAMES:
+            return None
+        draws = torch.Generator().manual_seed(1_000_003 * self.seed + number)
+        places = self.free.nonzero()[:, 0]
+        centre = self.rest[places[int(torch.randint(len(places), (), generator=draws))]]
+        direction = torch.nn.functional.normalize(torch.randn(3, generator=draws), dim=0).to(self.rest)
+        distance = (self.rest - centre).norm(dim=-1) / (PUSH_REACH * self.diagonal)
+        shift = PUSH_SHIFT * self.diagonal * torch.exp(-0.5 * distance.square())
+        return (2 * self.fps**2 * self.mass * shift * self.free)[:, None] * direction
+
+
+def endure(
+    dynamics: Dynamics,
+    initial: SimState,
+    rest: Float[Tensor, "K 3"],
+    diagonal: float,
+    frames: int,
+    *,
+    pushes: RandomPushes | None = None,
+) -> dict[str, Any]:
+    """Rolls out far and tells how the motion goes on.
+
+    Args:
+        dynamics: of the scene.
+        initial: where it starts.
+        rest: rest positions [scene units].
+        diagonal: of the scene [scene units].
+        frames: to predict.
+        pushes: forces on the way; none when None.
+
+    Returns:
+        ``energy``: mean motion energy of every 20 frames [diagonals^2, summed over kernels]; ``away``: mean distance of
+        kernels from rest in them [diagonals]; ``peak``: where its highest energy lies [frames]; ``growth``: the highest
+        energy after the pushes have ended (after the first quarter without pushes) over the highest before; ``late``:
+        energy of the last tenth over the highest of all.
+
+    Raises:
+        DivergenceError: a position is not finite; the message names the frame.
+    """
+    positions = dynamics.rollout(initial, frames, forces=pushes).positions
+    energy = _windows(motion_energy(positions).cpu().double().numpy() / diagonal**2)
+    away = _windows((positions[1:] - rest).norm(dim=-1).mean(-1).cpu().double().numpy() / diagonal)
+    border = max(1, (frames // 4 if pushes is None else pushes.frames + PUSH_EVERY) // WINDOW)
+    late = energy[-max(1, len(energy) // 10) :].mean()
+    top = max(float(energy.max()), np.finfo(float).tiny)
+    return {
+        "window": WINDOW,
+        "energy": energy.tolist(),
+        "away": away.tolist(),
+        "peak": int(energy.argmax()) * WINDOW,
+        "growth": float(energy[border:].max(initial=0.0) / max(float(energy[:border].max()), np.finfo(float).tiny)),
+        "late": float(late / top),
+    }
+
+
+def _windows(values: np.ndarray) -> np.ndarray:
+    count = len(values) // WINDOW
+    return values[: count * WINDOW].reshape(count, WINDOW).mean(1)
