@@ -90,6 +90,7 @@ def elastic(make_scene, request) -> ElasticScene:
         "amplitude": 0.02,
         "damping": request.param,
         "geometric": None,
+        "solid": None,
     }
     scene = ElasticScene(hierarchy, 1, **own)
     return scene.double().requires_grad_(False)
@@ -155,10 +156,39 @@ def test_discrete_energy_never_grows_for_random_mixing(elastic: ElasticScene, se
         assert float(energy[-1]) == pytest.approx(float(energy[0]), rel=1e-6)
 
 
+def test_the_energy_of_a_state_is_kept_without_damping_and_lost_with_it(elastic: ElasticScene) -> None:
+    generator = torch.Generator().manual_seed(5)
+    for damped in (False, True):
+        _shake(elastic, generator)
+        if not damped:
+            _undamped(elastic)
+        before, now = (
+            torch.einsum("m,ndm->nd", z, elastic.modes)[None] for z in torch.randn(2, 9, generator=generator).double()
+        )
+        energies = []
+        for _ in range(50):
+            energies.append(float(elastic.energy(now, before)))
+            before, now = now, torch.einsum("sm,ndm->snd", elastic(now, before), elastic.modes)
+        if damped:
+            assert all(b <= a * (1 + 1e-5) for a, b in zip(energies, energies[1:], strict=False))
+            assert energies[-1] < 0.97 * energies[0]
+        else:
+            assert energies == pytest.approx([energies[0]] * 50, rel=2e-3)  # the modes are kept in single precision
+
+
 def test_single_precision_rollout_stays_bounded_for_2000_steps(make_scene) -> None:
     hierarchy = build_hierarchy(make_scene(90), radii=(0.2, 0.5))
     scene = ElasticScene(
-        hierarchy, 1, modes=9, neighbours=8, period=6.0, hidden=0, amplitude=0.02, damping="full", geometric=None
+        hierarchy,
+        1,
+        modes=9,
+        neighbours=8,
+        period=6.0,
+        hidden=0,
+        amplitude=0.02,
+        damping="full",
+        geometric=None,
+        solid=None,
     ).requires_grad_(False)
     generator = torch.Generator().manual_seed(7)
     _shake(scene.double(), generator)
@@ -235,7 +265,7 @@ def test_parameters_are_grouped_by_role(make_scene, make_model) -> None:
 
 def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_order(make_scene) -> None:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
-    own = {"modes": 9, "neighbours": 8, "period": 6.0, "hidden": 0, "amplitude": 0.02, "damping": "full"}
+    own = {"modes": 9, "neighbours": 8, "period": 6.0, "hidden": 0, "amplitude": 0.02, "damping": "full", "solid": None}
     scene = ElasticScene(hierarchy, 1, **own, geometric=1.0).double().requires_grad_(False)
     springs, level = scene.springs, hierarchy.levels[1]
     assert springs is not None
@@ -261,6 +291,8 @@ def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_or
         torch.testing.assert_close(
             springs(z.detach()[None])[0], expected, rtol=1e-3, atol=1e-4 * float(expected.norm())
         )
+        potential = springs.potential(z[None])[0]
+        torch.testing.assert_close(potential, energy(z) / lowest, rtol=1e-3, atol=1e-5 * float(potential.abs()))
         z = z.detach()
     pulls = [float(springs(s * z[None]).norm()) for s in (1e-3, 2e-3)]
     assert pulls[1] / pulls[0] == pytest.approx(4, rel=0.02) and not bool(springs(0 * z[None]).any())
@@ -275,7 +307,15 @@ def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_or
 
 def test_dampings_are_what_they_are_called(make_scene) -> None:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
-    own = {"modes": 9, "neighbours": 8, "period": 12.0, "hidden": 0, "amplitude": 0.02, "geometric": None}
+    own = {
+        "modes": 9,
+        "neighbours": 8,
+        "period": 12.0,
+        "hidden": 0,
+        "amplitude": 0.02,
+        "geometric": None,
+        "solid": None,
+    }
     found = {}
     for name in ("modal", "rayleigh", "structural"):
         scene = ElasticScene(hierarchy, 1, **own, damping=name).double().requires_grad_(False)

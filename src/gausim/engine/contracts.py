@@ -110,6 +110,15 @@ class Hierarchical(Protocol):
 
 
 @runtime_checkable
+class Energetic(Protocol):
+    """A simulator that knows the energy of a state."""
+
+    def energy(self, batch: Any, state: SimState) -> Tensor:
+        """(S,) energy of every member of the batch, up to a factor per scene."""
+        ...
+
+
+@runtime_checkable
 class InitialVelocities(Protocol):
     """The frame before the first of every training sequence; a torch module with one parameter per sequence."""
 

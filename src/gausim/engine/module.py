@@ -16,10 +16,11 @@ from gausim.core import ConfigError, DivergenceError, Renderer, SimState
 from gausim.data.dataset import SampleFacts, SequenceSample
 from gausim.data.sampler import hash_seed
 from gausim.engine.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes, fingerprints
-from gausim.engine.contracts import InitialVelocities, SceneBatch, Simulator
+from gausim.engine.contracts import Energetic, InitialVelocities, SceneBatch, Simulator
 from gausim.engine.curriculum import LossGatedCurriculum
 from gausim.engine.exchange import Exchange
 from gausim.engine.optim import OptimizerSettings
+from gausim.engine.passivity import energy_growth
 from gausim.engine.ranks import Ranks, interleave
 from gausim.engine.reference import Yardsticks
 from gausim.engine.rollout import Explosions, States, UnitNoise, describe, windows
@@ -35,6 +36,8 @@ COLLAPSED = 0.05
 COLLAPSE_AFTER = 100
 # Batches in a row whose rollout explodes before anything can be learned from it; then training has diverged.
 BARREN_BATCHES = 20
+# Tells the random numbers of free motion from the others of a step.
+FREE_MOTION = 1
 
 
 class GausSimModule(LightningModule):
@@ -86,6 +89,8 @@ class GausSimModule(LightningModule):
                 f"initial states: {len(list(initial_states.parameters()))} parameters for "
                 f"{len(self.scene_of_sequence)} sequences; expected one each."
             )
+        if self.objective.energy_weight and not isinstance(model, Energetic):
+            raise ConfigError(f"loss.energy_weight: {type(model).__name__} knows no energy. Set it to 0.")
         self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
         self.images = ImageSupervision(self.simulator.scenes, renderer, self.objective.image)
         self.supervision = self.images if supervision is None else supervision
@@ -195,6 +200,7 @@ class GausSimModule(LightningModule):
         device = next(self.parameters()).device
         explosions = Explosions(batch, self.diagonals, whole, self.objective.explosion, ranks=self.ranks,
                                 deferred=device if self._defers(device) else None)  # fmt: skip
+        free = self._goes_on(draws)
         if batch is None:  # hears where the others' rollout ends
             any(explosions.end(None, start, tally.reach) for start in range(0, steps, length))
             return tally
@@ -202,6 +208,7 @@ class GausSimModule(LightningModule):
         starts: list[Callable[[SimState], SimState]] = [explosions.restart, *self._noise(batch, draws)]
         initial, kept = self.initial(samples, batch), self.objective.checkpoint_steps
         per = self.objective.step_weight(steps) / len(whole)
+        own, last = torch.zeros(len(samples), device=device), initial
         for start, made in windows(self.simulator, batch, initial, steps, length, starts, checkpoint=kept):
             states = States.of(made)
             if explosions.end(states.positions, start, tally.reach):
@@ -210,7 +217,28 @@ class GausSimModule(LightningModule):
             tally.motion.append(motion)
             momentum = explosions.counted(torch.stack([step.momentum for step in made]))
             self._descend(explosions.counted(losses), momentum, per, tally, measure=start == 0)
+            own = own + per * explosions.counted(losses).detach().sum(0)
+            last = SimState(made[-1].positions, made[-2].positions if len(made) > 1 else last.positions).detach()
+        else:
+            if free is not None:
+                tally.growth = self._go_on(batch, explosions.restart(last), own, len(whole), free)
         return tally
+
+    def _goes_on(self, draws: torch.Generator) -> torch.Generator | None:
+        """Whether this batch's motion goes on freely to see if its energy grows; the generator of that, or None."""
+        weight, chance = self.objective.energy_weight, self.objective.energy_probability
+        if weight == 0 or float(torch.rand((), generator=draws)) >= chance:
+            return None
+        return torch.Generator().manual_seed(hash_seed(draws.initial_seed(), FREE_MOTION))
+
+    def _go_on(self, batch: SceneBatch, state: SimState, scale: Tensor, count: int, draws: torch.Generator) -> Tensor:
+        """Backward of the energy's growth, each sequence's as a share of its image loss; returns the mean growth."""
+        total, frames, stretch = scale.new_zeros(()), self.objective.energy_frames, self.objective.energy_stretch
+        for growth in energy_growth(self.simulator, batch, state, frames, stretch, draws):
+            if growth.requires_grad:
+                self._backward(self.objective.energy_weight * (scale * growth).sum())
+            total += growth.detach().sum() / count
+        return total
 
     @staticmethod
     def _defers(device: torch.device) -> bool:

@@ -27,6 +27,7 @@ class Numbers:
         momentum: momentum loss of each predicted frame.
         motion: squared change of the predicted images, summed over the batch.
         static: the static loss, if this batch carried it.
+        growth: of the energy of free motion, mean over sequences, if this batch looked at it.
         share: the momentum loss's share of the network's gradient, where it was measured.
         gradients: norm of each parameter group's gradient.
     """
@@ -35,6 +36,7 @@ class Numbers:
     momentum: list[float]
     motion: float
     static: float | None
+    growth: float | None
     share: float | None
     gradients: dict[str, float]
 
@@ -52,6 +54,8 @@ class Numbers:
             stats["momentum_share"] = self.share
         if self.static is not None:
             stats["loss_static"] = self.static
+        if self.growth is not None:
+            stats["energy_growth"] = self.growth
         stats.update(steps=float(steps), exploded=float(lasted < steps))
         if lasted:
             stats["loss_momentum"] = sum(self.momentum) / (steps * count)
@@ -89,6 +93,7 @@ class Found:
         momentum: momentum loss per stretch and step, summed over sequences.
         motion: squared change of the predicted images per stretch, summed over sequences.
         static: the static loss of the scenes that are this rank's, if any.
+        growth: of the energy of free motion, this rank's sequences' part of the mean, if looked at.
         share: as in :class:`Numbers`, the same on all ranks.
         gradients: likewise.
     """
@@ -98,6 +103,7 @@ class Found:
     momentum: list[list[float]]
     motion: list[float]
     static: float | None
+    growth: float | None
     share: float | None
     gradients: dict[str, float]
 
@@ -108,6 +114,7 @@ class Found:
             return shares[0]
         held = [share for share in shares if share.reach]  # the others had no sequence
         static = [share.static for share in shares if share.static is not None]
+        growth = [share.growth for share in shares if share.growth is not None]
         return Found(
             reach=[_beside(tables) for tables in zip(*(s.reach for s in held), strict=True)],
             images=[_beside(tables) for tables in zip(*(s.images for s in held), strict=True)],
@@ -117,6 +124,7 @@ class Found:
             ],
             motion=[sum(values) for values in zip(*(s.motion for s in held), strict=True)],
             static=sum(static) if static else None,
+            growth=sum(growth) if growth else None,
             share=shares[0].share,
             gradients=shares[0].gradients,
         )
@@ -137,6 +145,7 @@ class Found:
             momentum=[value for values in self.momentum[:lasted] for value in values],
             motion=sum(self.motion[:lasted]),
             static=self.static,
+            growth=self.growth,
             share=self.share if lasted else None,  # of the first stretch
             gradients=self.gradients,
         )
@@ -163,6 +172,7 @@ class Tally:
         momentum: momentum loss per predicted step.
         motion: squared change of the predicted images, summed over the batch.
         static: the static loss, if this batch carries it.
+        growth: of the energy of free motion, if this batch looks at it.
         pulls: gradients of the network by the image losses and by the momentum loss, where their share is measured.
         share: the momentum loss's share of the network's gradient.
     """
@@ -172,6 +182,7 @@ class Tally:
     momentum: list[Float[Tensor, " T"]] = field(default_factory=list)
     motion: list[Float[Tensor, ""]] = field(default_factory=list)
     static: Float[Tensor, ""] | None = None
+    growth: Float[Tensor, ""] | None = None
     pulls: tuple[Float[Tensor, " P"], Float[Tensor, " P"]] | None = None
     share: Float[Tensor, ""] | None = None
 
@@ -181,7 +192,7 @@ class Tally:
         Args:
             norms: norm of each parameter group's gradient.
         """
-        single = [x for x in (self.static, self.share) if x is not None]
+        single = [x for x in (self.static, self.growth, self.share) if x is not None]
         parts = [*self.reach, *self.images, *self.momentum, *self.motion, *single, *norms.values()]
         device = parts[0].device
         fetched = iter(torch.cat([p.detach().to(device, torch.float32).reshape(-1) for p in parts]).tolist())
@@ -189,8 +200,9 @@ class Tally:
         momentum = [_take(len(x), fetched) for x in self.momentum]
         motion = _take(len(self.motion), fetched)
         static = next(fetched) if self.static is not None else None
+        growth = next(fetched) if self.growth is not None else None
         share = next(fetched) if self.share is not None else None
-        return Found(reach, images, momentum, motion, static, share, dict(zip(norms, fetched, strict=True)))
+        return Found(reach, images, momentum, motion, static, growth, share, dict(zip(norms, fetched, strict=True)))
 
 
 def _take(count: int, fetched: Iterator[float]) -> list[float]:

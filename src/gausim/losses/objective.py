@@ -24,6 +24,11 @@ class Objective:
             same gradients in less memory, for about a third more time of the dynamics.
         input_noise: standard deviation of the noise added to each unit's position before a step [diagonals of the
             scene's bounding box]; 0 is off.
+        energy_weight: of the energy that free motion beyond the frames seen gains, as a share of what it has, times the
+            batch's image loss; 0 is off. The model's template must know an energy.
+        energy_frames: how far that motion goes.
+        energy_stretch: frames over which its energy is averaged, about a period; gradients stop at its ends.
+        energy_probability: how often a batch carries it.
         explosion: a rollout that moves a kernel further than this from its rest position ends there and the rest of
             it is not learned from [diagonals of the scene's bounding box]; each such end is counted in the log.
     """
@@ -37,19 +42,25 @@ class Objective:
     backprop_steps: int = 1
     checkpoint_steps: bool = False
     input_noise: float = 0.0
+    energy_weight: float = 0.0
+    energy_frames: int = 36
+    energy_stretch: int = 12
+    energy_probability: float = 0.5
     explosion: float = 3.0
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
-        negative = [
-            name
-            for name in ("image_weight", "static_weight", "momentum_weight", "backprop_steps", "input_noise")
-            if getattr(self, name) < 0
-        ]
+        names = ("image_weight", "static_weight", "momentum_weight", "backprop_steps", "input_noise", "energy_weight")
+        negative = [name for name in names if getattr(self, name) < 0]
         if negative or self.explosion <= 0:
             raise ConfigError(f"loss: expected {', '.join(negative) or 'explosion'} not to be negative, got {self}.")
         if self.over_steps not in ("mean", "sum"):
             raise ConfigError(f"loss.over_steps: expected mean or sum, got '{self.over_steps}'.")
+        if not 0 <= self.energy_probability <= 1 or not 0 < self.energy_stretch < self.energy_frames:
+            raise ConfigError(
+                "loss: expected 0 <= energy_probability <= 1 and 0 < energy_stretch < energy_frames, got "
+                f"{self.energy_probability}, {self.energy_stretch} and {self.energy_frames}."
+            )
         if self.static_probability is not None and not 0 <= self.static_probability <= 1:
             raise ConfigError(f"loss.static_probability: expected null or 0..1, got {self.static_probability}.")
 

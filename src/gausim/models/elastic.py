@@ -13,7 +13,7 @@ that is zero at rest and starts at zero.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -150,6 +150,15 @@ class Springs(nn.Module):
         beyond = self.stiffness[:, None] * beyond
         return -(beyond.flatten(-2) @ self.modes)
 
+    def potential(self, z: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
+        """Energy of which :meth:`forward` is minus the gradient, in the same units."""
+        change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
+        squared = self.length.square()
+        along = (self.offset * change).sum(-1)
+        grown = 2 * along + change.square().sum(-1)
+        stretch = grown / ((squared + grown).clamp_min(1e-6 * squared).sqrt() + self.length)  # |d| - |d_0|
+        return 0.5 * (self.stiffness * (stretch.square() - along.square() / squared)).sum(-1)
+
 
 class ElasticScene(nn.Module):
     """Modes of one scene and the trained matrices that move them."""
@@ -208,12 +217,31 @@ class ElasticScene(nn.Module):
         if self.force is not None:
             zero_output(self.force)
 
+    def roots(self) -> tuple[Tensor, Tensor]:
+        """S (M,) and L (M, M) of K = S L L^T S."""
+        identity = torch.eye(len(self.values), dtype=self.values.dtype, device=self.values.device)
+        log_stiffness = self.initial_log_stiffness + SPECTRUM_GAIN * (self.stiffness + self.spectrum)
+        return (0.5 * log_stiffness).exp() * self.values.sqrt(), identity + MIXING_GAIN * self.mixing
+
+    def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:
+        """|v|^2 / 2 + m^T K m / 2 and the springs' beyond it, of the modes of displacements; constants but for these.
+
+        v is the step and m the middle of both, as the trapezoidal rule has it: without damping and springs the
+        template keeps this number exactly.
+        """
+        z, previous = (torch.cat((now, before)).flatten(1) @ self.projection.flatten(0, 1)).chunk(2)
+        root, mixing = (x.detach() for x in self.roots())
+        middle = (z + previous) / 2
+        energy = 0.5 * ((z - previous).square().sum(-1) + ((middle * root) @ mixing).square().sum(-1))
+        if self.springs is not None and self.gain is not None:
+            size = self.gain.detach() * (self.initial_log_stiffness + SPECTRUM_GAIN * self.stiffness.detach()).exp()
+            energy = energy + size * self.springs.potential(middle)
+        return energy
+
     def matrices(self) -> tuple[Tensor, Tensor, Tensor]:
         """A, B and H of z_{t+1} = A z_t - B z_{t-1} + H f."""
         identity = torch.eye(len(self.values), dtype=self.values.dtype, device=self.values.device)
-        log_stiffness = self.initial_log_stiffness + SPECTRUM_GAIN * (self.stiffness + self.spectrum)
-        root = (0.5 * log_stiffness).exp() * self.values.sqrt()
-        mixing = identity + MIXING_GAIN * self.mixing
+        root, mixing = self.roots()
         factor = root[:, None] * mixing
         stiffness = factor @ factor.mT
         log_damping = INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping
@@ -270,18 +298,23 @@ class PreparedScene:
         return (z @ self.motions.mT).view(*now.shape[:2], 12)
 
 
+def _rows(batch: SceneBatch) -> Iterator[tuple[int, Tensor, list[int]]]:
+    """Each scene of a batch, the rows of its members' finest units and the members."""
+    spans = batch.levels[-1].spans
+    for scene_id in sorted(set(batch.scene_ids)):
+        members = [i for i, s in enumerate(batch.scene_ids) if s == scene_id]
+        rows = torch.cat([torch.arange(spans[i].start, spans[i].stop) for i in members])
+        yield scene_id, rows.to(batch.rest.device), members
+
+
 class _PreparedTemplate:
     """The elastic template of one batch while its parameters do not change."""
 
     def __init__(self, template: ElasticTemplate, batch: SceneBatch) -> None:
         self.template = template
-        spans = batch.levels[-1].spans
-        self.parts = []
-        for scene_id in sorted(set(batch.scene_ids)):
-            rows = [torch.arange(t.start, t.stop) for t, s in zip(spans, batch.scene_ids, strict=True) if s == scene_id]
-            self.parts.append(
-                (PreparedScene(template.scene(scene_id)), torch.cat(rows).to(batch.rest.device), len(rows))
-            )
+        self.parts = [
+            (PreparedScene(template.scene(scene_id)), rows, len(members)) for scene_id, rows, members in _rows(batch)
+        ]
         order = torch.cat([rows for _, rows, _ in self.parts])
         self.places = torch.empty_like(order).index_copy(0, order, torch.arange(len(order), device=order.device))
 
@@ -377,6 +410,18 @@ class ElasticTemplate(Template):
     def prepare(self, batch: SceneBatch) -> Callable[[Motion], TemplateState]:
         """The template with its matrices computed."""
         return _PreparedTemplate(self, batch)
+
+    def energy(self, batch: SceneBatch, motion: Motion) -> Float[Tensor, " S"]:
+        """Energy of every member of the batch, see :meth:`ElasticScene.energy`."""
+        found = motion.rest.new_zeros(len(batch.scene_ids))
+        for scene_id, rows, members in _rows(batch):
+            now, before = (
+                (x.index_select(0, rows) - motion.rest.index_select(0, rows)).view(len(members), -1, 3)
+                for x in (motion.now, motion.before)
+            )
+            index = torch.tensor(members, device=found.device)
+            found = found.index_copy(0, index, self.scene(scene_id).energy(now, before))
+        return found
 
     def valid(self, gradient: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 3 3"]:
         """Keeps the determinant above its bound (towards the identity) and, with mass on, scales it to one."""

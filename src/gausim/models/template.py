@@ -52,6 +52,10 @@ class Template(nn.Module, ABC):
         """The template of one batch while parameters do not change; what only depends on them is computed here."""
         return partial(self, batch)
 
+    def energy(self, batch: SceneBatch, motion: Motion) -> Float[Tensor, " S"] | None:
+        """Energy of every member of a batch in the template's own terms, up to a factor; None where it has none."""
+        return None
+
     def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
         """What a scene has of its own in the template: names in its state dict, each behind ``prefix``."""
         return ()
