@@ -30,6 +30,8 @@ sample, sway_module = SWAY["sample"], SWAY["sway_module"]
 class Spiral:
     """Two members whose distance from rest grows by a factor per frame, each by its own."""
 
+    knows_energy = True
+
     def __init__(self, factor: Tensor) -> None:
         self.factor, self.batch_of = factor, SimpleNamespace(rest=torch.arange(12.0).view(4, 3), members=(0, 1))
         self.scenes, self.sizes = (), []
@@ -121,13 +123,14 @@ def test_members_of_several_scenes_have_their_own_energies() -> None:
     assert float(model.energy(batch, SimState(batch.rest, batch.rest)).abs().max()) < 1e-9
 
 
-def test_models_and_templates_without_energy_are_refused() -> None:
-    objective = Objective(energy_weight=1.0, energy_probability=1.0)
-    with pytest.raises(ConfigError, match=r"energy_weight: Sway knows no energy"):
-        sway_module(objective=objective)
-    module = _module(objective, RestTemplate)
-    with pytest.raises(ConfigError, match=r"energy_weight: RestTemplate knows no energy"):
-        module.optimise([sample(0)], module.configure_optimizers(), torch.Generator())
+def test_models_and_templates_without_energy_are_refused_and_null_asks_those_that_have_one() -> None:
+    asked = Objective(energy_weight=1.0)
+    with pytest.raises(ConfigError, match=r"energy_weight is 1.0, but Sway knows no energy"):
+        sway_module(objective=asked)
+    with pytest.raises(ConfigError, match=r"energy_weight is 1.0, but RestTemplate knows no energy"):
+        _module(asked, RestTemplate)
+    either = Objective(energy_weight=None)
+    assert [_module(either, template).energy_weight for template in (RestTemplate, ELASTIC)] == [0.0, 1.0]
 
 
 @pytest.mark.parametrize("wrong", [{"energy_weight": -1.0}, {"energy_probability": 2.0}, {"energy_stretch": 40}])

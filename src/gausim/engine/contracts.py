@@ -111,7 +111,16 @@ class Hierarchical(Protocol):
 
 @runtime_checkable
 class Energetic(Protocol):
-    """A simulator that knows the energy of a state."""
+    """A simulator that may know the energy of a state.
+
+    Attributes:
+        knows_energy: whether it does.
+    """
+
+    @property
+    def knows_energy(self) -> bool:
+        """Whether :meth:`energy` can be asked."""
+        ...
 
     def energy(self, batch: Any, state: SimState) -> Tensor:
         """(S,) energy of every member of the batch, up to a factor per scene."""

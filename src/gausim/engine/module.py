@@ -89,8 +89,7 @@ class GausSimModule(LightningModule):
                 f"initial states: {len(list(initial_states.parameters()))} parameters for "
                 f"{len(self.scene_of_sequence)} sequences; expected one each."
             )
-        if self.objective.energy_weight and not isinstance(model, Energetic):
-            raise ConfigError(f"loss.energy_weight: {type(model).__name__} knows no energy. Set it to 0.")
+        self.energy_weight = _energy_weight(self.objective, model)
         self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
         self.images = ImageSupervision(self.simulator.scenes, renderer, self.objective.image)
         self.supervision = self.images if supervision is None else supervision
@@ -226,8 +225,8 @@ class GausSimModule(LightningModule):
 
     def _goes_on(self, draws: torch.Generator) -> torch.Generator | None:
         """Whether this batch's motion goes on freely to see if its energy grows; the generator of that, or None."""
-        weight, chance = self.objective.energy_weight, self.objective.energy_probability
-        if weight == 0 or float(torch.rand((), generator=draws)) >= chance:
+        chance = self.objective.energy_probability
+        if self.energy_weight == 0 or float(torch.rand((), generator=draws)) >= chance:
             return None
         return torch.Generator().manual_seed(hash_seed(draws.initial_seed(), FREE_MOTION))
 
@@ -236,7 +235,7 @@ class GausSimModule(LightningModule):
         total, frames, stretch = scale.new_zeros(()), self.objective.energy_frames, self.objective.energy_stretch
         for growth in energy_growth(self.simulator, batch, state, frames, stretch, draws):
             if growth.requires_grad:
-                self._backward(self.objective.energy_weight * (scale * growth).sum())
+                self._backward(self.energy_weight * (scale * growth).sum())
             total += growth.detach().sum() / count
         return total
 
@@ -397,6 +396,20 @@ class GausSimModule(LightningModule):
         curriculum = self._curriculum()
         if curriculum is not None and "curriculum" in own:
             curriculum.load_state_dict(own["curriculum"])
+
+
+def _energy_weight(objective: Objective, model: nn.Module) -> float:
+    """Weight of the energy's growth; one that was asked for needs a model that knows an energy."""
+    knows = isinstance(model, Energetic) and model.knows_energy
+    if objective.energy_weight is None:
+        return 1.0 if knows else 0.0
+    if objective.energy_weight and not knows:
+        name = type(getattr(model, "template", model)).__name__
+        raise ConfigError(
+            f"loss.energy_weight is {objective.energy_weight}, but {name} knows no energy. Use a template that does "
+            "(gausim.models.elastic.ElasticTemplate), or set it to 0 or null."
+        )
+    return float(objective.energy_weight)
 
 
 def _pull(loss: Tensor, network: Sequence[nn.Parameter]) -> Float[Tensor, " P"]:

@@ -35,6 +35,8 @@ def energy_growth(
         stretch: frames per stretch; gradients stop at its beginning.
         draws: the random size.
 
+    A motion that explodes ends without a word: its gradients are not finite.
+
     Yields:
         max(0, E_k / E_{k-1} - 1) of every member, stretch by stretch from the second on; differentiable.
     """
@@ -49,6 +51,8 @@ def energy_growth(
     state = _last(state, made)
     for _, made in windows(model, batch, state, frames - stretch, stretch):
         now = _mean_energy(model, batch, state, made)
+        if not bool(torch.isfinite(now).all()):
+            return  # exploded; nothing can be learned from it
         yield (now / before.clamp_min(1e-30) - 1).clamp(0, LARGEST_GROWTH)
         before, state = now.detach(), _last(state, made)
 

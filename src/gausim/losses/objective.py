@@ -25,7 +25,7 @@ class Objective:
         input_noise: standard deviation of the noise added to each unit's position before a step [diagonals of the
             scene's bounding box]; 0 is off.
         energy_weight: of the energy that free motion beyond the frames seen gains, as a share of what it has, times the
-            batch's image loss; 0 is off. The model's template must know an energy.
+            batch's image loss; 0 is off. The model's template must know an energy; None is 1 where it does, else 0.
         energy_frames: how far that motion goes.
         energy_stretch: frames over which its energy is averaged, about a period; gradients stop at its ends.
         energy_probability: how often a batch carries it.
@@ -42,7 +42,7 @@ class Objective:
     backprop_steps: int = 1
     checkpoint_steps: bool = False
     input_noise: float = 0.0
-    energy_weight: float = 0.0
+    energy_weight: float | None = 0.0
     energy_frames: int = 36
     energy_stretch: int = 12
     energy_probability: float = 0.5
@@ -51,7 +51,7 @@ class Objective:
     def __post_init__(self) -> None:
         """Checks the ranges."""
         names = ("image_weight", "static_weight", "momentum_weight", "backprop_steps", "input_noise", "energy_weight")
-        negative = [name for name in names if getattr(self, name) < 0]
+        negative = [name for name in names if (getattr(self, name) or 0) < 0]
         if negative or self.explosion <= 0:
             raise ConfigError(f"loss: expected {', '.join(negative) or 'explosion'} not to be negative, got {self}.")
         if self.over_steps not in ("mean", "sum"):

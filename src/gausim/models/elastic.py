@@ -40,8 +40,13 @@ MIN_DETERMINANT = 0.2
 # Logarithms of stiffness and damping may move ten times faster than the mixing of modes; written as gains on the
 # parameters so that one learning rate serves both.
 SPECTRUM_GAIN, MIXING_GAIN = 2.0, 0.3
+# Of the roots of a number of damping per mode.
+DAMPING_GAIN = 0.3
 # Nearly undamped at the start: exp(-4) per frame of the velocity.
 INITIAL_LOG_DAMPING = -4.0
+# The springs' force beyond the linear one stays below this share of the trained stiffness's own (both as they act in a
+# step): it is taken at the beginning of the step, and thin parts that turn far would make it explode.
+LARGEST_GEOMETRIC = 0.5
 DAMPINGS = ("full", "modal", "rayleigh", "structural")
 
 
@@ -210,6 +215,8 @@ class ElasticScene(nn.Module):
         self.mixing = nn.Parameter(torch.zeros(count, count))
         numbers = {"full": count, "modal": count, "rayleigh": 2, "structural": 1}
         self.damping, self._damping = nn.Parameter(torch.zeros(numbers[damping])), damping
+        # What all modes have in common moves as fast as each mode's own part does beside it.
+        self.damping_level = nn.Parameter(torch.zeros(())) if damping == "modal" else None
         self.damping_mixing = nn.Parameter(torch.zeros(count, count)) if damping == "full" else None
         self.springs = None if geometric is None else Springs(rest, phi, neighbours)
         self.gain = None if geometric is None else nn.Parameter(torch.tensor(float(geometric)))
@@ -248,8 +255,10 @@ class ElasticScene(nn.Module):
         if self.damping_mixing is not None:
             factor = (0.5 * log_damping).exp()[:, None] * (identity + MIXING_GAIN * self.damping_mixing)
             damping = factor @ factor.mT
-        elif self._damping == "modal":
-            damping = torch.diag(log_damping.exp())
+        elif self.damping_level is not None:
+            # A square, not an exponential: from next to nothing it must find its way back.
+            amount = math.exp(0.5 * INITIAL_LOG_DAMPING) + DAMPING_GAIN * (self.damping_level + self.damping)
+            damping = torch.diag(amount.square())
         elif self._damping == "rayleigh":
             damping = log_damping[0].exp() * identity + log_damping[1].exp() * stiffness
         else:
@@ -276,7 +285,9 @@ class PreparedScene:
         self.force, parts = scene.force, [a.mT, -b.mT]
         if scene.springs is not None and scene.gain is not None:
             size = (scene.initial_log_stiffness + SPECTRUM_GAIN * scene.stiffness).exp()
-            parts.append(scene.gain * size * h.mT)
+            self.turned = scene.gain * size * h.mT
+            # I - A + B = H K: how the trained stiffness pulls back.
+            self.pull = torch.eye(len(a), dtype=a.dtype, device=a.device) - a.mT + b.mT
         if self.force is not None:
             parts.append(0.1 * scene.scale * h.mT)
             self.still = self.force(a.new_zeros(1, 2 * len(scene.values)))
@@ -286,11 +297,17 @@ class PreparedScene:
         """Modal coordinates at t + 1 from the displacements at t and t - 1 of S sequences."""
         z, previous = (torch.cat((now, before)).flatten(1) @ self.projection).chunk(2)
         parts = [z, previous]
-        if self.scene.springs is not None:
-            parts.append(self.scene.springs(z))
         if self.force is not None:
             parts.append(self.force(torch.cat((z, z - previous), -1) / self.scene.scale) - self.still)
-        return torch.cat(parts, -1) @ self.transition
+        after = torch.cat(parts, -1) @ self.transition
+        return after if self.scene.springs is None else after + self._springs(self.scene.springs, z)
+
+    def _springs(self, springs: Springs, z: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+        """What the springs add to the next coordinates, held below its bound."""
+        added = springs(z) @ self.turned
+        bound = LARGEST_GEOMETRIC * torch.linalg.vector_norm(z @ self.pull, dim=-1, keepdim=True).detach()
+        size = torch.linalg.vector_norm(added, dim=-1, keepdim=True).detach()
+        return added * (bound / size.clamp_min(1e-30)).clamp_max(1.0)
 
     def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
         """Displacement and its gradient, row by row, of every unit at t + 1."""
@@ -335,6 +352,8 @@ class _PreparedTemplate:
 
 class ElasticTemplate(Template):
     """Proposes the next state by learned elastodynamics, one set of matrices per scene."""
+
+    has_energy = True
 
     def __init__(
         self,

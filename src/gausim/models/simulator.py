@@ -206,21 +206,16 @@ class GausSim(nn.Module):
         log_density = torch.cat([self.log_density[i] for i in batch.scene_ids])
         return log_density.exp() * batch.volume, log_density
 
-    def energy(self, batch: SceneBatch, state: SimState) -> Float[Tensor, " S"]:
-        """Energy of every member of the batch in the template's terms, up to a factor per scene.
+    @property
+    def knows_energy(self) -> bool:
+        """Whether the template has an energy."""
+        return self.template.has_energy
 
-        Raises:
-            ConfigError: the template knows no energy.
-        """
+    def energy(self, batch: SceneBatch, state: SimState) -> Float[Tensor, " S"]:
+        """Energy of every member of the batch in the template's terms, up to a factor per scene."""
         prepared = self.prepare(batch)
         now, before = (prepared.aggregate(x)[-1] for x in (state.positions, state.previous))
-        found = self.template.energy(batch, Motion(prepared.levels[-1].rest, now, before))
-        if found is None:
-            raise ConfigError(
-                f"loss.energy_weight: {type(self.template).__name__} knows no energy. Use it with "
-                "gausim.models.elastic.ElasticTemplate, or set it to 0."
-            )
-        return found
+        return self.template.energy(batch, Motion(prepared.levels[-1].rest, now, before))
 
     def prepare(self, batch: SceneBatch) -> Prepared:
         """What steps of this batch have in common as long as no parameter changes.

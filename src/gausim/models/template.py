@@ -42,7 +42,13 @@ class TemplateState:
 
 
 class Template(nn.Module, ABC):
-    """Proposes the next configuration of the finest predicted level from its two latest ones."""
+    """Proposes the next configuration of the finest predicted level from its two latest ones.
+
+    Attributes:
+        has_energy: whether :meth:`energy` is there.
+    """
+
+    has_energy = False
 
     @abstractmethod
     def forward(self, batch: SceneBatch, motion: Motion) -> TemplateState:
@@ -52,9 +58,9 @@ class Template(nn.Module, ABC):
         """The template of one batch while parameters do not change; what only depends on them is computed here."""
         return partial(self, batch)
 
-    def energy(self, batch: SceneBatch, motion: Motion) -> Float[Tensor, " S"] | None:
-        """Energy of every member of a batch in the template's own terms, up to a factor; None where it has none."""
-        return None
+    def energy(self, batch: SceneBatch, motion: Motion) -> Float[Tensor, " S"]:
+        """Energy of every member of a batch in the template's own terms, up to a factor; see ``has_energy``."""
+        raise NotImplementedError(f"{type(self).__name__} has no energy")
 
     def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
         """What a scene has of its own in the template: names in its state dict, each behind ``prefix``."""
