@@ -305,6 +305,31 @@ def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_or
                                rtol=1e-4, atol=1e-8)  # fmt: skip
 
 
+def test_springs_never_add_more_than_half_of_what_the_stiffness_pulls(make_scene) -> None:
+    hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
+    own = {
+        "modes": 9,
+        "neighbours": 8,
+        "period": 6.0,
+        "hidden": 0,
+        "amplitude": 0.02,
+        "damping": "modal",
+        "solid": None,
+    }
+    scene = ElasticScene(hierarchy, 1, **own, geometric=1.0).double().requires_grad_(False)
+    plain = ElasticScene(hierarchy, 1, **own, geometric=None).double().requires_grad_(False)
+    a, b, _ = scene.matrices()
+    z = torch.randn(5, 9, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    shares = []
+    for size in (0.1, 10.0, 1e4):
+        now = torch.einsum("sm,ndm->snd", size * scene.scale * z, scene.modes.double())
+        added = (scene(now, now) - plain(now, now)).norm(dim=-1)
+        pull = ((size * scene.scale * z) @ (torch.eye(9) - a + b).mT).norm(dim=-1)
+        shares.append(added / pull)
+    assert float(shares[0].max()) < 0.1 < float(shares[1].max())
+    torch.testing.assert_close(shares[2], torch.full((5,), 0.5, dtype=torch.float64), rtol=1e-3, atol=0)
+
+
 def test_dampings_are_what_they_are_called(make_scene) -> None:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
     own = {

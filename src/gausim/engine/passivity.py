@@ -15,8 +15,7 @@ from gausim.engine.rollout import windows
 
 # The motion that goes on is made smaller or larger by up to these factors, so that no size of motion is left out.
 SMALLEST, LARGEST = 0.2, 1.5
-# Growth of a stretch's energy that counts at most: beyond it gradients of an exploding rollout tell nothing.
-LARGEST_GROWTH = 1.0
+TINY = 1e-30
 
 
 def energy_growth(
@@ -38,7 +37,7 @@ def energy_growth(
     A motion that explodes ends without a word: its gradients are not finite.
 
     Yields:
-        max(0, E_k / E_{k-1} - 1) of every member, stretch by stretch from the second on; differentiable.
+        max(0, ln E_k / E_{k-1}) of every member, stretch by stretch from the second on; differentiable.
     """
     low, high = math.log(SMALLEST), math.log(LARGEST)
     size = math.exp(low + (high - low) * float(torch.rand((), generator=draws)))
@@ -53,7 +52,7 @@ def energy_growth(
         now = _mean_energy(model, batch, state, made)
         if not bool(torch.isfinite(now).all()):
             return  # exploded; nothing can be learned from it
-        yield (now / before.clamp_min(1e-30) - 1).clamp(0, LARGEST_GROWTH)
+        yield (now.clamp_min(TINY) / before.clamp_min(TINY)).log().clamp_min(0)
         before, state = now.detach(), _last(state, made)
 
 

@@ -40,8 +40,6 @@ MIN_DETERMINANT = 0.2
 # Logarithms of stiffness and damping may move ten times faster than the mixing of modes; written as gains on the
 # parameters so that one learning rate serves both.
 SPECTRUM_GAIN, MIXING_GAIN = 2.0, 0.3
-# Of the roots of a number of damping per mode.
-DAMPING_GAIN = 0.3
 # Nearly undamped at the start: exp(-4) per frame of the velocity.
 INITIAL_LOG_DAMPING = -4.0
 # The springs' force beyond the linear one stays below this share of the trained stiffness's own (both as they act in a
@@ -215,8 +213,6 @@ class ElasticScene(nn.Module):
         self.mixing = nn.Parameter(torch.zeros(count, count))
         numbers = {"full": count, "modal": count, "rayleigh": 2, "structural": 1}
         self.damping, self._damping = nn.Parameter(torch.zeros(numbers[damping])), damping
-        # What all modes have in common moves as fast as each mode's own part does beside it.
-        self.damping_level = nn.Parameter(torch.zeros(())) if damping == "modal" else None
         self.damping_mixing = nn.Parameter(torch.zeros(count, count)) if damping == "full" else None
         self.springs = None if geometric is None else Springs(rest, phi, neighbours)
         self.gain = None if geometric is None else nn.Parameter(torch.tensor(float(geometric)))
@@ -255,10 +251,8 @@ class ElasticScene(nn.Module):
         if self.damping_mixing is not None:
             factor = (0.5 * log_damping).exp()[:, None] * (identity + MIXING_GAIN * self.damping_mixing)
             damping = factor @ factor.mT
-        elif self.damping_level is not None:
-            # A square, not an exponential: from next to nothing it must find its way back.
-            amount = math.exp(0.5 * INITIAL_LOG_DAMPING) + DAMPING_GAIN * (self.damping_level + self.damping)
-            damping = torch.diag(amount.square())
+        elif self._damping == "modal":
+            damping = torch.diag(log_damping.exp())
         elif self._damping == "rayleigh":
             damping = log_damping[0].exp() * identity + log_damping[1].exp() * stiffness
         else:
