@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, fields
 
 import torch
@@ -10,6 +11,8 @@ from torch import Tensor
 
 from gausim.baselines.mpm.config import Grid, Material
 from gausim.core import DivergenceError
+
+HALF = 0.999  # a node half way between held and free matter is held, whatever rounding makes of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +63,10 @@ class Particles:
     Attributes:
         mass: m [simulation units].
         volume: V at rest [simulation units^3].
-        pinned: particles that are held where they are.
-        pinned_nodes: nodes that hold pinned particles (the nearest of each); their velocity is 0.
+        pinned: particles that stay where they are. Their F takes part: the layer between the last pinned node and
+            the first free one would be soft without it.
+        pinned_nodes: nodes that hold pinned particles: the nearest of each, and those whose mass at rest is theirs by
+            half or more; their velocity is 0.
     """
 
     mass: Float[Tensor, " N"]
@@ -86,12 +91,29 @@ class Particles:
         require_inside(positions, grid, "at rest")
         if volume is None:
             volume = particle_volumes(positions, grid)
+        volume = volume.float()
+        nodes = torch.zeros((grid.cells + 1,) * 3, dtype=torch.bool, device=positions.device)
         if pinned is None:
             pinned = torch.zeros(len(positions), dtype=torch.bool, device=positions.device)
-        nodes = torch.zeros((grid.cells + 1,) * 3, dtype=torch.bool, device=positions.device)
-        nodes[tuple((positions[pinned] / grid.dx).round().long().T)] = True
-        volume = volume.float()
+        if pinned.any():
+            held = node_volumes(positions[pinned], volume[pinned], grid)
+            nodes = (held > 0) & (held > HALF * node_volumes(positions[~pinned], volume[~pinned], grid))
+            nodes[tuple((positions[pinned] / grid.dx).round().long().T)] = True
         return Particles(density * volume, volume, pinned, nodes)
+
+
+def node_volumes(positions: Float[Tensor, "N 3"], volume: Float[Tensor, " N"], grid: Grid) -> Float[Tensor, "n n n"]:
+    """Volume that every node has of the particles, by quadratic B-splines [simulation units^3]."""
+    n = grid.cells + 1
+    base = (positions / grid.dx - 0.5).floor()
+    f = positions / grid.dx - base
+    weights = torch.stack((0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2))
+    i, j, k = base.long().unbind(-1)
+    total = volume.new_zeros(n**3)
+    for a, b, c in itertools.product(range(3), repeat=3):
+        share = volume * weights[a, :, 0] * weights[b, :, 1] * weights[c, :, 2]
+        total.index_add_(0, ((i + a) * n + j + b) * n + k + c, share)
+    return total.view(n, n, n)
 
 
 def particle_volumes(positions: Float[Tensor, "N 3"], grid: Grid) -> Float[Tensor, " N"]:

@@ -117,8 +117,8 @@ class Substeps:
             self._kernels.grid_update, self.nodes, inputs, outputs, [momentum, *[None] * 5, *inputs[6:]], [velocity]
         )
         inputs, outputs = self._scatter(state, acceleration[0], dt)
-        moved = [adjoint.positions, adjoint.velocities, adjoint.affine, stress, acceleration[1], None, None, None]
-        self._adjoint(self._kernels.particles_to_grid, self.count, inputs, outputs, [*moved, *inputs[8:]], [momentum])
+        moved = [adjoint.positions, adjoint.velocities, adjoint.affine, stress, acceleration[1], None, None]
+        self._adjoint(self._kernels.particles_to_grid, self.count, inputs, outputs, [*moved, *inputs[7:]], [momentum])
         inputs, outputs = self._stresses(state, young[0])
         moved = [adjoint.gradients, adjoint.yield_stress, young[1], *inputs[3:]]
         self._adjoint(self._kernels.stress_kernel, self.count, inputs, outputs, moved, [stress])
@@ -136,7 +136,7 @@ class Substeps:
 
     def _scatter(self, state: State, acceleration: Any, dt: float) -> tuple[list[Any], list[Any]]:
         moving = [state.positions, state.velocities, state.affine, self._stress, acceleration]
-        fixed = [self._mass, self._volume, self._held, 1 / self._grid.dx, self._grid.cells, dt]
+        fixed = [self._mass, self._volume, 1 / self._grid.dx, self._grid.cells, dt]
         return [*moving, *fixed], [self._momentum]
 
     def _update(self, time: float, dt: float) -> tuple[list[Any], list[Any]]:

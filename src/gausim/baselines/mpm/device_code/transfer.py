@@ -58,19 +58,18 @@ def particles_to_grid(
     acceleration: wp.array[wp.vec3],
     mass: wp.array[float],
     volume: wp.array[float],
-    held: wp.array[wp.uint8],
     inverse_dx: float,
     cells: int,
     dt: float,
     grid: wp.array3d[wp.vec4],
 ) -> None:
-    """Adds momentum (x, y, z) and mass (w) of the particles that are not held to the grid.
+    """Adds momentum (x, y, z) and mass (w) of the particles to the grid.
 
     m_i v_i = sum_p w_ip (m_p (v_p + dt a_p) + (m_p C_p - dt V_p 4 / dx^2 tau_p) (x_i - x_p))
     """
     p = wp.tid()
     x = positions[p] * inverse_dx
-    if held[p] != wp.uint8(0) or not inside(positions[p], inverse_dx, cells):
+    if not inside(positions[p], inverse_dx, cells):
         return
     i, j, k = int(x[0] - 0.5), int(x[1] - 0.5), int(x[2] - 0.5)
     f = x - wp.vec3(float(i), float(j), float(k))
@@ -145,11 +144,14 @@ def grid_to_particles(
     new_gradients: wp.array[wp.mat33],
     new_yield_stress: wp.array[float],
 ) -> None:
-    """V = sum_i w_i v_i, C = 4 / dx^2 sum_i w_i v_i (x_i - x)^T, x += dt v, F = Z((I + dt C) F)."""
+    """V = sum_i w_i v_i, C = 4 / dx^2 sum_i w_i v_i (x_i - x)^T, x += dt v, F = Z((I + dt C) F).
+
+    Held particles keep their position.
+    """
     p = wp.tid()
     v = wp.vec3(0.0, 0.0, 0.0)
     B = wp.mat33(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    if held[p] == wp.uint8(0) and inside(positions[p], inverse_dx, cells):
+    if inside(positions[p], inverse_dx, cells):
         x = positions[p] * inverse_dx
         i, j, k = int(x[0] - 0.5), int(x[1] - 0.5), int(x[2] - 0.5)
         f = x - wp.vec3(float(i), float(j), float(k))
@@ -165,7 +167,10 @@ def grid_to_particles(
     F = (identity() + dt * C) * gradients[p]
     mu = shear_modulus(young[p], poisson)
     lam = lame_lambda(young[p], poisson)
-    new_positions[p] = positions[p] + dt * v
+    moved = positions[p] + dt * v
+    if held[p] != wp.uint8(0):
+        moved = positions[p]
+    new_positions[p] = moved
     new_velocities[p] = v
     new_affine[p] = C
     new_gradients[p] = return_map(kind, F, mu, lam, yield_stress[p], rheology, dt)
