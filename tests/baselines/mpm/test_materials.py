@@ -94,7 +94,7 @@ def test_stress_and_return_map_follow_the_closed_formulas(kind: MaterialKind, si
     if size > 0.1 and kind is not MaterialKind.FIXED_COROTATED:
         assert 10 < plastic.sum() < 200  # both branches are seen
     error = np.abs(mapped - expected(kind, F)).max(), np.abs(stress - expected_stress(kind, F)).max()
-    print(kind.name, size, "F %.1e tau %.1e" % error)
+    print(kind.name, size, "F {:.1e} tau {:.1e}".format(*error))
     assert np.abs(mapped - expected(kind, F)).max() < 1e-4 * size + 1e-6
     assert np.abs(stress - expected_stress(kind, F)).max() < 1e-4 * size + 4e-6
     flow = np.linalg.norm(strain - expected_strain(kind, strain), axis=-1)

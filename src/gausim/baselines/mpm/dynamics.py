@@ -22,6 +22,7 @@ from gausim.ops.deformation import determinant, polar_rotation
 
 FOLLOWED = 8  # kernels whose motion a filled particle begins with
 LEAST_DETERMINANT = 1e-4  # below it the polar rotation is taken from singular values
+ORTHOGONAL = 1e-4  # and where Newton's iteration ends further than this from a rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,13 +180,13 @@ class MPMDynamics:
 
 def rotations(gradients: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:
     """Polar rotations with determinant 1, also of matter that is turned inside out."""
-    det = determinant(gradients)
-    sound = (det > LEAST_DETERMINANT)[..., None, None]
     identity = torch.eye(3).to(gradients)
-    result = polar_rotation(torch.where(sound, gradients, identity))
-    if sound.all():
+    upright = (determinant(gradients) > LEAST_DETERMINANT)[..., None, None]
+    result = polar_rotation(torch.where(upright, gradients, identity))
+    turned = (result @ result.mT - identity).abs().amax((-1, -2), keepdim=True) < ORTHOGONAL
+    if (upright & turned).all():
         return result
     u, _, vt = torch.linalg.svd(gradients)
     sign = torch.ones_like(u[..., 0, :])
     sign[..., 2] = determinant(u @ vt).sign()
-    return torch.where(sound, result, (u * sign[..., None, :]) @ vt)
+    return torch.where(upright & turned, result, (u * sign[..., None, :]) @ vt)

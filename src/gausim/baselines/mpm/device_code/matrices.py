@@ -6,7 +6,7 @@ is at rest.
 
 import warp as wp
 
-POLAR_STEPS = wp.constant(12)
+POLAR_STEPS = wp.constant(20)  # at most; near rest two or three do
 POLAR_TOLERANCE = wp.constant(1.0e-7)
 LEAST_DETERMINANT = wp.constant(1.0e-4)  # below it Newton's iteration is not safe in float32
 LEAST_STRETCH_SQUARED = wp.constant(1.0e-12)
