@@ -24,7 +24,8 @@ from gausim.baselines.mpm import (  # noqa: E402
     pinned_box,
 )
 
-GRID = Grid(cells=10, size=1.0, gravity=(0.0, 0.0, -1.0), damping=0.5)
+# The block's window of nodes begins beside the origin and ends before the border.
+GRID = Grid(cells=24, size=2.4, gravity=(0.0, 0.0, -1.0), damping=0.5)
 FRAME_TIME, SUBSTEPS = 0.06, 20
 ELASTIC = Material(young_modulus=30.0, poisson_ratio=0.3, density=1.0)
 
@@ -32,10 +33,10 @@ ELASTIC = Material(young_modulus=30.0, poisson_ratio=0.3, density=1.0)
 def scene(lattice, material: Material = ELASTIC) -> tuple[MPMSolver, ParticleState, Tensor]:
     """A strained, moving block above a fixed floor, one of its sides pinned; 96 particles of different moduli."""
     generator = torch.Generator().manual_seed(0)
-    x = lattice((0.3, 0.4, 0.3), (0.6, 0.6, 0.5), 1 / 20)
+    x = lattice((1.1, 1.2, 1.1), (1.4, 1.4, 1.3), 1 / 20)
     x = x + 0.01 * torch.rand(x.shape, generator=generator)
-    particles = Particles.create(x, grid=GRID, density=material.density, pinned=x[:, 0] < 0.35)
-    floor = Conditions((pinned_box(Box((0.0, 0.0, 0.0), (1.0, 1.0, 0.21))),))
+    particles = Particles.create(x, grid=GRID, density=material.density, pinned=x[:, 0] < 1.15)
+    floor = Conditions((pinned_box(Box((0.0, 0.0, 0.0), (2.4, 2.4, 1.01))),))
     solver = MPMSolver(particles, material, GRID, TimeStep(FRAME_TIME, SUBSTEPS), floor)
 
     def noise(*shape: int) -> Tensor:

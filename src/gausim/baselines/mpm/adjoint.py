@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gausim.baselines.mpm.runtime import on_stream_of, warp
-from gausim.baselines.mpm.substeps import State, Substeps
+from gausim.baselines.mpm.substeps import State, Substeps, Window
 
 STATE = 5  # tensors of a particle state
 
@@ -22,6 +22,7 @@ class FramePlan:
         substeps: launches the kernels.
         count: substeps.
         dt: duration of each [s].
+        dx: edge of a cell [simulation units].
         start: time at which the frame begins [s].
         keep: whether a backward pass will come.
     """
@@ -29,6 +30,7 @@ class FramePlan:
     substeps: Substeps
     count: int
     dt: float
+    dx: float
     start: float
     keep: bool
 
@@ -42,23 +44,18 @@ class Frame(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, plan: FramePlan, *given: Tensor) -> tuple[Tensor, ...]:
-        """Makes the frame."""
+        """Makes the frame; again on the whole grid if a particle leaves the window round where they began."""
         given = tuple(t.detach().contiguous() for t in given)
-        slots = plan.count + 1 if plan.keep else 2
-        first, (young, acceleration) = given[:STATE], given[STATE:]
-        history = tuple(t.new_empty(slots, *t.shape) for t in first)
-        for kept, tensor in zip(history, first, strict=True):
-            kept[0] = tensor
-        with on_stream_of(young.device):
-            states = [State.of(tuple(h[s] for h in history)) for s in range(slots)]
-            E, a = _young_and_acceleration(young, acceleration)
-            for s in range(plan.count):
-                now, following = states[s % slots], states[(s + 1) % slots]
-                plan.substeps.forward(now, following, E, a, plan.start + s * plan.dt, plan.dt)
+        window = plan.substeps.window(given[0])
+        history = _run(plan, window, given)
+        last = plan.count % len(history[0])
+        if not window.holds(history[0][last], plan.dx):
+            window = plan.substeps.window()
+            history = _run(plan, window, given)
         if plan.keep:
-            ctx.plan = plan
-            ctx.save_for_backward(young, acceleration, *history)
-        return tuple(h[plan.count % slots].clone() for h in history)
+            ctx.plan, ctx.window = plan, window
+            ctx.save_for_backward(*given[STATE:], *history)
+        return tuple(h[last].clone() for h in history)
 
     @staticmethod
     def backward(ctx: Any, *adjoints: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
@@ -72,14 +69,31 @@ class Frame(torch.autograd.Function):
             E, a = _young_and_acceleration(young, acceleration)
             adjoint_E, adjoint_a = _young_and_acceleration(adjoint_young, adjoint_acceleration)
             given, found = State.of(tensors), State.of(other)
+            windows = ctx.window, Window(ctx.window.origin, ctx.window.shape, plan.substeps.device)
             following = State.of(tuple(h[plan.count] for h in history))
             for s in reversed(range(plan.count)):
                 now = State.of(tuple(h[s] for h in history))
-                time = plan.start + s * plan.dt
-                plan.substeps.backward(now, following, found, given, (E, adjoint_E), (a, adjoint_a), time, plan.dt)
+                states, pair, time = (now, following), (found, given), plan.start + s * plan.dt
+                plan.substeps.backward(windows, states, pair, (E, adjoint_E), (a, adjoint_a), time, plan.dt)
                 given, found, following = found, given, now
         final = tensors if plan.count % 2 == 0 else other
         return (None, *final, adjoint_young, adjoint_acceleration)
+
+
+def _run(plan: FramePlan, window: Window, given: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """All states of the frame (or the latest two), per tensor of the state, in slots substep % slots."""
+    slots = plan.count + 1 if plan.keep else 2
+    first, (young, acceleration) = given[:STATE], given[STATE:]
+    history = tuple(t.new_empty(slots, *t.shape) for t in first)
+    for kept, tensor in zip(history, first, strict=True):
+        kept[0] = tensor
+    with on_stream_of(young.device):
+        states = [State.of(tuple(h[s] for h in history)) for s in range(slots)]
+        E, a = _young_and_acceleration(young, acceleration)
+        for s in range(plan.count):
+            now, following = states[s % slots], states[(s + 1) % slots]
+            plan.substeps.forward(window, now, following, E, a, plan.start + s * plan.dt, plan.dt)
+    return history
 
 
 def _young_and_acceleration(young: Tensor, acceleration: Tensor) -> tuple[Any, Any]:

@@ -80,7 +80,7 @@ class MPMSolver:
         tensors = (*state.tensors(), young_modulus.float(), acceleration.float())
         keep = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
         time = self.step.frame_time
-        plan = FramePlan(self._substeps, count, time / count, frame * time, keep)
+        plan = FramePlan(self._substeps, count, time / count, self.grid.dx, frame * time, keep)
         following = ParticleState(*Frame.apply(plan, *tensors))
         self._check(following, frame + 1)
         return following

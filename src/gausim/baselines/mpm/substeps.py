@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from gausim.baselines.mpm.config import Grid, Material
@@ -40,10 +41,37 @@ class State:
             array.zero_()
 
 
+MARGIN = 4  # cells that particles may move within a frame before a larger window is needed
+
+
+class Window:
+    """The nodes that a frame computes on: a block round the particles, or the whole grid.
+
+    Attributes:
+        origin: number of its first node per axis.
+        shape: nodes per axis.
+        momentum: momentum (x, y, z) and mass (w) of the nodes.
+        velocity: their velocity.
+    """
+
+    def __init__(self, origin: tuple[int, int, int], shape: tuple[int, int, int], device: Any) -> None:
+        wp = warp()
+        self.origin, self.shape = origin, shape
+        self.momentum = wp.zeros(shape, dtype=wp.vec4, device=device)
+        self.velocity = wp.zeros(shape, dtype=wp.vec3, device=device)
+        self.origin_, self.shape_ = wp.vec3(*map(float, origin)), wp.vec3i(*shape)
+
+    def holds(self, positions: Float[Tensor, "N 3"], dx: float) -> bool:
+        """Whether all nodes of all particles are in the window."""
+        x = positions / dx - positions.new_tensor(self.origin)
+        return bool(((x >= 0.5) & (x < positions.new_tensor(self.shape) - 1.5)).all())
+
+
 class Substeps:
     """Launches the four kernels of a substep forwards and backwards.
 
-    Holds one grid and one array of stresses: the adjoint of a substep computes them again from the state at its start.
+    A window and one array of stresses are all it works on: the adjoint of a substep computes them again from the state
+    at its start.
 
     Args:
         particles: mass, volume and pins, on the device to compute on.
@@ -58,7 +86,7 @@ class Substeps:
 
         self._wp, self._kernels = wp, transfer
         self.device = wp.device_from_torch(particles.mass.device)
-        self.count, self.nodes = len(particles.mass), (grid.cells + 1,) * 3
+        self.count = len(particles.mass)
         self._grid, self._material = grid, material
         # Warp's views do not own the memory of the tensors they look at.
         held, pinned = particles.pinned.to(torch.uint8), particles.pinned_nodes.to(torch.uint8)
@@ -68,86 +96,96 @@ class Substeps:
         self._held, self._pinned_nodes = wp.from_torch(held), wp.from_torch(pinned)
         self._boxes = [wp.from_torch(b, dtype=wp.vec3) for b in boxes_]
         self._rheology = wp.vec3(material.friction, material.plastic_viscosity, material.softening)
-        self._momentum, self._velocity, self._stress = self._fields()
-        self._adjoint_fields: tuple[Any, Any, Any] | None = None
+        self._stress, self._adjoint_stress = (wp.zeros(self.count, dtype=wp.mat33, device=self.device) for _ in "ab")
 
-    def _fields(self) -> tuple[Any, Any, Any]:
-        """Momentum and mass of nodes, velocity of nodes, stress of particles."""
-        wp = self._wp
-        return (
-            wp.zeros(self.nodes, dtype=wp.vec4, device=self.device),
-            wp.zeros(self.nodes, dtype=wp.vec3, device=self.device),
-            wp.zeros(self.count, dtype=wp.mat33, device=self.device),
-        )
+    def window(self, positions: Float[Tensor, "N 3"] | None = None) -> Window:
+        """The nodes round these particles and :data:`MARGIN` more on each side; all nodes without particles."""
+        last = self._grid.cells
+        if positions is None or not len(positions) or not torch.isfinite(positions).all():
+            return Window((0, 0, 0), (last + 1,) * 3, self.device)
+        low = (positions.amin(0) / self._grid.dx - 0.5).floor().long() - MARGIN
+        high = (positions.amax(0) / self._grid.dx - 0.5).floor().long() + 2 + MARGIN
+        first, end = low.clamp(0, last).tolist(), high.clamp(0, last).tolist()
+        x, y, z = (b - a + 1 for a, b in zip(first, end, strict=True))
+        return Window((first[0], first[1], first[2]), (x, y, z), self.device)
 
-    def forward(self, state: State, following: State, young: Any, acceleration: Any, time: float, dt: float) -> None:
+    def forward(
+        self, window: Window, state: State, following: State, young: Any, acceleration: Any, time: float, dt: float
+    ) -> None:
         """Writes the state after a substep of ``dt`` that begins at ``time`` to ``following``."""
-        self._to_grid(state, young, acceleration, time, dt)
-        inputs, outputs = self._gather(state, following, young, dt)
+        self._to_grid(window, state, young, acceleration, time, dt)
+        inputs, outputs = self._gather(window, state, following, young, dt)
         self._launch(self._kernels.grid_to_particles, self.count, inputs, outputs)
 
     def backward(
         self,
-        state: State,
-        following: State,
-        adjoint: State,
-        adjoint_following: State,
+        windows: tuple[Window, Window],
+        states: tuple[State, State],
+        adjoints: tuple[State, State],
         young: tuple[Any, Any],
         acceleration: tuple[Any, Any],
         time: float,
         dt: float,
     ) -> None:
-        """Overwrites ``adjoint`` with that of the state, and adds to those of ``young`` and ``acceleration``.
+        """Overwrites the first of ``adjoints`` from the second, and adds to those of ``young`` and ``acceleration``.
 
-        ``young`` and ``acceleration`` are pairs of values and adjoints.
+        Args:
+            windows: one for values, one of the same nodes for adjoints.
+            states: at the start and the end of the substep.
+            adjoints: of these states.
+            young: values and adjoints.
+            acceleration: values and adjoints.
+            time: start of the substep [s].
+            dt: its duration [s].
         """
-        if self._adjoint_fields is None:
-            self._adjoint_fields = self._fields()
-        momentum, velocity, stress = self._adjoint_fields
-        for array in self._adjoint_fields:
+        (window, adjoint_window), (state, following), (adjoint, adjoint_following) = windows, states, adjoints
+        momentum, velocity, stress = adjoint_window.momentum, adjoint_window.velocity, self._adjoint_stress
+        for array in (momentum, velocity, stress):
             array.zero_()
         adjoint.zero()
-        self._to_grid(state, young[0], acceleration[0], time, dt)
+        self._to_grid(window, state, young[0], acceleration[0], time, dt)
 
-        inputs, outputs = self._gather(state, following, young[0], dt)
-        moved = [adjoint.positions, adjoint.gradients, adjoint.yield_stress, velocity, young[1], None, *inputs[6:]]
-        self._adjoint(self._kernels.grid_to_particles, self.count, inputs, outputs, moved, adjoint_following.all())
-        inputs, outputs = self._update(time, dt)
-        self._adjoint(
-            self._kernels.grid_update, self.nodes, inputs, outputs, [momentum, *[None] * 5, *inputs[6:]], [velocity]
-        )
-        inputs, outputs = self._scatter(state, acceleration[0], dt)
-        moved = [adjoint.positions, adjoint.velocities, adjoint.affine, stress, acceleration[1], None, None]
-        self._adjoint(self._kernels.particles_to_grid, self.count, inputs, outputs, [*moved, *inputs[7:]], [momentum])
+        inputs, outputs = self._gather(window, state, following, young[0], dt)
+        to = [adjoint.positions, adjoint.gradients, adjoint.yield_stress, velocity, young[1], None, *inputs[6:]]
+        self._adjoint(self._kernels.grid_to_particles, self.count, inputs, outputs, to, adjoint_following.all())
+        inputs, outputs = self._update(window, time, dt)
+        to = [momentum, *[None] * 5, *inputs[6:]]
+        self._adjoint(self._kernels.grid_update, window.shape, inputs, outputs, to, [velocity])
+        inputs, outputs = self._scatter(window, state, acceleration[0], dt)
+        to = [adjoint.positions, adjoint.velocities, adjoint.affine, stress, acceleration[1], None, None, *inputs[7:]]
+        self._adjoint(self._kernels.particles_to_grid, self.count, inputs, outputs, to, [momentum])
         inputs, outputs = self._stresses(state, young[0])
-        moved = [adjoint.gradients, adjoint.yield_stress, young[1], *inputs[3:]]
-        self._adjoint(self._kernels.stress_kernel, self.count, inputs, outputs, moved, [stress])
+        to = [adjoint.gradients, adjoint.yield_stress, young[1], *inputs[3:]]
+        self._adjoint(self._kernels.stress_kernel, self.count, inputs, outputs, to, [stress])
 
-    def _to_grid(self, state: State, young: Any, acceleration: Any, time: float, dt: float) -> None:
-        self._momentum.zero_()
+    def _to_grid(self, window: Window, state: State, young: Any, acceleration: Any, time: float, dt: float) -> None:
+        window.momentum.zero_()
         self._launch(self._kernels.stress_kernel, self.count, *self._stresses(state, young))
-        self._launch(self._kernels.particles_to_grid, self.count, *self._scatter(state, acceleration, dt))
-        self._launch(self._kernels.grid_update, self.nodes, *self._update(time, dt))
+        self._launch(self._kernels.particles_to_grid, self.count, *self._scatter(window, state, acceleration, dt))
+        self._launch(self._kernels.grid_update, window.shape, *self._update(window, time, dt))
 
     def _stresses(self, state: State, young: Any) -> tuple[list[Any], list[Any]]:
         material = self._material
         inputs = [state.gradients, state.yield_stress, young, material.poisson_ratio, int(material.kind)]
         return inputs, [self._stress]
 
-    def _scatter(self, state: State, acceleration: Any, dt: float) -> tuple[list[Any], list[Any]]:
+    def _scatter(self, window: Window, state: State, acceleration: Any, dt: float) -> tuple[list[Any], list[Any]]:
         moving = [state.positions, state.velocities, state.affine, self._stress, acceleration]
-        fixed = [self._mass, self._volume, 1 / self._grid.dx, self._grid.cells, dt]
-        return [*moving, *fixed], [self._momentum]
+        numbers = [1 / self._grid.dx, window.origin_, window.shape_, dt]
+        return [*moving, self._mass, self._volume, *numbers], [window.momentum]
 
-    def _update(self, time: float, dt: float) -> tuple[list[Any], list[Any]]:
+    def _update(self, window: Window, time: float, dt: float) -> tuple[list[Any], list[Any]]:
         grid = self._grid
-        numbers = [self._wp.vec3(*grid.gravity), max(0.0, 1 - grid.damping * dt), grid.dx, time, dt]
-        return [self._momentum, self._pinned_nodes, *self._boxes, *numbers], [self._velocity]
+        kept = max(0.0, 1 - grid.damping * dt)
+        numbers = [self._wp.vec3(*grid.gravity), kept, grid.dx, window.origin_, time, dt]
+        return [window.momentum, self._pinned_nodes, *self._boxes, *numbers], [window.velocity]
 
-    def _gather(self, state: State, following: State, young: Any, dt: float) -> tuple[list[Any], list[Any]]:
-        arrays = [state.positions, state.gradients, state.yield_stress, self._velocity, young, self._held]
+    def _gather(
+        self, window: Window, state: State, following: State, young: Any, dt: float
+    ) -> tuple[list[Any], list[Any]]:
+        arrays = [state.positions, state.gradients, state.yield_stress, window.velocity, young, self._held]
         material = [self._material.poisson_ratio, int(self._material.kind), self._rheology]
-        return [*arrays, *material, 1 / self._grid.dx, self._grid.cells, dt], following.all()
+        return [*arrays, *material, 1 / self._grid.dx, window.origin_, window.shape_, dt], following.all()
 
     def _launch(self, kernel: Any, size: Any, inputs: list[Any], outputs: list[Any]) -> None:
         self._wp.launch(kernel, dim=size, inputs=inputs, outputs=outputs, device=self.device)

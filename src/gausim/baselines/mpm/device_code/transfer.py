@@ -1,7 +1,8 @@
 """The kernels of one substep: stress, particles to grid, grid update, grid to particles.
 
 MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015) and quadratic B-splines, whose inertia tensor is dx^2 / 4. Nodes
-lie at multiples of dx from the origin of the domain. Every kernel reads its inputs and writes or adds to its outputs
+lie at multiples of dx from the origin of the domain; the arrays of nodes hold a window of them, which begins at node
+``origin``. Every kernel reads its inputs and writes or adds to its outputs
 only, so that Warp's adjoint of it is exact. The loops over nodes run to a length that is no constant: unrolled, each
 kernel would be compiled 27 times.
 """
@@ -25,12 +26,12 @@ def spline_weights(f: wp.vec3) -> wp.mat33:
 
 
 @wp.func
-def inside(x: wp.vec3, inverse_dx: float, cells: int) -> bool:
-    """Whether the 27 nodes of a particle are nodes of the grid; false for NaN."""
-    low = wp.min(wp.min(x[0], x[1]), x[2]) * inverse_dx
-    high = wp.max(wp.max(x[0], x[1]), x[2]) * inverse_dx
-    finite = wp.isfinite(x[0]) and wp.isfinite(x[1]) and wp.isfinite(x[2])
-    return finite and low >= 0.5 and high < float(cells) - 0.5
+def inside(x: wp.vec3, nodes: wp.vec3i) -> bool:
+    """Whether the 27 nodes of a particle are nodes of the window, x in cells from its first node; false for NaN."""
+    result = wp.isfinite(x[0]) and wp.isfinite(x[1]) and wp.isfinite(x[2])
+    for axis in range(3):
+        result = result and x[axis] >= 0.5 and x[axis] < float(nodes[axis]) - 1.5
+    return result
 
 
 @wp.kernel
@@ -59,7 +60,8 @@ def particles_to_grid(
     mass: wp.array[float],
     volume: wp.array[float],
     inverse_dx: float,
-    cells: int,
+    origin: wp.vec3,
+    nodes: wp.vec3i,
     dt: float,
     grid: wp.array3d[wp.vec4],
 ) -> None:
@@ -68,8 +70,8 @@ def particles_to_grid(
     m_i v_i = sum_p w_ip (m_p (v_p + dt a_p) + (m_p C_p - dt V_p 4 / dx^2 tau_p) (x_i - x_p))
     """
     p = wp.tid()
-    x = positions[p] * inverse_dx
-    if not inside(positions[p], inverse_dx, cells):
+    x = positions[p] * inverse_dx - origin
+    if not inside(x, nodes):
         return
     i, j, k = int(x[0] - 0.5), int(x[1] - 0.5), int(x[2] - 0.5)
     f = x - wp.vec3(float(i), float(j), float(k))
@@ -97,6 +99,7 @@ def grid_update(
     gravity: wp.vec3,
     kept: float,
     dx: float,
+    origin: wp.vec3,
     time: float,
     dt: float,
     velocity: wp.array3d[wp.vec3],
@@ -111,7 +114,7 @@ def grid_update(
     v = wp.vec3(0.0, 0.0, 0.0)
     if node[3] >= LEAST_NODE_MASS:
         v = kept * wp.vec3(node[0], node[1], node[2]) / node[3] + dt * gravity
-    x = dx * wp.vec3(float(i), float(j), float(k))
+    x = dx * (origin + wp.vec3(float(i), float(j), float(k)))
     for r in range(lower.shape[0]):
         if time >= span[r][0] and time < span[r][1]:
             y = x - span[r][2] * (time - span[r][0]) * motion[r]
@@ -119,7 +122,7 @@ def grid_update(
             below = y[0] <= upper[r][0] and y[1] <= upper[r][1] and y[2] <= upper[r][2]
             if above and below:
                 v = motion[r]
-    if pinned_nodes[i, j, k] != wp.uint8(0):
+    if pinned_nodes[i + int(origin[0]), j + int(origin[1]), k + int(origin[2])] != wp.uint8(0):
         v = wp.vec3(0.0, 0.0, 0.0)
     velocity[i, j, k] = v
 
@@ -136,7 +139,8 @@ def grid_to_particles(
     kind: int,
     rheology: wp.vec3,
     inverse_dx: float,
-    cells: int,
+    origin: wp.vec3,
+    nodes: wp.vec3i,
     dt: float,
     new_positions: wp.array[wp.vec3],
     new_velocities: wp.array[wp.vec3],
@@ -151,8 +155,8 @@ def grid_to_particles(
     p = wp.tid()
     v = wp.vec3(0.0, 0.0, 0.0)
     B = wp.mat33(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    if inside(positions[p], inverse_dx, cells):
-        x = positions[p] * inverse_dx
+    x = positions[p] * inverse_dx - origin
+    if inside(x, nodes):
         i, j, k = int(x[0] - 0.5), int(x[1] - 0.5), int(x[2] - 0.5)
         f = x - wp.vec3(float(i), float(j), float(k))
         w = spline_weights(f)
