@@ -151,3 +151,21 @@ def test_detached_frames_and_no_grad_record_nothing(lattice):
         again = solver.advance(state, 0, young_modulus=log_young.exp())
     assert not again.positions.requires_grad
     assert torch.allclose(again.positions, end.positions, atol=1e-6)
+
+
+@pytest.mark.gpu
+def test_a_gpu_gives_the_same_states_and_gradients(lattice):
+    results = []
+    for device in ("cpu", "cuda"):
+        _, state, log_young = scene(lattice)
+        x = state.positions
+        particles = Particles.create(x.to(device), grid=GRID, density=1.0, pinned=(x[:, 0] < 1.15).to(device))
+        solver = MPMSolver(particles, ELASTIC, GRID, TimeStep(FRAME_TIME, SUBSTEPS))
+        v = state.velocities.to(device).requires_grad_()
+        E = log_young.to(device).exp().requires_grad_()
+        rest = [t.to(device) for t in state.tensors()]
+        end = solver.advance(ParticleState(rest[0], v, *rest[2:]), 0, young_modulus=E)
+        (end.positions**2).sum().backward()
+        results.append([t.detach().cpu() for t in (*end.tensors(), v.grad, E.grad)])
+    for one, other in zip(*results, strict=True):
+        assert torch.allclose(one, other, rtol=1e-3, atol=1e-3 * float(one.abs().max()))

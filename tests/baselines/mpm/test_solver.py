@@ -116,6 +116,36 @@ def test_axial_period_of_an_elastic_bar(lattice, clamped: bool):
     assert found == pytest.approx(period, rel=0.05)
 
 
+def bending_period(lattice, cells: int) -> float:
+    """First period of a clamped beam of length 0.5 and square section of edge 0.125, E = rho = 1."""
+    grid = Grid(cells=cells, size=1.0)
+    x = lattice((0.1875, 0.4375, 0.4375), (0.75, 0.5625, 0.5625), 0.5 / cells)
+    material = Material(young_modulus=1.0, poisson_ratio=0.3, density=1.0)
+    solver = simulation(x, grid, material=material, frame_time=0.2, pinned=x[:, 0] < 0.25)
+    v = torch.zeros_like(x)
+    v[:, 2] = 0.002 * ((x[:, 0] - 0.25).clamp_min(0) / 0.5) ** 2
+    state = ParticleState.at_rest(x, v, material=material)
+    tip = x[:, 0] > 0.7
+    swing = [1.0]
+    while sum(a * b < 0 for a, b in zip(swing[:-1], swing[1:], strict=True)) < 2:
+        state = solver.advance(state, len(swing) - 1)
+        swing.append(float((state.positions - x)[tip, 2].mean()))
+    crossings = quarter_crossings(swing[1:], 0.2)  # from above, then from below
+    return 2 * (crossings[1] - crossings[0])
+
+
+@pytest.mark.slow
+def test_bending_period_of_a_clamped_beam(lattice):
+    """Bending (Euler) and shear in series (Dunkerley): 1 / w^2 = 1 / w_b^2 + 1 / w_s^2."""
+    bending = 1.8751**2 * 0.125 / math.sqrt(12) / 0.5**2
+    shear = math.pi / (2 * 0.5) * math.sqrt(0.85 / 2.6)
+    analytic = 2 * math.pi * math.sqrt(1 / bending**2 + 1 / shear**2)
+    coarse, fine = bending_period(lattice, 32), bending_period(lattice, 48)
+    print(f"period {coarse:.3f} on 4 cells across, {fine:.3f} on 6, analytic {analytic:.3f}")
+    assert fine == pytest.approx(analytic, rel=0.05)
+    assert abs(fine / analytic - 1) < abs(coarse / analytic - 1) < 0.1
+
+
 def test_pinned_particles_stay_and_the_rest_swings(lattice):
     grid = Grid(cells=16, size=1.0, gravity=(0.0, 0.0, -2.0))
     x = lattice((0.2, 0.4, 0.5), (0.7, 0.55, 0.6), 1 / 32)

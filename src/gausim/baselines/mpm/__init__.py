@@ -1,6 +1,14 @@
 """A differentiable material point method (MLS-MPM with APIC) on NVIDIA Warp, shared by PhysGaussian and PhysDreamer.
 
-Warp is imported when the first solver is made, not before.
+Warp is imported when the first solver is made, not before. A scene rolled out with given material:
+
+    dynamics = MPMDynamics(scene, fps=24.0, material=Material(young_modulus=1e5), grid=Grid(cells=50, size=2.0))
+    trajectory = dynamics.rollout(SimState(positions, previous), steps=50)
+
+and a frame that carries gradients, for whoever fits velocities or moduli:
+
+    dynamics = dynamics.with_young_modulus(log_young.exp())
+    state = dynamics.advance(dynamics.start(initial), frame=0)  # state.detach() ends the gradients there
 """
 
 from gausim.baselines.mpm.conditions import Box, Conditions, Impulse, PrescribedMotion, pinned_box

@@ -33,4 +33,4 @@ def on_stream_of(device: torch.device) -> AbstractContextManager[Any]:
     wp = warp()
     if device.type != "cuda":
         return nullcontext()
-    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)), sync_enter=False)
+    return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(device)))

@@ -35,11 +35,11 @@ class MPMSolver:
         material: Material,
         grid: Grid,
         step: TimeStep,
-        conditions: Conditions = Conditions(),  # noqa: B008
+        conditions: Conditions | None = None,
     ) -> None:
         self.particles, self.material, self.grid, self.step = particles, material, grid, step
-        self.conditions = conditions
-        boxes = conditions.packed(particles.mass.device)
+        self.conditions = conditions or Conditions()
+        boxes = self.conditions.packed(particles.mass.device)
         self._substeps = Substeps(particles, material, grid, boxes)
 
     def substeps(self, young_modulus: Float[Tensor, " N"]) -> int:
@@ -49,7 +49,7 @@ class MPMSolver:
             ConfigError: the configured number violates the bound of the time step.
         """
         density = self.particles.mass / self.particles.volume
-        return self.step.count(self.grid.dx, young_modulus, density)
+        return self.step.count(self.grid.dx, young_modulus, density, self.material.poisson_ratio)
 
     def advance(
         self,

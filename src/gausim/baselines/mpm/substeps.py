@@ -12,6 +12,7 @@ from torch import Tensor
 from gausim.baselines.mpm.config import Grid, Material
 from gausim.baselines.mpm.particles import Particles
 from gausim.baselines.mpm.runtime import warp
+from gausim.ops.announce import announced
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +87,8 @@ class Substeps:
 
         self._wp, self._kernels = wp, transfer
         self.device = wp.device_from_torch(particles.mass.device)
+        with announced("the material point method", keeper="Warp"):
+            wp.load_module(transfer.__name__, device=self.device)
         self.count = len(particles.mass)
         self._grid, self._material = grid, material
         # Warp's views do not own the memory of the tensors they look at.

@@ -58,7 +58,7 @@ def polar_rotation(F: wp.mat33) -> wp.mat33:
 
 @wp.func_grad(polar_rotation)
 def _adjoint_polar_rotation(F: wp.mat33, adjoint: wp.mat33) -> None:
-    """DR = R [w]x with (tr S I - S) w = axial(R^T dF - dF^T R), transposed."""
+    """The derivative dR = R [w]x with (tr S I - S) w = axial(R^T dF - dF^T R), transposed."""
     R = polar_rotation(F)
     S = wp.transpose(R) * F
     P = wp.transpose(R) * adjoint
