@@ -14,10 +14,10 @@ torch.set_num_threads(1)
 
 
 def _left_unchecked(decorator: ast.AST, *, marked=_import_hook._is_no_type_check) -> bool:
-    """numba cannot compile a function that the checker has wrapped, so its kernels go unchecked."""
+    """numba and Warp cannot compile a function that the checker has wrapped, so their kernels go unchecked."""
     names = {node.id for node in ast.walk(decorator) if isinstance(node, ast.Name)}
     names |= {node.attr for node in ast.walk(decorator) if isinstance(node, ast.Attribute)}
-    return marked(decorator) or bool(names & {"njit", "jit", "vectorize", "guvectorize"} and "torch" not in names)
+    return marked(decorator) or bool(names & {"njit", "jit", "vectorize", "guvectorize", "wp"} and "torch" not in names)
 
 
 _import_hook._is_no_type_check = _left_unchecked

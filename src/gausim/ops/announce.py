@@ -1,4 +1,4 @@
-"""Says so when numba compiles: a first call that takes seconds must not look like one that hangs."""
+"""Says so when numba or Warp compiles: a first call that takes seconds must not look like one that hangs."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _compiled: set[str] = set()
 
 
 @contextmanager
-def announced(what: str) -> Iterator[None]:
+def announced(what: str, *, keeper: str = "numba") -> Iterator[None]:
     """Logs once per process that ``what`` is being compiled, if the first block about it takes long."""
     if what in _compiled:
         yield
         return
-    text = f"Compiling {what} (once, some seconds; numba keeps the result for later runs)."
+    text = f"Compiling {what} (once, some seconds; {keeper} keeps the result for later runs)."
     timer = threading.Timer(ANNOUNCE_AFTER, logger.warning, (text,))
     timer.daemon = True
     timer.start()

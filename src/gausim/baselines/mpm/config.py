@@ -1,0 +1,158 @@
+"""What a simulation is made of: material, grid, and the bound of the time step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import ConfigError
+
+
+class MaterialKind(IntEnum):
+    """Kinds of matter; the numbers are compiled into the kernels."""
+
+    FIXED_COROTATED = 0
+    VON_MISES = 1
+    DRUCKER_PRAGER = 2
+    VISCOPLASTIC = 3
+    PLASTICINE = 4
+
+
+@dataclass(frozen=True)
+class Material:
+    """One material; Young's modulus may vary over the particles.
+
+    Attributes:
+        kind: which stress and which return map.
+        young_modulus: E of every particle that is not given its own [mass / (length s^2), simulation units].
+        poisson_ratio: nu, in (-1, 0.5).
+        density: mass per volume [simulation units].
+        yield_stress: y of von Mises (|dev tau| <= y), viscoplastic (sqrt(2/3) y) and plasticine [as E].
+        friction_angle: of Drucker-Prager [degrees] (Klar et al. 2016).
+        plastic_viscosity: of the viscoplastic flow [E s].
+        softening: of plasticine, loss of yield stress per plastic flow [as E].
+    """
+
+    kind: MaterialKind = MaterialKind.FIXED_COROTATED
+    young_modulus: float = 1e5
+    poisson_ratio: float = 0.4
+    density: float = 200.0
+    yield_stress: float = 1e3
+    friction_angle: float = 25.0
+    plastic_viscosity: float = 10.0
+    softening: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not -1 < self.poisson_ratio < 0.5:
+            raise ConfigError(f"poisson_ratio: expected -1 < nu < 0.5, got {self.poisson_ratio}. Rubber has 0.49.")
+        for name in ("young_modulus", "density"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"{name}: expected a positive number, got {getattr(self, name)}.")
+        for name in ("yield_stress", "plastic_viscosity", "softening"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name}: expected a number that is not negative, got {getattr(self, name)}.")
+        if not 0 <= self.friction_angle < 90:
+            raise ConfigError(f"friction_angle: expected degrees in [0, 90), got {self.friction_angle}.")
+
+    @property
+    def friction(self) -> float:
+        """Alpha = sqrt(2/3) 2 sin(phi) / (3 - sin(phi)) of the friction angle phi."""
+        sine = math.sin(math.radians(self.friction_angle))
+        return math.sqrt(2 / 3) * 2 * sine / (3 - sine)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The background grid over the domain [0, size]^3.
+
+    Attributes:
+        cells: cells per axis; nodes are one more.
+        size: edge L of the domain [simulation units].
+        gravity: acceleration of everything [simulation units / s^2].
+        damping: rate at which nodes lose velocity [1 / s]; 0 is none.
+    """
+
+    cells: int = 50
+    size: float = 2.0
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.cells < 4:
+            raise ConfigError(f"cells: expected at least 4 (a particle touches 3 nodes), got {self.cells}.")
+        if not 0 < self.size < math.inf:
+            raise ConfigError(f"size: expected a positive edge of the domain, got {self.size}.")
+        if self.damping < 0:
+            raise ConfigError(f"damping: expected a rate that is not negative, got {self.damping}.")
+
+    @property
+    def dx(self) -> float:
+        """Edge of a cell [simulation units]."""
+        return self.size / self.cells
+
+
+COVERED_POISSON_RATIO = 0.45  # up to which the bound of the time step needs no factor
+
+
+def pressure_wave(poisson_ratio: float) -> float:
+    """Speed of waves of pressure over sqrt(E / rho): sqrt((1 - nu) / ((1 + nu) (1 - 2 nu)))."""
+    nu = poisson_ratio
+    return math.sqrt((1 - nu) / ((1 + nu) * (1 - 2 * nu)))
+
+
+@dataclass(frozen=True)
+class TimeStep:
+    """How a frame is divided into substeps.
+
+    Attributes:
+        frame_time: duration of a frame [s].
+        substeps: substeps per frame; None derives the least number that keeps the bound.
+        courant: c of the bound dt < c dx / sqrt(E / rho). 0.3 leaves room for nu up to 0.45, where waves of pressure
+            are 1.9 times as fast as sqrt(E / rho); measured, 0.5 is stable up to 0.4 and 0.7 up to 0.3.
+    """
+
+    frame_time: float = 1 / 30
+    substeps: int | None = None
+    courant: float = 0.3
+
+    def __post_init__(self) -> None:
+        if not 0 < self.frame_time < math.inf:
+            raise ConfigError(f"frame_time: expected a positive duration [s], got {self.frame_time}.")
+        if self.substeps is not None and self.substeps < 1:
+            raise ConfigError(f"substeps: expected at least 1 or none, got {self.substeps}.")
+        if not 0 < self.courant <= 1:
+            raise ConfigError(f"courant: expected a number in (0, 1], got {self.courant}.")
+
+    def count(
+        self, dx: float, young_modulus: Float[Tensor, " N"], density: Float[Tensor, " N"], poisson_ratio: float
+    ) -> int:
+        """Substeps per frame: the given number, or the least that keeps dt < c dx / sqrt(E / rho) for all particles.
+
+        For nu > 0.45 sqrt(E / rho) is multiplied by how much faster waves of pressure are than at 0.45.
+
+        Raises:
+            ConfigError: the given number violates the bound, or a modulus is not a positive number.
+        """
+        speed = float((young_modulus.detach() / density).amax()) ** 0.5 if len(density) else 0.0
+        speed *= max(1.0, pressure_wave(poisson_ratio) / pressure_wave(COVERED_POISSON_RATIO))
+        least = float(young_modulus.detach().amin()) if len(density) else 1.0
+        if not (least > 0 and math.isfinite(speed)):
+            raise ConfigError(
+                f"young_modulus: expected positive numbers, got {least:.4g} .. (rho c^2, c = {speed:.4g})."
+            )
+        bound = self.courant * dx / speed if speed else math.inf
+        needed = math.floor(self.frame_time / bound) + 1
+        if self.substeps is None:
+            return needed
+        if self.substeps < needed:
+            raise ConfigError(
+                f"substeps: {self.substeps} per frame make dt = {self.frame_time / self.substeps:.3g} s, but the "
+                f"stiffest particle (sqrt(E / rho) = {speed:.4g}) on cells of {dx:.4g} needs dt < c dx / sqrt(E / rho) "
+                f"= {bound:.3g} s (c = {self.courant}). Give at least {needed} substeps, none to derive them, a "
+                "coarser grid, or a softer or denser material."
+            )
+        return self.substeps

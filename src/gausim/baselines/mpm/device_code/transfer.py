@@ -1,0 +1,181 @@
+"""The kernels of one substep: stress, particles to grid, grid update, grid to particles.
+
+MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015) and quadratic B-splines, whose inertia tensor is dx^2 / 4. Nodes
+lie at multiples of dx from the origin of the domain; the arrays of nodes hold a window of them, which begins at node
+``origin``. Every kernel reads its inputs and writes or adds to its outputs
+only, so that Warp's adjoint of it is exact. The loops over nodes run to a length that is no constant: unrolled, each
+kernel would be compiled 27 times.
+"""
+
+import warp as wp
+
+from gausim.baselines.mpm.device_code.constitutive import kirchhoff_stress, return_map, softened
+from gausim.baselines.mpm.device_code.elasticity import lame_lambda, shear_modulus
+from gausim.baselines.mpm.device_code.matrices import identity
+
+LEAST_NODE_MASS = wp.constant(1.0e-15)
+
+
+@wp.func
+def spline_weights(f: wp.vec3) -> wp.mat33:
+    """Row i: weights of the three axes at node i of three, f in [0.5, 1.5) cells from node 0."""
+    one = wp.vec3(1.0, 1.0, 1.0)
+    a, b, c = 1.5 * one - f, f - one, f - 0.5 * one
+    w0, w1, w2 = 0.5 * wp.cw_mul(a, a), 0.75 * one - wp.cw_mul(b, b), 0.5 * wp.cw_mul(c, c)
+    return wp.mat33(w0[0], w0[1], w0[2], w1[0], w1[1], w1[2], w2[0], w2[1], w2[2])
+
+
+@wp.func
+def inside(x: wp.vec3, nodes: wp.vec3i) -> bool:
+    """Whether the 27 nodes of a particle are nodes of the window, x in cells from its first node; false for NaN."""
+    result = wp.isfinite(x[0]) and wp.isfinite(x[1]) and wp.isfinite(x[2])
+    for axis in range(3):
+        result = result and x[axis] >= 0.5 and x[axis] < float(nodes[axis]) - 1.5
+    return result
+
+
+@wp.kernel
+def stress_kernel(
+    gradients: wp.array[wp.mat33],
+    yield_stress: wp.array[float],
+    young: wp.array[float],
+    poisson: float,
+    kind: int,
+    stress: wp.array[wp.mat33],
+) -> None:
+    """Kirchhoff stress per particle."""
+    p = wp.tid()
+    mu = shear_modulus(young[p], poisson)
+    lam = lame_lambda(young[p], poisson)
+    stress[p] = kirchhoff_stress(kind, gradients[p], mu, lam, yield_stress[p])
+
+
+@wp.kernel
+def particles_to_grid(
+    positions: wp.array[wp.vec3],
+    velocities: wp.array[wp.vec3],
+    affine: wp.array[wp.mat33],
+    stress: wp.array[wp.mat33],
+    acceleration: wp.array[wp.vec3],
+    mass: wp.array[float],
+    volume: wp.array[float],
+    inverse_dx: float,
+    origin: wp.vec3,
+    nodes: wp.vec3i,
+    dt: float,
+    grid: wp.array3d[wp.vec4],
+) -> None:
+    """Adds momentum (x, y, z) and mass (w) of the particles to the grid.
+
+    m_i v_i = sum_p w_ip (m_p (v_p + dt a_p) + (m_p C_p - dt V_p 4 / dx^2 tau_p) (x_i - x_p))
+    """
+    p = wp.tid()
+    x = positions[p] * inverse_dx - origin
+    if not inside(x, nodes):
+        return
+    i, j, k = int(x[0] - 0.5), int(x[1] - 0.5), int(x[2] - 0.5)
+    f = x - wp.vec3(float(i), float(j), float(k))
+    w = spline_weights(f)
+    A = mass[p] * affine[p] - (dt * volume[p] * 4.0 * inverse_dx * inverse_dx) * stress[p]
+    momentum = mass[p] * (velocities[p] + dt * acceleration[p])
+    three = 3
+    for a in range(three):
+        for b in range(three):
+            for c in range(three):
+                arm = (wp.vec3(float(a), float(b), float(c)) - f) / inverse_dx
+                weight = w[a, 0] * w[b, 1] * w[c, 2]
+                q = weight * (momentum + A * arm)
+                wp.atomic_add(grid, i + a, j + b, k + c, wp.vec4(q[0], q[1], q[2], weight * mass[p]))
+
+
+@wp.kernel
+def grid_update(
+    grid: wp.array3d[wp.vec4],
+    pinned_nodes: wp.array3d[wp.uint8],
+    lower: wp.array[wp.vec3],
+    upper: wp.array[wp.vec3],
+    motion: wp.array[wp.vec3],
+    span: wp.array[wp.vec3],
+    gravity: wp.vec3,
+    kept: float,
+    dx: float,
+    origin: wp.vec3,
+    time: float,
+    dt: float,
+    velocity: wp.array3d[wp.vec3],
+) -> None:
+    """Velocity of nodes: momentum over mass, gravity, damping (the factor ``kept``), then what is prescribed.
+
+    Nodes in box r = ``lower``..``upper`` move with ``motion[r]`` between the times ``span[r]`` = (start, end, follows);
+    a box that follows moves along. Later boxes win, pinned nodes win over boxes.
+    """
+    i, j, k = wp.tid()
+    node = grid[i, j, k]
+    v = wp.vec3(0.0, 0.0, 0.0)
+    if node[3] >= LEAST_NODE_MASS:
+        v = kept * wp.vec3(node[0], node[1], node[2]) / node[3] + dt * gravity
+    x = dx * (origin + wp.vec3(float(i), float(j), float(k)))
+    for r in range(lower.shape[0]):
+        if time >= span[r][0] and time < span[r][1]:
+            y = x - span[r][2] * (time - span[r][0]) * motion[r]
+            above = y[0] >= lower[r][0] and y[1] >= lower[r][1] and y[2] >= lower[r][2]
+            below = y[0] <= upper[r][0] and y[1] <= upper[r][1] and y[2] <= upper[r][2]
+            if above and below:
+                v = motion[r]
+    if pinned_nodes[i + int(origin[0]), j + int(origin[1]), k + int(origin[2])] != wp.uint8(0):
+        v = wp.vec3(0.0, 0.0, 0.0)
+    velocity[i, j, k] = v
+
+
+@wp.kernel
+def grid_to_particles(
+    positions: wp.array[wp.vec3],
+    gradients: wp.array[wp.mat33],
+    yield_stress: wp.array[float],
+    velocity: wp.array3d[wp.vec3],
+    young: wp.array[float],
+    held: wp.array[wp.uint8],
+    poisson: float,
+    kind: int,
+    rheology: wp.vec3,
+    inverse_dx: float,
+    origin: wp.vec3,
+    nodes: wp.vec3i,
+    dt: float,
+    new_positions: wp.array[wp.vec3],
+    new_velocities: wp.array[wp.vec3],
+    new_affine: wp.array[wp.mat33],
+    new_gradients: wp.array[wp.mat33],
+    new_yield_stress: wp.array[float],
+) -> None:
+    """V = sum_i w_i v_i, C = 4 / dx^2 sum_i w_i v_i (x_i - x)^T, x += dt v, F = Z((I + dt C) F).
+
+    Held particles keep their position.
+    """
+    p = wp.tid()
+    v = wp.vec3(0.0, 0.0, 0.0)
+    B = wp.mat33(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    x = positions[p] * inverse_dx - origin
+    if inside(x, nodes):
+        i, j, k = int(x[0] - 0.5), int(x[1] - 0.5), int(x[2] - 0.5)
+        f = x - wp.vec3(float(i), float(j), float(k))
+        w = spline_weights(f)
+        three = 3
+        for a in range(three):
+            for b in range(three):
+                for c in range(three):
+                    u = (w[a, 0] * w[b, 1] * w[c, 2]) * velocity[i + a, j + b, k + c]
+                    v += u
+                    B += wp.outer(u, wp.vec3(float(a), float(b), float(c)) - f)
+    C = (4.0 * inverse_dx) * B
+    F = (identity() + dt * C) * gradients[p]
+    mu = shear_modulus(young[p], poisson)
+    lam = lame_lambda(young[p], poisson)
+    moved = positions[p] + dt * v
+    if held[p] != wp.uint8(0):
+        moved = positions[p]
+    new_positions[p] = moved
+    new_velocities[p] = v
+    new_affine[p] = C
+    new_gradients[p] = return_map(kind, F, mu, lam, yield_stress[p], rheology, dt)
+    new_yield_stress[p] = softened(kind, F, mu, yield_stress[p], rheology)

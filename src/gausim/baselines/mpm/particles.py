@@ -1,0 +1,149 @@
+"""Particles: what stays (mass, volume, which are held) and what moves."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gausim.baselines.mpm.config import Grid, Material
+from gausim.core import DivergenceError
+
+HALF = 0.999  # a node half way between held and free matter is held, whatever rounding makes of it
+
+
+@dataclass(frozen=True, eq=False)
+class ParticleState:
+    """The state of N particles between two substeps [simulation units].
+
+    Attributes:
+        positions: x.
+        velocities: v.
+        affine: C, the velocity gradient of APIC [1 / s].
+        gradients: F, the elastic part of the deformation gradient.
+        yield_stress: y, which plasticine loses as it flows.
+    """
+
+    positions: Float[Tensor, "N 3"]
+    velocities: Float[Tensor, "N 3"]
+    affine: Float[Tensor, "N 3 3"]
+    gradients: Float[Tensor, "N 3 3"]
+    yield_stress: Float[Tensor, " N"]
+
+    @staticmethod
+    def at_rest(
+        positions: Float[Tensor, "N 3"], velocities: Float[Tensor, "N 3"] | None = None, *, material: Material
+    ) -> ParticleState:
+        """Undeformed particles (F = I, C = 0), at rest unless velocities are given."""
+        x = positions.float()
+        return ParticleState(
+            x,
+            torch.zeros_like(x) if velocities is None else velocities.float(),
+            x.new_zeros(len(x), 3, 3),
+            torch.eye(3, device=x.device).repeat(len(x), 1, 1),
+            x.new_full((len(x),), material.yield_stress),
+        )
+
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """(x, v, C, F, y)."""
+        return self.positions, self.velocities, self.affine, self.gradients, self.yield_stress
+
+    def detach(self) -> ParticleState:
+        """The same numbers without history (gradients stop here)."""
+        return ParticleState(*(getattr(self, f.name).detach() for f in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class Particles:
+    """What does not change during a simulation.
+
+    Attributes:
+        mass: m [simulation units].
+        volume: V at rest [simulation units^3].
+        pinned: particles that stay where they are. Their F takes part: the layer between the last pinned node and
+            the first free one would be soft without it.
+        pinned_nodes: nodes that hold pinned particles: the nearest of each, and those whose mass at rest is theirs by
+            half or more; their velocity is 0.
+    """
+
+    mass: Float[Tensor, " N"]
+    volume: Float[Tensor, " N"]
+    pinned: Bool[Tensor, " N"]
+    pinned_nodes: Bool[Tensor, "n n n"]
+
+    @staticmethod
+    def create(
+        positions: Float[Tensor, "N 3"],
+        *,
+        grid: Grid,
+        density: float,
+        volume: Float[Tensor, " N"] | None = None,
+        pinned: Bool[Tensor, " N"] | None = None,
+    ) -> Particles:
+        """Particles at rest at these positions; without ``volume`` a cell is shared by the particles in it.
+
+        Raises:
+            DivergenceError: a particle lies outside the domain.
+        """
+        require_inside(positions, grid, "at rest")
+        if volume is None:
+            volume = particle_volumes(positions, grid)
+        volume = volume.float()
+        nodes = torch.zeros((grid.cells + 1,) * 3, dtype=torch.bool, device=positions.device)
+        if pinned is None:
+            pinned = torch.zeros(len(positions), dtype=torch.bool, device=positions.device)
+        if pinned.any():
+            held = node_volumes(positions[pinned], volume[pinned], grid)
+            nodes = (held > 0) & (held > HALF * node_volumes(positions[~pinned], volume[~pinned], grid))
+            nodes[tuple((positions[pinned] / grid.dx).round().long().T)] = True
+        return Particles(density * volume, volume, pinned, nodes)
+
+
+def node_volumes(positions: Float[Tensor, "N 3"], volume: Float[Tensor, " N"], grid: Grid) -> Float[Tensor, "n n n"]:
+    """Volume that every node has of the particles, by quadratic B-splines [simulation units^3]."""
+    n = grid.cells + 1
+    base = (positions / grid.dx - 0.5).floor()
+    f = positions / grid.dx - base
+    weights = torch.stack((0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2))
+    i, j, k = base.long().unbind(-1)
+    total = volume.new_zeros(n**3)
+    for a, b, c in itertools.product(range(3), repeat=3):
+        share = volume * weights[a, :, 0] * weights[b, :, 1] * weights[c, :, 2]
+        total.index_add_(0, ((i + a) * n + j + b) * n + k + c, share)
+    return total.view(n, n, n)
+
+
+def particle_volumes(positions: Float[Tensor, "N 3"], grid: Grid) -> Float[Tensor, " N"]:
+    """V = dx^3 / number of particles in the particle's cell [simulation units^3] (PhysGaussian)."""
+    i, j, k = (positions / grid.dx).floor().long().unbind(-1)
+    cell = (i * grid.cells + j) * grid.cells + k
+    _, inverse, count = torch.unique(cell, return_inverse=True, return_counts=True)
+    return grid.dx**3 / count[inverse].float()
+
+
+def require_inside(positions: Float[Tensor, "N 3"], grid: Grid, when: str) -> None:
+    """Raises :class:`DivergenceError` naming the first particle whose 27 nodes are not all on the grid.
+
+    Args:
+        positions: positions [simulation units].
+        grid: the grid; the allowed region is half a cell less than the domain on each side.
+        when: what the message says about the time, e.g. 'frame 12'.
+    """
+    low, high = 0.5 * grid.dx, grid.size - 0.5 * grid.dx
+    outside = ~((positions >= low) & (positions < high)).all(-1)
+    if not outside.any():
+        return
+    first = int(outside.nonzero()[0])
+    place = ", ".join(f"{value:.4g}" for value in positions[first].tolist())
+    if torch.isfinite(positions[first]).all():
+        remedy = "Enlarge the domain or scale the scene down in it, or make the motion smaller."
+    else:
+        remedy = "The simulation blew up: take more substeps (a smaller Courant number) or a softer material."
+    raise DivergenceError(
+        f"material points, {when}: particle {first} is at ({place}); expected every coordinate in "
+        f"[{low:.4g}, {high:.4g}) of the domain [0, {grid.size:.4g}]^3 ({int(outside.sum())} of {len(positions)} are "
+        f"outside). {remedy}"
+    )
