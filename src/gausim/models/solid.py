@@ -14,7 +14,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy import ndimage
 from scipy.linalg import eigh
-from scipy.sparse.linalg import eigsh
+from scipy.sparse.linalg import LinearOperator, eigsh, factorized
 
 # Stiffness and density of the cells around the body, as a share of those inside.
 OUTSIDE = 0.01
@@ -24,9 +24,6 @@ SUBDIVISIONS = 2
 POISSON = 0.3
 # Pinned kernels are held by springs this much stiffer than a grid cell.
 PIN_STIFFNESS = 1e3
-# Mass is the units'; the inside gets this share of it only to keep the equations well posed. Much more of it would
-# bring modes that the units do not show, and the state of the simulator is what they show.
-INNER_MASS = 1e-3
 # Nodes at the rim with a stiffness below this share of the largest are left out: rounding would move them.
 NO_SUPPORT = 1e-9
 # Grid points within the support of a quadratic B-spline, along one axis.
@@ -155,18 +152,12 @@ def solid_modes(
         strength = PIN_STIFFNESS * weights.sum() / (held.sum() * spacing**2)
         for a in range(3):
             blocks[a][a] = blocks[a][a] + strength * (hold.T @ hold)
-    nodes, values, _ = grid.splines(rest[~pinned])
-    carry = matrix(nodes, values, grid.size)
-    nodes, values, _ = grid.splines(centres)
-    fill = matrix(nodes, values, grid.size)
-    inertia = carry.T @ sp.diags(mass[~pinned] / mass[~pinned].sum()) @ carry
-    inertia = inertia + INNER_MASS * (fill.T @ sp.diags(weights / weights.sum()) @ fill)
     whole = sp.bmat(blocks).tocsr()
     used = whole.diagonal() > NO_SUPPORT * whole.diagonal().max()
-    k = whole[used][:, used]
-    m = sp.block_diag([inertia] * 3).tocsr()[used][:, used]
-    count = min(modes, 3 * int((~pinned).sum()))
-    eigenvalues, vectors = lowest(k, m, count)
+    nodes, values, _ = grid.splines(rest[~pinned])
+    carry = sp.block_diag([matrix(nodes, values, grid.size)] * 3).tocsr()[:, used]
+    root = np.tile(np.sqrt(mass[~pinned]), 3)
+    eigenvalues, vectors = lowest(whole[used][:, used], sp.diags(root) @ carry, modes)
     full = np.zeros((3 * grid.size, vectors.shape[1]))
     full[used] = vectors
     field = full.reshape(3, grid.size, -1)
@@ -176,26 +167,34 @@ def solid_modes(
     slope = np.einsum("nkb,ankm->nabm", gradients, at)
     phi[pinned] = 0
     slope[pinned] = 0
-    norm = np.sqrt(np.einsum("nam,n,nam->m", phi, mass, phi))
-    sign = np.sign(
-        np.take_along_axis(phi.reshape(-1, len(norm)), np.abs(phi).reshape(-1, len(norm)).argmax(0)[None], 0)
-    )
-    scale = sign[0] / norm
+    flat = phi.reshape(-1, phi.shape[-1])
+    scale = np.sign(flat[np.abs(flat).argmax(0), np.arange(phi.shape[-1])])
     eigenvalues = np.maximum(eigenvalues, 1e-4 * eigenvalues[-1])
     return eigenvalues / eigenvalues[0], phi * scale, slope * scale
 
 
-def lowest(k: sp.spmatrix, m: sp.spmatrix, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest eigenvalues (M,) and vectors (D, M) of k x = value m x."""
-    size = k.shape[0]
-    count = min(count, size)
-    # The mass may be singular, the stiffness with a little of it is not: 1 / (value + shift) are the largest values of
-    # the inverse problem.
-    shift = 1e-6 * k.diagonal().mean() / m.diagonal().mean()
-    if size <= max(300, 3 * count):
-        inverse, vectors = eigh(m.toarray(), (k + shift * m).toarray())
-        inverse, vectors = inverse[::-1][:count], vectors[:, ::-1][:, :count]
-        return 1 / inverse - shift, vectors
-    values, vectors = eigsh(k.tocsc(), count, M=m.tocsc(), sigma=-shift, v0=np.ones(size))
-    order = np.argsort(values)
-    return values[order], vectors[:, order]
+def lowest(k: sp.spmatrix, carry: sp.spmatrix, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest eigenvalues (M,) and vectors (D, M) of k x = value carry^T carry x, with carry x orthonormal.
+
+    The mass carry^T carry has a small rank R, so the R x R matrix of compliances carry k^-1 carry^T is solved instead:
+    its largest eigenvalues are the inverses.
+    """
+    solve = factorized(k.tocsc())
+    rank = carry.shape[0]
+    count = min(count, rank)
+    turned = carry.T.tocsc()
+
+    def comply(x: np.ndarray) -> np.ndarray:
+        return carry @ solve(turned @ x.ravel())
+
+    if rank <= max(400, 2 * count):
+        compliance = np.stack([comply(row) for row in np.eye(rank)], 1)
+        inverse, found = eigh((compliance + compliance.T) / 2)
+    else:
+        operator = LinearOperator((rank, rank), matvec=comply, dtype=np.float64)
+        inverse, found = eigsh(operator, count, which="LM", v0=np.ones(rank))
+    order = np.argsort(inverse)[::-1][:count]
+    inverse, found = inverse[order], found[:, order]
+    kept = inverse > 1e-12 * inverse[0]
+    inverse, found = inverse[kept], found[:, kept]
+    return 1 / inverse, np.stack([solve(turned @ v) for v in found.T], 1) / inverse
