@@ -38,7 +38,10 @@ DEFAULT: dict[str, Any] = {
     "predicted_levels": (2, 1), "graph_radii": (2.0, 0.4), "max_neighbours": 8, "edges": "rest", "rest_inputs": True,
     "hidden": 32, "layers": 2, "output_scale": 0.01, "zero_output": True,
 }  # fmt: skip
-TEMPLATE: dict[str, Any] = {"modes": 48, "neighbours": 24, "period": 8.0, "hidden": 64, "amplitude": 0.02}
+TEMPLATE: dict[str, Any] = {
+    "modes": 48, "solid": 0.12, "geometric": 1.0, "neighbours": 24, "damping": "full", "period": 8.0, "hidden": 0,
+    "amplitude": 0.02,
+}  # fmt: skip
 # Calls of what takes long; its first call is not timed either.
 LONG_ROUNDS = 2
 PAPER_RATIO = "with hierarchy, same run (the paper: 2.8 in time, 1.7 in memory, rendering included)"
