@@ -57,7 +57,7 @@ def ratios(run: Path) -> list[float]:
 def test_only_initial_states_are_learned_and_the_result_is_a_run(trained: Path, pushed: Path, tmp_path: Path) -> None:
     out = tmp_path / "adapted"
     asked = [str(trained), "--data", str(pushed), "--sequences", "hard", "other_way", "--frames", "4"]
-    assert adapt.main([*asked, "--out", str(out), "--epochs", "12"]) == 0
+    assert adapt.main([*asked, "--out", str(out), "--epochs", "20"]) == 0
     found, source = weights(out), load_run(trained).module.model.state_dict()
     own = {name.removeprefix("model."): value for name, value in found.items() if name.startswith("model.")}
     of_toy = {
