@@ -15,7 +15,14 @@ if TYPE_CHECKING:
     from gausim.data.objects import ObjectData
     from gausim.data.records import SequenceRecord
 
-METHOD = "gausim"
+GAUSSIM = "gausim"
+
+
+def method_of(run: LoadedRun) -> str:
+    """What the run's predictions are called in tables."""
+    from gausim.engine.fitting import FittedModule
+
+    return run.module.method.name if isinstance(run.module, FittedModule) else GAUSSIM
 
 
 @dataclass(frozen=True)
@@ -101,23 +108,40 @@ class TrainedPrediction:
         predictions = hierarchy.predictions(predicted)
         return {"counts": counts, "predicted": predicted, "predictions": predictions, "kernels": counts[0]}
 
+    @property
+    def footnotes(self) -> dict[str, Any] | None:
+        """Whether it extrapolates, and what a reader must know; None for a simulator, of which all is in its config."""
+        from gausim.engine.fitting import FittedModule
+
+        module = self._run.module
+        if not isinstance(module, FittedModule):
+            return None
+        return {"extrapolates": module.method.extrapolates, "notes": module.notes()}
+
     def full(self, record: SequenceRecord) -> Trajectory:
         """All predicted frames of a sequence, the recorded ones and those asked for beyond."""
         if record.name not in self._known:
-            import torch
-
-            from gausim.core import SimState
-
-            # The parts of a run are torch modules; what they offer beyond that is stated by the engine's contracts.
-            model: Any = self._run.module.model
-            states: Any = self._run.module.initial_states
-            rest = scene_of(self._run, self._item).means
-            with torch.no_grad():
-                previous = states.previous(self._ids[record.name]).to(rest)
-            dynamics: Dynamics = model.dynamics(self._item.scene_id)
             steps = max(record.count, self._frames) - 1
-            self._known[record.name] = dynamics.rollout(SimState(rest, previous), steps)
+            self._known[record.name] = self._predict(self._ids[record.name], steps)
         return self._known[record.name]
+
+    def _predict(self, sequence_id: int, steps: int) -> Trajectory:
+        import torch
+
+        from gausim.core import SimState
+        from gausim.engine.fitting import FittedModule
+
+        module = self._run.module
+        if isinstance(module, FittedModule):
+            return module.foresee(sequence_id, steps)
+        # The parts of a run are torch modules; what they offer beyond that is stated by the engine's contracts.
+        model: Any = module.model
+        states: Any = module.initial_states
+        rest = scene_of(self._run, self._item).means
+        with torch.no_grad():
+            previous = states.previous(sequence_id).to(rest)
+        dynamics: Dynamics = model.dynamics(self._item.scene_id)
+        return dynamics.rollout(SimState(rest, previous), steps)
 
     def __call__(self, record: SequenceRecord) -> Trajectory:
         """Exactly the recorded frames of a sequence."""

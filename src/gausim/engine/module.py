@@ -49,7 +49,7 @@ class GausSimModule(LightningModule):
         self,
         *,
         model: nn.Module,
-        initial_states: nn.Module,
+        initial_states: nn.Module | None,
         scene_of_sequence: Sequence[int],
         renderer: Renderer,
         objective: Objective | None = None,
@@ -62,7 +62,7 @@ class GausSimModule(LightningModule):
 
         Args:
             model: the simulator (see :class:`gausim.engine.contracts.Simulator`).
-            initial_states: one parameter per training sequence, in their order.
+            initial_states: one parameter per training sequence, in their order; None where the model has its own.
             scene_of_sequence: the scene of each training sequence.
             renderer: draws the predictions, for training on images and for the pictures.
             objective: what is minimised; METHOD's when None.
@@ -81,11 +81,9 @@ class GausSimModule(LightningModule):
         self.settings = optimizer if optimizer is not None else OptimizerSettings()
         self.scene_of_sequence = tuple(scene_of_sequence)
         self.seed, self.share_every = seed, share_every
-        if len(list(initial_states.parameters())) != len(self.scene_of_sequence):
-            raise ConfigError(
-                f"initial states: {len(list(initial_states.parameters()))} parameters for "
-                f"{len(self.scene_of_sequence)} sequences; expected one each."
-            )
+        count = len(self.scene_of_sequence)
+        if initial_states is not None and (own := len(list(initial_states.parameters()))) != count:
+            raise ConfigError(f"initial states: {own} parameters for {count} sequences; expected one each.")
         self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
         self.images = ImageSupervision(self.simulator.scenes, renderer, self.objective.image)
         self.supervision = self.images if supervision is None else supervision
@@ -109,9 +107,14 @@ class GausSimModule(LightningModule):
         """The model, as what it can do."""
         return cast(Simulator, self.model)
 
+    def groups(self) -> dict[str, list[nn.Parameter]]:
+        """All parameters by the name that tells how fast they learn."""
+        assert self.initial_states is not None
+        return {**self.simulator.parameter_groups(), "initial": list(self.initial_states.parameters())}
+
     def configure_optimizers(self) -> Optimizer:
         """One optimiser over the groups of the model and the initial states."""
-        groups = {**self.simulator.parameter_groups(), "initial": list(self.initial_states.parameters())}
+        groups = self.groups()
         grouped = {id(p) for members in groups.values() for p in members}
         missing = [n for n, p in self.named_parameters() if p.requires_grad and id(p) not in grouped]
         if missing:
@@ -269,7 +272,7 @@ class GausSimModule(LightningModule):
         self.eval()
         batch = self.simulator.batch([sample.scene_id])
         look, units = self.images.looks.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
-        frames = [self.images.rest_image(sample, batch.rest)[None]]
+        frames = [self.images.rest_image(sample, batch.rest).rgb]
         try:
             for _, made in windows(self.simulator, batch, self.initial([sample], batch), sample.steps, 1):
                 states = States.of(made).tensors()
