@@ -59,7 +59,7 @@ class Anchors:
         if len(cells) < 4:
             raise SceneError(
                 f"{scene.name}: expected at least 4 occupied grid cells as anchors, got {len(cells)} of {most} allowed "
-                "and {len(points)} simulated kernels. Raise model.method.anchors."
+                f"and {len(points)} simulated kernels. Raise model.method.anchors."
             )
         pinned = share >= 0.5
         if bool(scene.pinned.any()) and not bool(pinned.any()):

@@ -173,14 +173,14 @@ def _arrays(net: Net, stiffness: Tensor, drag: Tensor, like: np.dtype) -> tuple[
 
 
 @numba.njit(fastmath=FINITE_MATH_OFF, **HELPER)
-def _spring(x, v, a, b, rest, kappa, c):
-    """Direction, length, stretch e, sqrt(1 + |e|), closing speed and pull of a spring."""
+def _spring(x, v, a, b, rest, kappa, c, one):
+    """Direction, 1 / length, stretch e, sqrt(1 + |e|), closing speed and pull; ``one`` is 1 in the type of ``x``."""
     rx, ry, rz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
     length = np.sqrt(rx * rx + ry * ry + rz * rz)
-    over = np.float32(1) / length if x.itemsize == 4 else 1 / length
+    over = one / length
     dx, dy, dz = rx * over, ry * over, rz * over
     e = (length - rest) / rest
-    root = np.sqrt(abs(e) + rest / rest)
+    root = np.sqrt(abs(e) + one)
     speed = (v[b, 0] - v[a, 0]) * dx + (v[b, 1] - v[a, 1]) * dy + (v[b, 2] - v[a, 2]) * dz
     return dx, dy, dz, over, e, root, speed, kappa * rest * e * root + c * speed
 
@@ -188,7 +188,7 @@ def _spring(x, v, a, b, rest, kappa, c):
 @numba.njit(fastmath=FINITE_MATH_OFF, **KERNEL)
 def _forward(xs, vs, starts, second, rest, kappa, drag, moving, dt):
     """Fills the states of all substeps."""
-    count = xs.shape[1]
+    count, one = xs.shape[1], dt / dt
     force = np.empty_like(xs[0])
     for step in range(xs.shape[0] - 1):
         x, v = xs[step], vs[step]
@@ -197,7 +197,7 @@ def _forward(xs, vs, starts, second, rest, kappa, drag, moving, dt):
             fx, fy, fz = force[a, 0], force[a, 1], force[a, 2]
             for s in range(starts[a], starts[a + 1]):
                 b = second[s]
-                dx, dy, dz, _, _, _, _, pull = _spring(x, v, a, b, rest[s], kappa[s], drag[s])
+                dx, dy, dz, _, _, _, _, pull = _spring(x, v, a, b, rest[s], kappa[s], drag[s], one)
                 fx += pull * dx
                 fy += pull * dy
                 fz += pull * dz
@@ -214,7 +214,7 @@ def _forward(xs, vs, starts, second, rest, kappa, drag, moving, dt):
 @numba.njit(fastmath=FINITE_MATH_OFF, **KERNEL)
 def _backward(xs, vs, starts, second, rest, kappa, drag, moving, dt, gx, gv, by_kappa, by_drag):
     """Takes gradients with respect to the last state to the first, in place, and adds those of the springs."""
-    count = xs.shape[1]
+    count, one = xs.shape[1], dt / dt
     gf = np.empty_like(gx)
     for step in range(xs.shape[0] - 2, -1, -1):
         x, v = xs[step], vs[step]
@@ -225,7 +225,7 @@ def _backward(xs, vs, starts, second, rest, kappa, drag, moving, dt, gx, gv, by_
         for a in range(count):
             for s in range(starts[a], starts[a + 1]):
                 b = second[s]
-                dx, dy, dz, over, e, root, speed, pull = _spring(x, v, a, b, rest[s], kappa[s], drag[s])
+                dx, dy, dz, over, e, root, speed, pull = _spring(x, v, a, b, rest[s], kappa[s], drag[s], one)
                 px, py, pz = gf[a, 0] - gf[b, 0], gf[a, 1] - gf[b, 1], gf[a, 2] - gf[b, 2]
                 along = px * dx + py * dy + pz * dz  # of the pull
                 by_kappa[s] += along * rest[s] * e * root
