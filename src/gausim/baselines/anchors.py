@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -81,8 +81,8 @@ class Anchors:
 
     def to(self, device: torch.device) -> Anchors:
         """The same on another device."""
-        tensors = (self.rest, self.pinned, self.followed, self.weights, self.slopes, self.means)
-        return self if self.rest.device == device else Anchors(*(x.to(device) for x in tensors), self.diagonal)
+        names = ("rest", "pinned", "followed", "weights", "slopes", "means")
+        return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
     def positions(self, displacement: Float[Tensor, "A 3"]) -> Float[Tensor, "K 3"]:
         """Kernels that follow displaced anchors [scene units]; ``displacement`` is in diagonals."""

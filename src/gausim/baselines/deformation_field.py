@@ -1,8 +1,8 @@
 """A field of space and time that deforms a scene: the HexPlane stage of DreamGaussian4D (Ren et al., 2023).
 
 The original fits it to videos that a diffusion model has dreamt up; here the calibrated videos take their place and
-there is no diffusion prior, which the method's name says. The field knows no dynamics: it is fitted to every sequence by
-itself, and beyond the trained frames its motion is repeated from frame 0, as the original loops it.
+there is no diffusion prior, which the method's name says. The field knows no dynamics: it is fitted to every sequence
+by itself, and beyond the trained frames its motion is repeated from frame 0, as the original loops it.
 """
 
 from __future__ import annotations

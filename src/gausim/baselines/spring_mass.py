@@ -69,7 +69,8 @@ class AnchoredMotion(Fitted):
     def anchors(self, sequence_id: int) -> Anchors:
         """The anchors of a sequence's scene."""
         scene_id = self.scene_of_sequence[sequence_id]
-        self._anchors[scene_id] = self._anchors[scene_id].to(self._device)
+        if self._anchors[scene_id].rest.device != self._device:
+            self._anchors[scene_id] = self._anchors[scene_id].to(self._device)
         return self._anchors[scene_id]
 
     def begin(self, sequence_id: int) -> FittedState:
@@ -183,7 +184,9 @@ class SpringMass(AnchoredMotion):
 
     def springs(self, scene_id: int) -> tuple[Float[Tensor, " E"], Float[Tensor, " E"]]:
         """Stiffness kappa [1 / frames^2] and drag [1 / frames] of every spring of a scene."""
-        net = self._nets[scene_id] = self._nets[scene_id].to(self._device)
+        if self._nets[scene_id].length.device != self._device:
+            self._nets[scene_id] = self._nets[scene_id].to(self._device)
+        net = self._nets[scene_id]
         k, fps = self.stiffness[scene_id], self.fps[scene_id]
         firm = net.attenuation(self.attenuation[scene_id]) / net.length
         both = 0.5 * (k.index_select(0, net.first) + k.index_select(0, net.second))
@@ -230,12 +233,12 @@ def slowest_vibration(net: Net, anchors: Anchors, kappa: Float[Tensor, " E"]) ->
     d = ((anchors.rest[net.second] - anchors.rest[net.first]) / net.length[:, None]).double()
     blocks = (kappa.double()[:, None, None] * d[:, :, None] * d[:, None, :]).numpy()
     rows, columns, values = [], [], []
-    axes = np.arange(3)
-    for a, b, sign in (("first", "first", 1), ("second", "second", 1), ("first", "second", -1), ("second", "first", -1)):
-        i, j = (3 * getattr(net, end).numpy()[:, None, None] for end in (a, b))
-        rows.append((i + axes[:, None] + 0 * blocks.astype(int)).ravel())
-        columns.append((j + axes + 0 * blocks.astype(int)).ravel())
-        values.append((sign * blocks).ravel())
+    axes, ends = np.arange(3), (net.first.numpy(), net.second.numpy())
+    for a, b in ((0, 0), (1, 1), (0, 1), (1, 0)):
+        row, column = 3 * ends[a][:, None, None] + axes[:, None], 3 * ends[b][:, None, None] + axes
+        rows.append(np.broadcast_to(row, blocks.shape).ravel())
+        columns.append(np.broadcast_to(column, blocks.shape).ravel())
+        values.append((blocks if a == b else -blocks).ravel())
     size = 3 * anchors.count
     whole = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)).tocsc()
     free = np.repeat(~anchors.pinned.numpy(), 3)

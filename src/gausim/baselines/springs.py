@@ -12,7 +12,7 @@ and b with -f: both ends alike, so that momentum is kept and, without damping, e
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numba
@@ -69,8 +69,8 @@ class Net:
 
     def to(self, device: torch.device) -> Net:
         """The same on another device."""
-        tensors = (self.first, self.second, self.starts, self.length, self.rank)
-        return self if self.first.device == device else Net(*(x.to(device) for x in tensors), self.reach)
+        names = ("first", "second", "starts", "length", "rank")
+        return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
     def attenuation(self, s: Float[Tensor, ""]) -> Float[Tensor, " E"]:
         """1 for the nearest :data:`FIRM`, else clamp(2 - exp(softplus(s) j / (reach - 16)), 0, 1), j = rank - 15."""
@@ -146,7 +146,9 @@ class _Move(torch.autograd.Function):
     """One frame as one node: the states of its substeps are kept, forces are computed once more on the way back."""
 
     @staticmethod
-    def forward(ctx: Any, x, v, stiffness, drag, net: Net, free, substeps: int):
+    def forward(
+        ctx: Any, x: Tensor, v: Tensor, stiffness: Tensor, drag: Tensor, net: Net, free: Tensor, substeps: int
+    ) -> tuple[Tensor, Tensor]:
         like = x.detach().numpy().dtype
         xs, vs = (np.empty((substeps + 1, *x.shape), like) for _ in range(2))
         xs[0], vs[0] = x.detach().numpy(), v.detach().numpy()
@@ -159,9 +161,9 @@ class _Move(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, gx, gv):
+    def backward(ctx: Any, *incoming: Tensor) -> tuple[Tensor | None, ...]:
         xs, vs, springs, moving = ctx.work
-        gx, gv = (np.array(g.numpy(), dtype=xs.dtype, order="C") for g in (gx, gv))
+        gx, gv = (np.array(g.numpy(), dtype=xs.dtype, order="C") for g in incoming)
         by_stiffness, by_drag = (np.zeros(len(springs[2]), xs.dtype) for _ in range(2))
         _backward(xs, vs, *springs, moving, xs.dtype.type(1 / (len(xs) - 1)), gx, gv, by_stiffness, by_drag)
         return (*map(torch.from_numpy, (gx, gv, by_stiffness, by_drag)), None, None, None)

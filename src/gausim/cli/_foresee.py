@@ -116,7 +116,7 @@ class TrainedPrediction:
         module = self._run.module
         if not isinstance(module, FittedModule):
             return None
-        return {"extrapolates": module.method.extrapolates, "notes": module.notes()}
+        return {"extrapolates": module.method.extrapolates, "notes": module.notes(), "fit": dict(module.cost)}
 
     def full(self, record: SequenceRecord) -> Trajectory:
         """All predicted frames of a sequence, the recorded ones and those asked for beyond."""

@@ -56,7 +56,8 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
     if "simulator" not in config.model or "initial_states" not in config.model:
         raise ConfigError(
             "model: expected the entries 'simulator' and 'initial_states' of a model that learns (gausim, "
-            f"gausim_paper), or 'method' and 'plan' of one that is fitted (spring_mass, ...), got {sorted(str(k) for k in config.model)}."
+            "gausim_paper), or 'method' and 'plan' of one that is fitted (spring_mass, ...), got "
+            f"{sorted(str(k) for k in config.model)}."
         )
     datamodule = instantiate(config.data)
     objects = datamodule.objects

@@ -181,7 +181,7 @@ class EpochSummary(Callback):
     def _line(self, trainer: Trainer, means: dict[str, Any]) -> str:
         parts = [f"epoch {means['epoch']}/{trainer.max_epochs}", f"T {means.get('steps', math.nan):.0f}"]
         labels = {
-            "loss_image": "loss {:.1f}", "excess_static": "{:.3f} of static", "ratio_first": "first frame {:.3f}",
+            "loss_image": "loss {:.4g}", "excess_static": "{:.3f} of static", "ratio_first": "first frame {:.3f}",
             "motion_energy": "motion {:.2f}", "grad_network": "|g| {:.3g}", "momentum_share": "momentum {:.1%}",
         }  # fmt: skip
         parts += [text.format(means[name]) for name, text in labels.items() if name in means]

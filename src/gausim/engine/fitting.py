@@ -8,6 +8,7 @@ minimised changes from stage to stage.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -28,6 +29,7 @@ from gausim.core import (
     Trajectory,
 )
 from gausim.data.dataset import SampleFacts, SequenceSample
+from gausim.engine.cost import peak_bytes
 from gausim.engine.module import GausSimModule
 from gausim.engine.optim import OptimizerSettings
 from gausim.engine.reference import Yardsticks
@@ -180,7 +182,8 @@ class FittedModule(GausSimModule):
         )
         self.plan, self.made = plan, dict.fromkeys((name for name, _ in plan.order), 0.0)
         self.stage = ""
-        self._explosion, self._position = explosion, 0.0
+        self.cost = {"cpu_seconds": 0.0, "peak_bytes": 0.0}
+        self._explosion, self._mark = explosion, time.process_time()
 
     @property
     def method(self) -> FittedMethod:
@@ -194,13 +197,18 @@ class FittedModule(GausSimModule):
             return FittedDynamics(self.method, sequence_id).rollout(SimState(rest, rest), steps)
 
     def notes(self) -> list[str]:
-        """What a reader of the figures must know: of the method, and of stages that a budget or setting cut short."""
+        """What a reader of the figures must know: of the method, of stages that were cut short, and the fit's cost."""
         notes = list(self.method.notes())
         for name, stage in self.plan.order:
             if round(self.made[name]) < stage.iterations:
                 notes.append(
                     f"Stage {name} had {self.made[name]:.0f} of its {stage.iterations} iterations per sequence."
                 )
+        if self.plan.order:
+            minutes, memory = self.cost["cpu_seconds"] / 60, self.cost["peak_bytes"] / 1e9
+            notes.append(
+                f"Fitted in {minutes:.1f} minutes of processor time; the process held {memory:.1f} GB at most."
+            )
         return notes
 
     # ------------------------------------------------------------------------------------------------ one step
@@ -260,8 +268,8 @@ class FittedModule(GausSimModule):
             return
         for facts in whole[self.ranks.rank :: self.ranks.size]:
             found = self.method.penalties(facts.sequence_id)
-            loss = sum((weight * found[name] for name, weight in weights.items()), start=torch.zeros(()))
-            self._backward(cast(Tensor, loss) / len(whole))
+            loss = torch.stack([weight * found[name] for name, weight in weights.items()]).sum()
+            self._backward(loss / len(whole))
 
     def _network(self) -> list[nn.Parameter]:
         return []
@@ -278,6 +286,10 @@ class FittedModule(GausSimModule):
         assert isinstance(curriculum, StagedCurriculum)
         return curriculum
 
+    def on_train_start(self) -> None:
+        """Counts the cost from here."""
+        self._mark = time.process_time()
+
     def on_train_epoch_end(self) -> None:
         """Forms the epoch's means and fixes what the next epoch learns: the next iterations, or what the clock says."""
         super().on_train_epoch_end()
@@ -288,8 +300,13 @@ class FittedModule(GausSimModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Adds where in the plan the fit is."""
         super().on_save_checkpoint(checkpoint)
+        now = time.process_time()
+        self.cost["cpu_seconds"] += now - self._mark
+        self.cost["peak_bytes"] = max(self.cost["peak_bytes"], float(peak_bytes() or 0))
+        self._mark = now
         place = self._staged().state_dict() if self.plan.order else {}
-        checkpoint["gausim"]["plan"] = {"place": place, "stage": self.stage, "made": dict(self.made)}
+        own = {"place": place, "stage": self.stage, "made": dict(self.made), "cost": dict(self.cost)}
+        checkpoint["gausim"]["plan"] = own
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restores it."""
@@ -303,3 +320,4 @@ class FittedModule(GausSimModule):
         own = checkpoint["gausim"]["plan"]
         self.stage = own["stage"]
         self.made.update(own["made"])
+        self.cost.update(own["cost"])

@@ -124,15 +124,11 @@ class FitPlan:
 
     def place(self, epochs: float) -> tuple[str, Stage, float]:
         """The stage after so many epochs of the plan, and the iterations of it that lie behind."""
-        name, stage, begun = "", None, 0.0
-        for name, stage in self.order:
-            if epochs < begun + self._epochs(stage):
-                break
-            begun += self._epochs(stage)
-        else:  # a budget may run a little beyond the end
-            assert stage is not None
-            begun -= self._epochs(stage)
-        return name, stage, min(float(stage.iterations), (epochs - begun) * self.shows)
+        rest, order = epochs, self.order
+        while len(order) > 1 and rest >= self._epochs(order[0][1]):  # a budget may run a little beyond the last
+            rest -= self._epochs(order.pop(0)[1])
+        name, stage = order[0]
+        return name, stage, min(float(stage.iterations), rest * self.shows)
 
 
 @dataclass(frozen=True)
