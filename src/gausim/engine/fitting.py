@@ -182,6 +182,7 @@ class FittedModule(GausSimModule):
         )
         self.plan, self.made = plan, dict.fromkeys((name for name, _ in plan.order), 0.0)
         self.stage = ""
+        self._warned = True  # a first stage begins at rest, and the warning's advice is about other settings
         self.cost = {"cpu_seconds": 0.0, "peak_bytes": 0.0}
         self._explosion, self._mark = explosion, time.process_time()
 
