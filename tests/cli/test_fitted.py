@@ -72,7 +72,8 @@ def weights(run: str) -> dict[str, torch.Tensor]:
 
 
 def test_stages_set_frames_and_what_learns(arguments: list[str]) -> None:
-    train.main(["model=spring_mass", *SMALL["spring_mass"], *arguments])
+    still = f"~{STAGES}.dynamics.rates.velocity"
+    train.main(["model=spring_mass", *SMALL["spring_mass"], still, *arguments])
     rows = list(csv.DictReader(Path("outputs/toy/seed_0/epochs.csv").open()))
     assert [float(r["steps"]) for r in rows] == [3.0, 3.0, 3.0]  # the velocity stage asks for three frames as well
     made = weights("toy")
