@@ -13,11 +13,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gausim.cli._run import LoadedRun
-    from gausim.core import Dynamics, GaussianScene, Trajectory
+    from gausim.core import GaussianScene, Trajectory
     from gausim.data.objects import ObjectData
     from gausim.data.records import SequenceRecord
 
-METHOD = "gausim"
 # Random pushes of `gausim evaluate --endurance` go on for so many frames.
 PUSHED_FRAMES = 240
 
@@ -113,22 +112,16 @@ class TrainedPrediction:
         model = self._run.module.model
         return tuple(model.units_of_kernels(self._item.scene_id)) if isinstance(model, Hierarchical) else ()
 
+    @property
+    def footnotes(self) -> dict[str, Any] | None:
+        """What the method says of itself (see :attr:`GausSimModule.footnotes`)."""
+        return self._run.module.footnotes
+
     def full(self, record: SequenceRecord) -> Trajectory:
         """All predicted frames of a sequence, the recorded ones and those asked for beyond."""
         if record.name not in self._known:
-            import torch
-
-            from gausim.core import SimState
-
-            # The parts of a run are torch modules; what they offer beyond that is stated by the engine's contracts.
-            model: Any = self._run.module.model
-            states: Any = self._run.module.initial_states
-            rest = scene_of(self._run, self._item).means
-            with torch.no_grad():
-                previous = states.previous(self._ids[record.name]).to(rest)
-            dynamics: Dynamics = model.dynamics(self._item.scene_id)
             steps = max(record.count, self._frames) - 1
-            self._known[record.name] = dynamics.rollout(SimState(rest, previous), steps)
+            self._known[record.name] = self._run.module.foresee(self._ids[record.name], steps)
         return self._known[record.name]
 
     def __call__(self, record: SequenceRecord) -> Trajectory:

@@ -10,12 +10,15 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from gausim.cli._config import instantiate
-from gausim.core import ConfigError, Renderer
+from gausim.core import ConfigError, GaussianScene, Renderer
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData
 from gausim.engine.checkpoint import check_scenes, load_weights, read_checkpoint
+from gausim.engine.fitting import FittedModule
 from gausim.engine.module import GausSimModule
 from gausim.engine.run import RunDirectory
+from gausim.engine.stages import StagedCurriculum
+from gausim.engine.supervision import Supervision
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,19 +51,20 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
         SceneError: a rest scene is missing or broken.
     """
     config = cfg if isinstance(cfg, DictConfig) else OmegaConf.create(dict(cfg))
+    if "method" in config.model:
+        return _build_fit(config)
     if "simulator" not in config.model or "initial_states" not in config.model:
         raise ConfigError(
             "model: expected the entries 'simulator' and 'initial_states' of a model that learns (gausim, "
-            f"gausim_paper), got {sorted(str(k) for k in config.model)}."
+            "gausim_paper), or 'method' and 'plan' of one that is fitted (spring_mass, ...), got "
+            f"{sorted(str(k) for k in config.model)}."
         )
     datamodule = instantiate(config.data)
     objects = datamodule.objects
     scenes = [item.scene() for item in objects]
     model = instantiate(config.model.simulator, scenes=scenes, fps=[item.fps for item in objects])()
     scene_of_sequence = [scene_id for scene_id, _ in datamodule.index.entries]
-    supervision = None
-    if config.get("supervision"):
-        supervision = instantiate(config.supervision, scenes=scenes, truth=datamodule.index.ground_truth)()
+    supervision = _supervision(config, scenes, datamodule)
     states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
     module = GausSimModule(
         model=model,
@@ -70,6 +74,39 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
         objective=instantiate(config.loss),
         optimizer=instantiate(config.optimizer),
         supervision=supervision,
+        seed=int(config.seed),
+    )
+    return module, datamodule
+
+
+def _supervision(config: DictConfig, scenes: list[GaussianScene], datamodule: ReadyDataModule) -> Supervision | None:
+    if not config.get("supervision"):
+        return None
+    made: Supervision = instantiate(config.supervision, scenes=scenes, truth=datamodule.index.ground_truth)()
+    return made
+
+
+def _build_fit(config: DictConfig) -> tuple[FittedModule, ReadyDataModule]:
+    """The module and the data of a method that is fitted in stages; T and shows per epoch are those of its plan."""
+    plan = instantiate(config.model.plan)
+    seen = int(config.data.curriculum.t_max)
+    curriculum = StagedCurriculum(t_start=1, t_max=seen, plan=plan)
+    datamodule = instantiate(config.data, curriculum=curriculum, repeats=plan.shows)
+    objects = datamodule.objects
+    scenes = [item.scene() for item in objects]
+    method = instantiate(
+        config.model.method,
+        scenes=scenes,
+        fps=[item.fps for item in objects],
+        scene_of_sequence=[scene_id for scene_id, _ in datamodule.index.entries],
+        seen=seen,
+    )()
+    module = FittedModule(
+        method=method,
+        plan=plan,
+        renderer=instantiate(config.render),
+        explosion=float(config.loss.explosion),
+        supervision=_supervision(config, scenes, datamodule),
         seed=int(config.seed),
     )
     return module, datamodule
@@ -93,5 +130,7 @@ def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mappin
     module, datamodule = build(config)
     check_scenes(loaded, module.simulator.scenes, str(directory.path / checkpoint))
     load_weights(module, loaded)
+    if isinstance(module, FittedModule):
+        module.take_plan(loaded)
     module.eval()
     return LoadedRun(config, module, datamodule.objects, datamodule, module.renderer, directory.path)

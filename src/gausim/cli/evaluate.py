@@ -89,7 +89,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _evaluate(run: LoadedRun, arguments: argparse.Namespace) -> list[ObjectCurves]:
-    from gausim.cli._foresee import METHOD, TrainedPrediction, progress, run_objects, scene_of
+    from gausim.cli._foresee import TrainedPrediction, progress, run_objects, scene_of
     from gausim.engine.evaluation import evaluate_object
 
     items = run_objects(run, arguments.object)
@@ -102,7 +102,7 @@ def _evaluate(run: LoadedRun, arguments: argparse.Namespace) -> list[ObjectCurve
                 evaluate_object(
                     item.data,
                     scene_of(run, item),
-                    {METHOD: TrainedPrediction(run, item)},
+                    {run.module.method_name: TrainedPrediction(run, item)},
                     run.renderer,
                     sequences=arguments.sequences,
                     views=_views(item.data, arguments.views),

@@ -120,7 +120,7 @@ def parse_background(text: str) -> Tensor | None:
 
 
 def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namespace, folder: Path) -> None:
-    from gausim.cli._foresee import METHOD, TrainedPrediction, progress, scene_of
+    from gausim.cli._foresee import TrainedPrediction, progress, scene_of
     from gausim.core.errors import DataError
     from gausim.data.records import SequenceRecord
     from gausim.engine.evaluation import evaluate_object
@@ -139,7 +139,9 @@ def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namesp
     predict = TrainedPrediction(run, item, frames=arguments.frames or 0)
     bar, advance = progress(len(names) * (1 + len(views)), f"simulate {item.data.name}")
     with bar:
-        curves = evaluate_object(item.data, scene, {METHOD: predict}, run.renderer, sequences=names, advance=advance)
+        curves = evaluate_object(
+            item.data, scene, {run.module.method_name: predict}, run.renderer, sequences=names, advance=advance
+        )
         for name in names:
             record = SequenceRecord(records[name].root, views=item.data.views, fps=item.data.fps)
             error_figure(curves, folder / name / "errors.png", sequence=name)

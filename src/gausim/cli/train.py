@@ -176,22 +176,28 @@ def _fit(
     parts: tuple[GausSimModule, ReadyDataModule],
     crew: Crew,
 ) -> float | None:
+    from gausim.engine.fitting import FittedModule
     from gausim.engine.judge import EpochJudge
 
     module, datamodule = parts
-    trainer = make(cfg, run, crew)
+    plan = module.plan if isinstance(module, FittedModule) else None
+    trainer = make(cfg, run, crew, epochs=None if plan is None else plan.epochs)
     for logger in trainer.loggers:
         logger.log_hyperparams(_plain(cfg))
     if crew.is_first:
         _introduce(trainer, module, datamodule, run, resumed=resume is not None)
     trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
+    if plan is not None and not plan.order:  # nothing to learn: no epoch has saved it
+        trainer.save_checkpoint(run.checkpoint, weights_only=False)
     if trainer.interrupted:
         raise KeyboardInterrupt
     if crew.is_first:
         # Counted by `processed`: of a run that is resumed after its last save, `current_epoch` lags behind.
         epochs = cast(Any, trainer.fit_loop.epoch_progress.current).processed
         pruned = any(isinstance(callback, EpochJudge) and callback.stopped for callback in cast(Any, trainer).callbacks)
-        facts = {"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary}
+        facts: dict[str, Any] = {"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary}
+        if isinstance(module, FittedModule):
+            facts["notes"] = module.notes()
         run.finish({**facts, **({"pruned": True} if pruned else {})})
         following = "" if cfg.evaluate else f"gausim evaluate {run.path}\n      "
         print(f"\nrun: {run.path}\nnext: {following}gausim simulate {run.path}", flush=True)
@@ -206,8 +212,16 @@ def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None
         RunError: that run is not there, or knows another scene.
     """
     from gausim.core import ConfigError
+    from gausim.engine.fitting import FittedModule
     from gausim.engine.transfer import load_shared, load_simulator
 
+    if isinstance(module, FittedModule):
+        if cfg.init_from is not None or cfg.freeze is not None:
+            raise ConfigError(
+                f"init_from, freeze: {module.method.name} is fitted to its own sequences and takes nothing over. Leave "
+                "both null, and train on the new sequences."
+            )
+        return
     if cfg.init_from == "":
         raise ConfigError("init_from: name the trained run whose network this one starts from (init_from=RUN).")
     if cfg.freeze not in (None, "network", "model"):
@@ -221,21 +235,31 @@ def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None
         module.simulator.freeze(scenes=cfg.freeze == "model")
 
 
-def make(cfg: DictConfig, run: RunDirectory, crew: Crew) -> Trainer:
-    """The trainer of a configuration, with its callbacks and, on the first rank, loggers that write into the run."""
+def make(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | None = None) -> Trainer:
+    """The trainer of a configuration, with its callbacks and, on the first rank, loggers that write into the run.
+
+    Args:
+        cfg: the configuration.
+        run: where it trains.
+        crew: the ranks.
+        epochs: instead of ``trainer.max_epochs``.
+    """
     from gausim.cli._config import instantiate
     from gausim.cli._sweep import judges
 
     callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node] + judges(cfg)
     wanted = (cfg.logger or {}).values() if crew.is_first else ()
     loggers = [instantiate(node, save_dir=str(run.path)) for node in wanted if node]
-    return instantiate(cfg.trainer, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew)
+    length = {} if epochs is None else {"max_epochs": epochs}
+    return instantiate(cfg.trainer, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew, **length)
 
 
 def _introduce(
     trainer: Trainer, module: GausSimModule, datamodule: ReadyDataModule, run: RunDirectory, *, resumed: bool
 ) -> None:
     import torch
+
+    from gausim.engine.fitting import FittedModule
 
     datamodule.setup("fit")
     batches = len(datamodule.train_dataloader())
@@ -250,9 +274,13 @@ def _introduce(
             f"  {item.name}: {scene.count} kernels ({int(scene.pinned.sum())} pinned), {len(item.sequences)} "
             f"sequences, {len(item.train_views)} views of {cameras.width}x{cameras.height}, {item.fps:g} fps"
         )
-    sizes = {name: sum(p.numel() for p in own) for name, own in module.simulator.parameter_groups().items()}
-    sizes["initial states"] = sum(p.numel() for p in module.initial_states.parameters())
-    lines.append("  parameters: " + ", ".join(f"{name} {count}" for name, count in sizes.items()))
+    sizes = {name: sum(p.numel() for p in own) for name, own in module.groups().items()}
+    lines.append("  parameters: " + (", ".join(f"{name} {count}" for name, count in sizes.items()) or "none"))
+    if isinstance(module, FittedModule):
+        lines += [f"  {name}: {stage.iterations} iterations per sequence" for name, stage in module.plan.order]
+        lines += [f"  note: {note}" for note in module.method.notes()]
+        print("\n".join(lines), file=sys.stdout, flush=True)
+        return
     frames = sum(datamodule.steps(epoch) * batches for epoch in range(epochs))
     lines.append(
         f"  {epochs} epochs x {batches} steps; T {datamodule.steps(0)} to {datamodule.curriculum.t_max}, "

@@ -2,6 +2,7 @@
 
 from gausim.core.camera import Cameras
 from gausim.core.errors import BusyError, ConfigError, DataError, DivergenceError, GausSimError, RunError, SceneError
+from gausim.core.fitted import FittedDynamics, FittedMethod, FittedState
 from gausim.core.protocols import Dynamics, Forces, Rendered, Renderer
 from gausim.core.scene import GaussianScene
 from gausim.core.state import SimState, Trajectory
@@ -13,6 +14,9 @@ __all__ = [
     "DataError",
     "DivergenceError",
     "Dynamics",
+    "FittedDynamics",
+    "FittedMethod",
+    "FittedState",
     "Forces",
     "GausSimError",
     "GaussianScene",

@@ -12,6 +12,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, RichProgressBar
 
 from gausim.core import ConfigError
+from gausim.engine.cadence import has_come
 from gausim.engine.checkpoint import LAST_CHECKPOINT, digest
 from gausim.engine.epoch_table import EpochTable, short
 from gausim.engine.loggers import Resumable
@@ -61,10 +62,9 @@ class RunCheckpoint(Checkpoint):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Saves when the epoch has come, the optimiser included (Lightning calls this last)."""
-        epoch = trainer.current_epoch + 1
-        last = trainer.should_stop or epoch == trainer.max_epochs
-        if last or epoch % self._every == 0 or self._due(trainer):
+        if has_come(trainer, self._every) or self._due(trainer):
             self._save(trainer)
+        epoch = trainer.current_epoch + 1
         if self._snapshot_every and epoch % self._snapshot_every == 0:
             snapshots = Path(trainer.default_root_dir) / "snapshots"
             trainer.save_checkpoint(snapshots / f"epoch_{epoch:04d}.ckpt", weights_only=False)
@@ -171,7 +171,7 @@ class EpochSummary(Callback):
     def _line(self, trainer: Trainer, means: dict[str, Any]) -> str:
         parts = [f"epoch {means['epoch']}/{trainer.max_epochs}", f"T {means.get('steps', math.nan):.0f}"]
         labels = {
-            "loss_image": "loss {:.1f}", "excess_static": "{:.3f} of static", "ratio_first": "first frame {:.3f}",
+            "loss_image": "loss {:.4g}", "excess_static": "{:.3f} of static", "ratio_first": "first frame {:.3f}",
             "motion_energy": "motion {:.2f}", "grad_network": "|g| {:.3g}", "momentum_share": "momentum {:.1%}",
         }  # fmt: skip
         parts += [text.format(means[name]) for name, text in labels.items() if name in means]

@@ -54,7 +54,7 @@ class Comparison:
         groups: Sequence[ViewGroup],
         looks: Sequence[SceneAppearance],
         frames: Sequence[UInt8[Tensor, "T _ _ _ 4"]],
-        rest: Sequence[Float[Tensor, "_ _ _ 3"]],
+        rest: Sequence[Float[Tensor, "_ _ _ C"]],
     ) -> None:
         """Binds what stays the same over a rollout.
 
@@ -102,26 +102,33 @@ class Comparison:
         place = self._batch.members[member]
         return place.kernels, place.units, place.units
 
-    def draw(self, chunk: Chunk, states: States) -> Float[Tensor, "M T V H W 3"]:
+    def draw(self, chunk: Chunk, states: States) -> Float[Tensor, "M T V H W C"]:
         """Images of the states of a chunk, member by member; gradients flow into the states."""
         group, units = self._groups[chunk.group], self._batch.members[chunk.members[0]].unit_of_kernel
-        images = draw(self._renderer, self._looks[chunk.group], *states.tensors(), units, group.cameras).rgb
+        drawn = draw(self._renderer, self._looks[chunk.group], *states.tensors(), units, group.cameras)
+        images = channels(drawn.rgb, drawn.alpha, self._loss)
         return images.unflatten(0, (len(chunk.members), -1))
 
     def compare(
-        self, images: Float[Tensor, "M T V H W 3"], chunk: Chunk, start: int
-    ) -> tuple[Float[Tensor, "M T"], Float[Tensor, "M T V H W 3"], Float[Tensor, ""]]:
+        self, images: Float[Tensor, "M T V H W C"], chunk: Chunk, start: int
+    ) -> tuple[Float[Tensor, "M T"], Float[Tensor, "M T V H W C"], Float[Tensor, ""]]:
         """Losses of a chunk's images, the gradient of their sum, and the squared change since the frames before."""
         span = slice(start + chunk.span.start, start + chunk.span.stop)
         frames = torch.stack([self._frames[i][span].to(images.device, non_blocking=True) for i in chunk.members])
-        values, slope = self._loss.value_and_gradient(images.flatten(0, 1), composite(frames)[0].flatten(0, 1))
+        target = channels(*composite(frames), self._loss)
+        values, slope = self._loss.value_and_gradient(images.flatten(0, 1), target.flatten(0, 1))
         change = images.new_zeros(())
-        for drawn, i in zip(images, chunk.members, strict=True):
+        for drawn, i in zip(images[..., :3], chunk.members, strict=True):
             change += F.mse_loss(drawn[0], self.last[i], reduction="sum")
             if len(drawn) > 1:
                 change += F.mse_loss(drawn[1:], drawn[:-1], reduction="sum")
             self.last[i] = drawn[-1]
         return values.unflatten(0, images.shape[:2]), slope.unflatten(0, images.shape[:2]), change
+
+
+def channels(rgb: Float[Tensor, "*B 3"], alpha: Float[Tensor, " *B"], loss: ImageLoss) -> Float[Tensor, "*B C"]:
+    """The channels that a loss compares: the colours, and the opacity where it asks for it."""
+    return torch.cat((rgb, alpha[..., None]), -1) if loss.compares_alpha else rgb
 
 
 class _Compare(torch.autograd.Function):

@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 from torch import Tensor
 from torch.nn import Module, Parameter
 
-from gausim.core import GaussianScene, SimState
+from gausim.core import Dynamics, GaussianScene, SimState
 
 
 @runtime_checkable
@@ -101,6 +101,15 @@ class Simulator(Protocol):
 
 
 @runtime_checkable
+class Foreseeing(Protocol):
+    """A simulator that rolls one scene out by itself, from any initial state."""
+
+    def dynamics(self, scene_id: int = 0) -> Dynamics:
+        """The simulator bound to one scene, without gradients and in evaluation mode."""
+        ...
+
+
+@runtime_checkable
 class Hierarchical(Protocol):
     """A simulator whose kernels belong to units of several levels."""
 
@@ -122,8 +131,8 @@ class Energetic(Protocol):
         """Whether :meth:`energy` can be asked."""
         ...
 
-    def energy(self, batch: Any, state: SimState) -> Tensor:
-        """(S,) energy of every member of the batch, up to a factor per scene."""
+    def energy(self, batch: Any, state: SimState, prepared: Any = None) -> Tensor:
+        """(S,) energy of every member of the batch, up to a factor per scene; ``prepared`` as in a step."""
         ...
 
 

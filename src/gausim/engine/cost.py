@@ -44,7 +44,7 @@ class CostMeter:
             torch.cuda.synchronize()
         self._seconds.append((time.perf_counter() - start) / max(1, frames))
         self._frames += frames
-        peak = torch.cuda.max_memory_allocated() if cuda else _resident("VmHWM")
+        peak = peak_bytes()
         if before is not None and peak is not None:
             self._kind = CUDA if cuda else RESIDENT
             self._peak = max(self._peak, peak)
@@ -79,6 +79,11 @@ class CostMeter:
         first, *others = self._added
         added = {"added_bytes": max(others or [first]), "first_added_bytes": first}
         return {"kind": self._kind, "peak_bytes": self._peak, **added}
+
+
+def peak_bytes() -> int | None:
+    """The most that CUDA had allocated, or the process had resident, since it was last reset; None where unknown."""
+    return torch.cuda.max_memory_allocated() if torch.cuda.is_initialized() else _resident("VmHWM")
 
 
 def _begin(cuda: bool) -> int | None:

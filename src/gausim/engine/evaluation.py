@@ -57,8 +57,9 @@ from gausim.report.summary import write_summary
 from gausim.report.tables import markdown
 
 # Predicts every frame of a sequence (count frames, frame 0 first) for all kernels of the scene. One that carries an
-# attribute ``levels`` (plain data: counts, predicted, predictions, kernels) has it stored in the summary; one that
-# carries ``units`` (the unit of every kernel, level by level) has its error told by level.
+# attribute ``levels`` (plain data: counts, predicted, predictions, kernels) or ``footnotes`` (extrapolates, notes) has
+# it stored in the summary; one that carries ``units`` (the unit of every kernel, level by level) has its error told by
+# level.
 Predict = Callable[[SequenceRecord], Trajectory]
 Rows = dict[str, dict[str, np.ndarray]]
 
@@ -184,8 +185,9 @@ class _ObjectMeasure:
         """What is known beside the figures: costs of every method, hashes of the data, what is absent, diagnosis."""
         levels = {name: getattr(predict, "levels", None) for name, predict in methods.items()}
         costs = {name: {**meter.summary(), "levels": levels[name]} for name, meter in self._costs.items()}
+        footnotes = {name: found for name, p in methods.items() if (found := getattr(p, "footnotes", None)) is not None}
         absent = {} if any(m.key == LPIPS.key for m in self.metrics) else {LPIPS.key: NO_WEIGHTS}
-        facts = {"efficiency": costs, "sources": data_provenance(self.data), "absent": absent}
+        facts = {"efficiency": costs, "sources": data_provenance(self.data), "absent": absent, "footnotes": footnotes}
         diagnosis = self._diagnosis.summary()
         return facts if diagnosis is None else {**facts, "diagnosis": diagnosis}
 

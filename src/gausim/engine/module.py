@@ -12,18 +12,18 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from gausim.core import ConfigError, DivergenceError, Renderer, SimState
+from gausim.core import ConfigError, DivergenceError, Renderer, SimState, Trajectory
 from gausim.data.dataset import SampleFacts, SequenceSample
 from gausim.data.sampler import hash_seed
 from gausim.engine.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes, fingerprints
-from gausim.engine.contracts import Energetic, InitialVelocities, SceneBatch, Simulator
+from gausim.engine.contracts import Foreseeing, InitialVelocities, SceneBatch, Simulator
 from gausim.engine.curriculum import LossGatedCurriculum
 from gausim.engine.exchange import Exchange
 from gausim.engine.optim import OptimizerSettings
-from gausim.engine.passivity import energy_growth
+from gausim.engine.passivity import energy_growth, energy_weight
 from gausim.engine.ranks import Ranks, interleave
 from gausim.engine.reference import Yardsticks
-from gausim.engine.rollout import Explosions, States, UnitNoise, describe, windows
+from gausim.engine.rollout import Explosions, States, UnitNoise, after, describe, windows
 from gausim.engine.supervision import ImageSupervision, Supervision
 from gausim.engine.tally import Found, Tally
 from gausim.losses.objective import Objective
@@ -52,7 +52,7 @@ class GausSimModule(LightningModule):
         self,
         *,
         model: nn.Module,
-        initial_states: nn.Module,
+        initial_states: nn.Module | None,
         scene_of_sequence: Sequence[int],
         renderer: Renderer,
         objective: Objective | None = None,
@@ -65,7 +65,7 @@ class GausSimModule(LightningModule):
 
         Args:
             model: the simulator (see :class:`gausim.engine.contracts.Simulator`).
-            initial_states: one parameter per training sequence, in their order.
+            initial_states: one parameter per training sequence, in their order; None where the model has its own.
             scene_of_sequence: the scene of each training sequence.
             renderer: draws the predictions, for training on images and for the pictures.
             objective: what is minimised; METHOD's when None.
@@ -84,12 +84,10 @@ class GausSimModule(LightningModule):
         self.settings = optimizer if optimizer is not None else OptimizerSettings()
         self.scene_of_sequence = tuple(scene_of_sequence)
         self.seed, self.share_every = seed, share_every
-        if len(list(initial_states.parameters())) != len(self.scene_of_sequence):
-            raise ConfigError(
-                f"initial states: {len(list(initial_states.parameters()))} parameters for "
-                f"{len(self.scene_of_sequence)} sequences; expected one each."
-            )
-        self.energy_weight = _energy_weight(self.objective, model)
+        count = len(self.scene_of_sequence)
+        if initial_states is not None and (own := len(list(initial_states.parameters()))) != count:
+            raise ConfigError(f"initial states: {own} parameters for {count} sequences; expected one each.")
+        self.energy_weight = energy_weight(self.objective, model)
         self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
         self.images = ImageSupervision(self.simulator.scenes, renderer, self.objective.image)
         self.supervision = self.images if supervision is None else supervision
@@ -104,6 +102,16 @@ class GausSimModule(LightningModule):
         self._exchange = Exchange(self.ranks, model)
 
     @property
+    def method_name(self) -> str:
+        """What the predictions are called in tables."""
+        return "gausim"
+
+    @property
+    def footnotes(self) -> dict[str, Any] | None:
+        """Whether the method extrapolates and what readers of its figures must know; None: the config says all."""
+        return None
+
+    @property
     def renderer(self) -> Renderer:
         """What draws the predictions."""
         return self.images.renderer
@@ -113,9 +121,14 @@ class GausSimModule(LightningModule):
         """The model, as what it can do."""
         return cast(Simulator, self.model)
 
+    def groups(self) -> dict[str, list[nn.Parameter]]:
+        """All parameters by the name that tells how fast they learn."""
+        assert self.initial_states is not None
+        return {**self.simulator.parameter_groups(), "initial": list(self.initial_states.parameters())}
+
     def configure_optimizers(self) -> Optimizer:
         """One optimiser over the groups of the model and the initial states."""
-        groups = {**self.simulator.parameter_groups(), "initial": list(self.initial_states.parameters())}
+        groups = self.groups()
         grouped = {id(p) for members in groups.values() for p in members}
         missing = [n for n, p in self.named_parameters() if p.requires_grad and id(p) not in grouped]
         if missing:
@@ -217,7 +230,7 @@ class GausSimModule(LightningModule):
             momentum = explosions.counted(torch.stack([step.momentum for step in made]))
             self._descend(explosions.counted(losses), momentum, per, tally, measure=start == 0)
             own = own + per * explosions.counted(losses).detach().sum(0)
-            last = SimState(made[-1].positions, made[-2].positions if len(made) > 1 else last.positions).detach()
+            last = after(made, last)
         else:
             if free is not None:
                 tally.growth = self._go_on(batch, explosions.restart(last), own, len(whole), free)
@@ -290,13 +303,25 @@ class GausSimModule(LightningModule):
         return SimState(batch.rest, previous.to(batch.rest))
 
     @torch.no_grad()
+    def foresee(self, sequence_id: int, steps: int) -> Trajectory:
+        """Frames 0..``steps`` of a training sequence, from its own initial state, for all kernels of its scene.
+
+        Raises:
+            DivergenceError: a position is not finite; names the frame.
+        """
+        scene_id = self.scene_of_sequence[sequence_id]
+        previous = cast(InitialVelocities, self.initial_states).previous(sequence_id)
+        initial = SimState(self.simulator.scenes[scene_id].means.to(previous), previous)
+        return cast(Foreseeing, self.model).dynamics(scene_id).rollout(initial, steps)
+
+    @torch.no_grad()
     def predict_images(self, sample: SequenceSample) -> Float[Tensor, "F V H W 3"]:
         """Images of frames 0..T of one training sequence, in evaluation mode."""
         was_training = self.training
         self.eval()
         batch = self.simulator.batch([sample.scene_id])
         look, units = self.images.looks.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
-        frames = [self.images.rest_image(sample, batch.rest)[None]]
+        frames = [self.images.rest_image(sample, batch.rest).rgb]
         try:
             for _, made in windows(self.simulator, batch, self.initial([sample], batch), sample.steps, 1):
                 states = States.of(made).tensors()
@@ -396,20 +421,6 @@ class GausSimModule(LightningModule):
         curriculum = self._curriculum()
         if curriculum is not None and "curriculum" in own:
             curriculum.load_state_dict(own["curriculum"])
-
-
-def _energy_weight(objective: Objective, model: nn.Module) -> float:
-    """Weight of the energy's growth; one that was asked for needs a model that knows an energy."""
-    knows = isinstance(model, Energetic) and model.knows_energy
-    if objective.energy_weight is None:
-        return 1.0 if knows else 0.0
-    if objective.energy_weight and not knows:
-        name = type(getattr(model, "template", model)).__name__
-        raise ConfigError(
-            f"loss.energy_weight is {objective.energy_weight}, but {name} knows no energy. Use a template that does "
-            "(gausim.models.elastic.ElasticTemplate), or set it to 0 or null."
-        )
-    return float(objective.energy_weight)
 
 
 def _pull(loss: Tensor, network: Sequence[nn.Parameter]) -> Float[Tensor, " P"]:

@@ -4,24 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from gausim.core import ConfigError, SimState, Trajectory
+from gausim.core import ConfigError, DivergenceError
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth
-from gausim.engine.contracts import Hierarchical, InitialVelocities
+from gausim.engine.cadence import has_come
+from gausim.engine.contracts import Hierarchical
 from gausim.engine.diagnosis import Diagnosis
 from gausim.engine.epoch_table import EpochTable
 from gausim.engine.module import GausSimModule
 from gausim.engine.points import attach_points
 from gausim.engine.randomness import undisturbed
-from gausim.engine.rollout import windows
 from gausim.metrics.motion_energy import motion_energy
 from gausim.report.diagnosis import read_diagnosis
 
@@ -67,15 +66,14 @@ class MotionWatch(Callback):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Looks when the epoch has come."""
-        epoch = trainer.current_epoch + 1
-        last = trainer.should_stop or epoch == trainer.max_epochs
-        if not (trainer.is_global_zero and self._every and (last or epoch % self._every == 0)):
+        if not (trainer.is_global_zero and has_come(trainer, self._every)):
             return
         assert isinstance(pl_module, GausSimModule)
         with undisturbed(), torch.no_grad():
             rows = self._look(trainer, pl_module)
         for name, row in rows.items():
-            self._table(trainer).append({"epoch": epoch, "step": trainer.global_step, "object": name, **row})
+            place = {"epoch": trainer.current_epoch + 1, "step": trainer.global_step, "object": name}
+            self._table(trainer).append({**place, **row})
         means = {key: _mean([row[key] for row in rows.values() if key in row]) for key in self.COLUMNS[3:]}
         known = {f"motion/{key}": value for key, value in means.items() if np.isfinite(value)}
         for logger in trainer.loggers if known else ():
@@ -104,30 +102,21 @@ class MotionWatch(Callback):
         self, module: GausSimModule, item: ObjectData, scene_id: int, first: int
     ) -> Iterator[tuple[GroundTruth, Tensor, Tensor]]:
         """True motion of each sequence, the predicted one and the kernels that the points are attached to."""
+        points = item.rest_points
+        if points is None:
+            return
         scene = module.simulator.scenes[scene_id]
+        attached = attach_points(scene, points)
         for number, record in enumerate(item.sequences[: self._sequences]):
             truth = item.ground_truth(record)
             if truth is None:
                 continue
-            attached = attach_points(scene, truth.rest)
-            made = foresee(module, scene_id, first + number, len(truth.positions) - 1, item.fps)
+            try:
+                made = module.foresee(first + number, len(truth.positions) - 1)
+            except DivergenceError as error:
+                module.print(f"motion of {item.name}/{record.name} is not told: {error}")
+                continue
             yield truth, made.carry(truth.rest, attached, scene.means).to(truth.positions), attached
-
-
-def foresee(module: GausSimModule, scene_id: int, sequence_id: int, steps: int, fps: float) -> Trajectory:
-    """Rolls one training sequence out from its initial state, ``steps`` frames far."""
-    batch = module.simulator.batch([scene_id])
-    previous = cast(InitialVelocities, module.initial_states).previous(sequence_id).to(batch.rest)
-    positions, gradients, rotations = [batch.rest], [], []
-    for _, (step,) in windows(module.simulator, batch, SimState(batch.rest, previous), steps, 1):
-        positions.append(step.positions)
-        gradients.append(step.gradients)
-        rotations.append(step.rotations)
-    still = torch.eye(3).to(batch.rest).expand_as(gradients[0])
-    return Trajectory(
-        torch.stack(positions), torch.stack([still, *gradients]), torch.stack([still, *rotations]),
-        batch.members[0].unit_of_kernel, fps,
-    )  # fmt: skip
 
 
 def figures(

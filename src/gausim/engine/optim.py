@@ -70,6 +70,28 @@ class CosineSchedule:
 
 
 @dataclass(frozen=True)
+class ExponentialSchedule:
+    """Falls by the same factor in equal times, down to ``final`` at the end."""
+
+    final: float = 0.1
+
+    def factor(self, epoch: float, epochs: int) -> float:
+        """Between ``final`` and 1."""
+        return float(self.final ** min(1.0, epoch / max(1, epochs)))
+
+
+@dataclass(frozen=True)
+class LinearSchedule:
+    """Falls evenly, down to ``final`` at the end."""
+
+    final: float = 0.0
+
+    def factor(self, epoch: float, epochs: int) -> float:
+        """Between ``final`` and 1."""
+        return 1.0 + (self.final - 1.0) * min(1.0, epoch / max(1, epochs))
+
+
+@dataclass(frozen=True)
 class OptimizerSettings:
     """Who learns how fast.
 

@@ -16,6 +16,7 @@ from gausim.core import ConfigError, DivergenceError
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
+from gausim.engine.cadence import has_come
 from gausim.engine.media import Clip, MediaLog, forget_media, safe_name, write_media
 from gausim.engine.module import GausSimModule
 from gausim.engine.randomness import undisturbed
@@ -57,9 +58,7 @@ class Panels(Callback):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Shows what is predicted when the epoch has come."""
-        epoch = trainer.current_epoch + 1
-        last = trainer.should_stop or epoch == trainer.max_epochs
-        if trainer.is_global_zero and self._every and (last or epoch % self._every == 0):
+        if trainer.is_global_zero and has_come(trainer, self._every):
             assert isinstance(pl_module, GausSimModule)
             with undisturbed():
                 self._show(trainer, pl_module)

@@ -7,15 +7,30 @@ from collections.abc import Iterator
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
-from gausim.core import SimState
+from gausim.core import ConfigError, SimState
 from gausim.engine.contracts import Energetic, SceneBatch, Simulator, Step
-from gausim.engine.rollout import windows
+from gausim.engine.rollout import after, windows
+from gausim.losses.objective import Objective
 
 # The motion that goes on is made smaller or larger by up to these factors, so that no size of motion is left out.
 SMALLEST, LARGEST = 0.2, 1.5
 TINY = 1e-30
+
+
+def energy_weight(objective: Objective, model: nn.Module) -> float:
+    """Weight of the energy's growth; one that was asked for needs a model that knows an energy."""
+    knows = isinstance(model, Energetic) and model.knows_energy
+    if objective.energy_weight is None:
+        return 1.0 if knows else 0.0
+    if objective.energy_weight and not knows:
+        name = type(getattr(model, "template", model)).__name__
+        raise ConfigError(
+            f"loss.energy_weight is {objective.energy_weight}, but {name} knows no energy. Use a template that does "
+            "(gausim.models.elastic.ElasticTemplate), or set it to 0 or null."
+        )
+    return float(objective.energy_weight)
 
 
 def energy_growth(
@@ -47,22 +62,17 @@ def energy_growth(
     with torch.no_grad():
         ((_, made),) = windows(model, batch, state, stretch, stretch)
         before = _mean_energy(model, batch, state, made)
-    state = _last(state, made)
+    state = after(made, state)
     for _, made in windows(model, batch, state, frames - stretch, stretch):
         now = _mean_energy(model, batch, state, made)
         if not bool(torch.isfinite(now).all()):
-            return  # exploded; nothing can be learned from it
+            return  # exploded; nothing can be learned from it (the one number of a step that a GPU is waited for)
         yield (now.clamp_min(TINY) / before.clamp_min(TINY)).log().clamp_min(0)
-        before, state = now.detach(), _last(state, made)
-
-
-def _last(state: SimState, made: list[Step]) -> SimState:
-    previous = made[-2].positions if len(made) > 1 else state.positions
-    return SimState(made[-1].positions, previous).detach()
+        before, state = now.detach(), after(made, state)
 
 
 def _mean_energy(model: Simulator, batch: SceneBatch, state: SimState, made: list[Step]) -> Float[Tensor, " S"]:
     assert isinstance(model, Energetic)
-    positions = [state.positions, *(step.positions for step in made)]
-    energies = [model.energy(batch, SimState(b, a)) for a, b in zip(positions, positions[1:], strict=False)]
+    positions, prepared = [state.positions, *(step.positions for step in made)], model.prepare(batch)
+    energies = [model.energy(batch, SimState(b, a), prepared) for a, b in zip(positions, positions[1:], strict=False)]
     return torch.stack(energies).mean(0)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as torch_checkpoint
 
-from gausim.core import Cameras, DivergenceError, GaussianScene, Renderer, SimState
+from gausim.core import Cameras, DivergenceError, GaussianScene, Rendered, Renderer, SimState
 from gausim.data.dataset import SampleFacts, SequenceSample
 from gausim.data.sampler import hash_seed
 from gausim.engine.contracts import SceneBatch, Simulator
@@ -175,19 +175,30 @@ def windows(
                 step: PredictedStep = checkpointed_step(model, batch, state)
             else:
                 step = model.step(batch, state, prepared=prepared)
-            state = SimState(step.positions, state.positions)
+            state = following(step, state)
             made.append(step)
         yield start, made
 
 
-def draw_rest(
-    renderer: Renderer, look: SceneAppearance, rest: Float[Tensor, "K 3"], cameras: Cameras
-) -> Float[Tensor, "V H W 3"]:
-    """Images of the rest state: the static prediction."""
+def following(step: PredictedStep, state: SimState) -> SimState:
+    """The state after a step: the step's own where a model carries more than positions (``step.state``)."""
+    own: SimState | None = getattr(step, "state", None)
+    return SimState(step.positions, state.positions) if own is None else own
+
+
+def after(steps: Sequence[PredictedStep], state: SimState) -> SimState:
+    """The state behind a stretch that began at ``state``, without history."""
+    for step in steps:
+        state = following(step, state)
+    return state.detach()
+
+
+def draw_rest(renderer: Renderer, look: SceneAppearance, rest: Float[Tensor, "K 3"], cameras: Cameras) -> Rendered:
+    """The rest state as one drawn state: the static prediction."""
     identity = torch.eye(3, dtype=rest.dtype, device=rest.device)[None, None]
     units = torch.zeros(rest.shape[0], dtype=torch.long, device=rest.device)
     with torch.no_grad():
-        return draw(renderer, look, rest[None], identity, identity, units, cameras).rgb[0]
+        return draw(renderer, look, rest[None], identity, identity, units, cameras)
 
 
 class UnitNoise:

@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import GaussianScene, Renderer
+from gausim.core import GaussianScene, Rendered, Renderer
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
-from gausim.engine.comparison import Comparison
+from gausim.engine.comparison import Comparison, channels
 from gausim.engine.contracts import SceneBatch
 from gausim.engine.rollout import Looks, States, Views, draw_rest
 from gausim.losses.image import ImageLoss
@@ -61,7 +61,7 @@ class ImageSupervision:
         """Keeps its parts; nothing is drawn yet."""
         self.renderer, self.loss = renderer, loss
         self.looks, self.views = Looks(scenes), Views()
-        self._rest: dict[Hashable, Tensor] = {}
+        self._rest: dict[Hashable, Rendered] = {}
 
     def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Comparison:
         """What draws and compares the predictions of a batch."""
@@ -74,13 +74,13 @@ class ImageSupervision:
             [self.looks.of(group.scene_id, batch.rest) for group in groups],
             [sample.frames[1:] for sample in samples],
             [
-                self.rest_image(sample, batch.rest[member.kernels])
+                self.rest_image(sample, batch.rest[member.kernels]).rgb[0]
                 for sample, member in zip(samples, batch.members, strict=True)
             ],
         )
 
-    def rest_image(self, sample: SequenceSample, rest: Float[Tensor, "K 3"]) -> Float[Tensor, "V H W 3"]:
-        """Images of the rest state in a sample's cameras; drawn once per scene and set of cameras."""
+    def rest_image(self, sample: SequenceSample, rest: Float[Tensor, "K 3"]) -> Rendered:
+        """The rest state (one) in a sample's cameras; drawn once per scene and set of cameras."""
         key = self.views.key(sample)
         if key not in self._rest:
             self._rest[key] = draw_rest(self.renderer, self.looks.of(sample.scene_id, rest), rest, sample.cameras)
@@ -89,7 +89,8 @@ class ImageSupervision:
     @torch.no_grad()
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
         """Scores the images of the rest state on frames ``first`` .. T of a sample."""
-        image = self.rest_image(sample, rest)
-        frames = composite(sample.frames[first:].to(image.device))[0]
-        losses = self.loss(image.expand_as(frames), frames).tolist()
+        drawn = self.rest_image(sample, rest)
+        frames, alpha = composite(sample.frames[first:].to(drawn.rgb.device))
+        image, target = channels(drawn.rgb, drawn.alpha, self.loss), channels(frames, alpha, self.loss)
+        losses = self.loss(image.expand_as(target), target).tolist()
         return StaticFigures(losses, (frames[1:] - frames[:-1]).square().sum((1, 2, 3, 4)).tolist())

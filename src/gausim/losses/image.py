@@ -33,7 +33,12 @@ class ImageLoss(nn.Module):
     Both are summed over channels, averaged over pixels and views and multiplied by ``pixels``, so that weights of
     other terms mean the same at every image size. float32 on the CPU goes through compiled kernels
     (:mod:`gausim.losses.fused`); everything else, and the tests' oracle, is plain torch and never waits for a device.
+
+    Attributes:
+        compares_alpha: whether images have the opacity as their fourth channel.
     """
+
+    compares_alpha: bool = False
 
     def __init__(
         self, *, balance: float = 0.9, window: int = 5, pixels: float = REFERENCE_PIXELS, crop: bool = True
@@ -59,7 +64,7 @@ class ImageLoss(nn.Module):
         self.balance, self.window, self.pixels, self.crop = balance, window, float(pixels), crop
 
     def forward(
-        self, prediction: Float[Tensor, "B V H W 3"], target: Float[Tensor, "B V H W 3"]
+        self, prediction: Float[Tensor, "B V H W C"], target: Float[Tensor, "B V H W C"]
     ) -> Float[Tensor, " B"]:
         """Loss of each of B states, averaged over its V views.
 
@@ -70,8 +75,8 @@ class ImageLoss(nn.Module):
         return loss
 
     def value_and_gradient(
-        self, prediction: Float[Tensor, "B V H W 3"], target: Float[Tensor, "B V H W 3"]
-    ) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V H W 3"]]:
+        self, prediction: Float[Tensor, "B V H W C"], target: Float[Tensor, "B V H W C"]
+    ) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V H W C"]]:
         """The losses and the gradient of their sum with respect to the prediction; neither is part of a graph.
 
         Raises:

@@ -105,14 +105,6 @@ def mode_gradients(rest: np.ndarray, modes: np.ndarray, neighbours: int) -> np.n
     return np.einsum("nk,nkim,nka,nab->nibm", weight, difference, offset, np.linalg.inv(moment), optimize=True)
 
 
-def projection(modes: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    """What takes displacements u of the units to the coordinates of the nearest Phi z under their mass, (N, 3, M)."""
-    weighted = modes * mass[:, None, None]
-    flat = weighted.reshape(-1, modes.shape[-1])
-    gram = flat.T @ modes.reshape(flat.shape)
-    return (flat @ np.linalg.pinv(gram, rcond=1e-6, hermitian=True)).reshape(modes.shape)
-
-
 class Springs(nn.Module):
     """The network's springs as they turn and stretch by more than a little, in modal coordinates.
 
@@ -143,24 +135,25 @@ class Springs(nn.Module):
 
     def forward(self, z: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
         """Modal forces beyond the linear ones, in units of the first mode's value."""
-        change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
-        squared = self.length.square()
-        along = (self.offset * change).sum(-1)
-        grown = 2 * along + change.square().sum(-1)  # |d|^2 - |d_0|^2
-        now = (squared + grown).clamp_min(1e-6 * squared).sqrt()
-        shrink = grown / (now * (now + self.length))  # 1 - |d_0| / |d| without the difference of nearly equal numbers
+        change, squared, along, now, stretch = self._stretched(z)
+        shrink = stretch / now
         beyond = shrink[..., None] * change + (shrink - along / squared)[..., None] * self.offset
         beyond = self.stiffness[:, None] * beyond
         return -(beyond.flatten(-2) @ self.modes)
 
     def potential(self, z: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
         """Energy of which :meth:`forward` is minus the gradient, in the same units."""
+        _, squared, along, _, stretch = self._stretched(z)
+        return 0.5 * (self.stiffness * (stretch.square() - along.square() / squared)).sum(-1)
+
+    def _stretched(self, z: Float[Tensor, "S M"]) -> tuple[Tensor, ...]:
+        """Psi z, |d_0|^2, d_0 . Psi z, |d| and |d| - |d_0| of every spring."""
         change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
         squared = self.length.square()
         along = (self.offset * change).sum(-1)
-        grown = 2 * along + change.square().sum(-1)
-        stretch = grown / ((squared + grown).clamp_min(1e-6 * squared).sqrt() + self.length)  # |d| - |d_0|
-        return 0.5 * (self.stiffness * (stretch.square() - along.square() / squared)).sum(-1)
+        grown = 2 * along + change.square().sum(-1)  # |d|^2 - |d_0|^2
+        now = (squared + grown).clamp_min(1e-6 * squared).sqrt()
+        return change, squared, along, now, grown / (now + self.length)  # no difference of nearly equal numbers
 
 
 class ElasticScene(nn.Module):
@@ -204,7 +197,7 @@ class ElasticScene(nn.Module):
         count = phi.shape[-1]
         self.register_buffer("values", torch.from_numpy(values).float())
         self.register_buffer("modes", torch.from_numpy(phi).float())
-        self.register_buffer("projection", torch.from_numpy(projection(phi, mass)).float())
+        self.register_buffer("projection", torch.from_numpy(phi * mass[:, None, None]).float())
         self.register_buffer("gradients", torch.from_numpy(slopes).float())
         self.scale = amplitude * hierarchy.diagonal * math.sqrt(len(rest) / count)
         self.initial_log_stiffness = 2 * math.log(2 * math.pi / period)

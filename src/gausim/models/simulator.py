@@ -211,9 +211,9 @@ class GausSim(nn.Module):
         """Whether the template has an energy."""
         return self.template.has_energy
 
-    def energy(self, batch: SceneBatch, state: SimState) -> Float[Tensor, " S"]:
+    def energy(self, batch: SceneBatch, state: SimState, prepared: Prepared | None = None) -> Float[Tensor, " S"]:
         """Energy of every member of the batch in the template's terms, up to a factor per scene."""
-        prepared = self.prepare(batch)
+        prepared = self.prepare(batch) if prepared is None else prepared
         now, before = (prepared.aggregate(x)[-1] for x in (state.positions, state.previous))
         return self.template.energy(batch, Motion(prepared.levels[-1].rest, now, before))
 

@@ -1,9 +1,10 @@
 """Vibration modes of the body that the kernels bound: linear elasticity on a regular grid around them.
 
 Kernels sit on what cameras see, the surface; what moves is solid. The finite cell method (Parvizian, Duester and Rank
-2007) needs no mesh of it: displacements are quadratic B-splines on a coarse grid, and elastic energy and mass are
-integrated over small cells, those inside the body in full and those just around it at a thousandth or so, which keeps
-the equations well posed. Modes found so are smooth across gaps between kernels and in places that no texture shows.
+2007) needs no mesh of it: displacements are quadratic B-splines on a coarse grid, and elastic energy is integrated
+over small cells, those inside the body in full and those just around it at a hundredth, which keeps the equations well
+posed; mass is that of the units. Modes found so are smooth across gaps between kernels and in places that no texture
+shows.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from scipy import ndimage
 from scipy.linalg import eigh
 from scipy.sparse.linalg import LinearOperator, eigsh, factorized
 
-# Stiffness and density of the cells around the body, as a share of those inside.
+# Stiffness of the cells around the body, as a share of those inside.
 OUTSIDE = 0.01
 # Integration cells per grid spacing.
 SUBDIVISIONS = 2
@@ -108,11 +109,12 @@ def stiffness(grid: Grid, centres: np.ndarray, weights: np.ndarray) -> list[list
     first = POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
     second = 1 / (2 * (1 + POISSON))
     laplace = second * sum(s.T @ weight @ s for s in slopes)
+    nothing = sp.csr_matrix(laplace.shape)
     return [
         [
             first * slopes[a].T @ weight @ slopes[b]
             + second * slopes[b].T @ weight @ slopes[a]
-            + (laplace if a == b else 0 * laplace)
+            + (laplace if a == b else nothing)
             for b in range(3)
         ]
         for a in range(3)
@@ -141,7 +143,7 @@ def solid_modes(
         spacing: of the grid [scene units].
 
     Returns:
-        Eigenvalues (M,) relative to the first, modes (N, 3, M) of unit norm under the units' mass and zero at pinned
+        Eigenvalues (M,) relative to the first, modes (N, 3, M) orthonormal under the units' mass and zero at pinned
         units, and their gradients (N, 3, 3, M) [1 / scene units].
     """
     grid, centres, weights = cells(kernels, spacing)

@@ -10,8 +10,9 @@ from gausim.metrics.lpips import HOW_TO_GET_WEIGHTS, NO_WEIGHTS
 from gausim.report import paper
 from gausim.report.curves import ERROR_3D
 from gausim.report.runs import RunRecord
-from gausim.report.study import NOT_MEASURED, Cell, Group, Study, Value, cell, dig, pooled
+from gausim.report.study import NOT_MEASURED, Cell, Group, Study, Value, cell, dig, pooled, says
 from gausim.report.summary import MOTION_ENERGY
+from gausim.report.tables import NO_FORESIGHT
 
 METHOD, REFERENCE, PAPER = "method", "reference", "paper"
 # The splits of the paper; `unseen_all` exists where recordings go on beyond frame 49.
@@ -135,7 +136,13 @@ def metric_sheet(study: Study, metric: str, views: str) -> Sheet | None:
         for name, splits in columns
     )
     title = f"{info['label']}{_unit(info)}, {VIEWS[views]}"
-    return Sheet(f"{metric}_{views}", title, _caption(metric, views, info, lines), heads, tuple(lines), "method")
+    caption = " ".join([_caption(metric, views, info, lines), *_blind(study.groups)])
+    return Sheet(f"{metric}_{views}", title, caption, heads, tuple(lines), "method")
+
+
+def _blind(groups: Sequence[Group]) -> list[str]:
+    """A footnote for every row whose unseen frames are no prediction."""
+    return [f"{group.label}: {NO_FORESIGHT}" for group in groups if NO_FORESIGHT in says(group)]
 
 
 def _unit(info: dict[str, Any]) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 
 from gausim.report.runs import BROKEN, EVALUATED, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
 from gausim.report.summary import MOTION_ENERGY
+from gausim.report.tables import footnotes
 
 FULL = "full"
 NOT_MEASURED = "not measured"
@@ -289,9 +290,16 @@ def _difference(run: RunRecord, rivals: Sequence[RunRecord]) -> str:
     return ", ".join(shown) + more if shown else run.name
 
 
+def says(group: Group) -> list[str]:
+    """What the group's method says of itself, each sentence once."""
+    entries = (entry for name in group.objects for _, entry in group.entries(name))
+    return list(dict.fromkeys(note for entry in entries for note in footnotes(entry, group.method)))
+
+
 def _notes(groups: Sequence[Group]) -> list[str]:
     notes = []
     for group in groups:
+        notes += [f"{group.label}: {note}" for note in says(group)]
         for name in group.objects:
             entries = [entry for _, entry in group.entries(name)]
             if len({json.dumps(e["sequences"]) for e in entries}) > 1:

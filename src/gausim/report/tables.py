@@ -15,6 +15,7 @@ LEGEND = (
     "the reconstruction itself against frame 0. Images are foreground on black."
 )
 FLOOR_ROW = "floor"
+NO_FORESIGHT = "Does not foresee: its frames after the trained ones repeat what was fitted."
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,17 @@ def _number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
+def footnotes(entry: dict[str, Any], method: str) -> list[str]:
+    """What a method says of itself in an object's entry: sentences, the first that it does not foresee."""
+    own = entry.get("footnotes")
+    own = own.get(method) if isinstance(own, dict) else None
+    if not isinstance(own, dict):
+        return []
+    notes = own.get("notes")
+    said = [str(note) for note in notes] if isinstance(notes, list) else []
+    return [NO_FORESIGHT, *said] if own.get("extrapolates") is False else said
+
+
 def markdown_table(table: Table) -> str:
     """One table as GitHub Markdown, its title as a heading."""
     lines = [f"### {table.title}", "", _markdown_row(table.head)]
@@ -104,6 +116,7 @@ def markdown(summary: dict[str, Any]) -> str:
         count, frames = len(entry["sequences"]), max(entry["frames"])
         parts += [f"## {name}", "", f"{count} sequences of {frames} frames at {entry['fps']:g} fps.", ""]
         parts += [markdown_table(table) for table in object_tables(name, entry)]
+        parts += [f"* {row}: {note}\n" for row in entry["methods"] for note in footnotes(entry, row)]
     return "\n".join([*parts, _contrast(summary)])
 
 

@@ -1,0 +1,76 @@
+"""What fitted methods have in common (:class:`gausim.core.FittedMethod`); by itself, the method that never moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Int
+from torch import Tensor, nn
+from torch.nn import Parameter
+
+from gausim.core import FittedState, GaussianScene
+
+
+class Fitted(nn.Module):
+    """A method with a gradient and a rotation for every kernel, and nothing to learn: a base for others.
+
+    Attributes:
+        name: its row in tables.
+        scenes: the rest scenes.
+        fps: frames per second of each.
+        scene_of_sequence: the scene of each sequence.
+        seen: predicted frames that training may see.
+        extrapolates: whether frames beyond those are foreseen.
+    """
+
+    name = "static"
+    extrapolates = True
+
+    def __init__(
+        self, *, scenes: Sequence[GaussianScene], fps: Sequence[float], scene_of_sequence: Sequence[int], seen: int
+    ) -> None:
+        """Keeps what it is fitted to."""
+        super().__init__()
+        self.scenes, self.fps = tuple(scenes), tuple(fps)
+        self.scene_of_sequence, self.seen = tuple(scene_of_sequence), seen
+
+    def notes(self) -> tuple[str, ...]:
+        """Nothing."""
+        return ()
+
+    def unit_of_kernel(self, scene_id: int) -> Int[Tensor, " K"]:
+        """Every kernel is a unit."""
+        return torch.arange(self.scenes[scene_id].count)
+
+    def begin(self, sequence_id: int) -> FittedState:
+        """The rest state."""
+        rest = self.scenes[self.scene_of_sequence[sequence_id]].means.to(self._device)
+        identity = torch.eye(3).to(rest).expand(len(rest), 3, 3)
+        return FittedState(sequence_id, 0, rest, identity, identity)
+
+    def advance(self, state: FittedState) -> FittedState:
+        """The same again."""
+        return FittedState(
+            state.sequence_id, state.frame + 1, state.positions, state.gradients, state.rotations, state.inner
+        )
+
+    def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
+        """None."""
+        return {}
+
+    def penalties(self, sequence_id: int) -> Mapping[str, Tensor]:
+        """None."""
+        return {}
+
+    @property
+    def _device(self) -> torch.device:
+        return next((p.device for p in self.parameters()), torch.device("cpu"))
+
+
+class Static(Fitted):
+    """The rest state for ever. It scores deceptively well on late frames, so every table needs it beside others."""
+
+    def notes(self) -> tuple[str, ...]:
+        """That nothing is learned."""
+        return ("Stands still in the rest state; nothing is learned.",)

@@ -1,0 +1,135 @@
+"""Methods that are fitted to recorded sequences: what training, evaluation and rollouts ask of each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import Parameter
+
+from gausim.core.errors import ConfigError, DivergenceError
+from gausim.core.protocols import Forces
+from gausim.core.scene import GaussianScene
+from gausim.core.state import SimState, Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class FittedState:
+    """One sequence at one frame.
+
+    Attributes:
+        sequence_id: the sequence, numbered over all objects.
+        frame: its frame, 0 the first.
+        positions: kernel means [scene units].
+        gradients: deformation gradients of the N units that carry kernels.
+        rotations: their rotations.
+        inner: what the method carries on to the next frame beside these (anchors, particles, fields).
+    """
+
+    sequence_id: int
+    frame: int
+    positions: Float[Tensor, "K 3"]
+    gradients: Float[Tensor, "N 3 3"]
+    rotations: Float[Tensor, "N 3 3"]
+    inner: tuple[Tensor, ...] = ()
+
+    def detach(self) -> FittedState:
+        """The same numbers without history (gradients stop here)."""
+        return replace(
+            self,
+            positions=self.positions.detach(),
+            gradients=self.gradients.detach(),
+            rotations=self.rotations.detach(),
+            inner=tuple(x.detach() for x in self.inner),
+        )
+
+
+@runtime_checkable
+class FittedMethod(Protocol):
+    """A method with parameters of its own for each sequence (an initial velocity) or object (a stiffness).
+
+    It is a torch module besides. It knows neither images nor losses: the engine draws its states with the renderer and
+    compares them with the videos, in the stages that ``conf/model/NAME.yaml`` lists.
+
+    Attributes:
+        name: its row in tables.
+        scenes: the rest scenes; their index is the ``scene_id`` of samples.
+        fps: frames per second of each.
+        scene_of_sequence: the scene of each sequence.
+        extrapolates: whether frames beyond the trained ones are foreseen; else they repeat what was fitted.
+    """
+
+    name: str
+    scenes: Sequence[GaussianScene]
+    fps: Sequence[float]
+    scene_of_sequence: Sequence[int]
+    extrapolates: bool
+
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of its figures must know: one sentence each, printed under every table."""
+        ...
+
+    def unit_of_kernel(self, scene_id: int) -> Int[Tensor, " K"]:
+        """The unit of every kernel of a scene, a row of the states' gradients and rotations."""
+        ...
+
+    def begin(self, sequence_id: int) -> FittedState:
+        """Frame 0 of a sequence; gradients flow into its parameters."""
+        ...
+
+    def advance(self, state: FittedState) -> FittedState:
+        """The next frame."""
+        ...
+
+    def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
+        """All parameters by the name that stages give a learning rate to."""
+        ...
+
+    def penalties(self, sequence_id: int) -> Mapping[str, Tensor]:
+        """What else a stage may weigh and minimise for a sequence (smoothness of fields), by name."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class FittedDynamics:
+    """A fitted method on one of its sequences, as :class:`gausim.core.Dynamics`.
+
+    Attributes:
+        method: fitted.
+        sequence_id: which sequence; it brings its own initial velocity.
+    """
+
+    method: FittedMethod
+    sequence_id: int
+
+    def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
+        """Predicts ``steps`` frames; only the positions of ``initial`` count, as frame 0.
+
+        Raises:
+            ConfigError: forces are given.
+            DivergenceError: the prediction left the finite numbers; names the frame.
+        """
+        if forces is not None:
+            raise ConfigError(f"{self.method.name}: takes no forces. Simulate without them, or with a model that does.")
+        scene_id = self.method.scene_of_sequence[self.sequence_id]
+        state = self.method.begin(self.sequence_id)
+        states = [replace(state, positions=initial.positions.to(state.positions))]
+        for _ in range(steps):
+            state = self.method.advance(state)
+            if not bool(torch.isfinite(state.positions).all()):
+                raise DivergenceError(
+                    f"{self.method.name}: the prediction of '{self.method.scenes[scene_id].name}' is not finite at "
+                    f"frame {state.frame}. Fit it again with smaller rates (model.plan.stages.STAGE.rates)."
+                )
+            states.append(state)
+        return Trajectory(
+            torch.stack([s.positions for s in states]),
+            torch.stack([s.gradients for s in states]),
+            torch.stack([s.rotations for s in states]),
+            self.method.unit_of_kernel(scene_id),
+            self.method.fps[scene_id],
+        )

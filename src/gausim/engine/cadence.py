@@ -1,0 +1,11 @@
+"""When callbacks that act every so many epochs act."""
+
+from __future__ import annotations
+
+from lightning.pytorch import Trainer
+
+
+def has_come(trainer: Trainer, every: int) -> bool:
+    """At the end of an epoch: whether it is one of every so many, or the last one; ``every`` 0 is never."""
+    epoch = trainer.current_epoch + 1
+    return every > 0 and (trainer.should_stop or epoch == trainer.max_epochs or epoch % every == 0)

@@ -1,0 +1,79 @@
+"""Mixtures of L1, squared error and SSIM, as other methods weigh them: what their stages minimise."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import ConfigError
+from gausim.losses.image import ImageLoss, structural_similarity
+
+# Size of the SSIM window of 3DGS and the methods after it [pixels].
+SSIM_WINDOW = 11
+
+
+class MixedLoss(ImageLoss):
+    """``l1`` |x - y| + ``mse`` (x - y)^2 + ``dssim`` (1 - SSIM) + ``alpha`` (a - b)^2, each a mean over its numbers.
+
+    Colours x, y are over black; a and b are the opacities. With ``alpha`` > 0 images have a fourth channel.
+    """
+
+    def __init__(
+        self, *, l1: float = 0.0, mse: float = 0.0, dssim: float = 0.0, alpha: float = 0.0, window: int = SSIM_WINDOW
+    ) -> None:
+        """Keeps the weights.
+
+        Args:
+            l1: of the absolute error.
+            mse: of the squared error.
+            dssim: of 1 - SSIM.
+            alpha: of the squared error of the opacity.
+            window: odd size of the SSIM window [pixels].
+
+        Raises:
+            ConfigError: a weight below zero, or none above it.
+        """
+        super().__init__(window=window)
+        if min(l1, mse, dssim, alpha) < 0 or max(l1, mse, dssim, alpha) == 0:
+            raise ConfigError(
+                f"loss: expected l1, mse, dssim, alpha >= 0 and one of them > 0, got {l1}, {mse}, {dssim}, {alpha}."
+            )
+        self.l1, self.mse, self.dssim, self.alpha = l1, mse, dssim, alpha
+        self.compares_alpha = alpha > 0
+
+    def value_and_gradient(
+        self, prediction: Float[Tensor, "B V H W C"], target: Float[Tensor, "B V H W C"]
+    ) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V H W C"]]:
+        """The losses and the gradient of their sum with respect to the prediction; neither is part of a graph.
+
+        Raises:
+            ConfigError: an image is smaller than the SSIM window.
+        """
+        if self.dssim > 0 and min(prediction.shape[2:4]) < self.window:
+            raise ConfigError(
+                f"loss: images of {prediction.shape[3]}x{prediction.shape[2]} pixels are smaller than the SSIM window "
+                f"of {self.window}. Lower `window` of the stage's loss."
+            )
+        leaf = prediction.detach().clone().requires_grad_()
+        with torch.enable_grad():
+            values = self._of_states(leaf, target)
+            (gradient,) = torch.autograd.grad(values.sum(), leaf)
+        return values.detach(), gradient
+
+    def _of_states(self, prediction: Tensor, target: Tensor) -> Tensor:
+        """Means over views, pixels and channels of each state."""
+        color, true = prediction[..., :3], target[..., :3]
+        difference = color - true
+        total = prediction.new_zeros(len(prediction))
+        if self.l1 > 0:
+            total = total + self.l1 * difference.abs().mean((1, 2, 3, 4))
+        if self.mse > 0:
+            total = total + self.mse * difference.square().mean((1, 2, 3, 4))
+        if self.dssim > 0:
+            first, second = (x.movedim(-1, 2).flatten(0, 2) for x in (color, true))
+            similarity = structural_similarity(first, second, self.window).reshape(len(total), -1)
+            total = total + self.dssim * (1 - similarity.mean(1))
+        if self.alpha > 0:
+            total = total + self.alpha * (prediction[..., 3] - target[..., 3]).square().mean((1, 2, 3))
+        return total

@@ -1,0 +1,156 @@
+"""Spring-Gaus and its anchors: gradients of known motions, a known stiffness found again, pins, substeps, messages."""
+
+from __future__ import annotations
+
+import math
+import runpy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from gausim.baselines.anchors import Anchors
+from gausim.baselines.spring_mass import ConstantVelocity, SpringMass, slowest_vibration
+from gausim.core import ConfigError, DivergenceError, FittedMethod, FittedState, SceneError, SimState
+from gausim.core.fitted import FittedDynamics
+from gausim.ops.quaternion import quaternion_to_matrix
+
+toy_scene = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["toy_scene"]
+
+
+def springs(**options: Any) -> SpringMass:
+    options = {"anchors": 40, "neighbours": 24, "substeps": 20, "period": 8.0, **options}
+    return SpringMass(scenes=[toy_scene()], fps=[24.0], scene_of_sequence=[0, 0], seen=7, **options)
+
+
+def swaying(method: SpringMass, speed: float = 0.01) -> SpringMass:
+    with torch.no_grad():
+        for velocity in method.velocity:
+            velocity[:, 0] = speed * method.anchors(0).rest[:, 2]
+    return method
+
+
+def rolled(method: FittedMethod, frames: int) -> list[FittedState]:
+    states = [method.begin(0)]
+    for _ in range(frames):
+        states.append(method.advance(states[-1]))
+    return states
+
+
+def test_kernels_follow_an_affine_motion_with_its_gradient() -> None:
+    scene = replace(toy_scene(), pinned=torch.zeros(36, dtype=torch.bool))
+    anchors = Anchors.of(scene, 40)
+    assert anchors.count == 36 and not bool(anchors.pinned.any())
+    turn = quaternion_to_matrix(torch.tensor([1.0, 0.2, -0.1, 0.3]))
+    wanted = turn @ torch.diag(torch.tensor([1.2, 0.9, 1.05]))
+    gradients, rotations = anchors.gradients(anchors.rest @ (wanted - torch.eye(3)).T)
+    error = (gradients - wanted).norm(dim=(1, 2)) / (wanted - torch.eye(3)).norm()
+    assert float(error.max()) < 0.02  # the ridge shrinks it a little
+    torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3).expand(36, 3, 3), atol=1e-5, rtol=0)
+    shift = torch.tensor([0.1, -0.2, 0.3])
+    moved = anchors.positions(shift.expand(anchors.count, 3))
+    torch.testing.assert_close(moved, scene.means + scene.diagonal * shift)
+
+
+def test_held_kernels_and_pinned_anchors_never_move() -> None:
+    scene = toy_scene()
+    outside = torch.zeros(36, dtype=torch.bool)
+    outside[-1] = True
+    scene = replace(scene, simulated=~outside)
+    method = SpringMass(
+        scenes=[scene], fps=[24.0], scene_of_sequence=[0], seen=7, anchors=40, neighbours=20, substeps=20
+    )
+    with torch.no_grad():
+        method.velocity[0].normal_(std=0.02)
+        states = rolled(method, 6)
+    held, anchors = scene.pinned | outside, method.anchors(0)
+    assert bool(anchors.pinned.any()) and not bool(anchors.pinned.all())
+    for state in states:
+        assert torch.equal(state.positions[held], scene.means[held])
+        torch.testing.assert_close(state.gradients[held], torch.eye(3).expand(int(held.sum()), 3, 3))
+        assert torch.equal(state.inner[0][anchors.pinned], anchors.rest[anchors.pinned])
+    assert float((states[-1].positions - scene.means)[~held].norm(dim=1).min()) > 0
+
+
+def test_the_slowest_vibration_has_the_period_that_was_asked_for() -> None:
+    method = springs(period=8.0, damping=1e-6, substeps=60)
+    kappa = method.springs(0)[0].detach()
+    square = slowest_vibration(method._nets[0], method.anchors(0), kappa)
+    assert 2 * math.pi / math.sqrt(square) == pytest.approx(8.0, rel=1e-4)
+    with torch.no_grad():
+        x = torch.stack([s.positions[:, 0].mean() for s in rolled(swaying(method, 1e-3), 24)])
+    x = x - x[0]
+    signs = (x[1:-1] * x[2:] < 0).nonzero().flatten().tolist()
+    assert signs[0] in (2, 3, 4)  # back at rest after about half a period
+
+
+@pytest.mark.parametrize("backprop", ["frame", "whole"])
+def test_a_known_stiffness_is_found_again(backprop: str) -> None:
+    truth = swaying(springs(period=7.0))
+    with torch.no_grad():
+        targets = [s.positions for s in rolled(truth, 8)]
+    method = swaying(springs(period=9.0))
+    known = float(truth.stiffness[0].detach().mean())
+    assert abs(float(method.stiffness[0].detach().mean()) - known) > 0.2
+    optimizer = torch.optim.Adam(method.stiffness.parameters(), lr=0.02)
+    for _ in range(40):
+        optimizer.zero_grad()
+        state, loss = method.begin(0), torch.zeros(())
+        for target in targets[1:]:
+            state = method.advance(state.detach() if backprop == "frame" else state)
+            loss = loss + (state.positions - target).square().mean()
+        loss.backward()
+        optimizer.step()
+    assert 10 ** abs(float(method.stiffness[0].detach().mean()) - known) < 1.2
+
+
+def test_stiff_springs_get_more_substeps_and_too_stiff_ones_a_message() -> None:
+    method = springs()
+    kappa, drag = (x.detach() for x in method.springs(0))
+    assert method._count(0, kappa, drag) == 20
+    count = method._count(0, 100 * kappa, drag)
+    assert count > 20 and count >= math.sqrt(method._nets[0].stiffest(100 * kappa))
+    with torch.no_grad():
+        method.stiffness[0] += 6
+        with pytest.raises(DivergenceError, match=r"'toy'.*substeps per frame.*model\.method\.substeps"):
+            method.advance(method.begin(0))
+
+
+def test_sequences_share_what_is_the_objects_only() -> None:
+    method = swaying(springs())
+    state = method.advance(method.advance(method.begin(1)))
+    (state.positions - toy_scene().means).square().sum().backward()
+    assert method.velocity[0].grad is None and method.velocity[1].grad is not None
+    assert float(method.stiffness[0].grad.abs().sum()) > 0 and float(method.attenuation[0].grad.abs()) > 0
+    assert sorted(method.parameter_groups()) == ["attenuation", "damping", "stiffness", "velocity"]
+
+
+def test_constant_velocity_goes_on_for_ever() -> None:
+    method = ConstantVelocity(scenes=[toy_scene()], fps=[24.0], scene_of_sequence=[0], seen=7, anchors=20)
+    with torch.no_grad():
+        method.velocity[0][:, 1] = 0.01
+    rest = toy_scene().means
+    with torch.no_grad():
+        x = FittedDynamics(method, 0).rollout(SimState(rest, rest), 20).positions
+    torch.testing.assert_close(x[20] - x[0], 20 * (x[1] - x[0]), rtol=1e-3, atol=1e-5)
+    fastest = float((x[1] - x[0]).norm(dim=1).max()) / toy_scene().diagonal  # some follow pinned anchors, too
+    assert 0.005 < fastest < 0.0101
+
+
+def test_what_is_smaller_than_the_original_is_said() -> None:
+    assert "40 anchors instead of 2048, 24 neighbours instead of 256" in springs().notes()[0]
+    full = SpringMass(scenes=[toy_scene()], fps=[24.0], scene_of_sequence=[0], seen=7)
+    assert full.notes() == () and isinstance(full, FittedMethod)
+
+
+def test_wrong_settings_name_their_field() -> None:
+    with pytest.raises(ConfigError, match=r"model\.method\.anchors"):
+        springs(anchors=3)
+    with pytest.raises(ConfigError, match=r"neighbours, substeps >= 1"):
+        springs(substeps=0)
+    point = toy_scene()
+    point = replace(point, means=torch.cat((point.means[:1].repeat(35, 1), point.means[1:2])))
+    with pytest.raises(SceneError, match=r"toy: expected at least 4 occupied grid cells"):
+        SpringMass(scenes=[point], fps=[24.0], scene_of_sequence=[0], seen=7)

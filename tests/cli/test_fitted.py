@@ -1,0 +1,145 @@
+"""Fitted methods through the same commands as the simulator: train, evaluate, report, simulate; resume; messages."""
+
+from __future__ import annotations
+
+import csv
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+import torch
+
+from gausim.cli import evaluate, report, simulate, train
+from gausim.cli._run import load_run
+from gausim.core import ConfigError
+from gausim.engine.checkpoint import read_checkpoint
+
+write_toy_object = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["write_toy_object"]
+
+TINY = (
+    "data.curriculum.t_max=3", "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1",
+    "render=reference", "callbacks.panels.every_epochs=0", "name=toy",
+)  # fmt: skip
+STAGES = "model.plan.stages"
+SMALL: dict[str, list[str]] = {
+    "static": [],
+    "constant_velocity": ["model.method.anchors=12", f"{STAGES}.velocity.iterations=6", "model.plan.round=3"],
+    "spring_mass": [
+        "model.method.anchors=12", "model.method.neighbours=8", "model.method.substeps=10", "model.plan.round=2",
+        f"{STAGES}.velocity.iterations=4", f"{STAGES}.dynamics.iterations=2",
+    ],
+    "deformation_field": [
+        "model.method.resolution=4", "model.method.features=4", "model.method.hidden=8",
+        f"{STAGES}.field.iterations=4", "model.plan.round=2",
+    ],
+}  # fmt: skip
+NAMES = {"deformation_field": "deformation_field (no diffusion prior)"}
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_toy_object(tmp_path_factory.mktemp("data") / "toy", frames=9).root
+
+
+@pytest.fixture
+def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    monkeypatch.chdir(tmp_path)
+    return [f"data.root={toy}", *TINY]
+
+
+@pytest.mark.parametrize("model", SMALL)
+def test_the_same_commands_serve_every_method(model: str, arguments: list[str]) -> None:
+    assert train.main([f"model={model}", *SMALL[model], *arguments]) == 0
+    run = Path("outputs/toy/seed_0")
+    assert evaluate.main([str(run)]) == 0
+    entry = json.loads((run / "evaluation" / "metrics.json").read_text())["objects"]["toy"]
+    row = NAMES.get(model, model)
+    assert entry["methods"] == [row] and row in entry["rows"]
+    assert entry["footnotes"][row]["notes"] and entry["efficiency"][row]["seconds_per_frame"]["mean"] >= 0
+    table = (run / "evaluation" / "table.md").read_text()
+    assert all(note in table for note in entry["footnotes"][row]["notes"])
+    assert simulate.main([str(run), "--frames", "12"]) == 0
+    assert (run / "simulation" / "toy" / "seq_000" / "cam_0.mp4").is_file()
+    assert report.main([str(run), "--out", "page"]) == 0
+    written = "".join(p.read_text() for p in Path("page").iterdir() if p.suffix == ".md").replace("\\", "")
+    assert model in written and ("Does not foresee" in written) == (model == "deformation_field")
+    assert all(note in written for note in load_run(run).module.notes())  # type: ignore[operator]
+
+
+def weights(run: str) -> dict[str, torch.Tensor]:
+    return read_checkpoint(Path(f"outputs/{run}/seed_0/last.ckpt"))["state_dict"]
+
+
+def test_stages_set_frames_and_what_learns(arguments: list[str]) -> None:
+    still = f"~{STAGES}.dynamics.rates.velocity"
+    train.main(["model=spring_mass", *SMALL["spring_mass"], still, *arguments])
+    rows = list(csv.DictReader(Path("outputs/toy/seed_0/epochs.csv").open()))
+    assert [float(r["steps"]) for r in rows] == [3.0, 3.0, 3.0]  # the velocity stage asks for three frames as well
+    made = weights("toy")
+    moved = {name: bool(value.abs().max() > 0) for name, value in made.items() if "velocity" in name}
+    assert len(moved) == 2 and all(moved.values())
+    assert float(made["model.method.stiffness.0"].std()) > 1e-4 and float(made["model.method.damping.0"]) == -1.0
+    train.main(["model=spring_mass", *SMALL["spring_mass"], f"{STAGES}.dynamics=null", *arguments, "name=short"])
+    short = weights("short")
+    assert float(short["model.method.stiffness.0"].std()) < 1e-6  # all alike
+    assert torch.equal(short["model.method.velocity.1"], made["model.method.velocity.1"])
+
+
+@pytest.mark.parametrize("model", ["spring_mass", "deformation_field"])
+def test_a_resumed_fit_equals_an_uninterrupted_one(
+    model: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gausim.engine.callbacks import RunCheckpoint
+
+    asked = [f"model={model}", *SMALL[model], *arguments, "callbacks.checkpoint.every_steps=1"]
+    train.main([*asked, "name=whole"])
+    saved, calls = RunCheckpoint.on_train_batch_end, []
+
+    def crash(self: RunCheckpoint, *args: object) -> None:
+        saved(self, *args)  # type: ignore[arg-type]
+        calls.append(1)
+        if len(calls) == 6:  # within the second epoch of four steps
+            raise MemoryError("power cut")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunCheckpoint, "on_train_batch_end", crash)
+        with pytest.raises(MemoryError):
+            train.main([*asked, "name=cut"])
+    train.main([*asked, "name=cut"])
+    whole, cut = weights("whole"), weights("cut")
+    for name, value in whole.items():
+        torch.testing.assert_close(cut[name], value, rtol=0, atol=0, msg=name)
+    notes = [load_run(Path(f"outputs/{run}/seed_0")).module.notes() for run in ("whole", "cut")]  # type: ignore[operator]
+    assert (
+        notes[0][:-1] == notes[1][:-1]
+        and "minutes of processor time" in notes[0][-1]
+        and not any("iterations" in note for note in notes[0])
+    )
+    tables = [Path(f"outputs/{run}/seed_0/epochs.csv").read_text() for run in ("whole", "cut")]
+    assert len({tuple(r.rsplit(",", 1)[0] for r in t.splitlines()) for t in tables}) == 1  # all but the seconds
+
+
+def test_a_budget_walks_through_all_stages_and_says_what_was_cut(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from gausim.engine import callbacks
+
+    clock = iter(float(i) for i in range(10_000))  # every look at the clock takes a second
+    monkeypatch.setattr(callbacks.time, "process_time", lambda: next(clock))
+    long = [f"{STAGES}.velocity.iterations=40", f"{STAGES}.dynamics.iterations=40"]
+    budget = ["trainer.max_minutes=0.3", "trainer.clock=cpu"]
+    train.main(["model=spring_mass", *SMALL["spring_mass"], *long, *budget, *arguments])
+    notes = load_run(Path("outputs/toy/seed_0")).module.notes()  # type: ignore[operator]
+    cut = [note for note in notes if "iterations per sequence" in note]
+    assert len(cut) == 2 and all("0 of its" not in note for note in cut)
+    assert json.loads(Path("outputs/toy/seed_0/FINISHED").read_text())["notes"] == notes
+
+
+def test_what_a_stage_asks_for_must_be_there(arguments: list[str]) -> None:
+    with pytest.raises(ConfigError, match=r"stages\.dynamics\.rates: \['softness'\].*attenuation.*stiffness"):
+        train.main(["model=spring_mass", f"+{STAGES}.dynamics.rates.softness=1", *arguments])
+    with pytest.raises(ConfigError, match=r"init_from, freeze: spring_mass is fitted"):
+        train.main(["model=spring_mass", "init_from=somewhere", *arguments])
+    with pytest.raises(ConfigError, match=r"model\.method\.anchors: expected at least 4"):
+        train.main(["model=spring_mass", "model.method.anchors=2", *arguments])
