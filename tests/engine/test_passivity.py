@@ -45,7 +45,7 @@ class Spiral:
         positions = batch.rest + factor * (state.positions - batch.rest)
         return SimpleNamespace(positions=positions, gradients=None, rotations=None, momentum=None)
 
-    def energy(self, batch: SimpleNamespace, state: SimState) -> Tensor:
+    def energy(self, batch: SimpleNamespace, state: SimState, prepared: object = None) -> Tensor:
         self.sizes.append(float((state.positions - batch.rest).abs().max()))
         return (state.positions - batch.rest).square().view(2, 6).sum(1)
 
