@@ -143,3 +143,9 @@ def test_what_a_stage_asks_for_must_be_there(arguments: list[str]) -> None:
         train.main(["model=spring_mass", "init_from=somewhere", *arguments])
     with pytest.raises(ConfigError, match=r"model\.method\.anchors: expected at least 4"):
         train.main(["model=spring_mass", "model.method.anchors=2", *arguments])
+
+
+def test_what_needs_a_simulator_says_so(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    train.main(["model=static", *arguments])
+    with pytest.raises(ConfigError, match="--endurance: static takes no forces"):
+        evaluate.main(["outputs/toy/seed_0", "--endurance", "300"])

@@ -131,9 +131,14 @@ class TrainedPrediction:
 
 def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
     """How the first sequence of an object goes on for so many frames: free, and under random pushes from rest."""
-    from gausim.core import SimState
+    from gausim.core import ConfigError, SimState
+    from gausim.engine.contracts import Foreseeing
     from gausim.engine.endurance import RandomPushes, endure
 
+    if not isinstance(run.module.model, Foreseeing):
+        raise ConfigError(
+            f"--endurance: {run.module.method_name} takes no forces. Leave the option out, or evaluate a simulator."
+        )
     scene, model, states = scene_of(run, item), cast(Any, run.module.model), cast(Any, run.module.initial_states)
     dynamics = model.dynamics(item.scene_id)
     previous = states.previous(item.first_sequence).detach().to(scene.means)
