@@ -9,16 +9,15 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from gausim.core import ConfigError, Forces, GaussianScene, SimState, Trajectory
+from gausim.core import ConfigError, GaussianScene, SimState
 from gausim.models.batch import BatchBuilder, GraphOptions, LevelBatch, SceneBatch
-from gausim.models.cuda_graph import GraphedStep, Predicted, StepFunction
+from gausim.models.dynamics import SceneDynamics
 from gausim.models.features import FeatureOptions, network_inputs
 from gausim.models.graph import EdgeSet, fill, fill_edges
 from gausim.models.hierarchy import build_hierarchy
 from gausim.models.prepared import Prepared, fixed_units
 from gausim.models.recursion import Solved, Units, advance, inherit
 from gausim.models.template import Motion, RestTemplate, Template
-from gausim.models.watch import Watch
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.mlp import zero_output as initialise_zero
 from gausim.nn.normaliser import RunningNormaliser
@@ -84,6 +83,7 @@ class GausSim(nn.Module):
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         normaliser_floor: float = 1e-2,
         cuda_graph: bool = False,
+        passive_frames: int = 0,
         template: Callable[..., Template] = RestTemplate,
     ) -> None:
         """Builds hierarchies, graph and network.
@@ -118,6 +118,8 @@ class GausSim(nn.Module):
             gravity: acceleration [scene units / s^2].
             normaliser_floor: smallest standard deviation of a normalised input.
             cuda_graph: rollouts on a CUDA device replay the step as one graph; of no effect elsewhere.
+            passive_frames: in rollouts, the network may not raise the template's energy beyond the largest of so many
+                frames before (:class:`gausim.models.passive.EnergyGuard`); 0, or a template without energy: no limit.
             template: what the gradients deform; called with (hierarchies, finest level, conserve_volume=conserve_mass).
         """
         super().__init__()
@@ -126,7 +128,7 @@ class GausSim(nn.Module):
         self.predicted_levels = tuple(predicted_levels)
         self.edges, self.output_scale = EdgeSet(edges, edge_bucket), output_scale
         self.conserve_mass, self.conserve_momentum = conserve_mass, conserve_momentum
-        self.cuda_graph = cuda_graph
+        self.cuda_graph, self.passive_frames = cuda_graph, passive_frames
         self.options = FeatureOptions(angle, rest_inputs, coarse_inputs)
         self.hierarchies = tuple(build_hierarchy(s, radii=radii, clustering=clustering) for s in scenes)
         graph = GraphOptions(tuple(graph_radii), max_neighbours)
@@ -236,6 +238,7 @@ class GausSim(nn.Module):
         state: SimState,
         force: Float[Tensor, "K 3"] | None = None,
         prepared: Prepared | None = None,
+        share: float = 1.0,
     ) -> Step:
         """Predicts the next frame.
 
@@ -245,6 +248,7 @@ class GausSim(nn.Module):
             force: force per kernel [mass scene units / s^2]; it displaces free kernels by f dt^2 / (2 m) before the
                 step (METHOD section 6).
             prepared: from :meth:`prepare`, shared by steps between which no parameter changes; made here when None.
+            share: factor on the network's output; 0 leaves the template alone.
 
         Raises:
             ValueError: ``prepared`` is of another batch, or carries no gradients while they are enabled.
@@ -256,11 +260,18 @@ class GausSim(nn.Module):
                 "Call prepare(batch) where step is called."
             )
         if force is not None:
-            state = SimState(state.positions + self._push(prepared, force), state.previous)
+            state = self.pushed(prepared, state, force)
         with announced("the simulator's step"):
-            return self._solve(prepared, state)
+            return self._solve(prepared, state, share)
 
-    def _solve(self, prepared: Prepared, state: SimState) -> Step:
+    def pushed(self, prepared: Prepared, state: SimState, force: Float[Tensor, "K 3"]) -> SimState:
+        """The state that a force makes of a state: f dt^2 / (2 m) further, pinned kernels where they are."""
+        batch = prepared.batch
+        shift = force.index_select(0, batch.simulated) * batch.dt**2 / (2 * prepared.mass[:, None])
+        shift = torch.where(batch.pinned[:, None], torch.zeros_like(shift), shift)
+        return SimState(state.positions.index_add(0, batch.simulated, shift), state.previous)
+
+    def _solve(self, prepared: Prepared, state: SimState, share: float) -> Step:
         """All predicted levels, coarse to fine, then the kernels."""
         batch = prepared.batch
         now, before = prepared.aggregate(state.positions), prepared.aggregate(state.previous)
@@ -274,7 +285,7 @@ class GausSim(nn.Module):
         for position, (level, unit, target) in enumerate(zip(batch.levels, units, targets, strict=True)):
             if position:
                 above = replace(above, index=level.parent)
-            gradient, rotation = self._predict(level, unit, above, target, position=position)
+            gradient, rotation = self._predict(level, unit, above, target, position, share)
             predicted.append(gradient)
             accumulated, turned, after = advance(gradient, rotation, target, above)
             if position and self.conserve_momentum:
@@ -282,19 +293,12 @@ class GausSim(nn.Module):
             above = Solved(unit.rest, unit.now, unit.before, after, target, accumulated, turned, above.index)
         return Step(*inherit(above, template.gradients, batch.kernels), momentum, tuple(predicted))
 
-    def _push(self, prepared: Prepared, force: Tensor) -> Tensor:
-        """Displacements f dt^2 / (2 m) of all kernels, zero for those that are held."""
-        batch = prepared.batch
-        shift = force.index_select(0, batch.simulated) * batch.dt**2 / (2 * prepared.mass[:, None])
-        shift = torch.where(batch.pinned[:, None], torch.zeros_like(shift), shift)
-        return torch.zeros_like(batch.rest).index_copy(0, batch.simulated, shift)
-
     def _fixes_shapes(self, positions: Tensor) -> bool:
         """Whether the number of edges must not depend on the state: where steps may be captured in a CUDA graph."""
         return self.edges.rule != "rest" and positions.device.type == "cuda" and not self.training
 
     def _predict(
-        self, level: LevelBatch, unit: Units, above: Solved, target: Tensor, *, position: int
+        self, level: LevelBatch, unit: Units, above: Solved, target: Tensor, position: int, share: float
     ) -> tuple[Tensor, Tensor]:
         """The network's gradient and rotation of each unit of a level; the identity for pinned units."""
         network = self.network[position] if isinstance(self.network, nn.ModuleList) else self.network
@@ -312,7 +316,7 @@ class GausSim(nn.Module):
             nodes, edges = fill(nodes, 1), fill(edges, extra)
             edge_index = fill_edges(edge_index, level.count, extra)
         output = network(nodes, edges, edge_index)[: level.count]
-        return gradient_from_output(output * (self.output_scale * level.free), conserve_mass=self.conserve_mass)
+        return gradient_from_output(output * (share * self.output_scale * level.free), conserve_mass=self.conserve_mass)
 
     def dynamics(self, scene_id: int = 0) -> SceneDynamics:
         """The simulator bound to one scene, as the protocol :class:`gausim.core.Dynamics`."""
@@ -323,76 +327,6 @@ def _momentum(level: LevelBatch, unit: Units, after: Tensor, parents: Tensor, ma
     """sum_c ||m_c x_c - sum_{i in c} m_i x_i||^2 over the parents c, of masses ``mass``, of a level's units."""
     weighted = weighted_sum(after, unit.mass, level.parent, len(parents))
     return (mass[:, None] * parents - weighted).square().sum()
-
-
-class SceneDynamics:
-    """Rolls one scene of a :class:`GausSim` out, without gradients and in evaluation mode."""
-
-    def __init__(self, model: GausSim, scene_id: int) -> None:
-        """Binds ``model`` to its scene number ``scene_id``."""
-        self.model, self.scene_id = model, scene_id
-
-    @property
-    @torch.no_grad()
-    def masses(self) -> Float[Tensor, " K"]:
-        """Mass of every kernel of the scene, up to a common factor; 0 for those never simulated."""
-        scene, hierarchy = self.model.scenes[self.scene_id], self.model.hierarchies[self.scene_id]
-        own, _ = self.model.masses(self.model.batch((self.scene_id,)))
-        return own.new_zeros(scene.count).index_copy(0, hierarchy.kernels.to(own.device), own)
-
-    @torch.no_grad()
-    def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
-        """Predicts ``steps`` frames; frame 0 is the initial state with identity gradients (METHOD: the rest state).
-
-        Raises:
-            DivergenceError: a position or force is not finite; the message names the frame.
-        """
-        was_training = self.model.training
-        self.model.eval()
-        try:
-            return self._rollout(initial, steps, forces)
-        finally:
-            self.model.train(was_training)
-
-    def _rollout(self, initial: SimState, steps: int, forces: Forces | None) -> Trajectory:
-        batch = self.model.batch((self.scene_id,))
-        member = batch.members[0]
-        units = member.units.stop - member.units.start
-        identity = torch.eye(3).to(initial.positions).expand(units, 3, 3)
-        positions, gradients, rotations = [initial.positions], [identity], [identity]
-        state = initial
-        watch = Watch(self.model.scenes[self.scene_id].name, steps, initial.positions.device)
-        watch.positions(0, initial.positions, initial.previous)
-        step = self._step(batch)
-        for number in range(steps):
-            force = forces(number) if forces is not None else None
-            if force is not None:
-                watch.forces(number, force)
-            watch.ask(number)
-            result = step(state, force)
-            watch.positions(number + 1, result.positions)
-            state = SimState(result.positions, state.positions)
-            positions.append(result.positions)
-            gradients.append(result.gradients)
-            rotations.append(result.rotations)
-        watch.ask(steps, now=True)
-        return Trajectory(
-            torch.stack(positions),
-            torch.stack(gradients),
-            torch.stack(rotations),
-            member.unit_of_kernel,
-            self.model.fps[self.scene_id],
-        )
-
-    def _step(self, batch: SceneBatch) -> StepFunction:
-        prepared = self.model.prepare(batch)
-
-        def step(state: SimState, force: Tensor | None) -> Predicted:
-            return self.model.step(batch, state, force, prepared)
-
-        if self.model.cuda_graph and batch.rest.device.type == "cuda":
-            return GraphedStep(step, batch.rest)
-        return step
 
 
 def _check(

@@ -1,0 +1,109 @@
+"""The guard of rollouts: the network cannot feed free motion, and where it does not try to nothing changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import torch
+
+from gausim.core import GaussianScene, SimState
+from gausim.models.elastic import ElasticTemplate
+from gausim.models.passive import EnergyGuard
+from gausim.models.simulator import GausSim, Step
+
+FRAMES = 10
+MakeModel, MakeScene, MakeState = Callable[..., GausSim], Callable[..., GaussianScene], Callable[..., SimState]
+
+
+def _model(make_model: MakeModel, scene: GaussianScene, *, frames: int = FRAMES, scale: float = 0.05) -> GausSim:
+    """A network with random weights of a size that feeds the motion of an elastic template."""
+    template = partial(ElasticTemplate, modes=8, geometric=1.0)
+    return make_model(scene, template=template, output_scale=scale, passive_frames=frames).eval()
+
+
+def _energies(model: GausSim, positions: torch.Tensor) -> list[float]:
+    batch = model.batch((0,))
+    with torch.no_grad():
+        return [float(model.energy(batch, SimState(b, a))) for a, b in zip(positions, positions[1:], strict=False)]
+
+
+def test_energy_grows_without_the_guard_and_not_with_it(
+    make_scene: MakeScene, make_model: MakeModel, make_state: MakeState
+) -> None:
+    scene = make_scene()
+    state = SimState(scene.means, make_state(scene).positions)
+    found = {}
+    for frames in (0, FRAMES):
+        rollout = _model(make_model, scene, frames=frames).dynamics().rollout(state, 150)
+        found[frames] = _energies(_model(make_model, scene), torch.cat((state.previous[None], rollout.positions)))
+    assert max(found[0][FRAMES:]) > 1.5 * max(found[0][:FRAMES])
+    kept = found[FRAMES]
+    for i in range(FRAMES, len(kept)):
+        assert kept[i] <= max(kept[i - FRAMES : i]) * (1 + 1e-4)
+    assert min(kept[-FRAMES:]) > 0
+
+
+def test_what_adds_no_energy_is_not_touched(
+    make_scene: MakeScene, make_model: MakeModel, make_state: MakeState
+) -> None:
+    scene = make_scene()
+    state = SimState(scene.means, make_state(scene).positions)
+    free, guarded = (
+        _model(make_model, scene, frames=frames, scale=0.0).dynamics().rollout(state, 40) for frames in (0, FRAMES)
+    )
+    assert torch.equal(free.positions, guarded.positions) and torch.equal(free.gradients, guarded.gradients)
+    assert float((free.positions - scene.means).norm(dim=-1).max()) > 1e-4
+
+
+def test_a_push_raises_the_limit_by_its_work(make_scene: MakeScene, make_model: MakeModel) -> None:
+    scene = make_scene()
+    model = _model(make_model, scene, scale=0.0)
+    still = SimState(scene.means, scene.means)
+
+    def push(frame: int) -> torch.Tensor | None:
+        return torch.full_like(scene.means, 1.0) * model.dynamics().masses[:, None] if frame in (3, 4) else None
+
+    guarded = model.dynamics().rollout(still, 20, forces=push)
+    model.passive_frames = 0
+    assert torch.equal(guarded.positions, model.dynamics().rollout(still, 20, forces=push).positions)
+    assert float((guarded.positions[8] - scene.means).norm(dim=-1).max()) > 1e-4
+
+
+@torch.no_grad()
+def test_a_held_back_step_takes_the_share_of_its_formula(
+    make_scene: MakeScene, make_model: MakeModel, make_state: MakeState
+) -> None:
+    scene = make_scene()
+    model = _model(make_model, scene, scale=0.002)
+    batch = model.batch((0,))
+    prepared = model.prepare(batch)
+    guard, state = EnergyGuard(model, prepared, FRAMES), SimState(scene.means, make_state(scene).positions)
+    energies: list[float] = [float(model.energy(batch, state))]
+
+    def whole(state: SimState, force: torch.Tensor | None) -> Step:
+        return model.step(batch, state, force, prepared)
+
+    while not guard.held and len(energies) < 200:
+        start, limit = state, max(energies[-FRAMES:])
+        state = SimState(guard.step(whole, start, None).positions, start.positions)
+        energies.append(float(model.energy(batch, state)))
+
+    def energy_with(share: float) -> float:
+        made = model.step(batch, start, None, prepared, share)
+        return float(model.energy(batch, SimState(made.positions, start.positions)))
+
+    low, high = energy_with(0.0), energy_with(1.0)
+    share = (limit - low) / (high - low)
+    assert guard.held == 1 and low < limit < high and energies[-1] <= limit
+    assert 0.01 < share < 0.99
+    assert torch.equal(state.positions, model.step(batch, start, None, prepared, share).positions)
+
+
+def test_a_template_without_energy_has_no_guard(make_scene: MakeScene, make_model: MakeModel) -> None:
+    scene = make_scene()
+    model = make_model(scene, passive_frames=FRAMES).eval()
+    assert not model.knows_energy
+    moved = model.dynamics().rollout(SimState(scene.means, scene.means), 3)
+    model.passive_frames = 0
+    assert torch.equal(moved.positions, model.dynamics().rollout(SimState(scene.means, scene.means), 3).positions)
