@@ -18,6 +18,7 @@ CASES = {
     "network": "the graph network against the textbook form: time, memory, share of the matrix-product peak",
     "step": "one predicted frame at the paper's size, with and without hierarchy, part by part",
     "train": "whole optimiser steps, part by part; KEY=VALUE chooses the experiment as in `gausim train`",
+    "data": "packed frames against decoding PNG; opening and streaming a set of the paper's size",
     "cluster": "clusters of bounded diameter and neighbour search",
 }
 DEFAULT_OVERRIDES = ("experiment=demo",)

@@ -1,4 +1,4 @@
-"""Records of a data set on disk: one sequence, its true motion, the stills. Frames are decoded when first asked for."""
+"""Records of a data set on disk: one sequence, its true motion, the stills. Frames are read when asked for."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from gausim.core import Cameras, DataError
+from gausim.data.frames import open_frames
 from gausim.data.images import read_rgba_into
 from gausim.io.npz import read_npz
-from gausim.io.transforms import PosedFrame, read_transforms
+from gausim.io.transforms import read_transforms
 
 # Every tenth still is left out of the reconstruction, to measure it on.
 STILLS_PER_HELDOUT = 10
-# A camera stands still through a sequence: its poses may differ by rounding only.
-POSE_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,23 +75,14 @@ class SequenceRecord:
     """
 
     def __init__(self, root: Path, *, views: Sequence[str], fps: float) -> None:
-        """Reads and checks ``transforms.json``; no image is decoded yet.
+        """Reads and checks ``transforms.json``, or ``frames.json`` of packed frames; no image is read yet.
 
         Raises:
-            DataError: a view of the data set or a frame of a view is not listed, or a camera moves.
+            DataError: a view of the data set or a frame of a view is not there, or a camera moves.
         """
-        posed = read_transforms(root / "transforms.json")
-        if posed.fps is not None and posed.fps != fps:
-            raise DataError(f"{posed.path}: field 'fps' is {posed.fps:g}, dataset.json says {fps:g}. Make them agree.")
         self.root, self.name, self.views, self.fps = root, root.name, tuple(views), fps
-        self._frames, index = _frames_of_views(posed.path, posed.frames, self.views)
-        self.count = len(self._frames[0])
-        _check_static(posed.path, posed.cameras, index, self.views)
-        chosen = posed.cameras.select([row[0] for row in index])
-        self.cameras = Cameras(chosen.viewmats, chosen.Ks, chosen.width, chosen.height, self.views)
-        # np.empty takes no memory before a frame is decoded into it.
-        self._pixels = np.empty((self.count, len(self.views), chosen.height, chosen.width, 4), np.uint8)
-        self._decoded = np.zeros((self.count, len(self.views)), bool)
+        self._source = open_frames(root, self.views, fps)
+        self.count, self.cameras = self._source.count, self._source.cameras
 
     def camera_indices(self, views: Sequence[str] | None = None) -> list[int]:
         """Positions of these views in :attr:`views` (all when None), or :class:`DataError`."""
@@ -106,21 +96,14 @@ class SequenceRecord:
         return self.cameras.select(self.camera_indices(views))
 
     def frames(self, frames: range, views: Sequence[str] | None = None) -> UInt8[Tensor, "F V H W 4"]:
-        """Straight-alpha RGBA of these frames and views; each image is decoded once and kept in memory.
+        """Straight-alpha RGBA of these frames and views.
 
         Raises:
             DataError: a frame or view does not exist, or an image is missing or malformed.
         """
         if len(frames) == 0 or frames[0] < 0 or frames[-1] >= self.count:
             raise DataError(f"{self.root}: frames {frames} asked for, it has frames 0..{self.count - 1}.")
-        columns = self.camera_indices(views)
-        missing = [(f, v) for f in frames for v in columns if not self._decoded[f, v]]
-        paths = [self._frames[v][f].path for f, v in missing]
-        size = self.cameras.width, self.cameras.height
-        read_rgba_into(paths, [self._pixels[f, v] for f, v in missing], size)
-        for f, v in missing:
-            self._decoded[f, v] = True
-        return torch.from_numpy(self._pixels[np.ix_(list(frames), columns)])
+        return self._source.read(frames, self.camera_indices(views))
 
     def ground_truth(self, rest: Float[Tensor, "P 3"] | None) -> GroundTruth | None:
         """True motion of the object's points, or None where the data set has none (real captures).
@@ -149,38 +132,3 @@ def read_array(path: Path, field: str) -> np.ndarray:
     if field not in arrays:
         raise DataError(f"{path}: array '{field}' is missing.")
     return arrays[field]
-
-
-def _frames_of_views(
-    path: Path, frames: Sequence[PosedFrame], views: Sequence[str]
-) -> tuple[list[list[PosedFrame]], list[list[int]]]:
-    """Entries and their indices, sorted into [view][frame]."""
-    table: dict[str, dict[int, int]] = {view: {} for view in views}
-    for i, frame in enumerate(frames):
-        if frame.camera not in table:
-            raise DataError(f"{path}: frames[{i}] is of camera '{frame.camera}', dataset.json has {list(views)}.")
-        number = frame.frame if frame.frame is not None else len(table[frame.camera])
-        if number in table[frame.camera]:
-            raise DataError(f"{path}: frame {number} of camera '{frame.camera}' is listed twice.")
-        table[frame.camera][number] = i
-    count = max(max(row, default=-1) for row in table.values()) + 1
-    for view, row in table.items():
-        absent = [f for f in range(count) if f not in row]
-        if absent:
-            raise DataError(
-                f"{path}: view '{view}' lacks {len(absent)} of {count} frames (first: {absent[0]}). "
-                "Restore them, or take the view out of dataset.json."
-            )
-    index = [[table[view][f] for f in range(count)] for view in views]
-    return [[frames[i] for i in row] for row in index], index
-
-
-def _check_static(path: Path, cameras: Cameras, index: list[list[int]], views: Sequence[str]) -> None:
-    for view, row in zip(views, index, strict=True):
-        pose = (cameras.viewmats[row] - cameras.viewmats[row[0]]).abs().amax((1, 2))
-        lens = (cameras.Ks[row] - cameras.Ks[row[0]]).abs().amax((1, 2))
-        moved = ((pose > POSE_TOLERANCE * (1 + cameras.viewmats[row[0]].abs().max())) | (lens > 1e-3)).nonzero()
-        if len(moved):
-            raise DataError(
-                f"{path}: camera '{view}' moves at frame {int(moved[0])}; sequences need cameras that stand still."
-            )

@@ -1,0 +1,129 @@
+"""Benchmark: packed frames against decoding images in the same run; opening and streaming a set of the paper's size.
+
+The large set is written as sparse files: its bytes are read as any others, but take no space on the disk.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gausim.benchmark.harness import Options, Row, medians
+from gausim.core import Cameras
+from gausim.data.frames import ImageSource, PackedSource
+from gausim.data.images import write_rgba
+from gausim.io.packed import HEADER, PIXELS, Crop, read_packed
+from gausim.io.packed_writer import header, write_packed
+from gausim.io.transforms import write_transforms
+
+FPS, FRAMES, VIEWS, CROP_SHARE = 24.0, 16, 4, 0.2
+# READY as the paper has it: sequences, frames, views, width, height.
+PAPER = (30, 100, 6, 960, 540)
+EPOCHS = 3
+
+
+def run(options: Options) -> list[Row]:
+    """Throughput of a training sample, and memory over epochs of a large set."""
+    size = 64 if options.quick else 512
+    with tempfile.TemporaryDirectory() as folder:
+        return _throughput(Path(folder), size, options) + _large(Path(folder) / "large", options)
+
+
+def _throughput(folder: Path, size: int, options: Options) -> list[Row]:
+    cameras = _cameras(VIEWS, size, size)
+    images = _images(size)
+    entries = []
+    for view, name in enumerate(cameras.names):
+        (folder / name).mkdir()
+        for frame, pixels in enumerate(images[view]):
+            write_rgba(folder / name / f"{frame:04d}.png", pixels)
+            entries.append({"file_path": f"{name}/{frame:04d}.png", "camera": name, "frame": frame})
+    write_transforms(
+        folder / "transforms.json", cameras.select([v for v in range(VIEWS) for _ in range(FRAMES)]), entries, fps=FPS
+    )
+    write_packed(folder, cameras, list(images), FPS, margin=2)
+    frames, columns = range(FRAMES), list(range(VIEWS))
+    packed = PackedSource(folder, cameras.names, FPS)
+    times = medians(
+        {
+            "image files": lambda: ImageSource(folder, cameras.names, FPS).read(frames, columns),
+            "packed": lambda: packed.read(frames, columns),
+        },
+        options,
+    )
+    case, count = f"{FRAMES} frames x {VIEWS} views of {size} x {size}", FRAMES * VIEWS
+    share = read_packed(folder).size / (4 * count * size * size)
+    return [
+        Row(case, "image files", count / times["image files"], "images/s"),
+        Row(case, "packed", count / times["packed"], "images/s"),
+        Row(case, "packed", times["image files"] / times["packed"], "x", "decoding PNG"),
+        Row(case, "stored", share, "1", "whole images"),
+    ]
+
+
+def _large(folder: Path, options: Options) -> list[Row]:
+    """Opens a set and reads the training frames of every sequence, several times over."""
+    sequences, frames, views, width, height = (3, 20, 2, 96, 54) if options.quick else PAPER
+    cameras = _cameras(views, width, height)
+    side = CROP_SHARE**0.5
+    crop = Crop(0, 0, int(side * width), int(side * height), 0)
+    crops = [Crop(0, 0, crop.width, crop.height, view * frames * crop.frame_bytes) for view in range(views)]
+    total = views * frames * crop.frame_bytes
+    for number in range(sequences):
+        place = folder / f"seq_{number:03d}"
+        place.mkdir(parents=True)
+        with (place / PIXELS).open("wb") as file:
+            file.truncate(total)
+        text = header(cameras, crops, count=frames, fps=FPS, size=total, sha256="0" * 64)
+        (place / HEADER).write_bytes(text)
+    start = time.perf_counter()
+    sources = [PackedSource(place, cameras.names, FPS) for place in sorted(folder.iterdir())]
+    opened, resident, spent = time.perf_counter() - start, [], []
+    for _ in range(EPOCHS):
+        start = time.perf_counter()
+        for source in sources:
+            source.read(range(FRAMES), list(range(min(VIEWS, views))))
+        spent.append((time.perf_counter() - start) / sequences)
+        resident.append(_resident())
+    case = f"{sequences} sequences x {frames} frames x {views} views of {width} x {height}"
+    return [
+        Row(case, "size", sequences * total, "B"),
+        Row(case, "opening", opened, "s"),
+        Row(case, f"sample of {FRAMES} frames x {min(VIEWS, views)} views", min(spent), "s"),
+        Row(case, f"resident memory, epoch {EPOCHS}", resident[-1] / resident[0], "x", "epoch 1"),
+    ]
+
+
+def _resident() -> int:
+    """Memory of this process that lies in the machine's [bytes]."""
+    status = Path("/proc/self/status")
+    if not status.is_file():  # not on Linux: the highest so far
+        from gausim.benchmark.harness import peak_resident
+
+        return peak_resident()
+    line = next(line for line in status.read_text().splitlines() if line.startswith("VmRSS"))
+    return 1024 * int(line.split()[1])
+
+
+def _cameras(views: int, width: int, height: int) -> Cameras:
+    k = torch.tensor([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
+    names = tuple(f"cam_{i}" for i in range(views))
+    return Cameras(torch.eye(4).repeat(views, 1, 1), k.repeat(views, 1, 1), width, height, names)
+
+
+def _images(size: int) -> np.ndarray:
+    """(V, F, H, W, 4): a noisy disc that sways, within a fifth of the image."""
+    rng = np.random.default_rng(0)
+    images = np.zeros((VIEWS, FRAMES, size, size, 4), np.uint8)
+    y, x = np.mgrid[:size, :size] / size - 0.5
+    texture = (60 * np.sin(30 * x) * np.cos(25 * y))[..., None] + rng.normal(120, 6, (VIEWS, 1, size, size, 3))
+    radius = 0.5 * (CROP_SHARE**0.5) - 0.03
+    for frame in range(FRAMES):
+        disc = (x - 0.03 * np.sin(0.4 * frame)) ** 2 + y**2 < radius**2
+        images[:, frame, ..., 3] = 255 * disc
+        images[:, frame, ..., :3] = np.clip(texture[:, 0], 0, 255) * disc[..., None]
+    return images

@@ -1,0 +1,41 @@
+"""`gausim verify`: names every fault of a data set."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+HELP = "Check a data set and name every fault."
+
+
+def main(argv: list[str]) -> int:
+    """Runs the command.
+
+    Args:
+        argv: the arguments after the command's name.
+
+    Returns:
+        0 if all is well, 1 if there are faults.
+
+    Raises:
+        DataError: there is no data set at a path.
+    """
+    parser = argparse.ArgumentParser(prog="gausim verify", description=f"{HELP} Exits with 1 if there are some.")
+    parser.add_argument("root", metavar="ROOT", nargs="+", type=Path, help="object directories, or folders of them")
+    parser.add_argument("--quick", action="store_true", help="headers and sizes only: no image is read or hashed")
+    parser.add_argument("--json", action="store_true", help="print an object: {DIRECTORY: [[file, fault], ...]}")
+    arguments = parser.parse_args(argv)
+    from gausim.data.objects import find_objects
+    from gausim.data.verify import verify
+
+    roots = [found for root in arguments.root for found in find_objects(root)]
+    faults = {str(root): verify(root, quick=arguments.quick) for root in roots}
+    if arguments.json:
+        print(json.dumps({root: [[f.where, f.what] for f in found] for root, found in faults.items()}, indent=1))
+    else:
+        for root, found in faults.items():
+            print(f"{root}: {'ok' if not found else f'{len(found)} faults'}")
+            for fault in found:
+                print(f"  {fault.where}: {fault.what}")
+    return 1 if any(faults.values()) else 0

@@ -1,0 +1,140 @@
+"""Where the frames of a sequence come from: image files, or packed frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from gausim.core import Cameras, DataError
+from gausim.data.images import read_rgba_into
+from gausim.io.packed import HEADER, is_packed, read_packed
+from gausim.io.transforms import PosedFrame, read_transforms
+
+# A camera stands still through a sequence: its poses may differ by rounding only.
+POSE_TOLERANCE = 1e-5
+
+
+@runtime_checkable
+class FrameSource(Protocol):
+    """The frames of one sequence.
+
+    Attributes:
+        count: number of frames.
+        cameras: one per view, in the data set's order.
+    """
+
+    count: int
+    cameras: Cameras
+
+    def read(self, frames: range, columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:
+        """Straight-alpha RGBA of these frames and cameras, all of which exist."""
+        ...
+
+
+def open_frames(root: Path, views: Sequence[str], fps: float) -> FrameSource:
+    """The frames of a sequence's folder; only headers are read.
+
+    Args:
+        root: the folder.
+        views: names of all cameras, in the order that is wanted.
+        fps: frames per second that it must have.
+
+    Raises:
+        DataError: a file is missing or a field is wrong, a view or a frame of a view is missing, or a camera moves.
+    """
+    return PackedSource(root, views, fps) if is_packed(root) else ImageSource(root, views, fps)
+
+
+class PackedSource:
+    """Packed frames: every call reads what it asks for, so memory does not grow with the data set."""
+
+    def __init__(self, root: Path, views: Sequence[str], fps: float) -> None:
+        """Reads the header; no frame is read yet."""
+        self._packed = packed = read_packed(root)
+        if packed.fps != fps:
+            raise DataError(
+                f"{root / HEADER}: field 'fps' is {packed.fps:g}, dataset.json says {fps:g}. Make them agree."
+            )
+        if set(packed.cameras.names) != set(views):
+            raise DataError(
+                f"{root / HEADER}: has the views {list(packed.cameras.names)}, dataset.json says {list(views)}."
+            )
+        self._columns = [packed.cameras.names.index(view) for view in views]
+        self.count, self.cameras = packed.count, packed.cameras.select(self._columns)
+
+    def read(self, frames: range, columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:
+        """See :class:`FrameSource`."""
+        return self._packed.read(frames, [self._columns[column] for column in columns])
+
+
+class ImageSource:
+    """Image files: each is decoded once and kept in memory."""
+
+    def __init__(self, root: Path, views: Sequence[str], fps: float) -> None:
+        """Reads ``transforms.json``; no image is decoded yet."""
+        self._root = root
+        posed = read_transforms(root / "transforms.json")
+        if posed.fps is not None and posed.fps != fps:
+            raise DataError(f"{posed.path}: field 'fps' is {posed.fps:g}, dataset.json says {fps:g}. Make them agree.")
+        self._frames, index = _frames_of_views(posed.path, posed.frames, views)
+        self.count = len(self._frames[0])
+        _check_static(posed.path, posed.cameras, index, views)
+        chosen = posed.cameras.select([row[0] for row in index])
+        self.cameras = Cameras(chosen.viewmats, chosen.Ks, chosen.width, chosen.height, tuple(views))
+        # np.empty takes no memory before a frame is decoded into it.
+        self._pixels = np.empty((self.count, len(views), chosen.height, chosen.width, 4), np.uint8)
+        self._decoded = np.zeros((self.count, len(views)), bool)
+
+    def read(self, frames: range, columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:
+        """See :class:`FrameSource`.
+
+        Raises:
+            DataError: an image is missing or malformed.
+        """
+        missing = [(f, v) for f in frames for v in columns if not self._decoded[f, v]]
+        paths = [self._frames[v][f].path for f, v in missing]
+        read_rgba_into(paths, [self._pixels[f, v] for f, v in missing], (self.cameras.width, self.cameras.height))
+        for f, v in missing:
+            self._decoded[f, v] = True
+        return torch.from_numpy(self._pixels[np.ix_(list(frames), list(columns))])
+
+
+def _frames_of_views(
+    path: Path, frames: Sequence[PosedFrame], views: Sequence[str]
+) -> tuple[list[list[PosedFrame]], list[list[int]]]:
+    """Entries and their indices, sorted into [view][frame]."""
+    table: dict[str, dict[int, int]] = {view: {} for view in views}
+    for i, frame in enumerate(frames):
+        if frame.camera not in table:
+            raise DataError(f"{path}: frames[{i}] is of camera '{frame.camera}', dataset.json has {list(views)}.")
+        number = frame.frame if frame.frame is not None else len(table[frame.camera])
+        if number in table[frame.camera]:
+            raise DataError(f"{path}: frame {number} of camera '{frame.camera}' is listed twice.")
+        table[frame.camera][number] = i
+    count = max(max(row, default=-1) for row in table.values()) + 1
+    for view, row in table.items():
+        absent = [f for f in range(count) if f not in row]
+        if absent:
+            raise DataError(
+                f"{path}: view '{view}' lacks {len(absent)} of {count} frames (first: {absent[0]}). "
+                "Restore them, or take the view out of dataset.json."
+            )
+    index = [[table[view][f] for f in range(count)] for view in views]
+    return [[frames[i] for i in row] for row in index], index
+
+
+def _check_static(path: Path, cameras: Cameras, index: list[list[int]], views: Sequence[str]) -> None:
+    for view, row in zip(views, index, strict=True):
+        pose = (cameras.viewmats[row] - cameras.viewmats[row[0]]).abs().amax((1, 2))
+        lens = (cameras.Ks[row] - cameras.Ks[row[0]]).abs().amax((1, 2))
+        moved = ((pose > POSE_TOLERANCE * (1 + cameras.viewmats[row[0]].abs().max())) | (lens > 1e-3)).nonzero()
+        if len(moved):
+            raise DataError(
+                f"{path}: camera '{view}' moves at frame {int(moved[0])}; sequences need cameras that stand still."
+            )

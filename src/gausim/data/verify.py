@@ -1,0 +1,137 @@
+"""Finds every fault of a data set on disk, instead of the first that training stumbles over."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from gausim.core import GausSimError
+from gausim.data.objects import ObjectData
+from gausim.data.records import SequenceRecord
+from gausim.io.packed import PIXELS, is_packed, read_packed
+from gausim.io.transforms import read_json
+
+# What `python -m data_prep.pack` writes; other stores have none.
+MANIFEST = "stage.json"
+FRAMES_AT_A_TIME = 8
+CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing that is wrong.
+
+    Attributes:
+        where: file or folder, relative to the object where it lies in it.
+        what: with the remedy.
+    """
+
+    where: str
+    what: str
+
+
+def verify(root: Path, *, quick: bool = False) -> list[Fault]:
+    """Checks one object: facts, sequences with all their images, true motion, stills, scene, hashes of a packed store.
+
+    Args:
+        root: its directory.
+        quick: look at headers and sizes only; no image is read and nothing is hashed.
+
+    Returns:
+        The faults; none of a data set that is as it should be.
+    """
+    faults = list(_manifest(root, quick=quick))
+    try:
+        data = ObjectData(root)
+    except GausSimError as error:
+        return [*faults, Fault("dataset.json", str(error))]
+    faults += _sequences(data, quick=quick)
+    if data.scene_path.is_file():
+        faults += _check("scene.ply", data.scene)
+    if (root / "static").is_dir() and not quick:
+        faults += _check("static", data.stills)
+    return faults
+
+
+def _check(where: str, action: object) -> list[Fault]:
+    assert callable(action)
+    try:
+        action()
+    except (GausSimError, OSError) as error:
+        return [Fault(where, str(error))]
+    return []
+
+
+def _sequences(data: ObjectData, *, quick: bool) -> Iterator[Fault]:
+    folder = data.root / "sequences"
+    names = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
+    if not names:
+        yield Fault("sequences", f"{folder}: holds no sequence. Restore the folder, or record some.")
+    for name in names:
+        where = f"sequences/{name}"
+        try:
+            record = SequenceRecord(folder / name, views=data.views, fps=data.fps)
+        except GausSimError as error:
+            yield Fault(where, str(error))
+            continue
+        if record.count < data.train_frames.stop:
+            yield Fault(where, f"has {record.count} frames, dataset.json trains on {data.train_frames}.")
+        if not quick:
+            yield from _images(record, where)
+        yield from _check(f"{where}/ground_truth.npz", lambda record=record: data.ground_truth(record))
+
+
+def _images(record: SequenceRecord, where: str) -> Iterator[Fault]:
+    """Reads every image and looks for the object; packed pixels are hashed."""
+    if is_packed(record.root):
+        packed = read_packed(record.root)
+        if packed.digest() != packed.sha256:
+            yield Fault(f"{where}/{PIXELS}", "its bytes are not those that were packed. Pack the sequence again.")
+            return
+    seen = dict.fromkeys(record.views, False)
+    for start in range(0, record.count, FRAMES_AT_A_TIME):
+        for view in record.views:
+            try:
+                found = record.frames(range(start, min(start + FRAMES_AT_A_TIME, record.count)), [view])
+            except GausSimError as error:
+                yield Fault(where, str(error))
+                return
+            seen[view] |= bool((found[..., 3] > 0).any())
+    for view, visible in seen.items():
+        if not visible:
+            yield Fault(where, f"view '{view}' never shows the object (alpha is 0). Take it out, or mask it again.")
+
+
+def _manifest(root: Path, *, quick: bool) -> Iterator[Fault]:
+    """Files that a packed store lists: there, of their size and content, and no others."""
+    path = root / MANIFEST
+    if not path.is_file():
+        return
+    try:
+        listed = read_json(path)["results"]["files"]
+        known = {str(name): (int(entry["bytes"]), str(entry["sha256"])) for name, entry in listed.items()}
+    except (GausSimError, KeyError, TypeError, ValueError, AttributeError) as error:
+        yield Fault(MANIFEST, f"lists no files ({error}). Pack the object again.")
+        return
+    for name, (size, sha256) in known.items():
+        file = root / name
+        if not file.is_file():
+            yield Fault(name, "is missing. Restore it, or pack the object again.")
+        elif file.stat().st_size != size:
+            yield Fault(name, f"has {file.stat().st_size} bytes, {MANIFEST} says {size}. Pack the object again.")
+        elif not quick and _digest(file) != sha256:
+            yield Fault(name, f"is not the file that {MANIFEST} lists (SHA-256 differs). Pack the object again.")
+    for file in sorted(p for p in root.rglob("*") if p.is_file()):
+        name = str(file.relative_to(root))
+        if name not in known and name != MANIFEST:
+            yield Fault(name, f"is not in {MANIFEST}. Remove it, or pack the object again.")
+
+
+def _digest(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(CHUNK):
+            digest.update(block)
+    return digest.hexdigest()

@@ -1,0 +1,186 @@
+"""Frames of one sequence in two files: ``frames.bin``, 8-bit pixels as they lie in memory, and ``frames.json``.
+
+A view holds only the part of the image that its foreground ever touches, all frames one after the other: a block of
+(F, h, w, 4) bytes, straight-alpha RGBA, from ``offset`` on. Outside it everything is transparent. Frames are read where
+they are needed; nothing is decoded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from gausim.core import Cameras, DataError
+from gausim.io.transforms import read_json
+
+SCHEMA = 1
+HEADER, PIXELS = "frames.json", "frames.bin"
+# Of a header; sequences beyond these sizes are a broken file rather than a film.
+MOST_FRAMES, MOST_PIXELS = 1_000_000, 1 << 16
+CHUNK = 1 << 20
+
+
+@dataclass(frozen=True)
+class Crop:
+    """The part of a view that is stored.
+
+    Attributes:
+        left: first column [pixels].
+        top: first row [pixels].
+        width: of the part; 0 where the view never shows any foreground.
+        height: of the part.
+        offset: of its first byte in ``frames.bin``.
+    """
+
+    left: int
+    top: int
+    width: int
+    height: int
+    offset: int
+
+    @property
+    def frame_bytes(self) -> int:
+        """Size of one frame."""
+        return 4 * self.width * self.height
+
+
+@dataclass(frozen=True, eq=False)
+class PackedFrames:
+    """A sequence's header.
+
+    Attributes:
+        folder: where both files lie.
+        count: number of frames.
+        fps: frames per second.
+        cameras: one per view.
+        crops: one per view.
+        size: of ``frames.bin`` [bytes].
+        sha256: of ``frames.bin``.
+    """
+
+    folder: Path
+    count: int
+    fps: float
+    cameras: Cameras
+    crops: tuple[Crop, ...]
+    size: int
+    sha256: str
+
+    def read(self, frames: Sequence[int], columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:
+        """Whole images of these frames and views, transparent black outside the crops.
+
+        Only the bytes asked for are read, and nothing stays in memory.
+        """
+        path, (height, width) = self.folder / PIXELS, (self.cameras.height, self.cameras.width)
+        images = np.zeros((len(frames), len(columns), height, width, 4), np.uint8)
+        for row, column in enumerate(columns):
+            crop = self.crops[column]
+            if not crop.frame_bytes:
+                continue
+            shape = (self.count, crop.height, crop.width, 4)
+            try:
+                stored = np.memmap(path, np.uint8, mode="r", offset=crop.offset, shape=shape)
+            except (OSError, ValueError) as error:
+                raise DataError(f"{path}: cannot be read ({error}). `gausim verify` tells what is wrong.") from error
+            part = images[:, row, crop.top : crop.top + crop.height, crop.left : crop.left + crop.width]
+            np.copyto(part, stored[list(frames)] if not _ascending(frames) else stored[frames[0] : frames[-1] + 1])
+        return torch.from_numpy(images)
+
+    def digest(self) -> str:
+        """SHA-256 of ``frames.bin`` as it is."""
+        digest = hashlib.sha256()
+        with (self.folder / PIXELS).open("rb") as file:
+            while block := file.read(CHUNK):
+                digest.update(block)
+        return digest.hexdigest()
+
+
+def is_packed(folder: Path) -> bool:
+    """Whether a sequence's folder holds packed frames."""
+    return (folder / HEADER).is_file()
+
+
+def read_packed(folder: Path) -> PackedFrames:
+    """Reads and checks ``frames.json`` against the size of ``frames.bin``.
+
+    Raises:
+        DataError: a file is missing or a field is wrong; names both.
+    """
+    path = folder / HEADER
+    data = read_json(path)
+    if data.get("schema") != SCHEMA:
+        raise DataError(f"{path}: schema is {data.get('schema')!r}, expected {SCHEMA}. Pack the sequence again.")
+    count = _integer(data, "frames", path, 1, MOST_FRAMES)
+    width, height = (_integer(data, key, path, 1, MOST_PIXELS) for key in ("width", "height"))
+    fps, size, sha256 = data.get("fps"), _integer(data, "bytes", path, 0, 1 << 62), data.get("sha256")
+    if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps < float("inf"):
+        raise DataError(f"{path}: field 'fps' must be a positive number, got {fps!r}.")
+    if not isinstance(sha256, str) or len(sha256) != 64:
+        raise DataError(f"{path}: field 'sha256' must be 64 hexadecimal digits, got {sha256!r}.")
+    views = data.get("views")
+    if not isinstance(views, list) or not views or not all(isinstance(v, dict) for v in views):
+        raise DataError(f"{path}: field 'views' must be a non-empty list of objects.")
+    crops = tuple(_crop(view, f"{path}: views[{i}]", (width, height), count, size) for i, view in enumerate(views))
+    cameras = _cameras(views, path, width, height)
+    pixels = folder / PIXELS
+    if not pixels.is_file() or pixels.stat().st_size != size:
+        found = f"{pixels.stat().st_size} bytes" if pixels.is_file() else "no such file"
+        raise DataError(f"{pixels}: expected {size} bytes as {HEADER} says, got {found}. Pack the sequence again.")
+    return PackedFrames(folder, count, float(fps), cameras, crops, size, sha256)
+
+
+def _ascending(frames: Sequence[int]) -> bool:
+    return list(frames) == list(range(frames[0], frames[0] + len(frames)))
+
+
+def _integer(data: dict[str, Any], key: str, where: Path | str, low: int, high: int) -> int:
+    value = data.get(key)
+    if type(value) is not int or not low <= value <= high:
+        raise DataError(f"{where}: field '{key}' must be an integer from {low} to {high}, got {value!r}.")
+    return value
+
+
+def _crop(view: dict[str, Any], where: str, size: tuple[int, int], count: int, total: int) -> Crop:
+    box = view.get("crop")
+    if not isinstance(box, list) or len(box) != 4 or not all(type(x) is int and x >= 0 for x in box):
+        raise DataError(f"{where}: field 'crop' must be four integers (left, top, width, height), got {box!r}.")
+    left, top, width, height = box
+    crop = Crop(left, top, width, height, _integer(view, "offset", where, 0, total))
+    if crop.left + crop.width > size[0] or crop.top + crop.height > size[1]:
+        raise DataError(f"{where}: field 'crop' {box} leaves the image of {size[0]}x{size[1]}.")
+    if crop.offset + count * crop.frame_bytes > total:
+        raise DataError(
+            f"{where}: {count} frames of {crop.frame_bytes} bytes from {crop.offset} on leave the {total} bytes that "
+            "field 'bytes' states."
+        )
+    return crop
+
+
+def _cameras(views: list[dict[str, Any]], path: Path, width: int, height: int) -> Cameras:
+    names = [view.get("name") for view in views]
+    if not all(isinstance(name, str) for name in names) or len(set(names)) != len(names):
+        raise DataError(f"{path}: field 'name' of the views must be different texts, got {names}.")
+    matrices = {}
+    for key, side in (("viewmat", 4), ("K", 3)):
+        for i, view in enumerate(views):
+            try:
+                found = torch.tensor(view.get(key), dtype=torch.float64)
+            except (TypeError, ValueError, RuntimeError):
+                found = torch.empty(0)
+            if found.shape != (side, side) or not torch.isfinite(found).all():
+                raise DataError(f"{path}: views[{i}]: field '{key}' must be a finite {side} x {side} matrix.")
+            matrices[key, i] = found.float()
+    for i in range(len(views)):
+        k = matrices["K", i]
+        if min(float(k[0, 0]), float(k[1, 1])) <= 0 or not torch.equal(k[2], torch.tensor([0.0, 0.0, 1.0])):
+            raise DataError(f"{path}: views[{i}]: field 'K' must have positive focal lengths and end in 0 0 1.")
+    stacked = [torch.stack([matrices[key, i] for i in range(len(views))]) for key in ("viewmat", "K")]
+    return Cameras(stacked[0], stacked[1], width, height, tuple(map(str, names))).validated(str(path))

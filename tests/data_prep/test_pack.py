@@ -1,0 +1,179 @@
+"""Packed stores: the same images, cameras and samples as the files they were made of, in bounded memory."""
+
+from __future__ import annotations
+
+import json
+import re
+import runpy
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from data_prep import pack as command
+from data_prep.pack import pack
+from gausim.core import DataError
+from gausim.data.dataset import SampleKey, SequenceIndex, TrainingDataset
+from gausim.data.images import composite
+from gausim.data.objects import ObjectData
+from gausim.data.verify import verify
+from gausim.io import packed_writer
+from gausim.io.packed import HEADER, PIXELS, read_packed
+from gausim.io.packed_writer import bounding_crop
+
+TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return TOY["write_toy_object"](tmp_path_factory.mktemp("data") / "toy", frames=9).root
+
+
+@pytest.fixture(scope="module")
+def packed(toy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    store = tmp_path_factory.mktemp("stores") / "toy"
+    pack(toy, store, margin=0)
+    return store
+
+
+def test_a_packed_object_gives_the_same_samples(toy: Path, packed: Path) -> None:
+    for frames in (range(9), range(3, 5)):
+        for ours, theirs in zip(ObjectData(packed).sequences, ObjectData(toy).sequences, strict=True):
+            views = ["cam_2", "cam_0"]
+            found, expected = (composite(record.frames(frames, views)) for record in (ours, theirs))
+            assert torch.equal(found[0], expected[0]) and torch.equal(found[1], expected[1])
+            assert float(found[1].amax()) > 0
+            a, b = ours.cameras_of(views), theirs.cameras_of(views)
+            assert torch.equal(a.viewmats, b.viewmats) and torch.equal(a.Ks, b.Ks) and a.names == b.names
+    samples = [TrainingDataset(SequenceIndex([ObjectData(root)]))[SampleKey(1, 4)] for root in (packed, toy)]
+    assert samples[0].facts == samples[1].facts
+    assert torch.equal(composite(samples[0].frames)[0], composite(samples[1].frames)[0])
+
+
+def test_only_the_foreground_is_stored_and_nothing_else_is_lost(toy: Path, packed: Path) -> None:
+    share = json.loads((packed / "stage.json").read_text())["results"]["share"]
+    assert 0.1 < share < 0.9  # the block fills most of these small images
+    header = read_packed(packed / "sequences" / "seq_000")
+    record = ObjectData(toy).sequences[0]
+    for column, crop in enumerate(header.crops):
+        touched = (record.frames(range(9), [record.views[column]])[:, 0, ..., 3] > 0).any(0)
+        rows, columns = touched.any(1).nonzero()[:, 0], touched.any(0).nonzero()[:, 0]
+        assert (crop.top, crop.left) == (int(rows[0]), int(columns[0]))
+        assert (crop.top + crop.height, crop.left + crop.width) == (int(rows[-1]) + 1, int(columns[-1]) + 1)
+    names = {str(p.relative_to(toy)) for p in toy.rglob("*") if p.is_file() and "cam_" not in str(p)}
+    kept = {str(p.relative_to(packed)) for p in packed.rglob("*") if p.is_file()}
+    assert {n for n in names if "transforms.json" not in n or n.startswith("static")} <= kept
+
+
+def test_a_view_without_foreground_takes_no_bytes() -> None:
+    crop = bounding_crop(np.zeros((3, 5, 7), np.uint8), 2, 11)
+    assert crop.frame_bytes == 0 and crop.offset == 11
+    alpha = np.zeros((3, 5, 7), np.uint8)
+    alpha[1, 0, 6], alpha[2, 3, 4] = 1, 255
+    crop = bounding_crop(alpha, 1, 0)
+    assert (crop.left, crop.top, crop.width, crop.height) == (3, 0, 4, 5)
+
+
+def test_packing_again_changes_nothing_and_other_margins_need_force(toy: Path, packed: Path) -> None:
+    assert pack(toy, packed, margin=0)["made"] is False
+    with pytest.raises(DataError, match="--force"):
+        pack(toy, packed, margin=3)
+    with pytest.raises(DataError, match="is the object itself"):
+        pack(toy, toy)
+
+
+def test_two_packings_are_the_same_bytes(toy: Path, packed: Path, tmp_path: Path) -> None:
+    assert command.main([str(toy), "--out", str(tmp_path / "store"), "--margin", "0"]) == 0
+    for path in packed.rglob("*"):
+        if path.is_file():
+            assert (tmp_path / "store" / path.relative_to(packed)).read_bytes() == path.read_bytes(), path
+
+
+def test_interrupted_packing_goes_on(toy: Path, packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+
+    def cut(alpha: np.ndarray, margin: int, offset: int) -> object:
+        calls.append("crop")
+        if len(calls) == 5:  # within the second sequence of three views
+            raise KeyboardInterrupt
+        return bounding_crop(alpha, margin, offset)
+
+    monkeypatch.setattr(packed_writer, "bounding_crop", cut)
+    with pytest.raises(KeyboardInterrupt):
+        pack(toy, tmp_path / "store", margin=0)
+    assert not (tmp_path / "store").exists()
+    pack(toy, tmp_path / "store", margin=0)
+    assert len(calls) == 5 + 3  # the first sequence was kept
+    assert verify(tmp_path / "store") == []
+
+
+# ---------------------------------------------------------------------------------------------------- faults
+
+
+@pytest.fixture
+def store(toy: Path, tmp_path: Path) -> Path:
+    pack(toy, tmp_path / "store")
+    return tmp_path / "store"
+
+
+def _edit(path: Path, change: Callable[[dict], object]) -> None:
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+FAULTS: dict[str, tuple[Callable[[Path], object], str, str]] = {
+    "pixels changed": (lambda s: _flip(s / "sequences/seq_000" / PIXELS), "seq_000/frames.bin", "not those"),
+    "pixels cut": (lambda s: _cut(s / "sequences/seq_001" / PIXELS), "seq_001", "expected .* bytes"),
+    "header gone": (lambda s: (s / "sequences/seq_001" / HEADER).unlink(), "seq_001", "transforms.json: no such file"),
+    "schema": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d.update(schema=9)), "seq_000", "schema"),
+    "nan": (lambda s: _edit(s / "sequences/seq_000" / HEADER,
+                            lambda d: d["views"][1]["viewmat"][0].__setitem__(3, float("nan"))), "seq_000", "viewmat"),
+    "crop": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d["views"][0].update(crop=[30, 0, 9, 9])),
+             "seq_000", "leaves the image"),
+    "offset": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d["views"][2].update(offset=10**9)),
+               "seq_000", "offset"),
+    "frames": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d.update(frames=10**9)),
+               "seq_000", "frames"),
+    "focal": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d["views"][0]["K"][0].__setitem__(0, -1.0)),
+              "seq_000", "focal"),
+    "fps": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d.update(fps=25)), "seq_000", "fps"),
+    "view": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d["views"][0].update(name="cam_9")),
+             "seq_000", "cam_9"),
+    "facts": (lambda s: _edit(s / "dataset.json", lambda d: d.update(fps=-1)), "dataset.json", "fps"),
+    "scene": (lambda s: (s / "scene.ply").write_bytes(b"ply\n"), "scene.ply", ""),
+    "stranger": (lambda s: (s / "notes.txt").write_text("x"), "notes.txt", "not in stage.json"),
+    "no sequences": (lambda s: shutil.rmtree(s / "sequences"), "sequences", "holds no sequence"),
+}  # fmt: skip
+
+
+def _flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+
+
+def _cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_every_fault_is_named(store: Path, name: str) -> None:
+    assert verify(store) == []
+    damage, where, what = FAULTS[name]
+    damage(store)
+    found = verify(store)
+    assert any(where in fault.where and re.search(what, fault.what) for fault in found), found
+
+
+def test_all_faults_at_once(store: Path) -> None:
+    _flip(store / "sequences" / "seq_000" / PIXELS)
+    (store / "sequences" / "seq_001" / HEADER).unlink()
+    (store / "scene.masks.npz").write_bytes(b"nothing")
+    places = {fault.where for fault in verify(store)}
+    assert {"sequences/seq_000/frames.bin", "sequences/seq_001", "scene.ply"} <= places
+    quick = {fault.where for fault in verify(store, quick=True)}
+    assert "sequences/seq_001" in quick and "sequences/seq_000/frames.bin" not in quick
