@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import runpy
+import sys
 from pathlib import Path
 
 import pytest
@@ -33,8 +34,21 @@ SMALL: dict[str, list[str]] = {
         "model.method.resolution=4", "model.method.features=4", "model.method.hidden=8",
         f"{STAGES}.field.iterations=4", "model.plan.round=2",
     ],
+    "physdreamer": [
+        "model.method.particles=30", "model.method.cells=12", f"{STAGES}.velocity.iterations=4",
+        f"{STAGES}.material.iterations=2", "model.plan.round=2",
+    ],
+    "physgaussian": ["model.method.cells=12", f"{STAGES}.velocity.iterations=4", "model.plan.round=2"],
 }  # fmt: skip
-NAMES = {"deformation_field": "deformation_field (no diffusion prior)"}
+NAMES = {
+    "deformation_field": "deformation_field (no diffusion prior)",
+    "physdreamer": "physdreamer (no diffusion prior)",
+}
+
+
+def needs_warp(model: str) -> None:
+    if model.startswith("phys"):
+        pytest.importorskip("warp", reason="the material point method needs warp-lang (extra 'baselines')")
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +64,7 @@ def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> lis
 
 @pytest.mark.parametrize("model", SMALL)
 def test_the_same_commands_serve_every_method(model: str, arguments: list[str]) -> None:
+    needs_warp(model)
     assert train.main([f"model={model}", *SMALL[model], *arguments]) == 0
     run = Path("outputs/toy/seed_0")
     assert evaluate.main([str(run)]) == 0
@@ -86,10 +101,11 @@ def test_stages_set_frames_and_what_learns(arguments: list[str]) -> None:
     assert torch.equal(short["model.method.velocity.1"], made["model.method.velocity.1"])
 
 
-@pytest.mark.parametrize("model", ["spring_mass", "deformation_field"])
+@pytest.mark.parametrize("model", ["spring_mass", "deformation_field", "physdreamer"])
 def test_a_resumed_fit_equals_an_uninterrupted_one(
     model: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    needs_warp(model)
     from gausim.engine.callbacks import RunCheckpoint
 
     asked = [f"model={model}", *SMALL[model], *arguments, "callbacks.checkpoint.every_steps=1"]
@@ -149,3 +165,32 @@ def test_what_needs_a_simulator_says_so(arguments: list[str], capsys: pytest.Cap
     train.main(["model=static", *arguments])
     with pytest.raises(ConfigError, match="--endurance: static takes no forces"):
         evaluate.main(["outputs/toy/seed_0", "--endurance", "300"])
+
+
+def test_physgaussian_takes_over_what_physdreamer_has_found(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needs_warp("physgaussian")
+    train.main(["model=physdreamer", *SMALL["physdreamer"], *arguments, "name=found"])
+    source = "init_from=outputs/found/seed_0"
+    alone = ["model=physgaussian", "model.method.cells=12", f"{STAGES}.velocity=null", *arguments]
+    train.main([*alone, source, "name=given"])
+    found, given = weights("found"), weights("given")
+    shared = [name for name in given if ".velocity." in name]
+    assert shared and all(torch.equal(given[name], found[name]) for name in shared)
+    young = given["model.method.young_0"]
+    assert float(young.std()) > 0  # the field, which has learned a little; 1e5 there is 0.324e5 here
+    assert 0.324e5 / 1.5 < float(young.mean()) < 0.324e5 * 1.5
+    Path("outputs/found").rename("outputs/gone")
+    loaded = load_run(Path("outputs/given/seed_0"))  # all that it needs is its own
+    assert torch.equal(loaded.module.simulator.state_dict()["method.young_0"], young)
+    with pytest.raises(ConfigError, match=r"init_from: physgaussian takes over.*is of physgaussian"):
+        train.main([*alone, "init_from=outputs/given/seed_0", "name=again"])
+    with pytest.raises(ConfigError, match=r"freeze: physgaussian.*Leave freeze null"):
+        train.main([*alone, "freeze=model", "name=again"])
+
+
+def test_without_warp_one_line_says_what_to_install(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "warp", None)  # importing it fails as if it were not installed
+    with pytest.raises(ConfigError, match=r"^[^\n]*pip install 'gausim\[baselines\]'[^\n]*$"):
+        train.main(["model=physdreamer", *SMALL["physdreamer"], *arguments])

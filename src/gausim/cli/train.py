@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from gausim.data.datamodule import ReadyDataModule
+    from gausim.engine.fitting import FittedModule
     from gausim.engine.launch import Crew
     from gausim.engine.module import GausSimModule
     from gausim.engine.run import RunDirectory
@@ -216,11 +217,7 @@ def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None
     from gausim.engine.transfer import load_shared, load_simulator
 
     if isinstance(module, FittedModule):
-        if cfg.init_from is not None or cfg.freeze is not None:
-            raise ConfigError(
-                f"init_from, freeze: {module.method.name} is fitted to its own sequences and takes nothing over. Leave "
-                "both null, and train on the new sequences."
-            )
+        _take_over_fit(cfg, module, resumed=resumed)
         return
     if cfg.init_from == "":
         raise ConfigError("init_from: name the trained run whose network this one starts from (init_from=RUN).")
@@ -233,6 +230,28 @@ def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None
         load(module.simulator, cfg.init_from, _plain(cfg)["model"])
     if cfg.freeze:
         module.simulator.freeze(scenes=cfg.freeze == "model")
+
+
+def _take_over_fit(cfg: DictConfig, module: FittedModule, *, resumed: bool) -> None:
+    """The same for a fitted method, if it is one that takes over what another has found."""
+    from gausim.cli._run import load_run
+    from gausim.core import ConfigError, TakesOver
+    from gausim.engine.fitting import FittedModule
+
+    method = module.method
+    if cfg.init_from is None and cfg.freeze is None:
+        return
+    if not isinstance(method, TakesOver) or cfg.freeze is not None or not cfg.init_from:
+        takes, leave = "nothing", "both null"
+        if isinstance(method, TakesOver):
+            takes, leave = "only what a named run of another method has found", "freeze null, name a run or none"
+        raise ConfigError(
+            f"init_from, freeze: {method.name} is fitted to its own sequences and takes {takes} over. Leave {leave}, "
+            "and train on the new sequences."
+        )
+    if not resumed:
+        source = load_run(cfg.init_from).module
+        method.take_over(source.method if isinstance(source, FittedModule) else source.simulator)
 
 
 def make(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | None = None) -> Trainer:

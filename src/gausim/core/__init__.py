@@ -2,7 +2,7 @@
 
 from gausim.core.camera import Cameras
 from gausim.core.errors import BusyError, ConfigError, DataError, DivergenceError, GausSimError, RunError, SceneError
-from gausim.core.fitted import FittedDynamics, FittedMethod, FittedState
+from gausim.core.fitted import FittedDynamics, FittedMethod, FittedState, TakesOver
 from gausim.core.protocols import Dynamics, Forces, Rendered, Renderer
 from gausim.core.scene import GaussianScene
 from gausim.core.state import SimState, Trajectory
@@ -25,5 +25,6 @@ __all__ = [
     "RunError",
     "SceneError",
     "SimState",
+    "TakesOver",
     "Trajectory",
 ]

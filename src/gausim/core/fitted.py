@@ -94,6 +94,19 @@ class FittedMethod(Protocol):
         ...
 
 
+@runtime_checkable
+class TakesOver(Protocol):
+    """A fitted method that begins with what another has found (``init_from=RUN``)."""
+
+    def take_over(self, other: object) -> None:
+        """Copies what it needs of a trained method.
+
+        Raises:
+            ConfigError: ``other`` has nothing for it.
+        """
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class FittedDynamics:
     """A fitted method on one of its sequences, as :class:`gausim.core.Dynamics`.

@@ -1,4 +1,4 @@
-"""Clusters of bounded diameter: how kernels become centre-of-mass systems (METHOD section 1)."""
+"""Clusters of bounded diameter (how kernels become centre-of-mass systems, METHOD section 1), and k-means."""
 
 from __future__ import annotations
 
@@ -138,3 +138,27 @@ CLUSTERINGS = {
     "complete_linkage": complete_linkage_clusters,
     "agglomerative": agglomerative_clusters,
 }
+
+
+def k_means(points: Float[np.ndarray, "N 3"], count: int) -> Float[np.ndarray, "count 3"]:
+    """Centres of ``count`` clusters by Lloyd's iterations, which begin at points that are far from each other.
+
+    Args:
+        points: at least ``count`` of them.
+        count: clusters, at least 1; with as many as points, the points themselves in their own order.
+    """
+    if count >= len(points):
+        return np.array(points, np.float64)
+    chosen = np.empty(count, np.int64)
+    chosen[0] = _canonical_order(points)[0]
+    distance = np.full(len(points), np.inf)
+    for i in range(1, count):
+        distance = np.minimum(distance, np.square(points - points[chosen[i - 1]]).sum(1))
+        chosen[i] = distance.argmax()
+    centres = points[chosen].astype(np.float64)
+    for _ in range(LLOYD_ITERATIONS):
+        _, nearest = cKDTree(centres).query(points)
+        size = np.bincount(nearest, minlength=count)
+        sums = np.stack([np.bincount(nearest, points[:, d], count) for d in range(3)], 1)
+        centres = np.where(size[:, None] > 0, sums / np.maximum(size, 1)[:, None], centres)
+    return centres

@@ -1,0 +1,285 @@
+"""PhysDreamer and PhysGaussian: kernels and their particles, a known material found again, units, messages."""
+
+from __future__ import annotations
+
+import math
+import runpy
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("warp", reason="the material point method needs warp-lang (extra 'baselines')")
+
+from gausim.baselines.driven import clustered, opaque
+from gausim.baselines.material_points import MaterialPoints
+from gausim.baselines.mpm import Filling, Grid, Material, MPMDynamics
+from gausim.baselines.physdreamer import PhysDreamer
+from gausim.baselines.physgaussian import PhysGaussian
+from gausim.core import ConfigError, FittedMethod, FittedState, GaussianScene, SceneError, SimState, TakesOver
+from gausim.core.fitted import FittedDynamics
+from gausim.ops.quaternion import quaternion_to_matrix
+
+toy_scene: Callable[[], GaussianScene] = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["toy_scene"]
+TRUE = 1e5
+
+
+def dreamer(scene: GaussianScene | None = None, **options: Any) -> PhysDreamer:
+    options = {"particles": 36, "cells": 12, "young_modulus": TRUE, **options}
+    return PhysDreamer(scenes=[scene or toy_scene()], fps=[24.0], scene_of_sequence=[0, 0], seen=7, **options)
+
+
+def gaussian(scene: GaussianScene | None = None, **options: Any) -> PhysGaussian:
+    options = {"cells": 14, "young_modulus": 3e4, **options}
+    return PhysGaussian(scenes=[scene or toy_scene()], fps=[24.0], scene_of_sequence=[0, 0], seen=7, **options)
+
+
+def swaying(method: MaterialPoints, speed: float = 0.8) -> FittedState:
+    """The beginning of sequence 0, but with a velocity along x that grows with the height squared."""
+    state, driven = method.begin(0), method.body(0).driven
+    velocity = torch.zeros_like(driven.rest)
+    velocity[:, 0] = speed * method.domain.side * driven.rest[:, 2] ** 2 * ~driven.pinned
+    return replace(state, inner=(state.inner[0], velocity, *state.inner[2:]))
+
+
+def rolled(method: MaterialPoints, state: FittedState, frames: int) -> list[FittedState]:
+    states = [state]
+    for _ in range(frames):
+        states.append(method.advance(states[-1]))
+    return states
+
+
+def turn(angle: float = 0.6) -> Tensor:
+    return quaternion_to_matrix(torch.tensor([math.cos(angle / 2), 0.2, -0.1, 0.3]))
+
+
+def test_kernels_follow_an_affine_motion_of_their_particles_exactly() -> None:
+    scene = replace(toy_scene(), pinned=torch.zeros(36, dtype=torch.bool))
+    driven = clustered(scene, torch.zeros(0, 3), 12)
+    assert driven.count == 12 and driven.followed.shape == (36, 8)
+    wanted = turn() @ torch.diag(torch.tensor([1.2, 0.9, 1.05]))
+    shift = torch.tensor([0.4, -0.2, 0.1])
+    positions, gradients, rotations = driven.carried(driven.rest @ wanted.T + shift, wanted.expand(12, 3, 3))
+    torch.testing.assert_close(positions, scene.means @ wanted.T + shift, rtol=0, atol=2e-6)
+    torch.testing.assert_close(gradients, wanted.expand(36, 3, 3), rtol=0, atol=1e-6)
+    u, _, vt = torch.linalg.svd(wanted)
+    torch.testing.assert_close(rotations, (u @ vt).expand(36, 3, 3), rtol=0, atol=1e-5)
+
+
+def test_the_originals_kernels_turn_and_keep_their_shape() -> None:
+    scene = replace(toy_scene(), pinned=torch.zeros(36, dtype=torch.bool))
+    driven = clustered(scene, torch.zeros(0, 3), 36, even=True)
+    torch.testing.assert_close(driven.weights, torch.full((36, 8), 1 / 8))
+    shift = torch.tensor([0.4, -0.2, 0.1])
+    positions, gradients, rotations = driven.turned(driven.rest + shift)
+    torch.testing.assert_close(positions, scene.means + shift)
+    _, gradients, rotations = driven.turned(driven.rest @ turn().T + shift)
+    torch.testing.assert_close(rotations, turn().expand(36, 3, 3), rtol=0, atol=1e-5)
+    assert torch.equal(gradients, rotations)
+
+
+def test_clusters_and_pins() -> None:
+    scene = toy_scene()
+    driven = clustered(scene, torch.zeros(0, 3), 20)
+    assert driven.count == 20 and int(driven.pinned.sum()) == 5  # a quarter of the kernels is pinned
+    assert float(driven.rest[driven.pinned, 2].max()) < 0.01 < 0.3 < float(driven.rest[~driven.pinned, 2].min())
+    inside = torch.tensor([[0.0, 0.0, 0.02], [0.1, 0.1, 0.9]])
+    filled = clustered(scene, inside, 100)
+    assert filled.count == 38 and int(filled.pinned.sum()) == 10
+    with pytest.raises(SceneError, match=r"toy: expected at least 8 simulated kernels"):
+        clustered(replace(scene, simulated=torch.arange(36) < 5, pinned=torch.arange(36) < 1), torch.zeros(0, 3), 20)
+
+
+def test_transparent_kernels_follow_the_nearest_particle() -> None:
+    scene = toy_scene()
+    logits = scene.opacity_logits.clone()
+    logits[[35, 20]] = -6.0
+    driven = opaque(replace(scene, opacity_logits=logits), torch.tensor([[0.0, 0.0, 0.03]]), 0.02)
+    assert driven.count == 35 and bool(driven.pinned[-1]) and driven.followed.shape == (36, 1)
+    near = torch.cdist(scene.means[[35]], driven.rest).argmin()
+    assert int(driven.followed[35, 0]) == int(near)
+    with pytest.raises(SceneError, match=r"opacity above 0.99999.*model\.method\.opacity"):
+        opaque(scene, torch.zeros(0, 3), 0.99999)
+
+
+@pytest.mark.parametrize("make", [dreamer, gaussian])
+def test_what_begins_at_rest_stays_at_rest_and_what_is_held_stays(make: Callable[..., MaterialPoints]) -> None:
+    outside = torch.arange(36) == 35
+    method = make(replace(toy_scene(), simulated=~outside))
+    assert isinstance(method, FittedMethod)
+    rest, held = toy_scene().means, method.body(0).driven.held
+    with torch.no_grad():
+        for state in rolled(method, method.begin(0), 3):
+            torch.testing.assert_close(state.positions, rest, rtol=0, atol=1e-6)
+        states = rolled(method, swaying(method), 5)
+    assert int(held.sum()) == 10
+    for state in states:
+        assert torch.equal(state.positions[held], rest[held])
+        assert torch.equal(state.gradients[held], torch.eye(3).expand(10, 3, 3))
+    assert float((states[-1].positions - rest)[~held].norm(dim=1).min()) > 1e-3
+
+
+def test_physgaussian_moves_as_the_material_point_method_moves_its_scene() -> None:
+    scene, method = toy_scene(), gaussian(poisson_ratio=0.3)
+    material = Material(young_modulus=3e4, poisson_ratio=0.3, density=200.0)
+    dynamics = MPMDynamics(scene, fps=24.0, material=material, grid=Grid(cells=14, size=2.0), courant=0.5)
+    begun = swaying(method)
+    velocity = begun.inner[1] / method.body(0).mapping.scale / 24.0
+    with torch.no_grad():
+        states = rolled(method, begun, 4)
+    wanted = dynamics.rollout(SimState(scene.means, scene.means - velocity), 4)
+    moved = float((wanted.positions[-1] - scene.means).norm(dim=1).max())
+    assert moved > 0.05
+    for frame, state in enumerate(states):
+        torch.testing.assert_close(state.positions, wanted.positions[frame], rtol=0, atol=1e-3 * moved)
+        torch.testing.assert_close(state.gradients, wanted.gradients[frame][wanted.unit_of_kernel], rtol=0, atol=1e-3)
+
+
+def observed(method: PhysDreamer, frames: int) -> list[Tensor]:
+    with torch.no_grad():
+        return [state.positions for state in rolled(method, swaying(method), frames)]
+
+
+def misfit(method: PhysDreamer, targets: list[Tensor], frames: int, begun: FittedState | None = None) -> Tensor:
+    states = rolled(method, begun or method.begin(0), frames)[1:]
+    return torch.stack([(s.positions - t).square().mean() for s, t in zip(states, targets[1:], strict=False)]).sum()
+
+
+def test_the_gradient_with_respect_to_the_modulus_is_its_difference_quotient() -> None:
+    targets, method = observed(dreamer(), 5), dreamer(young_modulus=TRUE / 10, substeps=25)
+    bias = method.modulus_field[0].network[-1].bias  # type: ignore[index,union-attr]
+    loss = misfit(method, targets, 5, swaying(method))
+    (slope,) = torch.autograd.grad(loss, [bias])
+    values = []
+    with torch.no_grad():
+        for step in (0.02, -0.02):
+            bias.fill_(step)  # type: ignore[operator,union-attr]
+            values.append(float(misfit(method, targets, 5, swaying(method))))
+    assert float(slope) == pytest.approx((values[0] - values[1]) / 0.04, rel=0.01)
+    assert float(slope) < 0  # stiffer is better
+
+
+@pytest.mark.slow
+def test_a_known_modulus_and_velocity_are_found_again() -> None:
+    frames = 10
+    truth = dreamer()
+    targets, wanted = observed(truth, frames), swaying(truth).inner[1]
+    torch.manual_seed(0)
+    method = dreamer(young_modulus=TRUE / 10)
+    groups = [{"params": own, "lr": 1e-2} for own in method.parameter_groups().values()]
+    optimizer = torch.optim.Adam(groups)
+    modulus = groups[1]
+    for iteration in range(160):
+        modulus["lr"] = 0.0 if iteration < 40 else 1e-2
+        optimizer.zero_grad()
+        seen = 2 if iteration < 40 else min(frames, 2 + (iteration - 40) // 8)
+        (1e3 * misfit(method, targets, seen) + method.penalties(0)["modulus_variation"]).backward()
+        optimizer.step()
+    with torch.no_grad():
+        found, velocity = method.modulus(0), method.begin(0).inner[1]
+    free = ~method.body(0).driven.pinned
+    assert math.exp(abs(float((found[free] / TRUE).log().mean()))) < 1.2
+    assert float((velocity - wanted).norm()) < 0.1 * float(wanted.norm())
+
+
+def test_sequences_share_the_modulus_and_nothing_else() -> None:
+    method = dreamer()
+    state = method.advance(replace(swaying(method), sequence_id=1))
+    state.positions.square().sum().backward()
+    grads = {name: [p.grad is not None for p in own] for name, own in method.parameter_groups().items()}
+    assert sorted(grads) == ["modulus", "velocity"] and any(grads["modulus"]) and not any(grads["velocity"])
+    second = method.begin(1).inner[1].sum()
+    second.backward()
+    assert all(p.grad is None for p in method.velocity[0].parameters())
+    assert any(p.grad is not None for p in method.velocity[1].parameters())
+    assert sorted(method.penalties(1)) == ["modulus_variation", "velocity_variation"]
+
+
+def test_moduli_keep_to_what_the_substeps_allow() -> None:
+    method = dreamer(most_substeps=20)
+    bias = method.modulus_field[0].network[-1].bias  # type: ignore[index,union-attr]
+    with torch.no_grad():
+        bias.fill_(0.5)  # type: ignore[operator,union-attr]
+        assert float(method.modulus(0)[0]) == pytest.approx(TRUE * math.exp(0.5), rel=1e-5)
+        bias.fill_(50.0)  # type: ignore[operator,union-attr]
+        assert method.substeps(0) == 20
+        method.advance(swaying(method))
+        bias.fill_(-50.0)  # type: ignore[operator,union-attr]
+        assert float(method.modulus(0)[0]) == 1e3
+    linear = dreamer(parametrisation="linear", modulus_scale=1000.0)
+    with torch.no_grad():
+        linear.modulus_field[0].network[-1].bias.fill_(-7.0)  # type: ignore[index,union-attr,operator]
+    assert float(linear.modulus(0)[0].detach()) == pytest.approx(TRUE - 7000, rel=1e-6)
+
+
+def test_a_modulus_means_the_same_in_both_methods() -> None:
+    source, method = dreamer(), gaussian()
+    with torch.no_grad():
+        source.modulus_field[0].network[-1].weight.normal_(std=0.3)  # type: ignore[index,union-attr,operator]
+        source.velocity[0].network[-1].weight.normal_(std=0.3)  # type: ignore[index,union-attr,operator]
+    assert isinstance(method, TakesOver) and not isinstance(source, TakesOver)
+    method.take_over(source)
+    with torch.no_grad():
+        assert float(source.speed(0).std()) > 0
+        # 36 driving particles are the kernels themselves, free ones before pinned ones
+        order = torch.cdist(source.body(0).driven.rest, method.body(0).driven.rest).argmin(1)
+        torch.testing.assert_close(method.speed(0)[order], source.speed(0), rtol=1e-4, atol=0)
+        moves = [m.begin(0).inner[1] / m.domain.side for m in (source, method)]
+    assert float(moves[0].norm()) > 0
+    torch.testing.assert_close(moves[1][order], moves[0], rtol=1e-4, atol=1e-5)
+    with pytest.raises(ConfigError, match=r"same scenes and sequences"):
+        method.take_over(dreamer(velocity_resolution=10))
+
+
+def test_place_and_scale_of_the_scene_do_not_matter() -> None:
+    first, scene = dreamer(), toy_scene()
+    second = dreamer(replace(scene, means=0.1 * scene.means - 3))
+    with torch.no_grad():
+        a, b = (rolled(m, m.begin(0), 1)[0].inner[0] for m in (first, second))
+        torch.testing.assert_close(a, b, rtol=0, atol=2e-5)
+        torch.testing.assert_close(first.body(0).places, second.body(0).places, rtol=0, atol=1e-4)
+
+
+def test_notes_say_what_differs_and_what_was_found() -> None:
+    said = " ".join(dreamer().notes())
+    for part in ("without its diffusion prior", "12 cells per unit instead of 64", "768 substeps", "36 particles"):
+        assert part in said
+    assert f"{dreamer().substeps(0)} substeps per frame" in said and "began with 1e+05" in said
+    assert "does not identify" in gaussian().notes()[0] and "3e+04" in gaussian().notes()[1]
+
+
+def test_interiors_are_filled() -> None:
+    filling = Filling(cells=16, dense=1e9, wall=0.2, per_cell=2)
+    hollow = gaussian().body(0).driven.count
+    scene = replace(toy_scene(), log_scales=torch.full((36, 3), math.log(0.2)))
+    method = gaussian(scene, filling=replace(filling, dense=0.5))
+    assert method.body(0).driven.count > hollow
+    with torch.no_grad():
+        positions = FittedDynamics(method, 0).rollout(SimState(scene.means, scene.means), 2).positions
+    torch.testing.assert_close(positions[2], scene.means, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("make", "options", "message"),
+    [
+        (dreamer, {"young_modulus": 10.0}, r"model\.method\.young_modulus: expected 1000 \.\. 5e\+08"),
+        (gaussian, {"young_modulus": math.inf}, r"model\.method\.young_modulus: expected"),
+        (
+            dreamer,
+            {"young_modulus": 1e8, "most_substeps": 100},
+            r"young_modulus: 1e\+08 would need more than 100 substeps",
+        ),
+        (dreamer, {"parametrisation": "square"}, r"model\.method\.parametrisation: expected log or linear"),
+        (gaussian, {"material": "rubber"}, r"model\.method\.material: expected fixed_corotated.*got 'rubber'"),
+        (dreamer, {"particles": 3}, r"model\.method: expected particles >= 8"),
+        (dreamer, {"velocity_scale": 0.0}, r"velocity_scale > 0"),
+        (gaussian, {"poisson_ratio": 0.5}, r"poisson_ratio: expected -1 < nu < 0.5"),
+    ],
+)
+def test_wrong_settings_name_their_field(make: Callable[..., Any], options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make(**options)
