@@ -137,7 +137,7 @@ def test_models_and_templates_without_energy_are_refused_and_null_asks_those_tha
     with pytest.raises(ConfigError, match=r"energy_weight is 1.0, but RestTemplate knows no energy"):
         _module(asked, RestTemplate)
     either = Objective(energy_weight=None)
-    assert [_module(either, template).energy_weight for template in (RestTemplate, ELASTIC)] == [0.0, 1.0]
+    assert [_module(either, template).free_motion.weight for template in (RestTemplate, ELASTIC)] == [0.0, 1.0]
 
 
 @pytest.mark.parametrize("wrong", [{"energy_weight": -1.0}, {"energy_probability": 2.0}, {"energy_stretch": 40}])

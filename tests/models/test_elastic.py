@@ -9,9 +9,10 @@ import scipy.linalg
 import torch
 
 from gausim.core import SimState
-from gausim.models.elastic import ElasticScene, ElasticTemplate, mode_gradients, spring_network, vibration_modes
+from gausim.models.elastic import ElasticScene, ElasticTemplate
 from gausim.models.hierarchy import build_hierarchy
 from gausim.models.initial_state import ModalInitialStates
+from gausim.models.springs import mode_gradients, spring_network, vibration_modes
 from gausim.models.template import Motion
 
 

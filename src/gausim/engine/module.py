@@ -20,7 +20,7 @@ from gausim.engine.contracts import Foreseeing, InitialVelocities, SceneBatch, S
 from gausim.engine.curriculum import LossGatedCurriculum
 from gausim.engine.exchange import Exchange
 from gausim.engine.optim import OptimizerSettings
-from gausim.engine.passivity import energy_growth, energy_weight
+from gausim.engine.passivity import FreeMotion
 from gausim.engine.ranks import Ranks, interleave
 from gausim.engine.reference import Yardsticks
 from gausim.engine.rollout import Explosions, States, UnitNoise, after, describe, windows
@@ -36,8 +36,6 @@ COLLAPSED = 0.05
 COLLAPSE_AFTER = 100
 # Batches in a row whose rollout explodes before anything can be learned from it; then training has diverged.
 BARREN_BATCHES = 20
-# Tells the random numbers of free motion from the others of a step.
-FREE_MOTION = 1
 
 
 class GausSimModule(LightningModule):
@@ -87,7 +85,7 @@ class GausSimModule(LightningModule):
         count = len(self.scene_of_sequence)
         if initial_states is not None and (own := len(list(initial_states.parameters()))) != count:
             raise ConfigError(f"initial states: {own} parameters for {count} sequences; expected one each.")
-        self.energy_weight = energy_weight(self.objective, model)
+        self.free_motion = FreeMotion(model, self.objective)
         self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
         self.images = ImageSupervision(self.simulator.scenes, renderer, self.objective.image)
         self.supervision = self.images if supervision is None else supervision
@@ -212,7 +210,7 @@ class GausSimModule(LightningModule):
         device = next(self.parameters()).device
         explosions = Explosions(batch, self.diagonals, whole, self.objective.explosion, ranks=self.ranks,
                                 deferred=device if self._defers(device) else None)  # fmt: skip
-        free = self._goes_on(draws)
+        free = self.free_motion.chosen(draws)
         if batch is None:  # hears where the others' rollout ends
             any(explosions.end(None, start, tally.reach) for start in range(0, steps, length))
             return tally
@@ -233,24 +231,9 @@ class GausSimModule(LightningModule):
             last = after(made, last)
         else:
             if free is not None:
-                tally.growth = self._go_on(batch, explosions.restart(last), own, len(whole), free)
+                state = explosions.restart(last)
+                tally.growth = self.free_motion.descend(batch, state, own, len(whole), free, self._backward)
         return tally
-
-    def _goes_on(self, draws: torch.Generator) -> torch.Generator | None:
-        """Whether this batch's motion goes on freely to see if its energy grows; the generator of that, or None."""
-        chance = self.objective.energy_probability
-        if self.energy_weight == 0 or float(torch.rand((), generator=draws)) >= chance:
-            return None
-        return torch.Generator().manual_seed(hash_seed(draws.initial_seed(), FREE_MOTION))
-
-    def _go_on(self, batch: SceneBatch, state: SimState, scale: Tensor, count: int, draws: torch.Generator) -> Tensor:
-        """Backward of the energy's growth, each sequence's as a share of its image loss; returns the mean growth."""
-        total, frames, stretch = scale.new_zeros(()), self.objective.energy_frames, self.objective.energy_stretch
-        for growth in energy_growth(self.simulator, batch, state, frames, stretch, draws):
-            if growth.requires_grad:
-                self._backward(self.energy_weight * (scale * growth).sum())
-            total += growth.detach().sum() / count
-        return total
 
     @staticmethod
     def _defers(device: torch.device) -> bool:

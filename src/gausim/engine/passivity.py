@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.core import ConfigError, SimState
+from gausim.data.sampler import hash_seed
 from gausim.engine.contracts import Energetic, SceneBatch, Simulator, Step
 from gausim.engine.rollout import after, windows
 from gausim.losses.objective import Objective
@@ -17,20 +19,8 @@ from gausim.losses.objective import Objective
 # The motion that goes on is made smaller or larger by up to these factors, so that no size of motion is left out.
 SMALLEST, LARGEST = 0.2, 1.5
 TINY = 1e-30
-
-
-def energy_weight(objective: Objective, model: nn.Module) -> float:
-    """Weight of the energy's growth; one that was asked for needs a model that knows an energy."""
-    knows = isinstance(model, Energetic) and model.knows_energy
-    if objective.energy_weight is None:
-        return 1.0 if knows else 0.0
-    if objective.energy_weight and not knows:
-        name = type(getattr(model, "template", model)).__name__
-        raise ConfigError(
-            f"loss.energy_weight is {objective.energy_weight}, but {name} knows no energy. Use a template that does "
-            "(gausim.models.elastic.ElasticTemplate), or set it to 0 or null."
-        )
-    return float(objective.energy_weight)
+# Tells the random numbers of free motion from the others of a step.
+FREE_MOTION = 1
 
 
 def energy_growth(
@@ -76,3 +66,67 @@ def _mean_energy(model: Simulator, batch: SceneBatch, state: SimState, made: lis
     positions, prepared = [state.positions, *(step.positions for step in made)], model.prepare(batch)
     energies = [model.energy(batch, SimState(b, a), prepared) for a, b in zip(positions, positions[1:], strict=False)]
     return torch.stack(energies).mean(0)
+
+
+class FreeMotion:
+    """The term of the loss: how often, how far and with what weight motion goes on freely.
+
+    Attributes:
+        weight: of the growth of energy; 0 where the model knows none.
+    """
+
+    def __init__(self, model: nn.Module, objective: Objective) -> None:
+        """Keeps its parts.
+
+        Raises:
+            ConfigError: a weight was asked for, and the model knows no energy.
+        """
+        self.weight, self._objective = energy_weight(objective, model), objective
+        self._model = cast(Simulator, model)
+
+    def chosen(self, draws: torch.Generator) -> torch.Generator | None:
+        """Whether this batch's motion goes on to see if its energy grows: the generator of that, or None."""
+        if self.weight == 0 or float(torch.rand((), generator=draws)) >= self._objective.energy_probability:
+            return None
+        return torch.Generator().manual_seed(hash_seed(draws.initial_seed(), FREE_MOTION))
+
+    def descend(
+        self,
+        batch: SceneBatch,
+        state: SimState,
+        losses: Float[Tensor, " S"],
+        count: int,
+        draws: torch.Generator,
+        backward: Callable[[Tensor], None],
+    ) -> Float[Tensor, ""]:
+        """Backward of the growth, each member's as a share of its image loss; returns the mean growth.
+
+        Args:
+            batch: the disjoint graph.
+            state: from which the motion goes on.
+            losses: of the members.
+            count: sequences of the step, over all ranks.
+            draws: from :meth:`chosen`.
+            backward: of a loss.
+        """
+        frames, stretch = self._objective.energy_frames, self._objective.energy_stretch
+        total = losses.new_zeros(())
+        for growth in energy_growth(self._model, batch, state, frames, stretch, draws):
+            if growth.requires_grad:
+                backward(self.weight * (losses * growth).sum())
+            total += growth.detach().sum() / count
+        return total
+
+
+def energy_weight(objective: Objective, model: nn.Module) -> float:
+    """Weight of the energy's growth; one that was asked for needs a model that knows an energy."""
+    knows = isinstance(model, Energetic) and model.knows_energy
+    if objective.energy_weight is None:
+        return 1.0 if knows else 0.0
+    if objective.energy_weight and not knows:
+        name = type(getattr(model, "template", model)).__name__
+        raise ConfigError(
+            f"loss.energy_weight is {objective.energy_weight}, but {name} knows no energy. Use a template that does "
+            "(gausim.models.elastic.ElasticTemplate), or set it to 0 or null."
+        )
+    return float(objective.energy_weight)

@@ -9,11 +9,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gausim.baselines.mpm.mapping import SceneMapping
+from gausim.baselines.mpm.mapping import SceneMapping, Vector
 from gausim.baselines.mpm.particles import ParticleState
 from gausim.core import ConfigError
-
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
