@@ -10,7 +10,7 @@ def _feed(model, *, top: float, below: float) -> None:
     """Random gradients of these sizes instead of the network's; pinned units keep the identity."""
     generator = torch.Generator().manual_seed(0)
 
-    def predict(level, unit, above, target, *, position):
+    def predict(level, unit, above, target, *, position, share):
         size = below if position else top
         noise = torch.randn(level.count, 3, 3, generator=generator, dtype=torch.float64)
         value = torch.eye(3) + size * noise * ~level.pinned[:, None, None]

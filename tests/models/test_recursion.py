@@ -22,7 +22,7 @@ def test_positions_equal_the_corrected_sum_over_three_levels(make_scene, make_mo
     turns: dict[int, Tensor] = {}
     order = iter(levels)
 
-    def random_gradients(level, unit, above, target, *, position):
+    def random_gradients(level, unit, above, target, *, position, share):
         number = next(order)
         generator = torch.Generator().manual_seed(number)
         own[number] = torch.eye(3) + 0.4 * torch.randn(level.count, 3, 3, generator=generator, dtype=torch.float64)
@@ -96,7 +96,7 @@ def test_rotating_the_scene_and_the_gradients_rotates_everything(make_scene, mak
         model = make_model(current, radii=radii, clustering="complete_linkage")
         calls = iter((0, 1))
 
-        def fed(level, unit, above, target, *, position, rotation=rotation, calls=calls):
+        def fed(level, unit, above, target, *, position, share, rotation=rotation, calls=calls):
             output = torch.where(level.pinned[:, None], 0.0, _field(unit.rest @ rotation, next(calls)))
             gradient, turn = gradient_from_output(output, conserve_mass=False)
             return rotation @ gradient @ rotation.T, rotation @ turn @ rotation.T
@@ -133,7 +133,7 @@ def test_turning_everything_about_the_root_carries_the_whole_body(make_scene, ma
     model = make_model(scene)
     r = quaternion_to_matrix(torch.tensor([[0.9, 0.1, -0.4, 0.2]], dtype=torch.float64))[0]
 
-    def turn_the_top(level, unit, above, target, *, position):
+    def turn_the_top(level, unit, above, target, *, position, share):
         value = (r if position == 0 else torch.eye(3, dtype=torch.float64)).expand(level.count, 3, 3)
         return value, value
 

@@ -55,7 +55,7 @@ def test_coarse_template_positions_are_the_centres_of_mass_of_their_children(
     model = make_model(scene, template=_Given)
     seen = []
 
-    def identity(level, unit, above, target, *, position):
+    def identity(level, unit, above, target, *, position, share):
         seen.append((unit, target))
         return gradient_from_output(torch.zeros(level.count, 11, dtype=torch.float64), conserve_mass=True)
 

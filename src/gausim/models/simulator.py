@@ -285,7 +285,7 @@ class GausSim(nn.Module):
         for position, (level, unit, target) in enumerate(zip(batch.levels, units, targets, strict=True)):
             if position:
                 above = replace(above, index=level.parent)
-            gradient, rotation = self._predict(level, unit, above, target, position, share)
+            gradient, rotation = self._predict(level, unit, above, target, position=position, share=share)
             predicted.append(gradient)
             accumulated, turned, after = advance(gradient, rotation, target, above)
             if position and self.conserve_momentum:
@@ -298,7 +298,7 @@ class GausSim(nn.Module):
         return self.edges.rule != "rest" and positions.device.type == "cuda" and not self.training
 
     def _predict(
-        self, level: LevelBatch, unit: Units, above: Solved, target: Tensor, position: int, share: float
+        self, level: LevelBatch, unit: Units, above: Solved, target: Tensor, *, position: int, share: float
     ) -> tuple[Tensor, Tensor]:
         """The network's gradient and rotation of each unit of a level; the identity for pinned units."""
         network = self.network[position] if isinstance(self.network, nn.ModuleList) else self.network
