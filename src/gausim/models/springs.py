@@ -1,0 +1,124 @@
+"""The network of springs between units: its vibration modes, and what it does beyond small motions."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.sparse import bsr_matrix, diags
+from scipy.sparse.linalg import eigsh
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+# Springs keep this share of their stiffness across their direction: a central-force network alone has soft mechanisms.
+TRANSVERSE_STIFFNESS = 0.3
+# Regularises the least-squares gradient of units whose neighbours lie in a plane (share of the trace).
+GRADIENT_RIDGE = 1e-3
+
+
+def spring_network(rest: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
+    """Undirected springs (E, 2) between nearest neighbours and their stiffness blocks (E, 3, 3), k = 1 / length^2."""
+    k = min(neighbours + 1, len(rest))
+    near = cKDTree(rest).query(rest, k=k)[1].reshape(len(rest), k)[:, 1:]
+    pairs = np.stack((np.repeat(np.arange(len(rest)), k - 1), near.ravel()), 1)
+    pairs = np.unique(np.sort(pairs, 1), axis=0)
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    offset = rest[pairs[:, 1]] - rest[pairs[:, 0]]
+    length = np.maximum(np.linalg.norm(offset, axis=1), 1e-9 * np.abs(rest).max())[:, None, None]
+    outer = offset[:, :, None] * offset[:, None, :] / length**2
+    blocks = ((1 - TRANSVERSE_STIFFNESS) * outer + TRANSVERSE_STIFFNESS * np.eye(3)) / length**2
+    return pairs, blocks
+
+
+def vibration_modes(
+    rest: np.ndarray, mass: np.ndarray, pinned: np.ndarray, *, modes: int, neighbours: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest eigenvalues (M,), relative to the first, and mass-orthonormal modes (N, 3, M), zero on pinned units."""
+    pairs, blocks = spring_network(rest, neighbours)
+    i, j = pairs.T
+    rows, cols = np.concatenate((i, j, i, j)), np.concatenate((i, j, j, i))
+    data = np.concatenate((blocks, blocks, -blocks, -blocks))
+    order = np.lexsort((cols, rows))
+    pointer = np.searchsorted(rows[order], np.arange(len(rest) + 1))
+    stiffness = bsr_matrix((data[order], cols[order], pointer), shape=(3 * len(rest),) * 2).tocsr()
+    free = np.repeat(~pinned, 3)
+    scale = np.repeat(mass, 3)[free] ** -0.5
+    reduced = (diags(scale) @ stiffness[free][:, free] @ diags(scale)).tocsc()
+    size = reduced.shape[0]
+    count = min(modes, size)
+    if size <= max(300, 3 * count):
+        values, vectors = np.linalg.eigh(reduced.toarray())
+    else:
+        shift = -1e-6 * reduced.diagonal().mean()
+        values, vectors = eigsh(reduced, count, sigma=shift, v0=np.ones(size))
+        ascending = np.argsort(values)
+        values, vectors = values[ascending], vectors[:, ascending]
+    values, vectors = values[:count], vectors[:, :count]
+    vectors = vectors * np.sign(vectors[np.abs(vectors).argmax(0), np.arange(count)])
+    full = np.zeros((3 * len(rest), count))
+    full[free] = scale[:, None] * vectors
+    values = np.maximum(values, 1e-4 * values[-1])
+    return values / values[0], full.reshape(len(rest), 3, count)
+
+
+def mode_gradients(rest: np.ndarray, modes: np.ndarray, neighbours: int) -> np.ndarray:
+    """Least-squares displacement gradient of each mode at each unit, (N, 3, 3, M)."""
+    k = min(neighbours + 1, len(rest))
+    near = cKDTree(rest).query(rest, k=k)[1].reshape(len(rest), k)[:, 1:]
+    offset = rest[near] - rest[:, None]
+    weight = 1.0 / np.maximum((offset**2).sum(-1), 1e-12)
+    moment = np.einsum("nk,nka,nkb->nab", weight, offset, offset)
+    moment += GRADIENT_RIDGE * np.trace(moment, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    difference = modes[near] - modes[:, None]
+    return np.einsum("nk,nkim,nka,nab->nibm", weight, difference, offset, np.linalg.inv(moment), optimize=True)
+
+
+class Springs(nn.Module):
+    """The network's springs as they turn and stretch by more than a little, in modal coordinates.
+
+    A spring from d_0 to d = d_0 + Psi z has the energy k (|d| - |d_0|)^2 / 2, linearised k (n . Psi z)^2 / 2 with
+    n = d_0 / |d_0|. The force is minus the gradient of the difference, so it has a potential and vanishes at rest to
+    second order: the linear part is left to the trained matrices.
+    """
+
+    modes: Tensor
+    offset: Tensor
+    length: Tensor
+    stiffness: Tensor
+
+    def __init__(self, rest: np.ndarray, phi: np.ndarray, neighbours: int) -> None:
+        """Springs of :func:`spring_network` between the units, stiffness such that the first mode has the value 1."""
+        super().__init__()
+        pairs, blocks = spring_network(rest, neighbours)
+        difference = phi[pairs[:, 1]] - phi[pairs[:, 0]]
+        first = difference[:, :, 0]
+        lowest = np.einsum("ea,eab,eb->", first, blocks, first)
+        offset = rest[pairs[:, 1]] - rest[pairs[:, 0]]
+        squared = (offset**2).sum(1)
+        self.register_buffer("modes", torch.from_numpy(difference.reshape(-1, phi.shape[-1])).float(), persistent=False)
+        self.register_buffer("offset", torch.from_numpy(offset).float(), persistent=False)
+        self.register_buffer("length", torch.from_numpy(np.sqrt(squared)).float(), persistent=False)
+        stiffness = (1 - TRANSVERSE_STIFFNESS) / (squared * lowest)
+        self.register_buffer("stiffness", torch.from_numpy(stiffness).float(), persistent=False)
+
+    def forward(self, z: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+        """Modal forces beyond the linear ones, in units of the first mode's value."""
+        change, squared, along, now, stretch = self._stretched(z)
+        shrink = stretch / now
+        beyond = shrink[..., None] * change + (shrink - along / squared)[..., None] * self.offset
+        beyond = self.stiffness[:, None] * beyond
+        return -(beyond.flatten(-2) @ self.modes)
+
+    def potential(self, z: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
+        """Energy of which :meth:`forward` is minus the gradient, in the same units."""
+        _, squared, along, _, stretch = self._stretched(z)
+        return 0.5 * (self.stiffness * (stretch.square() - along.square() / squared)).sum(-1)
+
+    def _stretched(self, z: Float[Tensor, "S M"]) -> tuple[Tensor, ...]:
+        """Psi z, |d_0|^2, d_0 . Psi z, |d| and |d| - |d_0| of every spring."""
+        change = (z @ self.modes.mT).unflatten(-1, (-1, 3))
+        squared = self.length.square()
+        along = (self.offset * change).sum(-1)
+        grown = 2 * along + change.square().sum(-1)  # |d|^2 - |d_0|^2
+        now = (squared + grown).clamp_min(1e-6 * squared).sqrt()
+        return change, squared, along, now, grown / (now + self.length)  # no difference of nearly equal numbers
