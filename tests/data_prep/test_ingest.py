@@ -1,0 +1,475 @@
+"""Ingest: a film of several cameras made here, with known starts, comes out synchronised; broken films are named."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from data_prep.films import probe
+from data_prep.ingest import Options, ingest, main
+from data_prep.stage import read_manifest
+from data_prep.sync import align, measure
+from data_prep.takes import find_takes, natural, offset_seconds
+from data_prep.timecode import label_of_frame
+from gausim.core import DataError
+
+NTSC = Fraction(30000, 1001)
+RATE = 48000
+SIZE = 96, 64
+# The lamp is on between these moments of the world [s].
+LAMP = (0.83, 1.37)
+
+
+def world_sound(seconds: float = 4.0) -> np.ndarray:
+    """Knocks and voices in a room: bursts of noise of all lengths, over a little noise."""
+    random = np.random.default_rng(3)
+    sound = 0.002 * random.standard_normal(int(seconds * RATE))
+    for start in np.sort(random.uniform(0, seconds - 0.2, 14)):
+        length = int(random.uniform(0.01, 0.15) * RATE)
+        burst = random.standard_normal(length) * np.exp(-np.arange(length) / (0.2 * length))
+        sound[int(start * RATE) :][:length] += random.uniform(0.1, 0.4) * burst
+    return sound
+
+
+SOUND = world_sound()
+
+
+@dataclass(frozen=True)
+class Camera:
+    """How one camera filmed the world: its start [s], rate, and what it records."""
+
+    start: float
+    rate: Fraction
+    frames: int
+    timecode: str | None = None
+    audio: str | None = "aac"
+    lamp: bool = True
+    seed: int = 0
+    turned: int = 0
+    crf: str = "28"
+
+    def picture(self, k: int) -> np.ndarray:
+        """Frame k: a disc that swings over a pattern, lit by the lamp for the part of the exposure that it was on."""
+        begin = self.start + k / float(self.rate)
+        lit = max(0.0, min(LAMP[1], begin + 1 / float(self.rate)) - max(LAMP[0], begin)) * float(self.rate)
+        x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+        linear = 0.05 + 0.03 * ((x // 8 + y // 8) % 2)
+        centre = 48 + 20 * np.sin(2 * np.pi * 0.9 * begin)
+        linear = np.where((x - centre) ** 2 + (y - 32) ** 2 < 150, 0.2, linear) * (1 + 2.5 * lit * self.lamp)
+        noise = np.random.default_rng(1000 * self.seed + k).normal(0, 1.5, linear.shape)
+        value = np.clip(255 * linear ** (1 / 2.2) + noise, 0, 255).astype(np.uint8)
+        return np.stack([value, value, value // 2], axis=-1)
+
+    def write(self, path: Path, *, stamps: list[int] | None = None) -> Path:
+        """Encodes the film; ``stamps`` are time stamps in frames where they are not 0, 1, 2 …"""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with av.open(str(path), "w") as film:
+            video = film.add_stream("libx264", rate=self.rate)
+            video.width, video.height, video.pix_fmt = *SIZE, "yuv420p"
+            video.options = {"crf": self.crf, "preset": "veryfast"}
+            if self.turned:
+                video.set_display_rotation(self.turned)
+            if self.timecode:
+                film.metadata["timecode"] = video.metadata["timecode"] = self.timecode
+            track = film.add_stream(self.audio, rate=RATE, layout="mono") if self.audio else None
+            for k in range(self.frames):
+                frame = av.VideoFrame.from_ndarray(self.picture(k), format="rgb24")
+                frame.pts, frame.time_base = (stamps[k] if stamps else k), 1 / self.rate
+                film.mux(video.encode(frame))
+            film.mux(video.encode())
+            if track is not None:
+                self._write_sound(film, track)
+        return path
+
+    def _write_sound(self, film: Any, track: Any) -> None:
+        first, count = round(self.start * RATE), round(self.frames / float(self.rate) * RATE)
+        heard = SOUND[first : first + count] * (0.5 + 0.2 * self.seed)
+        # Each stands elsewhere in a room: echoes of its own, and the noise of its own microphone.
+        for k, delay in enumerate((0.011 + 0.007 * self.seed, 0.029 - 0.003 * self.seed)):
+            late = round(delay * RATE)
+            heard[late:] += 0.5 ** (k + 1) * heard[:-late]
+        heard = heard + 0.01 * np.random.default_rng(self.seed).standard_normal(len(heard))
+        if (self.audio or "").startswith("pcm"):
+            frame = av.AudioFrame.from_ndarray((32767 * heard[None]).astype(np.int16), format="s16", layout="mono")
+        else:
+            frame = av.AudioFrame.from_ndarray(heard[None].astype(np.float32), format="fltp", layout="mono")
+        frame.sample_rate, frame.pts, frame.time_base = RATE, 0, Fraction(1, RATE)
+        film.mux(track.encode(frame))
+        film.mux(track.encode())
+
+
+def label(rate: Fraction, frame: int, *, drop: bool) -> str:
+    return label_of_frame(frame, base=round(rate), drop=drop)
+
+
+def three_cameras(rate: Fraction, late: float = 7.3) -> dict[str, Camera]:
+    """The second camera begins ``late`` frames after the first, the third three frames before the first."""
+    drop = rate.denominator != 1
+    # Just before a minute, so that drop-frame labels are left out between the cameras' starts.
+    first = 1796 if drop else round(rate) * 60 - 4
+    frame = 1 / float(rate)
+    count = int(1.6 * rate)
+
+    def camera(i: int, start: float, audio: str) -> Camera:
+        return Camera(
+            0.2 + start * frame, rate, count, label(rate, first + int(np.floor(start)), drop=drop), audio, seed=i
+        )
+
+    return {"cam_0": camera(0, 0, "aac"), "cam_1": camera(1, late, "pcm_s16le"), "cam_2": camera(2, -3, "aac")}
+
+
+@pytest.fixture(scope="module", params=[Fraction(50), NTSC], ids=["50", "29.97"])
+def filmed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Fraction, Path]:
+    """A sequence of three lossy films: MP4 with AAC, MOV with PCM, MP4 with AAC."""
+    folder = tmp_path_factory.mktemp("films") / "poke"
+    for name, camera in three_cameras(request.param).items():
+        camera.write(folder / f"{name}{'.mov' if camera.audio == 'pcm_s16le' else '.mp4'}")
+    return request.param, folder
+
+
+@pytest.mark.parametrize(("method", "expected"), [("audio", 7.3), ("flash", 7.3), ("timecode", 7.0)])
+def test_offsets_are_found_to_a_quarter_frame(filmed: tuple[Fraction, Path], method: str, expected: float) -> None:
+    """Sound and flash see the three tenths of a frame; time code has whole frames, and says so."""
+    rate, folder = filmed
+    take = find_takes(folder)[0]
+    films = {name: probe(path) for name, path in take.films.items()}
+    assert all(film.rate == rate and not film.variable for film in films.values())
+    offsets = measure(films, method, given={})
+    later = {name: (offsets.seconds[name] - offsets.seconds["cam_0"]) * float(rate) for name in films}
+    assert later["cam_1"] == pytest.approx(expected, abs=0.25 if method != "timecode" else 1e-9)
+    assert later["cam_2"] == pytest.approx(-3, abs=0.25 if method != "timecode" else 1e-9)
+    assert (method == "timecode") == any("whole frames" in note for note in offsets.notes)
+    assert offsets.resolution["cam_1"] * float(rate) <= 0.5
+
+
+@pytest.mark.parametrize("method", ["audio", "flash", "timecode", "offsets", "auto"])
+def test_frames_come_out_synchronised(filmed: tuple[Fraction, Path], tmp_path: Path, method: str) -> None:
+    """Each output frame shows the disc where it was, for every camera, within the residual that is reported."""
+    rate, folder = filmed
+    given = {"cam_1": "7.3f", "cam_2": f"{-3 / float(rate)}s"} if method == "offsets" else None
+    manifest = ingest(folder, tmp_path / "out", Options(sync=method, offsets=given))
+    found = manifest["results"]["sequences"]["seq_000"]
+    assert found["method"] == ("timecode" if method == "auto" else method)
+    cameras, truth = found["cameras"], three_cameras(rate)
+    reference = truth[found["reference"]]
+    first = {name: facts["kept"][0] for name, facts in cameras.items()}
+    start = reference.start + first[found["reference"]] / float(rate)
+    for name, facts in cameras.items():
+        assert facts["kept"][1] - facts["kept"][0] + 1 == found["frames"] > 0.9 * rate
+        true_residual = (truth[name].start + first[name] / float(rate) - start) * float(rate)
+        assert abs(true_residual) <= 0.5
+        if method not in ("timecode", "auto"):
+            assert facts["residual_frames"]["mean"] == pytest.approx(true_residual, abs=0.25)
+        for k in (0, found["frames"] - 1):
+            written = cv2.imread(
+                str(tmp_path / "out" / "sequences" / "seq_000" / name / f"{k:04d}.png"), cv2.IMREAD_UNCHANGED
+            )
+            assert written.shape == (*SIZE[::-1], 3) and written.dtype == np.uint8
+            true = truth[name].picture(first[name] + k)
+            assert np.abs(cv2.cvtColor(written, cv2.COLOR_BGR2RGB).astype(int) - true).mean() < 12
+    assert (tmp_path / "out" / "sequences" / "seq_000" / "sync.png").stat().st_size > 1000
+
+
+def test_frames_are_lossless(filmed: tuple[Fraction, Path], tmp_path: Path) -> None:
+    """The PNGs hold what the decoder gave, bit for bit."""
+    _, folder = filmed
+    ingest(folder, tmp_path / "out", Options(sync="timecode"))
+    facts = read_manifest(tmp_path / "out", "ingest")["results"]["sequences"]["seq_000"]["cameras"]["cam_0"]
+    with av.open(str(folder / "cam_0.mp4")) as film:
+        decoded = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    for k in (0, 5):
+        written = cv2.imread(str(tmp_path / "out" / "sequences" / "seq_000" / "cam_0" / f"{k:04d}.png"))
+        assert np.array_equal(cv2.cvtColor(written, cv2.COLOR_BGR2RGB), decoded[facts["kept"][0] + k])
+
+
+# ---- what does not go together, and what is broken
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two short films of 25 frames per second without sound, lamp or time code; the second begins 2.5 frames later."""
+    folder = tmp_path_factory.mktemp("pair")
+    for i in range(2):
+        Camera(0.1 * i, Fraction(25), 20, audio=None, lamp=False, seed=i).write(folder / f"side_{i}.mp4")
+    return folder
+
+
+def refused(capsys: pytest.CaptureFixture[str], folder: Path, out: Path, *options: str) -> str:
+    """The error that the command ends with; nothing may be left that looks like a result."""
+    assert main([str(folder), "--out", str(out), *options]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("error: ") and not (out / "stage.json").exists()
+    return message
+
+
+def test_a_camera_that_nothing_places_is_named(pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every method says why it does not apply."""
+    message = refused(capsys, pair, tmp_path / "out")
+    assert (
+        "timecode: cam_0 (side_0.mp4): has no time code" in message
+        and "audio: cam_0 (side_0.mp4): has no sound" in message
+    )
+    assert "flash: cam_0 (side_0.mp4): no flash" in message and "--offsets" in message
+
+
+def test_silence_and_strangers_sounds_are_refused(tmp_path: Path) -> None:
+    """A silent camera, and two that heard different things, are no measurement."""
+    Camera(0.2, Fraction(25), 40).write(tmp_path / "a.mp4")
+    silent = Camera(0.2, Fraction(25), 40, seed=1)
+    object.__setattr__(silent, "_write_sound", lambda film, track: _hush(film, track))
+    silent.write(tmp_path / "b.mp4")
+    films = {"cam_0": probe(tmp_path / "a.mp4"), "cam_1": probe(tmp_path / "b.mp4")}
+    with pytest.raises(DataError, match=r"cam_1 \(b.mp4\).*silent"):
+        measure(films, "audio", given={})
+    Camera(2.2, Fraction(25), 40, seed=1).write(tmp_path / "c.mp4")
+    films["cam_1"] = probe(tmp_path / "c.mp4")
+    with pytest.raises(DataError, match=r"cam_1 \(c.mp4\) against cam_0.*does not tell where it belongs"):
+        measure(films, "audio", given={})
+
+
+def _hush(film: Any, track: Any) -> None:
+    frame = av.AudioFrame.from_ndarray(np.zeros((1, RATE), np.float32), format="fltp", layout="mono")
+    frame.sample_rate, frame.pts, frame.time_base = RATE, 0, Fraction(1, RATE)
+    film.mux(track.encode(frame))
+    film.mux(track.encode())
+
+
+def test_time_code_that_the_sound_contradicts_is_refused(
+    filmed: tuple[Fraction, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """auto does not believe a camera whose time code was never set."""
+    rate, folder = filmed
+    (tmp_path / "in").mkdir()
+    truth = three_cameras(rate)["cam_1"]
+    os.link(folder / "cam_0.mp4", tmp_path / "in" / "cam_0.mp4")
+    drop = rate.denominator != 1
+    Camera(truth.start, rate, truth.frames, label(rate, 1810, drop=drop), "aac", seed=1).write(
+        tmp_path / "in" / "cam_1.mp4"
+    )
+    message = refused(capsys, tmp_path / "in", tmp_path / "out")
+    assert "cam_1 (cam_1.mp4): its time code and its sound disagree" in message and "--sync audio" in message
+
+
+@pytest.mark.parametrize("offset", ["2.5f", "0.1"])
+def test_offsets_choose_frames_and_trim(pair: Path, tmp_path: Path, offset: str) -> None:
+    """Half a frame is the most that rounding leaves; what only one camera saw is cut off."""
+    manifest = ingest(pair, tmp_path / "out", Options(sync="offsets", offsets={"side_1": offset}))
+    cameras = manifest["results"]["sequences"]["seq_000"]["cameras"]
+    assert cameras["cam_1"]["residual_frames"]["largest"] in (0.0, pytest.approx(0.5, abs=1e-3))
+    assert cameras["cam_0"]["kept"][0] in (2, 3) and cameras["cam_0"]["kept"][1] == 19
+    assert cameras["cam_1"]["kept"][0] == 0 and cameras["cam_1"]["offset_frames"] - cameras["cam_0"][
+        "offset_frames"
+    ] == pytest.approx(2.5)
+    assert cameras["cam_1"]["repeated"] == 0
+
+
+def test_start_duration_and_size(pair: Path, tmp_path: Path) -> None:
+    options = Options(sync="offsets", offsets={"cam_1": "2f"}, reference="side_0", start=0.2, duration=0.3, max_side=48)
+    found = ingest(pair, tmp_path / "out", options)["results"]["sequences"]["seq_000"]
+    assert found["frames"] == 8 and found["reference"] == "cam_0"
+    assert found["cameras"]["cam_0"]["kept"] == [7, 14] and found["cameras"]["cam_1"]["kept"] == [5, 12]
+    assert cv2.imread(str(tmp_path / "out/sequences/seq_000/cam_1/0000.png")).shape == (32, 48, 3)
+
+
+def test_whole_multiples_of_a_rate_go_together_and_others_do_not(
+    pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """50 beside 25 gives every second frame; 29.97 beside 25 is refused by name."""
+    folder = tmp_path / "in"
+    Camera(0.1, Fraction(25), 20, audio=None, seed=1).write(folder / "a.mp4")
+    Camera(0.1 + 3 / 50, Fraction(50), 40, audio=None, seed=1).write(folder / "b.mp4")
+    found = ingest(folder, tmp_path / "out", Options(sync="offsets", offsets={"b": "3f"}))["results"]["sequences"][
+        "seq_000"
+    ]
+    assert found["fps"] == 25 and found["cameras"]["cam_0"]["fps"] == 25 and found["cameras"]["cam_1"]["fps"] == 50
+    kept = found["cameras"]["cam_1"]["kept"]
+    assert (
+        kept[1] - kept[0] == 2 * (found["frames"] - 1)
+        and found["cameras"]["cam_1"]["residual_frames"]["largest"] <= 0.5 + 1e-6
+    )
+    Camera(0.1, NTSC, 20, audio=None).write(folder / "b.mp4")
+    message = refused(capsys, folder, tmp_path / "other", "--sync", "offsets", "--offsets", "b=0")
+    assert "cam_1 (b.mp4): 29.97" in message and "no whole multiple" in message
+
+
+def test_films_that_never_overlap_are_refused(pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    message = refused(capsys, pair, tmp_path / "out", "--sync", "offsets", "--offsets", "cam_1=5s")
+    assert "cam_1 (side_1.mp4) begins" in message and "no time in common" in message
+    message = refused(capsys, pair, tmp_path / "out", "--sync", "offsets", "--offsets", "cam_1=0", "--start", "5")
+    assert "after leaving out 5 s" in message
+
+
+def test_missing_frames_leave_a_residual_and_are_refused(
+    pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A camera that dropped frames has none near their places: which camera and which frame is said."""
+    folder = tmp_path / "in"
+    Camera(0.0, Fraction(25), 20, audio=None).write(folder / "a.mp4")
+    Camera(0.0, Fraction(25), 17, audio=None).write(folder / "b.mp4", stamps=[*range(9), *range(12, 20)])
+    assert probe(folder / "b.mp4").variable
+    message = refused(capsys, folder, tmp_path / "out", "--sync", "offsets", "--offsets", "b=0")
+    assert "cam_1 (b.mp4): output frame" in message and "allowed 0.5" in message and "rate varies" in message
+    found = ingest(folder, tmp_path / "cut", Options(sync="offsets", offsets={"b": "0"}, duration=0.3))
+    assert found["results"]["sequences"]["seq_000"]["frames"] == 8  # before the gap all is well
+
+
+def test_cameras_whose_measurements_disagree_are_refused(pair: Path) -> None:
+    films = {name: probe(path) for name, path in find_takes(pair)[0].films.items()}
+    good = measure(films, "offsets", given={"cam_1": 0.0})
+    apart = type(good)("audio", good.seconds, {"cam_0": 0.0, "cam_1": 0.03}, good.resolution)
+    with pytest.raises(DataError, match=r"cam_1 \(side_1.mp4\).*disagree by 0.75 frames"):
+        align(films, apart)
+
+
+def test_turned_cameras_come_out_upright(tmp_path: Path) -> None:
+    """The display matrix of a phone held upright is applied, not only read."""
+    camera = Camera(0.1, Fraction(25), 6, audio=None, turned=90, crf="10")
+    camera.write(tmp_path / "in" / "a.mp4")
+    found = ingest(tmp_path / "in", tmp_path / "out")["results"]["sequences"]["seq_000"]
+    assert found["method"] == "single" and found["cameras"]["cam_0"]["rotation"] == 90
+    assert found["cameras"]["cam_0"]["size"] == list(SIZE[::-1])
+    written = cv2.cvtColor(cv2.imread(str(tmp_path / "out/sequences/seq_000/cam_0/0003.png")), cv2.COLOR_BGR2RGB)
+    assert np.abs(written.astype(int) - np.rot90(camera.picture(3))).mean() < 6
+
+
+def break_film(name: str, good: bytes) -> bytes:
+    broken = {"empty": b"", "noise": bytes(range(256)) * 40, "header": good[:600], "no end": good[: len(good) * 2 // 3]}
+    return broken[name]
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
+@pytest.mark.parametrize("fault", ["empty", "noise", "header", "no end"])
+def test_broken_films_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], suffix: str, fault: str) -> None:
+    good = Camera(0.1, Fraction(25), 20, crf="1").write(tmp_path / f"good{suffix}").read_bytes()
+    folder = tmp_path / "in"
+    folder.mkdir()
+    (folder / f"bad{suffix}").write_bytes(break_film(fault, good))
+    message = refused(capsys, folder, tmp_path / "out")
+    assert f"bad{suffix}: " in message and "Copy it again" in message
+    assert ("empty (0 bytes)" in message) == (fault == "empty")
+
+
+def test_damage_in_the_middle_is_no_silent_gap(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    film = Camera(0.1, Fraction(25), 20, audio=None, crf="1").write(tmp_path / "in" / "a.mp4")
+    data = bytearray(film.read_bytes())
+    middle = slice(len(data) // 3, len(data) // 2)
+    data[middle] = bytes(len(data[middle]))
+    film.write_bytes(data)
+    assert "a.mp4" in refused(capsys, tmp_path / "in", tmp_path / "out")
+
+
+def test_sound_without_pictures_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "in").mkdir()
+    with av.open(str(tmp_path / "in" / "a.mp4"), "w") as film:
+        _hush(film, film.add_stream("aac", rate=RATE, layout="mono"))
+    assert "a.mp4: holds no video stream" in refused(capsys, tmp_path / "in", tmp_path / "out")
+
+
+# ---- which films, and starting again
+
+
+def test_folders_and_lists_name_the_same_sequences(tmp_path: Path) -> None:
+    for take in ("take_10", "take_2"):
+        for camera in ("left", "right"):
+            (tmp_path / take).mkdir(exist_ok=True)
+            (tmp_path / take / f"{camera}.mp4").touch()
+    takes = find_takes(tmp_path)
+    assert [(t.name, t.source) for t in takes] == [("seq_000", "take_2"), ("seq_001", "take_10")]
+    assert takes[0].labels == {"cam_0": "left", "cam_1": "right"}
+    entries = [{"name": t.source, "cameras": {k: f"{t.source}/{k}.mp4" for k in ("left", "right")}} for t in takes]
+    entries[1].update(offsets={"right": 0.5}, start=1)
+    (tmp_path / "list.json").write_text(json.dumps({"sequences": entries}))
+    listed = find_takes(tmp_path / "list.json")
+    assert [t.films for t in listed] == [t.films for t in takes]
+    assert listed[1].offsets == {"right": "0.5"} and listed[1].start == 1 and listed[0].start is None
+
+
+def _touch(*names: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        for name in names:
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).touch()
+        return folder
+
+    return make
+
+
+def _list(text: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        (folder / "list.json").write_text(text)
+        return folder / "list.json"
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (_touch(), "no films in it"),
+        (_touch("a.mp4", "b/c.mp4"), "both in it and in b"),
+        (_touch("a.mp4", "a.mov"), "name one camera"),
+        (_touch("x/a.mp4", "x/b.mp4", "y/a.mp4"), "sequence 'y' has the cameras"),
+        (_list("{"), "cannot be read as JSON"),
+        (_list('{"sequences": []}'), "must be a list"),
+        (_list('{"sequences": [3]}'), "expected an object"),
+        (_list('{"sequences": [{"cameras": {"a": 1}}]}'), "'cameras' must map"),
+        (_list('{"sequences": [{"cameras": {"a": "x.mp4"}, "start": NaN}]}'), "'start'"),
+        (_list('{"sequences": [{"cameras": {"a": "x.mp4"}, "offset": {}}]}'), "expected an object of"),
+        (_list('{"sequences": [{"cameras": {"a": "x.mp4"}, "offsets": {"a": true}}]}'), "'offsets' must map"),
+    ],
+)
+def test_unclear_inputs_are_refused(tmp_path: Path, make: Callable[[Path], Path], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        find_takes(make(tmp_path))
+
+
+def test_offsets_and_natural_order() -> None:
+    assert offset_seconds("7.3f", 50) == pytest.approx(0.146) and offset_seconds("-0.5s", 50) == -0.5
+    for text in ("", "abc", "1e999", "nan", "7 frames"):
+        with pytest.raises(DataError, match="offset"):
+            offset_seconds(text, 25)
+    assert sorted(["cam_10", "cam_2", "b", "3"], key=natural) == ["3", "b", "cam_2", "cam_10"]
+
+
+def test_offsets_for_unknown_cameras_are_refused(
+    pair: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "no camera 'cam_7'" in refused(capsys, pair, tmp_path / "o", "--sync", "offsets", "--offsets", "cam_7=1")
+    assert "no camera 'x'" in refused(
+        capsys, pair, tmp_path / "o", "--sync", "offsets", "--offsets", "cam_1=1f", "--reference", "x"
+    )
+
+
+def test_a_killed_ingest_goes_on(pair: Path, tmp_path: Path) -> None:
+    """SIGKILL in the middle leaves no result; the same command ends with what an uninterrupted one makes."""
+    options = ["--sync", "offsets", "--offsets", "side_1=1f"]
+    command = [sys.executable, "-m", "data_prep.ingest", str(pair), "--out", str(tmp_path / "out"), *options]
+    work = tmp_path / ".out.ingest.work" / "sequences" / "seq_000" / "cam_0"
+    process = subprocess.Popen(command, cwd=Path(__file__).parents[2], stderr=subprocess.DEVNULL)
+    while process.poll() is None and not list(work.glob("00*.png")):
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL and not (tmp_path / "out").exists()
+    left = {path: path.stat().st_mtime_ns for path in work.glob("00*.png")}
+    assert 0 < len(left) < 20
+    assert main([*command[3:]]) == 0
+    assert main([str(pair), "--out", str(tmp_path / "whole"), *options]) == 0
+    for path in sorted((tmp_path / "whole").rglob("*.png")):
+        assert (tmp_path / "out" / path.relative_to(tmp_path / "whole")).read_bytes() == path.read_bytes()
+    for path, made in left.items():
+        assert (tmp_path / "out/sequences/seq_000/cam_0" / path.name).stat().st_mtime_ns == made
+    assert read_manifest(tmp_path / "out") == read_manifest(tmp_path / "whole")

@@ -1,0 +1,471 @@
+"""Segment: known discs are found by every backend, masks are cleaned and steady, and broken inputs are named."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from data_prep.clips import find_clips, read_picture
+from data_prep.mask_cleanup import UNTOUCHED, Cleanup, cleaned, fill_holes, keep_largest, matte, overlap, soften, steady
+from data_prep.segment import Backend, main, segment
+from data_prep.segment_onnx import OnnxSegmenter
+from data_prep.segment_sam2 import Prompt, Sam2Segmenter, load_predictor, make_prompt
+from data_prep.segmenters import BackgroundSegmenter, ChromaSegmenter
+from data_prep.stage import read_manifest
+from gausim.core import ConfigError, DataError
+
+SIZE = 96, 72
+FRAMES = 9
+
+
+def disc(k: int) -> np.ndarray:
+    """Where the object is in frame k, (H, W) bool: it crosses the picture and comes back to no place twice."""
+    x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    return (x - (16 + 8 * k)) ** 2 + (y - 36) ** 2 < 13**2
+
+
+def picture(k: int, background: tuple[int, int, int] | None = None) -> np.ndarray:
+    """An orange disc over a textured wall, or over a screen of one colour, with noise."""
+    random = np.random.default_rng(5)
+    wall = cv2.GaussianBlur(random.uniform(40, 180, (SIZE[1], SIZE[0], 3)).astype(np.float32), (0, 0), 3)
+    wall = np.broadcast_to(np.array(background, np.float32), wall.shape) if background else wall
+    rgb = np.where(disc(k)[..., None], np.array([235, 120, 20], np.float32), wall)
+    return np.clip(rgb + np.random.default_rng(k + 100).normal(0, 2, rgb.shape), 0, 255).astype(np.uint8)
+
+
+def write(path: Path, pixels: np.ndarray) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    code = cv2.COLOR_RGBA2BGRA if pixels.shape[-1] == 4 else cv2.COLOR_RGB2BGR
+    assert cv2.imwrite(str(path), cv2.cvtColor(pixels, code))
+    return path
+
+
+@pytest.fixture
+def film(tmp_path: Path) -> Path:
+    """A camera's frames as ingest lays them out."""
+    for k in range(FRAMES):
+        write(tmp_path / "in" / "sequences" / "seq_000" / "cam_0" / f"{k:04d}.png", picture(k))
+    return tmp_path / "in"
+
+
+def found_masks(out: Path) -> list[np.ndarray]:
+    return [read_picture(out / "sequences" / "seq_000" / "cam_0" / f"{k:04d}.png")[..., 3] for k in range(FRAMES)]
+
+
+def agreement(masks: list[np.ndarray]) -> float:
+    return min(overlap(mask, disc(k).astype(np.uint8) * 255) for k, mask in enumerate(masks))
+
+
+@pytest.mark.parametrize("options", [[], ["--no-grabcut"], ["--plate", "PLATE"], ["--plate", "PLATES"]])
+def test_background_difference_finds_what_moves(film: Path, tmp_path: Path, options: list[str]) -> None:
+    """Against the median over time, a picture of the empty scene, and one per camera."""
+    empty = picture(-20)
+    write(tmp_path / "plates" / "cam_0.png", empty)
+    places = {"PLATE": write(tmp_path / "empty.png", empty), "PLATES": tmp_path / "plates"}
+    arguments = [str(places.get(option, option)) for option in options]
+    assert main([str(film), "--out", str(tmp_path / "out"), "--backend", "background", *arguments]) == 0
+    masks = found_masks(tmp_path / "out")
+    assert agreement(masks) > 0.9
+    figures = read_manifest(tmp_path / "out", "segment")["results"]["clips"]["sequences/seq_000/cam_0"]
+    assert figures["pictures"] == FRAMES and figures["empty"] == []
+    assert figures["coverage"]["mean"] == pytest.approx(disc(3).mean(), rel=0.15)
+    overlays = tmp_path / "out" / "overlays"
+    with av.open(str(overlays / "sequences_seq_000_cam_0.mp4")) as video:
+        assert sum(1 for _ in video.decode(video=0)) == FRAMES
+    assert (overlays / "sequences_seq_000_cam_0.jpg").is_file()
+    assert not list((tmp_path / "out").glob(".*"))
+
+
+@pytest.mark.parametrize("options", [[], ["--key", "00b140"], ["--no-grabcut"]])
+def test_chroma_key_finds_what_is_not_the_screen(tmp_path: Path, options: list[str]) -> None:
+    for k in (2, 5):
+        write(tmp_path / "in" / f"{k}.png", picture(k, (0, 177, 64)))
+    assert main([str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--backend", "chroma", *options]) == 0
+    for k in (2, 5):
+        rgba = read_picture(tmp_path / "out" / f"{k}.png")
+        assert overlap(rgba[..., 3], disc(k).astype(np.uint8) * 255) > 0.93
+        assert (rgba[..., 3][cv2.dilate(disc(k).astype(np.uint8), np.ones((9, 9))) == 0] == 0).all()
+
+
+def test_grey_screens_and_stills_without_a_plate_are_refused(film: Path, tmp_path: Path, capsys: Any) -> None:
+    write(tmp_path / "grey" / "0.png", picture(1, (128, 128, 128)))
+    assert main([str(tmp_path / "grey"), "--out", str(tmp_path / "o"), "--backend", "chroma"]) == 2
+    assert "nearly grey" in capsys.readouterr().err
+    assert main([str(tmp_path / "grey"), "--out", str(tmp_path / "o"), "--backend", "background"]) == 2
+    assert "--plate" in capsys.readouterr().err
+    small = write(tmp_path / "small.png", picture(1)[:40])
+    assert main([str(film), "--out", str(tmp_path / "o"), "--backend", "background", "--plate", str(small)]) == 2
+    assert "small.png: is 96x40" in capsys.readouterr().err
+
+
+def test_alpha_is_taken_as_it_is(tmp_path: Path, capsys: Any) -> None:
+    """To the bit, faint values too; a picture without alpha has no mask."""
+    alpha = np.random.default_rng(0).integers(0, 256, SIZE[::-1], np.uint8)
+    rgba = np.dstack([picture(1), alpha])
+    write(tmp_path / "in" / "static" / "a.png", rgba)
+    assert main([str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--backend", "alpha"]) == 0
+    assert np.array_equal(read_picture(tmp_path / "out" / "static" / "a.png"), rgba)
+    write(tmp_path / "in" / "static" / "b.png", picture(1))
+    assert main([str(tmp_path / "in"), "--out", str(tmp_path / "o"), "--backend", "alpha"]) == 2
+    assert "b.png: has no transparent pixel" in capsys.readouterr().err
+
+
+def test_poses_are_carried_over(tmp_path: Path) -> None:
+    """transforms.json points to the new pictures, and is otherwise as it was."""
+    write(tmp_path / "in" / "static" / "images" / "a.jpg", picture(1, (0, 177, 64)))
+    poses = {"fl_x": 90.0, "frames": [{"file_path": "images/a.jpg", "transform_matrix": np.eye(4).tolist()}]}
+    (tmp_path / "in" / "static" / "transforms.json").write_text(json.dumps(poses))
+    assert main([str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--backend", "chroma"]) == 0
+    carried = json.loads((tmp_path / "out" / "static" / "transforms.json").read_text())
+    assert carried["frames"][0].pop("file_path") == "images/a.png"
+    poses["frames"][0].pop("file_path")
+    assert carried == poses
+
+
+def test_a_film_can_be_segmented_directly(tmp_path: Path) -> None:
+    with av.open(str(tmp_path / "clip.mp4"), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = *SIZE, "yuv420p"
+        for k in range(FRAMES):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(k), format="rgb24")))
+        container.mux(stream.encode())
+    assert main([str(tmp_path / "clip.mp4"), "--out", str(tmp_path / "out"), "--backend", "background"]) == 0
+    masks = [read_picture(p)[..., 3] for p in sorted((tmp_path / "out" / "clip").glob("*.png"))]
+    assert len(masks) == FRAMES and agreement(masks) > 0.85
+
+
+# ---- ONNX
+
+
+def proto(field: int, value: bytes | int) -> bytes:
+    """A field of a protocol buffer: a varint, or bytes with their length."""
+
+    def varint(n: int) -> bytes:
+        return bytes([n]) if n < 128 else bytes([n & 127 | 128]) + varint(n >> 7)
+
+    if isinstance(value, int):
+        return varint(field << 3) + varint(value)
+    return varint(field << 3 | 2) + varint(len(value)) + value
+
+
+def tensor_type(name: str, shape: tuple[int | str, ...]) -> bytes:
+    dims = b"".join(proto(1, proto(1, n) if isinstance(n, int) else proto(2, n.encode())) for n in shape)
+    return proto(1, name.encode()) + proto(2, proto(1, proto(1, 1) + proto(2, dims)))
+
+
+def network(
+    path: Path, operation: str, *, side: int | str = 32, channels: int = 3, axes: tuple[int, ...] = (1,)
+) -> Path:
+    """A network of one ReduceMax (over channels) or other operation, written by hand: no ONNX library is needed."""
+    attributes = proto(5, proto(1, b"axes") + b"".join(proto(8, n) for n in axes) + proto(20, 7))
+    node = (
+        proto(1, b"x") + proto(2, b"y") + proto(4, operation.encode()) + (attributes if "Reduce" in operation else b"")
+    )
+    shape = (1, channels, side, side)
+    graph = (
+        proto(1, node)
+        + proto(2, b"g")
+        + proto(11, tensor_type("x", shape))
+        + proto(12, proto(1, b"y") + proto(2, proto(1, proto(1, 1))))
+    )
+    path.write_bytes(proto(1, 8) + proto(7, graph) + proto(8, proto(1, b"") + proto(2, 12)))
+    return path
+
+
+def test_any_network_can_tell_the_foreground(tmp_path: Path) -> None:
+    """Size, mean, scale and activation are options; the mask comes back at the picture's size."""
+    pytest.importorskip("onnxruntime")
+    rgb = np.where(disc(3)[..., None], np.uint8(250), np.uint8(5)).repeat(3, axis=-1)
+    write(tmp_path / "in" / "a.png", rgb)
+    file = network(tmp_path / "max.onnx", "ReduceMax", side="n")
+    options = ["--onnx", str(file), "--onnx-size", "96", "--onnx-mean", "5", "--onnx-scale", "245", "--backend", "onnx"]
+    assert main([str(tmp_path / "in"), "--out", str(tmp_path / "out"), *options]) == 0
+    mask = read_picture(tmp_path / "out" / "a.png")[..., 3]
+    assert mask.shape == SIZE[::-1] and overlap(mask, disc(3).astype(np.uint8) * 255) > 0.95
+    sigmoid = OnnxSegmenter(file, size=32, mean=(127.0,) * 3, scale=(10.0,) * 3, activation="sigmoid").mask(rgb)
+    assert sigmoid[disc(3)].max() == pytest.approx(1, abs=1e-4) and sigmoid[0, -1] == pytest.approx(0, abs=1e-4)
+    stretched = OnnxSegmenter(file, size=48, mean=(7.0,), scale=(3.0,), activation="minmax").mask(rgb)
+    assert stretched.min() == 0 and stretched.max() == 1
+
+
+def test_networks_that_do_not_fit_are_named(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    file = network(tmp_path / "max.onnx", "ReduceMax")
+    with pytest.raises(DataError, match="values of .* expected 0 to 1. Try --onnx-activation"):
+        OnnxSegmenter(file, mean=(0.0,), scale=(1.0,)).mask(picture(1))
+    with pytest.raises(ConfigError, match="--onnx-size says 64"):
+        OnnxSegmenter(file, size=64)
+    with pytest.raises(ConfigError, match="has outputs 0 to 0, asked for 2"):
+        OnnxSegmenter(file, output=2)
+    with pytest.raises(ConfigError, match="leaves the size of its input open"):
+        OnnxSegmenter(network(tmp_path / "open.onnx", "ReduceMax", side="n"))
+    with pytest.raises(DataError, match="expected one input of float32"):
+        OnnxSegmenter(network(tmp_path / "grey.onnx", "ReduceMax", channels=1))
+    with pytest.raises(DataError, match="expected one map"):
+        OnnxSegmenter(network(tmp_path / "same.onnx", "Identity")).mask(picture(1))
+    with pytest.raises(DataError, match="values that are no numbers"):
+        OnnxSegmenter(network(tmp_path / "log.onnx", "Log"), mean=(255.0,), output=0).mask(picture(1))
+    (tmp_path / "noise.onnx").write_bytes(struct.pack("40d", *range(40)))
+    with pytest.raises(DataError, match=r"noise.onnx: cannot be loaded"):
+        OnnxSegmenter(tmp_path / "noise.onnx")
+    with pytest.raises(DataError, match="no such network"):
+        OnnxSegmenter(tmp_path / "none.onnx")
+
+
+@pytest.mark.slow
+def test_a_real_network_on_a_real_film(data_root: Path, tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    weights, clip = data_root / "weights" / "isnet_quint8.onnx", data_root / "real_dynamic" / "hat_0_real.mp4"
+    if not weights.is_file() or not clip.is_file():
+        pytest.skip("GAUSIM_TEST_DATA has no weights/isnet_quint8.onnx or real_dynamic/hat_0_real.mp4")
+    options = ["--backend", "onnx", "--onnx", str(weights), "--every", "100"]
+    assert main([str(clip), "--out", str(tmp_path / "out"), *options]) == 0
+    found = read_manifest(tmp_path / "out")["results"]["clips"]["hat_0_real"]
+    assert found["pictures"] == 2 and 0.05 < found["coverage"]["mean"] < 0.6
+
+
+# ---- SAM 2
+
+
+class FakePredictor:
+    """Stands for SAM 2: its object is whatever has the colour under the prompt, logits ±10."""
+
+    def __init__(self, upset: bool = False) -> None:
+        self.prompts: list[dict[str, Any]] = []
+        self.upset = upset
+
+    def init_state(self, video_path: str, offload_video_to_cpu: bool = False) -> Any:
+        files = sorted(Path(video_path).glob("*.jpg"))
+        assert [p.stem for p in files] == [f"{i:05d}" for i in range(len(files))]
+        return SimpleNamespace(frames=[cv2.imread(str(p)).astype(np.float32) for p in files], colour=None)
+
+    def add_new_points_or_box(self, inference_state: Any, frame_idx: int, obj_id: int, **prompt: Any) -> Any:
+        assert (frame_idx, obj_id) == (0, 1)
+        self.prompts.append(prompt)
+        place = prompt["points"][0] if "points" in prompt else (prompt["box"][:2] + prompt["box"][2:]) / 2
+        inference_state.colour = inference_state.frames[0][round(float(place[1])), round(float(place[0]))]
+
+    def propagate_in_video(self, inference_state: Any) -> Iterator[tuple[int, list[int], Any]]:
+        for k, frame in enumerate(inference_state.frames):
+            near = np.abs(frame - inference_state.colour).max(-1) < 40
+            yield k + self.upset, [1], torch.from_numpy(np.where(near, 10.0, -10.0))[None, None]
+
+
+def sam2(predictor: FakePredictor, prompts: dict[str, Prompt]) -> Backend:
+    return Backend("sam2", lambda: Sam2Segmenter(predictor, prompts), soft=True, settings={"prompts": sorted(prompts)})
+
+
+@pytest.mark.parametrize("prompt", [Prompt(box=(4, 24, 28, 48)), Prompt(points=((16, 36, 1), (90, 5, 0)))])
+def test_sam2_follows_a_prompt(film: Path, tmp_path: Path, prompt: Prompt) -> None:
+    predictor = FakePredictor()
+    # The disc moves by a twelfth of the picture per frame, which the tolerance has to know.
+    segment(film, tmp_path / "out", sam2(predictor, {"": prompt}), Cleanup(motion=0.09))
+    assert agreement(found_masks(tmp_path / "out")) > 0.9
+    assert len(predictor.prompts) == 1 and set(predictor.prompts[0]) == (
+        {"box"} if prompt.box else {"points", "labels"}
+    )
+
+
+def test_sam2_says_what_is_missing(film: Path, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "sam2", None)
+    with pytest.raises(ConfigError, match="package sam2"):
+        load_predictor(tmp_path / "w.pt", "c.yaml", device="cpu")
+    command = [str(film), "--out", str(tmp_path / "out"), "--backend", "sam2"]
+    assert main(command) == 2 and "--sam2-checkpoint" in capsys.readouterr().err
+    assert main([*command, "--sam2-checkpoint", "w.pt"]) == 2 and "--box, --point" in capsys.readouterr().err
+    assert main([*command, "--sam2-checkpoint", "w.pt", "--box", "9,9,2,2"]) == 2
+    assert "x0 < x1" in capsys.readouterr().err
+    with pytest.raises(DataError, match="prompts: none for 'sequences/seq_000/cam_0'"):
+        segment(film, tmp_path / "out", sam2(FakePredictor(), {"cam_7": Prompt((0, 0, 9, 9))}), Cleanup())
+    with pytest.raises(DataError, match="lie outside"):
+        segment(film, tmp_path / "out", sam2(FakePredictor(), {"": Prompt((0, 0, 900, 9))}), Cleanup())
+    with pytest.raises(DataError, match="gave no mask of this picture"):
+        segment(film, tmp_path / "out", sam2(FakePredictor(upset=True), {"": Prompt((4, 24, 28, 48))}), Cleanup())
+    for box, points in (
+        (None, []),
+        (None, [(1, 2, 0)]),
+        ([1, 2, float("nan"), 4], []),
+        ([1, 2], []),
+        (None, [(1, 2, 7)]),
+    ):
+        with pytest.raises(DataError, match="box"):
+            make_prompt(box, points, "here")
+
+
+def test_sam2_reads_checkpoints_without_running_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights go into the predictor that the package builds; a pickle of code is refused."""
+    built: dict[str, Any] = {}
+
+    def build(config: str, ckpt_path: Any, device: str) -> torch.nn.Module:
+        assert ckpt_path is None
+        built.update(config=config, device=device, model=torch.nn.Linear(2, 1))
+        return built["model"]
+
+    module = SimpleNamespace(build_sam2_video_predictor=build)
+    monkeypatch.setitem(__import__("sys").modules, "sam2", SimpleNamespace(build_sam=module))
+    monkeypatch.setitem(__import__("sys").modules, "sam2.build_sam", module)
+    weights = {"weight": torch.tensor([[3.0, 4.0]]), "bias": torch.tensor([5.0])}
+    torch.save({"model": weights}, tmp_path / "good.pt")
+    assert load_predictor(tmp_path / "good.pt", "c.yaml", device="cpu") is built["model"]
+    assert torch.equal(built["model"].weight, weights["weight"]) and built["config"] == "c.yaml"
+    torch.save({"model": {"weight": weights["weight"]}}, tmp_path / "other.pt")
+    with pytest.raises(DataError, match="does not fit"):
+        load_predictor(tmp_path / "other.pt", "c.yaml", device="cpu")
+    torch.save({"model": SimpleNamespace()}, tmp_path / "code.pt")
+    with pytest.raises(DataError, match="no checkpoint of SAM 2"):
+        load_predictor(tmp_path / "code.pt", "c.yaml", device="cpu")
+
+
+# ---- cleaning
+
+
+def square(top: int, left: int, side: int, size: int = 60) -> np.ndarray:
+    mask = np.zeros((size, size), np.float32)
+    mask[top : top + side, left : left + side] = 1
+    return mask
+
+
+def test_small_holes_are_filled_and_large_ones_are_not() -> None:
+    mask = square(10, 10, 40)
+    mask[20:24, 20:24] = 0  # 1 % of the foreground
+    mask[30:42, 30:42] = 0  # 9 %
+    filled = fill_holes(mask, 0.02)
+    assert (filled[20:24, 20:24] == 1).all() and (filled[30:42, 30:42] == 0).all()
+    notch = square(0, 0, 40)
+    notch[0:3, 10:13] = 0  # open to the border: no hole
+    assert np.array_equal(fill_holes(notch, 0.5), notch)
+
+
+def test_the_largest_parts_are_kept_with_their_soft_edges() -> None:
+    mask = np.maximum(square(5, 5, 30), square(45, 45, 8))
+    mask[35:37, 5:35] = 0.3  # soft edge of the large one
+    mask[50:52, 5:9] = 1.0  # a crumb
+    one, two = keep_largest(mask, 1, 0), keep_largest(mask, 2, 0)
+    assert one[45:53, 45:53].max() == 0 and (one[35:37, 5:35] == np.float32(0.3)).all()
+    assert two[45:53, 45:53].min() == 1 and two[50:52, 5:9].max() == 0
+    assert keep_largest(mask, 0, 0.005)[50:52, 5:9].max() == 0
+
+
+def test_flashes_in_time_go_and_motion_stays() -> None:
+    """A blob of one frame vanishes, a frame's loss is mended, an edge that moves by 2 pixels a frame is left alone."""
+    masks = [square(20, 10 + 2 * k, 20) for k in range(5)]
+    neighbours = [(abs(k - 2), masks[k]) for k in (0, 1, 3, 4)]
+    assert np.array_equal(steady(masks[2], neighbours, 2.0), masks[2])
+    flash = np.maximum(masks[2], square(50, 50, 6))
+    assert np.array_equal(steady(flash, neighbours, 2.0), masks[2])
+    lost = masks[2].copy()
+    lost[28:36, 20:28] = 0
+    assert steady(lost, neighbours, 2.0)[28:36, 20:28].min() == 1
+    assert np.array_equal(steady(flash, neighbours[:1], 2.0), flash)  # one neighbour is no majority
+
+
+def test_edges_follow_the_picture() -> None:
+    """A mask that is a pixel off is softened to the picture's edge; far from the edge nothing changes."""
+    rgb = np.full((60, 60, 3), 30, np.uint8)
+    rgb[20:40, 20:40] = 220
+    soft = soften(square(19, 19, 22), rgb, 3)
+    assert 0 < soft[30, 19] < soft[30, 21] and soft[30, 30] == 1 and soft[30, 10] == 0
+    alpha = cleaned(square(19, 19, 22), rgb, Cleanup(edge=0.05), soft=False)
+    assert alpha.dtype == np.uint8 and ((alpha == 0) | (alpha >= 12)).all() and len(np.unique(alpha)) > 3
+    assert set(np.unique(cleaned(square(19, 19, 22), rgb, UNTOUCHED, soft=False))) == {0, 255}
+
+
+def test_mattes_keep_colour_around_the_foreground() -> None:
+    rgb = np.full((60, 60, 3), 99, np.uint8)
+    alpha = (square(25, 25, 10) * 255).astype(np.uint8)
+    rgba = matte(rgb, alpha)
+    assert np.array_equal(rgba[..., 3], alpha)
+    assert (rgba[17:43, 17:43, :3] == 99).all() and (rgba[:16, :, :3] == 0).all()
+
+
+# ---- what is broken, and starting again
+
+
+def test_masks_that_are_no_masks_are_refused(film: Path, tmp_path: Path) -> None:
+    for value, message in ((np.full((3, 3), 0.5), "shape"), (np.full(SIZE[::-1], np.nan), "no numbers")):
+        broken = SimpleNamespace(open=lambda clip, value=value: lambda index: value)
+        with pytest.raises(DataError, match=message):
+            segment(film, tmp_path / "out", Backend("mine", lambda broken=broken: broken), Cleanup())
+    nothing = SimpleNamespace(open=lambda clip: lambda index: np.zeros(SIZE[::-1], np.float32))
+    with pytest.raises(DataError, match="nothing was found in any of 9 pictures"):
+        segment(film, tmp_path / "out", Backend("mine", lambda: nothing), Cleanup())
+    assert not (tmp_path / "out").exists()
+
+
+def test_unclear_inputs_are_refused(tmp_path: Path, capsys: Any) -> None:
+    command = ["--out", str(tmp_path / "out"), "--backend", "chroma"]
+    assert main([str(tmp_path / "none"), *command]) == 2 and "expected a folder of pictures" in capsys.readouterr().err
+    (tmp_path / "in").mkdir()
+    assert main([str(tmp_path / "in"), *command]) == 2 and "no pictures in it" in capsys.readouterr().err
+    (tmp_path / "in" / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(50))
+    assert main([str(tmp_path / "in"), *command]) == 2 and "a.png: cannot be decoded" in capsys.readouterr().err
+    (tmp_path / "in" / "a.jpg").write_bytes(b"")
+    assert main([str(tmp_path / "in"), *command]) == 2 and "would become the same PNG" in capsys.readouterr().err
+    for option, value in (("--components", "-1"), ("--motion", "nan"), ("--key", "12345"), ("--every", "0")):
+        with pytest.raises(SystemExit):
+            main([str(tmp_path / "in"), *command, option, value])
+
+
+def test_pictures_of_all_kinds_are_read(tmp_path: Path) -> None:
+    grey = np.arange(12, dtype=np.uint8).reshape(3, 4) * 20
+    assert cv2.imwrite(str(tmp_path / "grey.png"), grey)
+    assert np.array_equal(read_picture(tmp_path / "grey.png")[..., 0], grey)
+    assert cv2.imwrite(str(tmp_path / "deep.png"), np.dstack([grey] * 3).astype(np.uint16) * 257)
+    assert np.array_equal(read_picture(tmp_path / "deep.png")[..., 2], grey)
+    assert cv2.imwrite(str(tmp_path / "float.tiff"), grey.astype(np.float32))
+    with pytest.raises(DataError, match=r"float.tiff: expected 8 or 16 bit"):
+        read_picture(tmp_path / "float.tiff")
+
+
+def test_clips_are_found_in_natural_order(tmp_path: Path) -> None:
+    for name in ("b/10.png", "b/9.png", "sequences/seq_000/cam_0/0.png", ".hidden/1.png", "sequences/seq_000/sync.png"):
+        write(tmp_path / name, picture(0))
+    clips = find_clips(tmp_path)
+    assert [(c.name, c.moving) for c in clips] == [("b", False), ("sequences/seq_000/cam_0", True)]
+    assert [p.name for p in clips[0].paths] == ["9.png", "10.png"]
+    assert (
+        all(c.moving for c in find_clips(tmp_path, kind="film")) and not find_clips(tmp_path, kind="stills")[1].moving
+    )
+
+
+def test_an_interrupted_run_goes_on_frame_by_frame(film: Path, tmp_path: Path) -> None:
+    """Masks that were made are not made again, and the result is that of an uninterrupted run."""
+    asked: list[int] = []
+
+    def backend(stop: int | None) -> Backend:
+        def mask(clip: Any, index: int) -> np.ndarray:
+            asked.append(index)
+            if index == stop:
+                raise KeyboardInterrupt
+            return disc(index).astype(np.float32)
+
+        return Backend("mine", lambda: SimpleNamespace(open=lambda clip: lambda index: mask(clip, index)))
+
+    with pytest.raises(KeyboardInterrupt):
+        segment(film, tmp_path / "out", backend(4), Cleanup())
+    assert not (tmp_path / "out").exists()
+    segment(film, tmp_path / "out", backend(None), Cleanup())
+    assert asked == [0, 1, 2, 3, 4, 4, 5, 6, 7, 8]
+    segment(film, tmp_path / "whole", backend(None), Cleanup())
+    for path in (tmp_path / "whole").rglob("*.png"):
+        assert (tmp_path / "out" / path.relative_to(tmp_path / "whole")).read_bytes() == path.read_bytes()
+    assert segment(film, tmp_path / "out", backend(None), Cleanup())["made"] is False
+
+
+def test_segmenters_can_be_used_alone(film: Path) -> None:
+    """From Python: open a clip, ask for a mask."""
+    clip = find_clips(film)[0]
+    mask = BackgroundSegmenter().open(clip)(4)
+    assert mask.dtype == np.float32 and overlap((mask * 255).astype(np.uint8), disc(4).astype(np.uint8) * 255) > 0.85
+    with pytest.raises(DataError, match="nearly grey"):
+        ChromaSegmenter(key=(90, 90, 90)).open(clip)
