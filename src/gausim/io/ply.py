@@ -94,6 +94,22 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
     return load_masks(scene, side) if masks is not None or side.is_file() else scene
 
 
+def load_points(path: Path | str) -> np.ndarray:
+    """Positions (P, 3) float32 of a PLY's vertices, whatever else they have (point clouds, meshes, scenes).
+
+    Raises:
+        SceneError: naming the file and the property that is missing, malformed, NaN or infinite.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file. Expected a point cloud in PLY format.")
+    table = _read_vertices(path)
+    missing = [n for n in ("x", "y", "z") if n not in (table.dtype.names or ())]
+    if missing:
+        raise SceneError(f"{path}: property '{missing[0]}' is missing. Expected points with x, y and z.")
+    return np.stack([_finite_column(path, table, n) for n in ("x", "y", "z")], axis=-1)
+
+
 def save_scene(scene: GaussianScene, path: Path | str) -> None:
     """Writes the scene as little-endian float32 PLY in INRIA order, and its masks next to it; replaces atomically."""
     path = Path(path)

@@ -79,34 +79,38 @@ def read_transforms(path: Path) -> PosedImages:
         size = size or here
         if here != size:
             raise DataError(f"{field}: is {here[0]}x{here[1]}, frames[0] is {size[0]}x{size[1]}; use one image size.")
-        viewmats.append(_viewmat(entry, field))
+        viewmats.append(viewmat_of(entry, field))
         intrinsics.append(_intrinsics(fields, here, field))
     assert size is not None
     names = tuple(_name(f) for f in frames)
     cameras = Cameras(torch.stack(viewmats), torch.stack(intrinsics), size[0], size[1], names).validated(str(path))
-    fps = _number(data, "fps", str(path)) if "fps" in data else None
+    fps = number_field(data, "fps", str(path)) if "fps" in data else None
     return PosedImages(path, tuple(frames), cameras, fps)
 
 
 def write_transforms(path: Path, cameras: Cameras, entries: list[dict[str, Any]], *, fps: float | None = None) -> None:
     """Writes entries (``file_path`` and further keys) with the pose of the camera of the same index.
 
-    All cameras must share one K, which becomes the file's global intrinsics.
+    One K of all cameras becomes the file's global intrinsics; otherwise every entry carries its own.
     """
-    k = cameras.Ks[0]
-    if len(entries) != len(cameras.names) or not torch.equal(cameras.Ks, k.expand_as(cameras.Ks)):
-        raise DataError(f"{path}: expected one camera per entry and one K for all, got {len(entries)} entries.")
-    fl_x, fl_y, cx, cy = (float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
-    data: dict[str, Any] = {
-        "camera_model": "OPENCV",
-        "camera_angle_x": 2 * math.atan(cameras.width / (2 * fl_x)),
-        **{"fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy, "w": cameras.width, "h": cameras.height},
-    }
+    if len(entries) != len(cameras.names):
+        raise DataError(f"{path}: expected one camera per entry, got {len(entries)} for {len(cameras.names)}.")
+    data: dict[str, Any] = {"camera_model": "OPENCV"}
+    if torch.equal(cameras.Ks, cameras.Ks[0].expand_as(cameras.Ks)):
+        data["camera_angle_x"] = 2 * math.atan(cameras.width / (2 * float(cameras.Ks[0, 0, 0])))
+        data.update(_lens_fields(cameras.Ks[0]))
+    else:
+        entries = [{**entry, **_lens_fields(k)} for entry, k in zip(entries, cameras.Ks, strict=True)]
+    data.update(w=cameras.width, h=cameras.height)
     if fps is not None:
         data["fps"] = fps
     poses = torch.linalg.inv(cameras.viewmats.double()) * torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
     data["frames"] = [{**entry, "transform_matrix": pose.tolist()} for entry, pose in zip(entries, poses, strict=True)]
     path.write_text(json.dumps(data, indent=1))
+
+
+def _lens_fields(k: Float[Tensor, "3 3"]) -> dict[str, float]:
+    return {"fl_x": float(k[0, 0]), "fl_y": float(k[1, 1]), "cx": float(k[0, 2]), "cy": float(k[1, 2])}
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -122,7 +126,8 @@ def read_json(path: Path) -> dict[str, Any]:
     return data
 
 
-def _number(fields: dict[str, Any], key: str, where: str) -> float:
+def number_field(fields: dict[str, Any], key: str, where: str) -> float:
+    """A field that must be a finite number, or :class:`DataError` that names it."""
     value = fields.get(key)
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         raise DataError(f"{where}: field '{key}' must be a finite number, got {value!r}.")
@@ -148,7 +153,7 @@ def _name(frame: PosedFrame) -> str:
 
 def _size(fields: dict[str, Any], image: Path, field: str, *, fallback: tuple[int, int] | None) -> tuple[int, int]:
     if "w" in fields or "h" in fields:
-        size = int(_number(fields, "w", field)), int(_number(fields, "h", field))
+        size = int(number_field(fields, "w", field)), int(number_field(fields, "h", field))
         if min(size) < 1:
             raise DataError(f"{field}: fields 'w', 'h' must be positive, got {size}.")
         return size
@@ -160,7 +165,12 @@ def _size(fields: dict[str, Any], image: Path, field: str, *, fallback: tuple[in
     return pixels.shape[1], pixels.shape[0]
 
 
-def _viewmat(entry: dict[str, Any], field: str) -> Float[Tensor, "4 4"]:
+def viewmat_of(entry: dict[str, Any], field: str) -> Float[Tensor, "4 4"]:
+    """World to camera (OpenCV) of an entry's ``transform_matrix``; whether it is a rotation is checked elsewhere.
+
+    Raises:
+        DataError: the field is missing, or not a finite 4 x 4 matrix with the last row of a pose.
+    """
     if "transform_matrix" not in entry:
         raise DataError(f"{field}: field 'transform_matrix' is missing (camera to world, 4 x 4, OpenGL axes).")
     try:
@@ -183,21 +193,35 @@ def _intrinsics(fields: dict[str, Any], size: tuple[int, int], field: str) -> Fl
     model = fields.get("camera_model", "PINHOLE")
     if model not in PINHOLE_MODELS:
         raise DataError(f"{field}: camera_model {model!r} is not supported, expected one of {PINHOLE_MODELS}.")
-    bent = {key: fields[key] for key in DISTORTION if key in fields and _number(fields, key, field) != 0}
+    bent = {key: fields[key] for key in DISTORTION if key in fields and number_field(fields, key, field) != 0}
     if bent:
         raise DataError(f"{field}: the lens is distorted ({bent}); undistort the images and set these fields to 0.")
+    return pinhole_of(fields, size, field)
+
+
+def pinhole_of(fields: dict[str, Any], size: tuple[int, int], field: str) -> Float[Tensor, "3 3"]:
+    """K [pixels] of an entry with its file's global fields, whatever its lens does besides.
+
+    Args:
+        fields: of the entry and the file.
+        size: (width, height) of the image [pixels].
+        field: what messages call the entry.
+
+    Raises:
+        DataError: no focal length is given, or a number is malformed or impossible.
+    """
     if "fl_x" in fields:
-        fl_x = _number(fields, "fl_x", field)
+        fl_x = number_field(fields, "fl_x", field)
     elif "camera_angle_x" in fields:
-        angle = _number(fields, "camera_angle_x", field)
+        angle = number_field(fields, "camera_angle_x", field)
         if not 0 < angle < math.pi:
             raise DataError(f"{field}: field 'camera_angle_x' must be between 0 and pi [radian], got {angle:g}.")
         fl_x = size[0] / (2 * math.tan(angle / 2))
     else:
         raise DataError(f"{field}: neither field 'fl_x' [pixels] nor 'camera_angle_x' [radian] is there.")
-    fl_y = _number(fields, "fl_y", field) if "fl_y" in fields else fl_x
+    fl_y = number_field(fields, "fl_y", field) if "fl_y" in fields else fl_x
     if fl_x <= 0 or fl_y <= 0:
         raise DataError(f"{field}: focal lengths must be positive, got fl_x {fl_x:g}, fl_y {fl_y:g}.")
-    cx = _number(fields, "cx", field) if "cx" in fields else size[0] / 2
-    cy = _number(fields, "cy", field) if "cy" in fields else size[1] / 2
+    cx = number_field(fields, "cx", field) if "cx" in fields else size[0] / 2
+    cy = number_field(fields, "cy", field) if "cy" in fields else size[1] / 2
     return torch.tensor([[fl_x, 0.0, cx], [0.0, fl_y, cy], [0.0, 0.0, 1.0]])

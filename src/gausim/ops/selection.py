@@ -6,8 +6,12 @@ import re
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gausim.core.errors import SceneError
@@ -17,6 +21,8 @@ from gausim.ops.spherical_harmonics import C0
 AXES = {"x": 0, "y": 1, "z": 2}
 # Distances of this many pairs are held at once (float32: 64 MiB).
 _PAIRS_AT_ONCE = 1 << 24
+# More kernels within one step than this say that the radius is that of the object, not of its gaps.
+_STEPS_PER_KERNEL, _FEW_STEPS = 400, 1 << 22
 
 
 class Selection(ABC):
@@ -108,6 +114,41 @@ class NearPoints(Selection):
         exact = "donot_use_mm_for_euclid_dist"  # the product form loses digits where distances are small
         near = [(torch.cdist(x, points, compute_mode=exact) <= self.distance).any(-1) for x in chunks]
         return torch.cat(near)
+
+
+@dataclass(frozen=True)
+class Component(Selection):
+    """The kernels that hang together: steps from mean to mean no longer than a radius lead from one to the other.
+
+    Attributes:
+        radius: longest step [scene units].
+        seed: the component of the kernel nearest to this point; the largest one when None.
+    """
+
+    radius: float
+    seed: tuple[float, float, float] | None = None
+
+    def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
+        """True for the kernels of that component.
+
+        Raises:
+            SceneError: the radius is not positive, or so large that far too many kernels are within one step.
+        """
+        means = scene.means.detach().double().cpu().numpy()
+        tree = cKDTree(means)
+        if not 0 < self.radius < float("inf"):
+            raise SceneError(f"{scene.name}: component radius {self.radius:g}: expected more than 0 scene units.")
+        steps = int(tree.count_neighbors(tree, self.radius))
+        if steps > max(_STEPS_PER_KERNEL * scene.count, _FEW_STEPS):
+            raise SceneError(
+                f"{scene.name}: component radius {self.radius:g}: {steps / scene.count:.0f} kernels are within one "
+                "step of each; choose one nearer to the distance between neighbours."
+            )
+        pairs = tree.query_pairs(self.radius, output_type="ndarray")
+        links = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=(scene.count, scene.count))
+        _, label = connected_components(links, directed=False)
+        chosen = np.bincount(label).argmax() if self.seed is None else label[tree.query(np.array(self.seed))[1]]
+        return torch.from_numpy(label == chosen).to(scene.means.device)
 
 
 @dataclass(frozen=True)

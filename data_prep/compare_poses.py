@@ -1,0 +1,106 @@
+"""How far poses are from others of the same photos, after the similarity that brings their cameras nearest.
+
+Both may be a transforms.json (or the result of the stage poses), a COLMAP model, or a folder of projection matrices.
+Photos are told apart by their names without ending; for results of the stage poses, by the names that they came with.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gausim.core.errors import DataError, GausSimError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+
+def read_poses(path: Path, images: Path | None = None) -> dict[str, np.ndarray]:
+    """World-to-camera matrices (4, 4) by the photos' names without ending.
+
+    Args:
+        path: what holds the poses.
+        images: folder of the photos, which projection matrices need for their names.
+
+    Raises:
+        DataError: it holds none, they are malformed, or two photos have the same name.
+    """
+    if path.is_file() or (path / "transforms.json").is_file():
+        return _of_transforms(path if path.is_file() else path / "transforms.json")
+    from gausim.io.colmap import find_colmap, read_colmap
+
+    try:
+        folder = find_colmap(path)
+    except DataError:
+        if images is None:
+            raise
+        from data_prep.photos import list_images
+        from data_prep.pose_sources import factors, match_matrices, read_matrix
+
+        found = match_matrices(path, list_images(images))
+        return _by_stem({photo.name: factors(read_matrix(m), str(m))[1] for photo, m in found.items()}, path)
+    return _by_stem({image.name: image.viewmat for image in read_colmap(folder).images}, path)
+
+
+def _of_transforms(path: Path) -> dict[str, np.ndarray]:
+    from gausim.io.transforms import read_json, viewmat_of
+
+    entries = read_json(path).get("frames")
+    if not isinstance(entries, list) or not all(isinstance(e, dict) for e in entries):
+        raise DataError(f"{path}: field 'frames' must be a list of objects.")
+    poses = {}
+    for i, entry in enumerate(entries):
+        name = entry.get("source", entry.get("file_path"))
+        if not isinstance(name, str) or name in poses:
+            raise DataError(f"{path}: frames[{i}]: field 'file_path' must name an image once, got {name!r:.80}.")
+        poses[name] = viewmat_of(entry, f"{path}: frames[{i}]").double().numpy()
+    return _by_stem(poses, path)
+
+
+def _by_stem(poses: dict[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
+    short = {Path(name).stem: pose for name, pose in poses.items()}
+    if len(short) < len(poses):
+        raise DataError(f"{path}: photos of different folders have the same name; nothing to compare them by.")
+    return short
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m data_prep.compare_poses",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("poses", type=Path, metavar="POSES", help="what is compared")
+    parser.add_argument("reference", type=Path, metavar="REFERENCE", help="with what")
+    parser.add_argument("--images", type=Path, metavar="DIR", help="the photos, for projection matrices")
+    arguments = parser.parse_args(argv)
+    import numpy as np
+
+    from data_prep.world import compare
+
+    try:
+        mine, other = (read_poses(p, arguments.images) for p in (arguments.poses, arguments.reference))
+        names = sorted(set(mine) & set(other))
+        if len(names) < 3:
+            raise DataError(
+                f"{arguments.reference}: has {len(names)} photos in common with {arguments.poses}, expected 3."
+            )
+        facts = compare(np.stack([mine[n] for n in names]), np.stack([other[n] for n in names]))
+    except GausSimError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(f"{len(names)} photos in common ({len(mine)} and {len(other)})")
+    center, turn = (f"{kind}_error_{{}}_{unit}" for kind, unit in (("center", "percent"), ("rotation", "degree")))
+    print(
+        f"centres      mean {facts[center.format('mean')]:.4f} %, largest {facts[center.format('max')]:.4f} % of the "
+        "largest distance between two cameras"
+    )
+    print(f"orientation  mean {facts[turn.format('mean')]:.4f}, largest {facts[turn.format('max')]:.4f} degrees")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

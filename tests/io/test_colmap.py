@@ -1,0 +1,237 @@
+"""COLMAP models: binary and text say the same, pycolmap agrees, and what is broken is named and never believed."""
+
+from __future__ import annotations
+
+import os
+import random
+import runpy
+import struct
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gausim.core import DataError
+from gausim.io.colmap import ColmapCamera, ColmapModel, find_colmap, read_colmap
+
+files = runpy.run_path(str(Path(__file__).parents[1] / "colmap_files.py"))
+WRITERS: dict[str, Callable] = {"binary": files["write_binary"], "text": files["write_text"]}
+MUTATIONS = 400
+
+
+@pytest.fixture(params=list(WRITERS))
+def model(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    WRITERS[request.param](tmp_path, *files["small_model"]())
+    return tmp_path
+
+
+def test_both_forms_say_what_was_written(model: Path) -> None:
+    read = read_colmap(model)
+    cameras, images, points = files["small_model"]()
+    assert {n: (c.model, c.width, c.height, c.params.tolist()) for n, c in read.cameras.items()} == cameras
+    assert [i.name for i in read.images] == ["photo_0.png", "photo_1.png", "sub/photo_2.png"]
+    assert read.images[1].camera == 7 and read.images[1].point_ids.tolist() == [5, 9]
+    assert read.images[1].xy.tolist() == [[11.5, 20.25], [30.0, 31.0]] and read.images[0].xy.shape == (0, 2)
+    assert read.points.ids.tolist() == [5, 9, 12] and read.points.tracks.tolist() == [2, 2, 0]
+    assert read.points.xyz.tolist() == [list(p[1]) for p in points]
+    assert read.points.rgb.tolist() == [list(p[2]) for p in points] and read.points.error.tolist() == [0.5, 0.25, -1.0]
+    for image, azimuth in zip(read.images, (0.3, 1.4, 2.9), strict=True):
+        np.testing.assert_allclose(image.viewmat[:3, :3] @ image.viewmat[:3, :3].T, np.eye(3), atol=1e-12)
+        eye = -image.viewmat[:3, :3].T @ image.viewmat[:3, 3]
+        np.testing.assert_allclose(eye, 4 * np.array([np.cos(azimuth), np.sin(azimuth), 0]), atol=1e-9)
+
+
+def test_pycolmap_reads_the_same(model: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    theirs, ours = pycolmap.Reconstruction(model), read_colmap(model)
+    assert len(theirs.images) == len(ours.images)
+    by_name = {image.name: image for image in theirs.images.values()}
+    for image in ours.images:
+        np.testing.assert_allclose(by_name[image.name].cam_from_world().matrix(), image.viewmat[:3], atol=1e-12)
+    for number, camera in ours.cameras.items():
+        k = theirs.cameras[number].calibration_matrix()
+        np.testing.assert_allclose((k[0, 0], k[1, 1], k[0, 2], k[1, 2]), camera.intrinsics)
+
+
+@pytest.mark.parametrize("name", files["MODEL_NUMBERS"])
+def test_every_lens_model_is_read_with_its_intrinsics(tmp_path: Path, name: str) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    theirs = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
+    theirs.params = [v + 0.01 * i for i, v in enumerate(theirs.params)]
+    _, images, points = files["small_model"]()
+    images = {n: (i[0], 1, *i[2:]) for n, i in images.items()}
+    for write in WRITERS.values():
+        write(tmp_path, {1: (name, 640, 480, [float(v) for v in theirs.params])}, images, points)
+        camera = read_colmap(tmp_path).cameras[1]
+        k = theirs.calibration_matrix()
+        np.testing.assert_allclose((k[0, 0], k[1, 1], k[0, 2], k[1, 2]), camera.intrinsics)
+        assert camera.distorted is not name.endswith("PINHOLE")
+        (tmp_path / "cameras.bin").unlink()
+
+
+def test_a_scaled_camera_sees_the_same_directions() -> None:
+    camera = ColmapCamera("OPENCV", 640, 480, np.array([500.0, 510, 320, 240, 0.1, 0, 0, 0]))
+    half = camera.scaled(0.5, 0.5)
+    assert (half.width, half.height) == (320, 240)
+    assert half.params.tolist() == [250, 255, 160, 120, 0.1, 0, 0, 0]
+    with pytest.raises(DataError, match="cannot be scaled"):
+        ColmapCamera("SIMPLE_PINHOLE", 640, 480, np.array([500.0, 320, 240])).scaled(0.5, 0.8)
+
+
+def test_the_model_is_found_where_colmap_puts_it(tmp_path: Path) -> None:
+    files["write_binary"](tmp_path / "sparse" / "0", *files["small_model"]())
+    assert find_colmap(tmp_path) == find_colmap(tmp_path / "sparse") == tmp_path / "sparse" / "0"
+    (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
+    assert len(read_colmap(find_colmap(tmp_path)).points.ids) == 0
+    (tmp_path / "sparse" / "0" / "images.bin").unlink()
+    with pytest.raises(DataError, match=r"images\.bin: no such file"):
+        read_colmap(find_colmap(tmp_path))
+    with pytest.raises(DataError, match="no COLMAP model here"):
+        find_colmap(tmp_path / "nothing")
+
+
+# What is wrong, in a text model: file, what is replaced by what, and what the message must say.
+FAULTS = {
+    "model": ("cameras", "PINHOLE 64", "EQUIRECTANGULAR 64", "'model'"),
+    "focal length": ("cameras", "60.0 61.0", "60.0 -61.0", "focal lengths"),
+    "infinite focal length": ("cameras", "60.0 61.0", "inf 61.0", "'params'"),
+    "size": ("cameras", "64 48", "64 0", "'height'"),
+    "too few parameters": ("cameras", " 24.0\n", "\n", "expected 8 words"),
+    "not a number": ("cameras", "61.0", "x61", "expected a number"),
+    "camera twice": ("cameras", "7 SIMPLE", "1 SIMPLE", "stands twice"),
+    "camera of an image": ("images", " 7 photo_1", " 8 photo_1", "'camera_id'"),
+    "name twice": ("images", "photo_1", "photo_0", "stands twice"),
+    "name outside": ("images", "photo_1", "../photo_1", "inside the folder"),
+    "name absolute": ("images", "photo_1", "/etc/photo_1", "inside the folder"),
+    "translation": ("images", " 4.0 7 photo_1", " nan 7 photo_1", "'translation'"),
+    "keypoints": ("images", "11.5 20.25 5", "11.5 20.25", "triples"),
+    "keypoint": ("images", "11.5 20.25 5", "nan 20.25 5", "keypoints"),
+    "keypoint's point": ("images", "11.5 20.25 5", "11.5 20.25 5.5", "whole number"),
+    "point": ("points3D", "0.1 -0.2 0.3", "0.1 nan 0.3", "'xyz'"),
+    "huge point": ("points3D", "0.1 -0.2 0.3", "0.1 1e300 0.3", "'xyz'"),
+    "error": ("points3D", " 0.5 ", " inf ", "'error'"),
+    "colour": ("points3D", "250 10 7", "256 10 7", "'rgb'"),
+    "track": ("points3D", "0.5 3 0 4 0", "0.5 3 0 4", "pairs"),
+    "point twice": ("points3D", "9 1.0 2.0", "5 1.0 2.0", "stands twice"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_faults_are_named_with_file_and_field(tmp_path: Path, fault: str) -> None:
+    files["write_text"](tmp_path, *files["small_model"]())
+    role, old, new, message = FAULTS[fault]
+    path = tmp_path / f"{role}.txt"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(DataError, match=message) as caught:
+        read_colmap(tmp_path)
+    assert str(path) in str(caught.value)
+
+
+def test_a_quaternion_that_is_none_is_refused(tmp_path: Path) -> None:
+    cameras, images, points = files["small_model"]()
+    for bad in ((0.0, 0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0), (float("nan"), 0.0, 0.0, 1.0)):
+        images[3] = (*images[3][:2], bad, *images[3][3:])
+        files["write_binary"](tmp_path, cameras, images, points)
+        with pytest.raises(DataError, match="'quaternion'"):
+            read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize("role", ["cameras", "images", "points3D"])
+def test_counts_are_not_believed(tmp_path: Path, role: str) -> None:
+    files["write_binary"](tmp_path, *files["small_model"]())
+    path = tmp_path / f"{role}.bin"
+    whole = path.read_bytes()
+    tracemalloc.start()
+    for count in (1 << 62, 1 << 40, 4):
+        path.write_bytes(struct.pack("<Q", count) + whole[8:])
+        with pytest.raises(DataError, match="truncated") as caught:
+            read_colmap(tmp_path)
+        assert path.name in str(caught.value)
+    path.write_bytes(struct.pack("<Q", 1) + whole[8:])
+    with pytest.raises(DataError, match="follow the last record"):
+        read_colmap(tmp_path)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 1 << 20
+
+
+def test_memory_stays_in_proportion_to_the_files(tmp_path: Path) -> None:
+    cameras, images, points = files["small_model"]()
+    many = [(float(i % 60), 3.0, i + 20) for i in range(20_000)]
+    images[3] = (*images[3][:4], many)
+    points = points + [(i + 20, (0.1, 0.2, 0.3), (1, 2, 3), 0.5, []) for i in range(20_000)]
+    limit = {"binary": 2, "text": 4}  # a short number in text takes eight bytes in memory
+    for form, write in WRITERS.items():
+        write(tmp_path / form, cameras, images, points)
+        size = sum(p.stat().st_size for p in (tmp_path / form).iterdir())
+        tracemalloc.start()
+        read = read_colmap(tmp_path / form)
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+        assert len(read.points.ids) == 20_003 and peak < limit[form] * size + (1 << 18), (form, peak, size)
+
+
+def _mutated(data: bytes, rng: random.Random) -> bytes:
+    out = bytearray(data)
+    for _ in range(rng.randint(1, 4)):
+        at = rng.randrange(len(out) + 1)
+        match rng.randrange(5):
+            case 0 if out:
+                out[at % len(out)] ^= 1 << rng.randrange(8)
+            case 1:
+                del out[at : at + rng.randint(1, 40)]
+            case 2:
+                out[at:at] = bytes(rng.randrange(256) for _ in range(rng.randint(1, 16)))
+            case 3:
+                extreme = rng.choice([b"\xff" * 8, b"\x7f\xf0" + bytes(6), struct.pack("<d", float("nan")), bytes(8)])
+                out[at : at + 8] = extreme
+            case 4:
+                out[at:at] = rng.choice(
+                    [b" nan ", b" inf ", b" -1 ", b" 1e999 ", b"\n", b"#", b" 99999999999999999999 "]
+                )
+    return bytes(out)
+
+
+def _is_sound(model: ColmapModel) -> bool:
+    finite = [c.params for c in model.cameras.values()] + [model.points.xyz, model.points.error]
+    finite += [array for image in model.images for array in (image.viewmat, image.xy)]
+    count = len(model.points.ids)
+    shapes = model.points.xyz.shape == (count, 3) == model.points.rgb.shape and model.points.tracks.shape == (count,)
+    return shapes and all(np.isfinite(a).all() for a in finite) and all(i.camera in model.cameras for i in model.images)
+
+
+@pytest.mark.parametrize("form", list(WRITERS))
+def test_mutated_files_are_refused_by_name_or_sound(tmp_path: Path, form: str) -> None:
+    WRITERS[form](tmp_path, *files["small_model"]())
+    rng, refused = random.Random(7), 0
+    paths = sorted(tmp_path.iterdir())
+    contents = {path: path.read_bytes() for path in paths}
+    for _ in range(MUTATIONS):
+        path = rng.choice(paths)
+        path.write_bytes(_mutated(contents[path], rng))
+        try:
+            assert _is_sound(read_colmap(tmp_path))
+        except DataError as error:
+            # What one file says can be at odds with another, which is then the one that is named.
+            assert str(tmp_path) in str(error)
+            refused += 1
+        path.write_bytes(contents[path])
+    assert MUTATIONS // 2 < refused < MUTATIONS
+
+
+def test_a_real_model_is_read_as_pycolmap_reads_it() -> None:
+    root = os.environ.get("GAUSIM_TEST_DATA")
+    if not root:
+        pytest.skip("GAUSIM_TEST_DATA names no folder of real data")
+    pycolmap = pytest.importorskip("pycolmap")
+    folder = find_colmap(Path(root) / "photos" / "backyard_colmap")
+    ours, theirs = read_colmap(folder), pycolmap.Reconstruction(folder)
+    assert len(ours.images) == theirs.num_reg_images() == 15
+    assert (
+        len(ours.points.ids) == theirs.num_points3D() and ours.points.tracks.sum() == theirs.compute_num_observations()
+    )
+    assert ours.points.error.mean() == pytest.approx(theirs.compute_mean_reprojection_error())
