@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import runpy
 from pathlib import Path
 
 import cv2
@@ -15,8 +14,6 @@ from data_prep.selecting import parse_selection, read_points
 from data_prep.stage import read_manifest
 from gausim.core import ConfigError, DataError, GaussianScene, SceneError
 from gausim.io.ply import load_scene, save_scene
-
-toy_scene = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["toy_scene"]
 
 
 @pytest.fixture
@@ -120,5 +117,10 @@ def test_selections_that_hold_nothing_are_refused(
 
 def wide_scene() -> GaussianScene:
     """So many kernels that all pairs of them would not fit into memory."""
-    toy = toy_scene()
-    return toy.select(torch.zeros(6000, dtype=torch.long))
+    return GaussianScene.create(
+        means=torch.zeros(6000, 3),
+        log_scales=torch.zeros(6000, 3),
+        quats=torch.ones(6000, 4),
+        opacity_logits=torch.zeros(6000),
+        sh=torch.zeros(6000, 1, 3),
+    )
