@@ -15,8 +15,9 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, Protocol
 
 from data_prep.stage import write_item
@@ -58,9 +59,11 @@ class BlenderProcess:
 
     Attributes:
         python: its interpreter.
+        cores: those that no process of ours is on; each is bound to one.
     """
 
     python: Path
+    cores: SimpleQueue[int] = field(default_factory=lambda: _cores(), repr=False)
 
     def versions(self) -> dict[str, str]:
         """See :class:`Blender`.
@@ -87,11 +90,15 @@ class BlenderProcess:
         Raises:
             BlenderError: with what Blender said last.
         """
-        with tempfile.TemporaryFile("w+", errors="replace") as said:
+        with self._core() as core, tempfile.TemporaryFile("w+", errors="replace") as said:
             try:
                 # -I: no variable of this environment and no module of this folder may change what Blender loads.
                 process = subprocess.Popen(
-                    [self.python, "-I", SCRIPT], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=said, text=True
+                    [self.python, "-I", SCRIPT, str(core)],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=said,
+                    text=True,
                 )
             except OSError as error:
                 raise BlenderError(f"{self.python}: cannot be started ({error}).") from error
@@ -104,6 +111,26 @@ class BlenderProcess:
                 raise BlenderError("stopped, because another job failed.")
             if code != 0:
                 raise BlenderError(f"Blender gave up (exit code {code}):\n{_tail(said)}")
+
+    @contextmanager
+    def _core(self) -> Iterator[int]:
+        core = self.cores.get()
+        try:
+            yield core
+        finally:
+            self.cores.put(core)
+
+
+def _cores() -> SimpleQueue[int]:
+    if not hasattr(os, "sched_setaffinity"):
+        raise BlenderError(
+            "Blender's soft body gives the same motion twice only on one core, which this system cannot bind it to. "
+            "Make the set on Linux."
+        )
+    free: SimpleQueue[int] = SimpleQueue()
+    for core in sorted(os.sched_getaffinity(0), reverse=True):
+        free.put(core)
+    return free
 
 
 def _give(

@@ -15,9 +15,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-if __name__ == "__main__":  # before bpy is loaded: what Blender prints must not mix with what is told
+if __name__ == "__main__":
+    # Before bpy is loaded. What Blender prints must not mix with what is told.
     TOLD = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
+    # Blender moves a soft body while other threads still work out the forces on it, so that some are lost at random.
+    # It makes as many threads as there are cores for it when it is loaded: on one core the same motion comes out again.
+    os.sched_setaffinity(0, {int(sys.argv[1])})
 
 import bpy
 import numpy as np
@@ -54,10 +58,7 @@ def replace_whole(path: Path, data: bytes) -> None:
 
 
 def empty_scene() -> Any:
-    """A new scene of Blender's defaults, computed by one thread.
-
-    With more than one, Blender's soft body loses forces at random: the same motion would not come out twice.
-    """
+    """A new scene of Blender's defaults, computed by one thread."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.render.threads_mode, scene.render.threads = "FIXED", 1
