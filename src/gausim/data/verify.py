@@ -13,8 +13,9 @@ from gausim.data.records import SequenceRecord
 from gausim.io.packed import PIXELS, is_packed, read_packed
 from gausim.io.transforms import read_json
 
-# What `python -m data_prep.pack` writes; other stores have none.
+# What the stages of data preparation write; a packed store holds nothing else than its manifest lists.
 MANIFEST = "stage.json"
+CLOSED = "pack"
 FRAMES_AT_A_TIME = 8
 CHUNK = 1 << 20
 
@@ -105,24 +106,27 @@ def _images(record: SequenceRecord, where: str) -> Iterator[Fault]:
 
 
 def _manifest(root: Path, *, quick: bool) -> Iterator[Fault]:
-    """Files that a packed store lists: there, of their size and content, and no others."""
+    """Files that a manifest lists: there, of their size and content; in a packed store no others."""
     path = root / MANIFEST
     if not path.is_file():
         return
     try:
-        listed = read_json(path)["results"]["files"]
+        manifest = read_json(path)
+        listed = manifest["results"]["files"]
         known = {str(name): (int(entry["bytes"]), str(entry["sha256"])) for name, entry in listed.items()}
     except (GausSimError, KeyError, TypeError, ValueError, AttributeError) as error:
-        yield Fault(MANIFEST, f"lists no files ({error}). Pack the object again.")
+        yield Fault(MANIFEST, f"lists no files ({error}). Make it again.")
         return
     for name, (size, sha256) in known.items():
         file = root / name
         if not file.is_file():
-            yield Fault(name, "is missing. Restore it, or pack the object again.")
+            yield Fault(name, "is missing. Restore it, or make the set again.")
         elif file.stat().st_size != size:
-            yield Fault(name, f"has {file.stat().st_size} bytes, {MANIFEST} says {size}. Pack the object again.")
+            yield Fault(name, f"has {file.stat().st_size} bytes, {MANIFEST} says {size}. Make it again.")
         elif not quick and _digest(file) != sha256:
-            yield Fault(name, f"is not the file that {MANIFEST} lists (SHA-256 differs). Pack the object again.")
+            yield Fault(name, f"is not the file that {MANIFEST} lists (SHA-256 differs). Make it again.")
+    if manifest.get("stage") != CLOSED:
+        return
     for file in sorted(p for p in root.rglob("*") if p.is_file()):
         name = str(file.relative_to(root))
         if name not in known and name != MANIFEST:

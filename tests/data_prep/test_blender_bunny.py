@@ -1,0 +1,374 @@
+"""The set made by Blender: its layout, resumption, environment and processes, with stand-ins for Blender and pip."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from data_prep import blender_env
+from data_prep.blender_bunny import main, make_set
+from data_prep.blender_env import REQUIREMENTS, BlenderError, BlenderProcess, create_environment, find_blender
+from data_prep.blender_plan import Plan, action, cage, camera, sequence_job, still_job, video_poses
+from data_prep.meshes import Mesh
+from data_prep.surface import Surface, make_surface
+from gausim.core import ConfigError, DataError
+from gausim.data.objects import ObjectData
+from gausim.data.verify import verify
+
+PLAN = Plan(
+    name="box", up="z", sequences=3, frames=4, views=3, heldout=1, stills=23, resolution=(20, 12),
+    still_resolution=(16, 16), samples=1, points=40,
+)  # fmt: skip
+BOX = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 2) for z in (0, 3))
+BOX += "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
+
+
+@pytest.fixture
+def mesh(tmp_path: Path) -> Path:
+    path = tmp_path / "box.obj"
+    path.write_text(BOX)
+    return path
+
+
+@pytest.fixture
+def surface() -> Surface:
+    corners = [[float(v) for v in line.split()[1:]] for line in BOX.splitlines()[:8]]
+    faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6)]
+    return make_surface(Mesh(np.array(corners), np.array(faces)), Path("box"), up="z", points=40, seed=0)
+
+
+class FakeBlender:
+    """Moves nothing, draws discs; the same for the same job. May die before a picture, or leave one out."""
+
+    def __init__(self, *, die_at: int | None = None, skip: str = "", version: str = "4.5") -> None:
+        self.die_at, self.skip, self.version, self.taken = die_at, skip, version, 0
+        self.jobs: list[Mapping[str, Any]] = []
+
+    def versions(self) -> dict[str, str]:
+        return {"bpy": self.version, "numpy": "1.26", "python": "3.11"}
+
+    def run(self, job: Mapping[str, Any], told: Callable[[str], None], stop: threading.Event) -> None:
+        self.jobs.append(job)
+        points = np.load(job["rest"])["gt_ids"].size
+        if job["motion"] is not None and not Path(job["motion"]["file"]).is_file():
+            held = io.BytesIO()
+            moved = np.zeros((job["motion"]["frames"], points, 3), np.float32)
+            moved[1:, :, 0] = job["motion"]["amplitude"]
+            np.savez_compressed(held, displacement=moved, strength=np.float64(7))
+            Path(job["motion"]["file"]).parent.mkdir(parents=True, exist_ok=True)
+            Path(job["motion"]["file"]).write_bytes(held.getvalue())
+        for image in job["images"]:
+            path, (width, height) = Path(image["file"]), job["camera"]["size"]
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if self.die_at is not None and self.taken >= self.die_at:
+                path.with_name(f".{path.stem}.99.tmp.png").write_bytes(b"half")
+                raise BlenderError("Blender gave up (exit code -9)")
+            picture = np.zeros((height, width, 4), np.uint8)
+            cv2.circle(picture, (width // 2, height // 2), 3, (len(self.version), image["frame"] or 0, 9, 255), -1)
+            if not (self.skip and image["file"].endswith(self.skip)):
+                cv2.imwrite(str(path), picture)
+            self.taken += 1
+            told("image")
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_the_set_is_read_and_verified(mesh: Path, tmp_path: Path) -> None:
+    blender = FakeBlender()
+    manifest = make_set(mesh, tmp_path / "set", PLAN, lambda: blender)
+    data = ObjectData(tmp_path / "set")
+    assert (data.name, data.fps, data.train_frames) == ("box", 24, range(0, 4))
+    assert (data.train_views, data.heldout_views) == (("cam_0", "cam_1"), ("cam_2",))
+    assert [s.name for s in data.sequences] == ["seq_000", "seq_001", "seq_002"] and data.sequences[0].count == 4
+    assert data.stills().images.shape == (23, 16, 16, 4) and data.sequences[1].frames(range(4)).shape == (
+        4,
+        3,
+        12,
+        20,
+        4,
+    )
+    truth = data.ground_truth(data.sequences[2])
+    assert truth is not None and truth.positions.shape == (4, 40, 3)
+    assert (truth.positions[0] == truth.rest).all() and verify(tmp_path / "set") == []
+    told = manifest["results"]
+    assert told["images"] == 23 + 3 * 4 * 3 and told["blender"]["bpy"] == "4.5"
+    assert [s["kind"] for s in told["sequences"]] == ["poke", "drag", "double"]
+    for entry in told["sequences"]:
+        assert entry["amplitude_percent"] == pytest.approx(entry["amplitude_wanted_percent"], abs=2e-3)
+        assert 8 <= entry["amplitude_percent"] <= 13
+    assert [len(job["images"]) for job in blender.jobs] == [20, 3, 12, 12, 12]
+    assert cv2.imread(str(tmp_path / "set" / "overview.png")).shape == (3 * 120, 4 * 200, 3)
+    assert make_set(mesh, tmp_path / "set", PLAN, lambda: pytest.fail("asked for Blender"))["made"] is False
+
+
+def test_a_scene_beside_the_set_is_no_fault_but_a_changed_picture_is(mesh: Path, tmp_path: Path) -> None:
+    make_set(mesh, tmp_path / "set", PLAN, FakeBlender)
+    (tmp_path / "set" / "scene.json").write_text("{}")
+    assert verify(tmp_path / "set") == []
+    picture = tmp_path / "set" / "sequences" / "seq_001" / "cam_0" / "0002.png"
+    data = bytearray(picture.read_bytes())
+    data[-1] ^= 1  # of the last checksum: decoders do not mind
+    picture.write_bytes(data)
+    assert [fault.where for fault in verify(tmp_path / "set")] == ["sequences/seq_001/cam_0/0002.png"]
+
+
+@pytest.mark.parametrize("die_at", [0, 5, 23, 30, 58])
+def test_what_was_interrupted_goes_on_with_what_is_missing(mesh: Path, tmp_path: Path, die_at: int) -> None:
+    make_set(mesh, tmp_path / "whole", PLAN, FakeBlender)
+    with pytest.raises(BlenderError, match="gave up"):
+        make_set(mesh, tmp_path / "set", PLAN, lambda: FakeBlender(die_at=die_at))
+    assert not (tmp_path / "set").exists()
+    second = FakeBlender()
+    make_set(mesh, tmp_path / "set", PLAN, lambda: second)
+    assert second.taken == 23 + 36 - die_at
+    assert contents(tmp_path / "set") == contents(tmp_path / "whole")
+
+
+def test_work_of_another_blender_is_not_taken_over(mesh: Path, tmp_path: Path) -> None:
+    with pytest.raises(BlenderError):
+        make_set(mesh, tmp_path / "set", PLAN, lambda: FakeBlender(die_at=30))
+    newer = FakeBlender(version="4.5.16")
+    make_set(mesh, tmp_path / "set", PLAN, lambda: newer)
+    make_set(mesh, tmp_path / "whole", PLAN, lambda: FakeBlender(version="4.5.16"))
+    assert newer.taken == 59 and contents(tmp_path / "set") == contents(tmp_path / "whole")
+
+
+def test_several_workers_give_the_same_bytes_and_the_first_error_ends_all(mesh: Path, tmp_path: Path) -> None:
+    for workers in (1, 3):
+        make_set(mesh, tmp_path / str(workers), PLAN, FakeBlender, workers=workers)
+    assert contents(tmp_path / "1") == contents(tmp_path / "3")
+    with pytest.raises(BlenderError, match=r"0003\.png: Blender ended without writing it"):
+        make_set(mesh, tmp_path / "set", PLAN, lambda: FakeBlender(skip="cam_1/0003.png"), workers=3)
+
+
+def test_settings_decide_what_is_made(mesh: Path, tmp_path: Path) -> None:
+    make_set(mesh, tmp_path / "set", PLAN, FakeBlender)
+    with pytest.raises(DataError, match="--force"):
+        make_set(mesh, tmp_path / "set", replace(PLAN, seed=1), FakeBlender)
+    assert make_set(mesh, tmp_path / "set", replace(PLAN, seed=1), FakeBlender, force=True)["settings"]["seed"] == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"sequences": 0}, "--sequences: expected 1 to 1000, got 0"),
+        ({"frames": 1}, "--frames"),
+        ({"heldout": 3}, "--heldout: expected fewer than the 3"),
+        ({"resolution": (20, 1)}, "--resolution"),
+        ({"still_resolution": (99999, 20)}, "--still-resolution"),
+        ({"amplitude": (9.0, 8.0)}, "--amplitude: expected the smaller"),
+        ({"amplitude": (9.0, float("nan"))}, "--amplitude"),
+        ({"stiffness": 1.5}, "--stiffness"),
+        ({"up": "w"}, "--up"),
+    ],
+)
+def test_impossible_plans_are_refused(change: dict[str, Any], what: str) -> None:
+    with pytest.raises(ConfigError, match=what):
+        replace(PLAN, **change).checked()
+
+
+def test_pushes_are_of_their_number_and_act_on_the_upper_part(surface: Surface) -> None:
+    actions = [action(PLAN, surface, i) for i in range(10)]
+    assert actions == [action(PLAN, surface, i) for i in range(10)]
+    assert [a["kind"] for a in actions[:5]] == ["poke", "drag", "double", "poke", "drag"]
+    assert [len(a["pushes"]) for a in actions[:5]] == [1, 1, 2, 1, 1]
+    for push in (push for a in actions for push in a["pushes"]):
+        assert np.linalg.norm(push["direction"]) == pytest.approx(1, abs=1e-3) and push["point"][2] > 0.3 * 2
+    assert len({json.dumps(a["pushes"]) for a in actions}) == 10
+
+
+def test_cameras_see_the_whole_object(surface: Surface) -> None:
+    jobs = [still_job(PLAN, surface, Path("/set"), range(23)), sequence_job(PLAN, surface, Path("/set"), 0)]
+    for job in jobs:
+        width, height = job["camera"]["size"]
+        for image in job["images"]:
+            view = np.linalg.inv(np.array(image["pose"])) * np.array([[1], [-1], [-1], [1]])
+            seen = surface.vertices @ view[:3, :3].T + view[:3, 3]
+            pixels = job["camera"]["focal"] * seen[:, :2] / seen[:, 2:] + (width / 2, height / 2)
+            assert (seen[:, 2] > 0).all() and (pixels > 0).all() and (pixels < (width, height)).all()
+    angles = [np.degrees(np.arctan2(pose[0][3], -pose[1][3])) % 360 for pose in video_poses(PLAN, surface)]
+    np.testing.assert_allclose(angles, [20, 200, 110])
+    for size in ((540, 960), (960, 540)):
+        assert camera(size)["focal"] == pytest.approx(270 / np.tan(np.radians(20)))
+
+
+def test_cage_encloses_the_object_with_even_cells(surface: Surface) -> None:
+    spec = cage(surface)
+    assert spec["points"] == [4, 5, 7] and spec["pinned_layers"] == 2
+    half = np.array(spec["spacing"]) * (np.array(spec["points"]) - 1) / 2
+    assert (np.abs(surface.vertices - spec["center"]) < half).all()
+    assert max(spec["spacing"]) < 1.6 * min(spec["spacing"])
+
+
+# -------------------------------------------------------------------------------------------------------- environment
+
+
+class FakeRunner:
+    """Stands in for subprocess.run: makes an interpreter when asked for an environment; may fail at pip."""
+
+    def __init__(self, *, pip: int = 0, version: str = "3.11") -> None:
+        self.pip, self.version = pip, version
+        self.commands: list[list[str]] = []
+
+    def __call__(self, command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
+        self.commands.append(command)
+        if "venv" in command:
+            (Path(command[-1]) / "bin").mkdir(parents=True)
+            (Path(command[-1]) / "bin" / "python").write_text("")
+        if "pip" in command:
+            return subprocess.CompletedProcess(command, self.pip, "", "no matching distribution" if self.pip else "")
+        return subprocess.CompletedProcess(command, 0, self.version + "\n", "")
+
+
+def test_environment_is_created_once(tmp_path: Path) -> None:
+    said: list[str] = []
+    runner = FakeRunner()
+    python = create_environment(tmp_path / "cache" / "blender", say=said.append, run=runner)
+    assert python == tmp_path / "cache" / "blender" / "bin" / "python" and python.exists()
+    assert runner.commands[-1][-2:] == list(REQUIREMENTS) and "venv" in runner.commands[-2]
+    assert len(said) == 1 and "bpy==" in said[0] and str(tmp_path / "cache" / "blender") in said[0]
+    again = FakeRunner()
+    assert find_blender(None, tmp_path / "cache" / "blender", say=said.append, run=again).python == python
+    assert again.commands == [] and len(said) == 1
+
+
+def test_failed_installation_says_why_and_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(BlenderError, match="no matching distribution(.|\n)*--blender-python"):
+        create_environment(tmp_path / "blender", say=lambda _: None, run=FakeRunner(pip=1))
+    assert [p.name for p in tmp_path.iterdir()] == [".blender.lock"]
+    create_environment(tmp_path / "blender", say=lambda _: None, run=FakeRunner())
+
+
+def test_leftovers_of_a_killed_installation_are_replaced(tmp_path: Path) -> None:
+    (tmp_path / ".blender.making" / "bin").mkdir(parents=True)
+    (tmp_path / ".blender.making" / "half").write_text("")
+    create_environment(tmp_path / "blender", say=lambda _: None, run=FakeRunner())
+    assert sorted(p.name for p in (tmp_path / "blender").iterdir()) == ["bin", blender_env.MARKER]
+
+
+def test_a_folder_of_something_else_is_not_touched(tmp_path: Path) -> None:
+    for content in ("{", '{"requirements": ["bpy==3.0"]}', "[]"):
+        (tmp_path / blender_env.MARKER).write_text(content)
+        with pytest.raises(DataError, match="--blender-env"):
+            create_environment(tmp_path, say=lambda _: None, run=FakeRunner())
+        assert (tmp_path / blender_env.MARKER).read_text() == content
+
+
+def test_without_the_right_python_the_remedy_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"needs Python 3\.11(.|\n)*--blender-python"):
+        create_environment(tmp_path / "blender", say=lambda _: None, run=FakeRunner(version="3.12"))
+
+
+# ---------------------------------------------------------------------------------------------------------- processes
+
+
+def program(path: Path, code: str) -> Path:
+    """A stand-in for Blender's Python: runs this code, whatever script it is given."""
+    path.write_text(f"#!{sys.executable} -S\nimport json, os, sys, time\n{code}\n")
+    path.chmod(path.stat().st_mode | stat.S_IXUSR)
+    return path
+
+
+def test_a_process_gets_its_job_and_is_heard(tmp_path: Path) -> None:
+    code = "job = json.load(sys.stdin)\nfor i in range(job['n']): print('image', flush=True)\nprint(json.dumps(sys.argv[1:]))"
+    heard: list[str] = []
+    BlenderProcess(program(tmp_path / "python", code)).run({"n": 3}, heard.append, threading.Event())
+    assert heard[:3] == ["image"] * 3
+    flag, script, core = json.loads(heard[3])
+    assert (flag, script) == ("-I", str(blender_env.SCRIPT)) and int(core) in os.sched_getaffinity(0)
+
+
+def test_a_failed_process_says_why(tmp_path: Path) -> None:
+    code = "sys.stderr.write('Fra:1 Mem:2\\nno push gives an amplitude\\n'); sys.exit(3)"
+    blender = BlenderProcess(program(tmp_path / "python", code))
+    with pytest.raises(BlenderError, match=r"exit code 3\):\nno push gives"):
+        blender.run({"filler": "x" * (1 << 20)}, lambda _: None, threading.Event())
+    with pytest.raises(BlenderError, match="expected a Python with bpy"):
+        blender.versions()
+    with pytest.raises(BlenderError, match="cannot be started"):
+        BlenderProcess(tmp_path / "absent").run({}, lambda _: None, threading.Event())
+    with pytest.raises(BlenderError, match="--blender-python"):
+        find_blender(tmp_path / "absent", tmp_path, say=lambda _: None)
+    with pytest.raises(BlenderError, match="did not tell its versions"):
+        BlenderProcess(program(tmp_path / "silent", "sys.stdin.read()")).versions()
+
+
+def test_a_process_is_stopped_when_another_failed(tmp_path: Path) -> None:
+    code = "sys.stdin.read()\nprint(os.getpid(), flush=True)\nwhile True: print('image', flush=True); time.sleep(0.01)"
+    heard: list[str] = []
+    stop = threading.Event()
+
+    def told(step: str) -> None:
+        heard.append(step)
+        if len(heard) > 2:
+            stop.set()
+
+    with pytest.raises(BlenderError, match="another job failed"):
+        BlenderProcess(program(tmp_path / "python", code)).run({}, told, stop)
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(heard[0]), 0)
+
+
+def test_command_line(tmp_path: Path, mesh: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = ["--mesh", str(mesh), "--out", str(tmp_path / "set"), "--blender-python", str(tmp_path / "absent")]
+    assert main([*given, "--quick"]) == 2
+    assert "error: --blender-python" in capsys.readouterr().err
+    assert main([*given, "--quick", "--frames", "1"]) == 2
+    assert "error: --frames: expected 2" in capsys.readouterr().err
+    mesh.write_text("v 0 0 nan\n")
+    assert main(given) == 2
+
+
+# ----------------------------------------------------------------------------------------------------------- the real
+
+
+def real_command(mesh: Path, out: Path) -> list[str]:
+    python = os.environ.get("GAUSIM_BLENDER_PYTHON")
+    if not python:
+        pytest.skip("GAUSIM_BLENDER_PYTHON names no Python with bpy")
+    return [
+        sys.executable, "-m", "data_prep.blender_bunny", "--mesh", str(mesh), "--out", str(out), "--up", "z", "--quick",
+        "--sequences", "2", "--frames", "4", "--stills", "3", "--views", "2", "--blender-python", python,
+        "--workers", "1",
+    ]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_blender_gives_the_same_bytes_again_even_when_killed(mesh: Path, tmp_path: Path) -> None:
+    subprocess.run(real_command(mesh, tmp_path / "first"), check=True, timeout=900)
+    assert verify(tmp_path / "first") == []
+    data = ObjectData(tmp_path / "first")
+    frames = data.sequences[0].frames(range(4))
+    assert (frames[0] != frames[2]).any()
+    truth = data.ground_truth(data.sequences[0])
+    assert truth is not None and (truth.positions[0] == truth.rest).all()
+    manifest = json.loads((tmp_path / "first" / "stage.json").read_text())
+    for entry in manifest["results"]["sequences"]:
+        assert entry["amplitude_percent"] == pytest.approx(entry["amplitude_wanted_percent"], rel=0.08)
+    process = subprocess.Popen(real_command(mesh, tmp_path / "second"))
+    work, deadline = tmp_path / ".second.blender_bunny.work", time.monotonic() + 600
+    while len(list(work.glob("sequences/*/*/[0-9]*.png"))) < 3:
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "second").exists()
+    subprocess.run(real_command(mesh, tmp_path / "second"), check=True, timeout=900)
+    assert contents(tmp_path / "second") == contents(tmp_path / "first")

@@ -1,0 +1,200 @@
+"""Meshes: what OBJ and PLY files hold, hostile files, and the surface that is made of them."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_prep.meshes import Mesh, read_mesh
+from data_prep.surface import farthest_points, make_surface, paint, refine
+from gausim.core import DataError
+
+CORNERS = [(x, y, z) for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)]
+QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+TETRAHEDRON = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]
+POINTS = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0.2, 0.3, 1)], np.float64)
+
+
+def box_obj(path: Path) -> Path:
+    lines = [f"v {x} {y} {z}" for x, y, z in CORNERS]
+    lines += ["f " + " ".join(f"{i + 1}/1/{i + 1}" for i in quad) for quad in QUADS]
+    path.write_text("# a box\nvt 0 0\n" + "\n".join(lines) + "\n")
+    return path
+
+
+def ply(
+    path: Path, encoding: str, faces: list[tuple[int, ...]], *, count: str | None = None, kind: str = "int"
+) -> Path:
+    header = f"ply\nformat {encoding} 1.0\ncomment made here\nelement vertex {count or len(CORNERS)}\n"
+    header += "property float x\nproperty float y\nproperty double z\nproperty uchar red\n"
+    header += (
+        f"element face {len(faces)}\nproperty uchar quality\nproperty list uchar {kind} vertex_indices\nend_header\n"
+    )
+    if encoding == "ascii":
+        lines = [f"{x} {y} {z} 255" for x, y, z in CORNERS]
+        lines += [f"7 {len(face)} " + " ".join(map(str, face)) for face in faces]
+        path.write_text(header + "\n".join(lines) + "\n")
+        return path
+    order = "<" if "little" in encoding else ">"
+    body = b"".join(struct.pack(f"{order}ffdB", *corner, 255) for corner in CORNERS)
+    body += b"".join(struct.pack(f"{order}BB{len(face)}i", 7, len(face), *face) for face in faces)
+    path.write_bytes(header.encode() + body)
+    return path
+
+
+def test_obj_and_all_encodings_of_ply_give_the_same_box(tmp_path: Path) -> None:
+    expected = read_mesh(box_obj(tmp_path / "box.obj"))
+    assert expected.vertices.tolist() == [list(c) for c in CORNERS] and expected.triangles.shape == (12, 3)
+    for encoding in ("ascii", "binary_little_endian", "binary_big_endian"):
+        found = read_mesh(ply(tmp_path / f"{encoding}.ply", encoding, QUADS))
+        np.testing.assert_array_equal(found.vertices, expected.vertices)
+        np.testing.assert_array_equal(found.triangles, expected.triangles)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_faces_of_different_lengths(tmp_path: Path, encoding: str) -> None:
+    found = read_mesh(ply(tmp_path / "m.ply", encoding, [(0, 1, 2), (4, 6, 7, 5), (3, 1, 2)]))
+    assert found.triangles.tolist() == [[0, 1, 2], [4, 6, 7], [4, 7, 5], [3, 1, 2]]
+
+
+def test_indices_of_obj_may_count_backwards(tmp_path: Path) -> None:
+    path = tmp_path / "m.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 0 0 1\nf 1 \\\n2 4\n")
+    assert read_mesh(path).triangles.tolist() == [[0, 1, 2], [0, 1, 3]]
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("v 0 0\n", "line 1"),
+        ("v 0 0 x\n", "line 1"),
+        ("v 0 0 0\nf 1 1\n", "line 2.*3 corners"),
+        ("v 0 0 0\nf 0 1 1\n", "counted from 1"),
+        ("v 0 0 0\nf 1 a 1\n", "line 2"),
+        ("v 0 0 0\nf 1 1 " + "9" * 30 + "\n", "line 2"),
+        ("v 0 0 0\nf 1 1 " + "9" * 5000 + "\n", "line 2"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "there are 3"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 -9\n", "there are 3"),
+        ("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "vertex 1 has a coordinate"),
+        ("v 0 0 0\nv 0 inf 0\nv 0 1 0\nf 1 2 3\n", "vertex 1 has a coordinate"),
+        ("v 0 0 0\n", "no faces"),
+        ("", "no faces"),
+    ],
+)
+def test_hostile_obj(tmp_path: Path, text: str, what: str) -> None:
+    path = tmp_path / "bad.obj"
+    path.write_text(text)
+    with pytest.raises(DataError, match=rf"bad\.obj: .*{what}"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_hostile_ply(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "bad.ply"
+    for faces, what in (([(0, 1, 8)], "there are 8"), ([(0, 1, -1)], "there are 8"), ([(0, 1)], "3 corners")):
+        with pytest.raises(DataError, match=rf"bad\.ply: .*{what}"):
+            read_mesh(ply(path, encoding, faces))
+    for count in ("99999999999999", "-1", "1e3", "9" * 40):
+        with pytest.raises(DataError, match=r"bad\.ply: "):
+            read_mesh(ply(path, encoding, QUADS, count=count))
+    with pytest.raises(DataError, match="whole numbers"):
+        read_mesh(ply(path, encoding, QUADS, kind="float"))
+    with pytest.raises(DataError, match=r"bad\.ply: "):  # a vertex too many: faces are taken for it
+        read_mesh(ply(path, encoding, QUADS, count="9"))
+    whole = ply(path, encoding, QUADS).read_bytes()
+    for length in range(0, len(whole) - 2, 7):
+        path.write_bytes(whole[:length])
+        with pytest.raises(DataError, match=r"bad\.ply: "):
+            read_mesh(path)
+
+
+def test_random_damage_never_crashes(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    path = tmp_path / "bad.ply"
+    whole = [ply(path, encoding, QUADS).read_bytes() for encoding in ("ascii", "binary_little_endian")]
+    whole.append(box_obj(tmp_path / "bad.obj").read_bytes())
+    refused = 0
+    for i in range(600):
+        data = bytearray(whole[i % 3])
+        for _ in range(rng.integers(1, 4)):
+            data[rng.integers(len(data))] = rng.integers(256)
+        target = path if i % 3 < 2 else path.with_suffix(".obj")
+        target.write_bytes(data)
+        try:
+            found = read_mesh(target)
+        except DataError as error:
+            assert str(target) in str(error)
+            refused += 1
+        else:
+            assert np.isfinite(found.vertices).all()
+            assert 0 <= found.triangles.min() and found.triangles.max() < len(found.vertices)
+    assert 100 < refused < 600
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        read_mesh(tmp_path / "absent.obj")
+    (tmp_path / "mesh.stl").write_text("solid")
+    with pytest.raises(DataError, match=r"\.obj or \.ply"):
+        read_mesh(tmp_path / "mesh.stl")
+
+
+def test_surface_stands_upright_in_its_frame(tmp_path: Path) -> None:
+    path = box_obj(tmp_path / "box.obj")
+    for up, extent in (("x", (4 / 3, 2, 2 / 3)), ("y", (2, 2 / 3, 4 / 3)), ("z", (2 / 3, 4 / 3, 2))):
+        found = make_surface(read_mesh(path), path, up=up, points=50, seed=0)
+        np.testing.assert_allclose(np.ptp(found.vertices, axis=0), extent, rtol=1e-6)
+        np.testing.assert_allclose(found.vertices[:, :2].min(0), -found.vertices[:, :2].max(0), rtol=1e-6)
+        assert found.vertices[:, 2].min() == 0 and len(found.gt_ids) == 50
+        # Outward faces stay outward: the object is turned, not mirrored.
+        a, b, c = (found.vertices[found.faces[:, i]].astype(np.float64) for i in range(3))
+        volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
+        original = read_mesh(path)
+        a, b, c = (original.vertices[original.triangles[:, i]] for i in range(3))
+        assert np.sign(volume) == np.sign(np.einsum("ij,ij->i", a, np.cross(b, c)).sum())
+
+
+def test_refined_surface_is_closed_and_of_the_same_volume_and_area() -> None:
+    mesh = Mesh(POINTS, np.array(TETRAHEDRON))
+    fine = refine(mesh, 0.13)
+    for found in (mesh, fine):
+        a, b, c = (found.vertices[found.triangles[:, i]] for i in range(3))
+        np.testing.assert_allclose(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6, 1 / 6, rtol=1e-12)
+        edges = np.concatenate([found.triangles[:, [i, (i + 1) % 3]] for i in range(3)])
+        assert len(np.unique(edges, axis=0)) == len(edges)  # each directed edge once, so neighbours stay joined
+        assert {tuple(e) for e in edges.tolist()} == {tuple(e[::-1]) for e in edges.tolist()}
+    lengths = np.linalg.norm(np.diff(fine.vertices[edges], axis=1)[:, 0], axis=1)
+    assert lengths.max() <= 0.13 and len(fine.triangles) > 100
+
+
+def test_useless_surfaces_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "m.obj"
+    flat = Mesh(POINTS * (1, 1, 0), np.array(TETRAHEDRON))
+    with pytest.raises(DataError, match="flat along its up axis 'z'"):
+        make_surface(flat, path, up="z", points=4, seed=0)
+    for vertices in (POINTS * 0, POINTS * (1, 0, 0)):
+        with pytest.raises(DataError, match="no face has an area"):
+            make_surface(Mesh(vertices, np.array(TETRAHEDRON)), path, up="z", points=4, seed=0)
+    with pytest.raises(DataError, match="too large"):
+        make_surface(Mesh((POINTS - 0.5) * 3e308, np.array(TETRAHEDRON)), path, up="z", points=4, seed=0)
+    monkeypatch.setattr("data_prep.surface.MOST_TRIANGLES", 5000)
+    with pytest.raises(DataError, match="Remesh"):
+        refine(Mesh(POINTS, np.array(TETRAHEDRON)), 1e-4)
+
+
+def test_paint_is_bright_varied_and_of_its_seed() -> None:
+    points = np.random.default_rng(1).uniform(-1, 1, (500, 3))
+    first, again, other = (paint(points, np.random.default_rng(seed)) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any() and 0.03 <= first.min() and first.max() <= 0.95 and (first.std(0) > 0.03).all()
+
+
+def test_farthest_points_are_far_from_each_other() -> None:
+    points = np.random.default_rng(2).uniform(0, 1, (400, 3))
+    chosen = points[farthest_points(points, 20)]
+    gaps = np.linalg.norm(chosen[:, None] - chosen, axis=-1) + np.eye(20)
+    assert gaps.min() > 0.25 and len(farthest_points(points[:5], 20)) == 5
+    assert farthest_points(np.zeros((9, 3)), 4).tolist() == [0]
