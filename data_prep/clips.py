@@ -128,7 +128,8 @@ def write_picture(path: Path, pixels: np.ndarray) -> None:
 
     code = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}.get(pixels.shape[2] if pixels.ndim == 3 else 1)
     ordered = pixels if code is None else cv2.cvtColor(pixels, code)
-    ok, data = cv2.imencode(path.suffix, ordered, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 1] if path.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 90]
+    ok, data = cv2.imencode(path.suffix, ordered, options)
     if not ok:
         raise DataError(f"{path}: cannot be encoded.")
     write_item(path, data.tobytes())

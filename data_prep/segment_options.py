@@ -83,6 +83,9 @@ def _cleanup_options(group: Any) -> None:
     group.add_argument(
         "--motion", type=number(0, 1), help="how far edges move per frame, as part of the longer side (0.02)"
     )
+    group.add_argument(
+        "--reach", type=number(0, 1), help="soft edges' width, as part of the longer side; 0: any (0.01)"
+    )
     group.add_argument("--floor", type=number(0, 1), help="alpha below this becomes 0 (0.05)")
     group.add_argument(
         "--edge", type=number(0, 0.1), help="width of softened edges, as part of the longer side (0.004)"

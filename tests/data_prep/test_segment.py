@@ -380,6 +380,15 @@ def test_edges_follow_the_picture() -> None:
     assert set(np.unique(cleaned(square(19, 19, 22), rgb, UNTOUCHED, soft=False))) == {0, 255}
 
 
+def test_faint_guesses_beside_the_object_go() -> None:
+    """Alpha above 0 is foreground, so a network's doubts about the rest of the picture must not be kept."""
+    mask = square(20, 20, 20)
+    mask[20:40, 40:58] = 0.3
+    alpha = cleaned(mask, np.zeros((60, 60, 3), np.uint8), Cleanup(reach=0.05), soft=True)
+    assert (alpha[20:40, 40:43] > 0).all() and alpha[:, 43:].max() == 0
+    assert cleaned(mask, np.zeros((60, 60, 3), np.uint8), Cleanup(reach=0.0), soft=True)[30, 57] > 0
+
+
 def test_mattes_keep_colour_around_the_foreground() -> None:
     rgb = np.full((60, 60, 3), 99, np.uint8)
     alpha = (square(25, 25, 10) * 255).astype(np.uint8)
