@@ -198,21 +198,23 @@ def make_motion(job: dict[str, Any], points: np.ndarray) -> None:
     """Finds the strength that gives the amplitude asked for, and writes the motion it makes."""
     motion = job["motion"]
     target, strength = motion["amplitude"], FIRST_STRENGTH
-    trials: list[tuple[float, float]] = []
+    trials: list[tuple[float, float, np.ndarray]] = []
     for _ in range(TRIALS):
         found = simulate(job, points, strength, min(motion["trial_frames"], motion["frames"]))
         ratio = target / max(float(np.linalg.norm(found["displacement"], axis=-1).max()), 1e-9)
-        trials.append((abs(math.log(ratio)), strength))
+        trials.append((abs(math.log(ratio)), strength, found["displacement"]))
         if trials[-1][0] <= math.log1p(TOLERANCE):
             break
         strength *= min(max(ratio, 1 / LARGEST_CHANGE), LARGEST_CHANGE)
-    off, strength = min(trials)
+    off, strength, expected = min(trials, key=lambda trial: trial[0])
     if off > math.log(2.0):
         raise SystemExit(
             f"no push gives an amplitude of {target:.3f} scene units: the nearest is off by a factor of "
             f"{math.exp(off):.1f}. Use another --amplitude, --stiffness or --seed."
         )
     made = simulate(job, points, strength, motion["frames"])
+    if not np.array_equal(made["displacement"][: len(expected)], expected):
+        raise SystemExit("the same push did not move the object the same way twice. Is this process on one core?")
     held = io.BytesIO()
     stored: dict[str, Any] = {name: array.astype(np.float32) for name, array in made.items()}
     np.savez_compressed(held, strength=np.float64(strength), **stored)

@@ -287,7 +287,8 @@ def program(path: Path, code: str) -> Path:
 
 
 def test_a_process_gets_its_job_and_is_heard(tmp_path: Path) -> None:
-    code = "job = json.load(sys.stdin)\nfor i in range(job['n']): print('image', flush=True)\nprint(json.dumps(sys.argv[1:]))"
+    code = "job = json.load(sys.stdin)\nfor i in range(job['n']): print('image', flush=True)\n"
+    code += "print(json.dumps(sys.argv[1:]))"
     heard: list[str] = []
     BlenderProcess(program(tmp_path / "python", code)).run({"n": 3}, heard.append, threading.Event())
     assert heard[:3] == ["image"] * 3
