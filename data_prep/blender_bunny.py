@@ -95,7 +95,7 @@ def _plan(arguments: argparse.Namespace) -> Plan:
         name: getattr(arguments, name)
         for name in (*SIZES, *FACTORS, "up", "resolution", "still_resolution", "amplitude")
     }
-    given = {name: tuple(value) if isinstance(value, list) else value for name, value in chosen.items()}
+    given: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in chosen.items()}
     plan = Plan(name=arguments.name or arguments.mesh.stem)
     plan = plan.quick() if arguments.quick else plan
     return replace(plan, **{name: value for name, value in given.items() if value is not None}).checked()

@@ -206,7 +206,7 @@ def _sweep(root: Path) -> None:
             path.unlink()
 
 
-def _write_npz(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+def _write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
     held = io.BytesIO()
     np.savez_compressed(held, **arrays)
     write_item(path, held.getvalue())
