@@ -74,8 +74,9 @@ def open_photo(path: Path, name: str) -> Photo:
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise DataError(f"{path}: cannot be read as an image ({error}). Export it again.") from error
     size = (height, width) if turned else (width, height)
-    known = isinstance(focal_35mm, int | float) and 0 < focal_35mm < 1e4
-    focal = float(focal_35mm) / _FRAME_35MM * max(size) if known else None
+    focal = None
+    if isinstance(focal_35mm, int | float) and 0 < focal_35mm < 1e4:
+        focal = focal_35mm / _FRAME_35MM * max(size)
     return Photo(name, path, *size, focal)
 
 

@@ -62,7 +62,7 @@ def failures(
                 "few features: blurred, dark or without texture; take it again, or put printed cloth into the scene"
             )
         elif inliers < _FEW_MATCHES:
-            remedy = "no other photo shows enough of the same: take photos in between, or match exhaustively"
+            remedy = "no other photo shows enough of the same: photos in between, --thorough, or --matching exhaustive"
         else:
             remedy = (
                 "matches fit no camera: the scene moved, mirrors or repeats itself, or the lens model is too simple"

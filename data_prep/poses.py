@@ -10,9 +10,9 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from data_prep.pose_material import Material, Sources
 from gausim.core.errors import DataError, GausSimError
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 # Raise when the same inputs and settings give another result than before.
 REVISION = 1
 PACKAGES = ("pycolmap", "numpy", "opencv-python-headless", "pillow")
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,8 @@ def _make(
     tracks = points.tracks
     results["points"] = {"count": len(tracks), "mean_track": float(tracks.mean()) if len(tracks) else None}
     by_name = {key_of(shot.photo.name): shot for shot in moved}
-    used, sequences, left_out = set(), {}, {}
+    used: set[str] = set()
+    sequences, left_out = {}, {}
     straighteners = Straighteners()
     for folder, names in material.sequences.items():
         cameras, missing = _cameras_of(folder, names, by_name, used)
@@ -223,20 +225,7 @@ def main(argv: list[str] | None = None) -> int:
     from data_prep.progress import bars
 
     try:
-        names = ("images", "sequences", "colmap", "transforms", "projections", "scale", "fps")
-        sources = Sources(**{name: getattr(arguments, name) for name in names})
-        names = (
-            "camera_model",
-            "intrinsics",
-            "matching",
-            "overlap",
-            "features",
-            "feature_size",
-            "focal",
-            "thorough",
-            "threads",
-        )
-        mapping = MappingOptions(**{name: getattr(arguments, name) for name in names})
+        sources, mapping = _picked(Sources, arguments), _picked(MappingOptions, arguments)
         world = WorldOptions(arguments.up, tuple((a, b, m) for a, b, m in arguments.distance))
         with bars() as tick:
             manifest = find_poses(
@@ -247,6 +236,11 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     print(_told(arguments.out, manifest))
     return 0
+
+
+def _picked(kind: type[T], arguments: argparse.Namespace) -> T:
+    """An instance of a dataclass from the arguments that have its fields' names."""
+    return kind(**{field.name: getattr(arguments, field.name) for field in fields(kind)})  # type: ignore[arg-type]
 
 
 def _told(out: Path, manifest: dict[str, Any]) -> str:
