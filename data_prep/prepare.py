@@ -6,10 +6,10 @@
       poses: {images: photos/flower, sequences: "{ingest}"}
       segment: {pictures: "{poses}", backend: onnx, onnx: isnet.onnx}
 
-Keys are the options of ``python -m data_prep.STAGE`` (films, pictures, scene and root are the arguments of its command);
-``true`` is a flag, a list several values. ``{STAGE}`` in a value is the directory of an earlier stage; a text that names
-a file or folder beside the configuration becomes its path. A stage whose result is there already is not run again; what
-was interrupted goes on.
+Keys are the options of ``python -m data_prep.STAGE`` (films, pictures, scene and root are arguments of its command);
+``true`` is a flag, a list several values. ``{STAGE}`` in a value is the directory of an earlier stage; a text that
+names a file or folder beside the configuration becomes its path. A stage whose result is there already is not run
+again; what was interrupted goes on.
 """
 
 from __future__ import annotations
