@@ -304,10 +304,15 @@ def summary(results: Mapping[str, Any]) -> str:
             f"  {name or '.'}: {found['pictures']} pictures, foreground {100 * found['coverage']['mean']:.1f} % "
             f"({100 * found['coverage']['least']:.1f} to {100 * found['coverage']['most']:.1f})"
             + (f", overlap with the frame before {over['mean']:.3f} (least {over['least']:.3f})" if over else "")
-            + (f", EMPTY: {', '.join(found['empty'][:5])}" if found["empty"] else "")
-            + (f", look at: {', '.join(found['look_at'][:5])}" if found["look_at"] else "")
+            + _some("EMPTY", found["empty"])
+            + _some("look at", found["look_at"])
         )
     return "\n".join([*lines, f"Look at {OVERLAYS}/ before you go on."])
+
+
+def _some(what: str, names: list[str]) -> str:
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return f", {what}: {', '.join(names[:4])}{more}" if names else ""
 
 
 def _parser() -> argparse.ArgumentParser:
