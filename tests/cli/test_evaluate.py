@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gausim.cli import _run, evaluate
-from gausim.core import DataError, RunError
+from gausim.core import DataError, RunError, SimState
 from gausim.data.objects import ObjectData
 from gausim.render.reference import ReferenceRenderer
 
@@ -27,7 +27,13 @@ def run(tmp_path, monkeypatch):
         return toy.truth(names[round(float((state.previous - toy.scene.means).mean()))], frames=steps + 1)
 
     model = SimpleNamespace(scenes=[toy.scene], dynamics=lambda scene_id: SimpleNamespace(rollout=rollout))
-    module = SimpleNamespace(model=model, simulator=model, initial_states=initial)
+
+    def foresee(sequence, steps):
+        return rollout(SimState(toy.scene.means, initial.previous(sequence)), steps)
+
+    module = SimpleNamespace(
+        model=model, simulator=model, initial_states=initial, foresee=foresee, method_name="gausim", footnotes=None
+    )
     directory = tmp_path / "run"
     directory.mkdir()
     torch.save({"state_dict": {}, "gausim": {}, "epoch": 3, "global_step": 40}, directory / "last.ckpt")

@@ -142,3 +142,14 @@ def test_the_template_carries_solid_modes_and_the_simulator_steps_with_them(make
     batch = model.batch([0])
     step = model.step(batch, SimState(batch.rest, batch.rest))
     torch.testing.assert_close(step.positions, batch.rest, atol=1e-5, rtol=0)
+
+
+def test_parts_that_nothing_holds_still_have_orthonormal_modes() -> None:
+    axis = np.array([0.0, 0.5, 1.0])
+    kernels = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)  # each an island of its own
+    held = kernels[:, 2] < 0.1
+    mass = np.random.default_rng(0).uniform(0.5, 2.0, len(kernels))
+    values, phi, slopes = solid.solid_modes(kernels, held, kernels, mass, held, modes=40, spacing=0.1)
+    gram = np.einsum("nam,n,nak->mk", phi, mass, phi)
+    np.testing.assert_allclose(gram, np.eye(len(values)), atol=1e-5)
+    assert np.isfinite(slopes).all() and len(values) == 40 and not phi[held].any()

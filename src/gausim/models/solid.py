@@ -27,6 +27,9 @@ POISSON = 0.3
 PIN_STIFFNESS = 1e3
 # Nodes at the rim with a stiffness below this share of the largest are left out: rounding would move them.
 NO_SUPPORT = 1e-9
+# Everything is held by springs of this share of the median stiffness: parts that nothing connects to a pin could move
+# without any force, and the equations would have no solution.
+FOUNDATION = 1e-8
 # Grid points within the support of a quadratic B-spline, along one axis.
 SUPPORT = 3
 
@@ -156,6 +159,7 @@ def solid_modes(
             blocks[a][a] = blocks[a][a] + strength * (hold.T @ hold)
     whole = sp.bmat(blocks).tocsr()
     used = whole.diagonal() > NO_SUPPORT * whole.diagonal().max()
+    whole = (whole + FOUNDATION * np.median(whole.diagonal()[used]) * sp.identity(whole.shape[0])).tocsr()
     nodes, values, _ = grid.splines(rest[~pinned])
     carry = sp.block_diag([matrix(nodes, values, grid.size)] * 3).tocsr()[:, used]
     root = np.tile(np.sqrt(mass[~pinned]), 3)
