@@ -18,7 +18,7 @@ DIRS ?= $(if $(filter-out file,$(origin RUN)),$(RUN),outputs)
 ARGS ?=
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install test test-slow test-notebooks lint format data demo train evaluate simulate report benchmark clean
+.PHONY: help install test test-slow test-notebooks lint format data demo dataset train evaluate simulate report benchmark clean
 
 help: ## Show this text
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -57,6 +57,10 @@ data: $(DATA)/.made ## Make the synthetic data set
 $(DATA)/.made: | install
 	$(BIN)/python -m data_prep.synthesize --out $(DATA)
 	touch $@
+
+dataset: install ## Stages from film to data set, as a file lists them: make dataset CONFIG=object.yaml
+	@test -n "$(CONFIG)" || { echo "error: name what to run: make dataset CONFIG=object.yaml (python -m data_prep.prepare --help)" >&2; exit 1; }
+	$(BIN)/python -m data_prep.prepare "$(CONFIG)" $(ARGS)
 
 train: install ## Train: make train ARGS="experiment=demo seed=1"
 	$(BIN)/gausim train $(ARGS)
