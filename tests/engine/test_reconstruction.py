@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
 from gausim.cli.main import main
 from gausim.core import Cameras, ConfigError, DataError, GaussianScene
 from gausim.data.images import write_rgba
-from gausim.engine.reconstruction import ReconstructionOptions, reconstruct
+from gausim.engine.reconstruction import Reconstruction, ReconstructionOptions, reconstruct
+from gausim.engine.reconstruction_state import Partial, identity
+from gausim.engine.splat_start import PointCloud
 from gausim.engine.splats import LearningRates, Splats
 from gausim.engine.stills import ImageSet, draw_rest, measure, reduced
 from gausim.io.ply import load_scene
 from gausim.io.transforms import write_transforms
+from gausim.ops.spherical_harmonics import evaluate_sh
 from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import draw
 
@@ -106,7 +113,7 @@ def test_same_seed_same_scene(stills: ImageSet) -> None:
 def test_given_points_replace_the_hull_as_start(stills: ImageSet) -> None:
     options = ReconstructionOptions(kernels=40, iterations=1, hull_resolution=16, start_share=1.0, rounds=1)
     points = true_scene().means[::2]
-    scene = reconstruct([stills], CpuRenderer(threads=1), options, points=points)
+    scene = reconstruct([stills], CpuRenderer(threads=1), options, cloud=PointCloud(points))
     assert torch.cdist(scene.means, points).amin(1).max() < 0.02
 
 
@@ -117,8 +124,112 @@ def test_empty_hull_is_refused(stills: ImageSet) -> None:
         reconstruct([ImageSet("stills", images, stills.cameras)], CpuRenderer(threads=1), TINY)
 
 
-@pytest.mark.parametrize("change", [{"kernels": 0}, {"iterations": 0}, {"sh_degree": 4}])
-def test_options_out_of_range_are_refused(change: dict[str, int]) -> None:
+def test_masks_that_miss_a_part_are_outvoted(stills: ImageSet) -> None:
+    images = stills.images.clone()
+    images[3, ..., 3] = 0
+    allowed = replace(TINY, missing_masks=0.05, iterations=1)
+    scene = reconstruct([ImageSet("stills", images, stills.cameras)], CpuRenderer(threads=1), allowed)
+    whole = reconstruct([stills], CpuRenderer(threads=1), allowed)
+    assert scene.count > 50
+    assert (scene.means.amin(0) - whole.means.amin(0)).abs().max() < 0.1
+
+
+def test_points_outside_of_all_masks_are_refused(stills: ImageSet) -> None:
+    far = PointCloud(torch.rand(9, 3) + 20)
+    with pytest.raises(DataError, match="0 of 9 points lie in the visual hull"):
+        reconstruct([stills], CpuRenderer(threads=1), TINY, cloud=far)
+
+
+def walled(stills: ImageSet) -> ImageSet:
+    """The same stills with something behind the object: all of the image counts."""
+    rgb, alpha = stills.images[..., :3].float(), stills.images[..., 3:].float() / 255
+    wall = torch.tensor([40.0, 90.0, 60.0])
+    pixels = (rgb * alpha + wall * (1 - alpha)).round()
+    return ImageSet("photos", torch.cat((pixels, torch.full_like(alpha, 255)), -1).to(torch.uint8), stills.cameras)
+
+
+def shell() -> PointCloud:
+    """Points of the two balls and of a far sphere around everything."""
+    g = torch.Generator().manual_seed(5)
+    around = 6 * torch.nn.functional.normalize(torch.randn(700, 3, generator=g), dim=-1)
+    near = evaluate_sh(true_scene().sh[::2], torch.tensor([0.0, 0.0, 1.0]).expand(75, 3))
+    far = (torch.tensor([40.0, 90.0, 60.0]) / 255).expand(700, 3)
+    return PointCloud(torch.cat((true_scene().means[::2], around)), torch.cat((near, far)))
+
+
+def test_an_open_scene_grows_from_its_points(stills: ImageSet) -> None:
+    photos, renderer = walled(stills), CpuRenderer(threads=1)
+    options = ReconstructionOptions(
+        kernels=1000, iterations=400, extent="scene", rounds=6, minimum_opacity=0.01, anisotropy_limit=10.0
+    )
+    train, left_out = photos.select(range(20)), photos.select(range(20, 24))
+    scene = reconstruct([train], renderer, options, cloud=shell())
+    figures = measure(scene, renderer, left_out)
+    assert 775 < scene.count <= 1000
+    assert figures["psnr"] > 28 and figures["psnr"] == pytest.approx(figures["psnr_foreground"])
+    assert (scene.means.norm(dim=-1) > 3).any()  # what lies behind is there too
+    with pytest.raises(ConfigError, match="starts from points"):
+        reconstruct([train], renderer, options)
+    with pytest.raises(DataError, match="need colours"):
+        reconstruct([train], renderer, options, cloud=PointCloud(shell().points))
+
+
+def test_error_is_blamed_on_the_kernels_under_it(stills: ImageSet) -> None:
+    """Against the sum over pixels of the kernel's weight times the error, its weight found by drawing it alone."""
+    run = Reconstruction([stills], CpuRenderer(threads=1), TINY, cloud=None, name="balls")
+    error, black = torch.zeros(SIZE, SIZE), torch.zeros(3)
+    error[18:22, 18:22] = 0.5
+    run._blame(stills, 0, black, error)
+    means, covars, colors, opacities = (x.detach() for x in run.splats.drawable(stills.cameras.centers[0]))
+    for k in run.splats.error.topk(3).indices.tolist():
+        lit = torch.zeros_like(colors)
+        lit[k] = 1.0
+        rgb, _ = run._render(stills, 0, black, (means, covars, lit, opacities))
+        assert float(run.splats.error[k]) == pytest.approx(float((rgb.mean(-1) * error).sum()), rel=1e-3)
+    assert (run.splats.error == 0).any()
+
+
+def test_an_interrupted_reconstruction_goes_on_bit_by_bit(stills: ImageSet, tmp_path: Path) -> None:
+    options = ReconstructionOptions(kernels=60, iterations=30, hull_resolution=16, rounds=3)
+    whole = reconstruct([stills], CpuRenderer(threads=1), options)
+    partial = Partial(tmp_path / "scene.ply", identity([stills], options, None))
+    assert partial.read() is None
+
+    def stop_at_half(run: Reconstruction) -> None:
+        if run.done == 17:
+            partial.write(run.state())
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct([stills], CpuRenderer(threads=1), options, progress=stop_at_half)
+    begun = partial.read()
+    assert begun is not None and int(begun["done"]) == 17
+    scene = reconstruct([stills], CpuRenderer(threads=1), options, begun=begun)
+    for name in ("means", "log_scales", "quats", "opacity_logits", "sh"):
+        assert torch.equal(getattr(scene, name), getattr(whole, name)), name
+    for other in (replace(options, seed=1), replace(options, kernels=61)):
+        assert Partial(tmp_path / "scene.ply", identity([stills], other, None)).read() is None
+    assert Partial(tmp_path / "scene.ply", identity([stills.select(range(23))], options, None)).read() is None
+    partial.path.write_bytes(b"torn")
+    assert partial.read() is None
+    partial.remove()
+    assert not list(tmp_path.iterdir())
+
+
+def test_it_stops_where_more_steps_do_not_help(stills: ImageSet) -> None:
+    still = LearningRates(means=0, log_scales=0, quats=0, opacity=0, color=0, color_rest=0)
+    options = replace(TINY, iterations=100, rounds=2, patience=2, rates=still, random_background=False)
+    steps: list[int] = []
+    reconstruct([stills.select([0])], CpuRenderer(threads=1), options, progress=lambda run: steps.append(run.done))
+    assert steps[-1] == 71 + 3 * 5  # the first look, and two that are not better
+    steps.clear()
+    patient = replace(options, patience=0)
+    reconstruct([stills.select([0])], CpuRenderer(threads=1), patient, progress=lambda run: steps.append(run.done))
+    assert steps[-1] == 100
+
+
+@pytest.mark.parametrize("change", [{"kernels": 0}, {"iterations": 0}, {"sh_degree": 4}, {"missing_masks": 1.0}])
+def test_options_out_of_range_are_refused(change: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=next(iter(change))):
         ReconstructionOptions(**change)
 
@@ -151,7 +262,7 @@ def test_split_and_keep_carry_parameters_and_moments() -> None:
     splats.step({"": 1.0})
     before = splats["means"].detach().clone()
     moments = splats.optimizer.state[splats["means"]]["exp_avg"].clone()
-    assert splats.pull[5] > splats.pull[0] > 0
+    assert splats.seen.all()
     splats.split(torch.tensor([2]))
     assert splats.count == 7
     means = splats["means"].detach()
@@ -188,6 +299,32 @@ def test_command_writes_scene_masks_figures_and_picture(
     assert "stills left out" in capsys.readouterr().out
     assert main([*command, "--kernels", "80", "--iterations", "20", "--pin-below", "z=-9"]) == 2
     assert "holds none of" in capsys.readouterr().err
+
+
+def test_command_takes_photos_without_masks_as_a_scene(
+    stills: ImageSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "images").mkdir()
+    for i, image in enumerate(walled(stills).images):
+        bgr = np.ascontiguousarray(image[..., :3].flip(-1).numpy())
+        assert cv2.imwrite(str(tmp_path / "images" / f"{i:02d}.png"), bgr)
+    write_transforms(
+        tmp_path / "transforms.json", stills.cameras, [{"file_path": f"images/{i:02d}.png"} for i in range(24)]
+    )
+    command = ["reconstruct", "--transforms", str(tmp_path / "transforms.json"), "--iterations", "30"]
+    assert main([*command]) == 2
+    assert "got 40x40 RGB" in capsys.readouterr().err
+    assert main([*command, "--extent", "scene"]) == 2
+    assert "starts from points" in capsys.readouterr().err
+    points, colors = shell().points.numpy(), (255 * shell().colors).to(torch.uint8).numpy()
+    np.savez(tmp_path / "points.npz", points=points, colors=colors)
+    assert main([*command, "--extent", "scene", "--leave-out", "12", "--longest", "30", "--kernels", "900"]) == 0
+    measured = json.loads((tmp_path / "scene.json").read_text())["measured"]
+    assert measured["stills left out"]["images"] == 2 and measured["stills to train on"]["images"] == 22
+    assert not list(tmp_path.glob(".*"))
+    np.savez(tmp_path / "points.npz", points=points, colors=colors[:3])
+    assert main([*command, "--extent", "scene"]) == 2
+    assert "'colors' must be (775, 3)" in capsys.readouterr().err
 
 
 def test_command_needs_one_source(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,21 +7,28 @@ import json
 import os
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gausim.cli.inspect import add_pin_options, pinned_by
 
 if TYPE_CHECKING:
-    from torch import Tensor
-
     from gausim.core import GaussianScene, Renderer
     from gausim.engine.reconstruction import ReconstructionOptions
+    from gausim.engine.reconstruction_state import Partial
+    from gausim.engine.splat_start import PointCloud
     from gausim.engine.stills import ImageSet, Material
 
 HELP = "Fit the Gaussians of the rest scene to posed stills."
 
 # Images side by side in the comparison picture.
 COMPARED = 5
+LEFT_OUT_COMPARED = 2
+# Times that what is done so far is written while a scene is made.
+SAVES = 20
+# An open scene has parts of every size, seen through one another, and grows from few points.
+SCENE_OPTIONS: dict[str, Any] = {
+    "kernels": 30_000, "rounds": 16, "minimum_opacity": 0.01, "anisotropy_limit": 10.0,
+}  # fmt: skip
 
 
 def main(argv: list[str]) -> int:
@@ -40,25 +47,21 @@ def main(argv: list[str]) -> int:
     arguments = _parser().parse_args(argv)
     import torch
 
-    from gausim.engine.reconstruction import ReconstructionOptions
+    from gausim.engine.reconstruction_state import Partial, identity
     from gausim.engine.stills import measure
     from gausim.io.ply import save_scene
 
     torch.set_num_threads(arguments.threads)
-    options = ReconstructionOptions(
-        kernels=arguments.kernels,
-        iterations=arguments.iterations,
-        sh_degree=arguments.sh_degree,
-        random_background=arguments.background == "random",
-        seed=arguments.seed,
-    )
-    name, material, out = _inputs(arguments)
+    options = _options(arguments)
+    name, material, cloud, out = _inputs(arguments, options)
     renderer = _renderer(arguments.renderer)
-    points = _points(arguments.points)
     start, cpu = time.perf_counter(), time.process_time()
-    scene = pinned_by(_fit(material, renderer, options, points, name), arguments.pin_below, arguments.pin_above)
+    partial = Partial(out, identity(material.train, options, cloud))
+    fitted = _fit(material, renderer, options, cloud, name, partial)
+    scene = pinned_by(fitted, arguments.pin_below, arguments.pin_above)
     seconds = {"wall_seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - cpu}
     save_scene(scene, out)
+    partial.remove()
     figures = {images.name: {"images": len(images.images), **measure(scene, renderer, images)}
                for images in material.measure}  # fmt: skip
     _write_json(out.with_suffix(".json"), _record(scene, options, figures, seconds))
@@ -74,13 +77,28 @@ def _parser() -> argparse.ArgumentParser:
     add("root", nargs="?", metavar="ROOT", help="directory of the object (dataset.json, static/, sequences/)")
     add("--transforms", metavar="FILE", help="transforms.json of the stills, where there is no data set")
     add("--out", metavar="SCENE.ply", help="scene to write; default ROOT/scene.ply")
-    add("--kernels", type=int, default=2000, help="number of Gaussians aimed at (default %(default)s)")
+    add("--extent", default="object", choices=("object", "scene"),
+        help="object: what the stills' alpha shows; scene: everything in them (default %(default)s)")  # fmt: skip
+    add("--kernels", type=int, metavar="N", help="Gaussians aimed at (default 2000, of a scene 30000)")
     add("--iterations", type=int, default=4000, help="optimiser steps, one image each (default %(default)s)")
+    add("--patience", type=int, default=3, metavar="N", help="stop early where the mean loss was not better N times, "
+        "looked at every twentieth of the steps; 0 never (default %(default)s)")  # fmt: skip
     add("--sh-degree", type=int, default=1, choices=(0, 1, 2, 3), help="spherical harmonics (default %(default)s)")
+    add("--anisotropy", type=float, metavar="R", help="length over width of a kernel that costs nothing (default 3, "
+        "of a scene 10)")  # fmt: skip
+    add("--points", metavar="FILE.npz", help="start from its array 'points' (P, 3), with 'colors' if there, instead "
+        "of the masks' visual hull; of a scene the default is points.npz beside --transforms")  # fmt: skip
+    add("--missing-masks", type=float, default=0.0, metavar="SHARE", help="share of the stills whose masks may miss a "
+        "part that all others show (default %(default)s)")  # fmt: skip
     add("--video-share", type=float, default=0.5, metavar="S",
-        help="share of the steps at the size of the videos, on reduced stills and on frame 0 of the views to train "
-        "on; 0 uses the stills only (default %(default)s)")  # fmt: skip
-    add("--points", metavar="FILE.npz", help="start from the array 'points' (P, 3) instead of the masks' visual hull")
+        help="of ROOT: share of the steps at the size of the videos, on reduced stills and on frame 0 of the views to "
+        "train on; 0 uses the stills only (default %(default)s)")  # fmt: skip
+    add("--longest", type=int, metavar="PIXELS", help="of --transforms: reduce the stills to this length of their "
+        "longer side")  # fmt: skip
+    add("--coarse", type=float, default=0.5, metavar="S", help="of --transforms: share of the steps, the first "
+        "ones, on stills of half the size (default %(default)s)")  # fmt: skip
+    add("--leave-out", type=int, default=10, metavar="N", help="of --transforms: one still in N is left out and "
+        "measured (default %(default)s)")  # fmt: skip
     add("--background", default="random", choices=("random", "black"), help="behind training images (random)")
     add("--renderer", default="cpu", choices=("cpu", "reference"), help="default %(default)s")
     add("--threads", type=int, default=1, help="processor threads (default %(default)s)")
@@ -89,22 +107,54 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _inputs(arguments: argparse.Namespace) -> tuple[str, Material, Path]:
+def _options(arguments: argparse.Namespace) -> ReconstructionOptions:
+    from gausim.engine.reconstruction import ReconstructionOptions
+
+    given = {"kernels": arguments.kernels, "anisotropy_limit": arguments.anisotropy}
+    chosen = {name: value for name, value in given.items() if value is not None}
+    defaults = SCENE_OPTIONS if arguments.extent == "scene" else {}
+    return ReconstructionOptions(
+        iterations=arguments.iterations,
+        extent=arguments.extent,
+        sh_degree=arguments.sh_degree,
+        missing_masks=arguments.missing_masks,
+        random_background=arguments.background == "random",
+        patience=arguments.patience,
+        seed=arguments.seed,
+        **{**defaults, **chosen},
+    )
+
+
+def _inputs(
+    arguments: argparse.Namespace, options: ReconstructionOptions
+) -> tuple[str, Material, PointCloud | None, Path]:
     from gausim.core.errors import DataError
     from gausim.data.objects import ObjectData
     from gausim.engine.stills import gather_object, gather_stills
 
+    opaque = options.extent == "scene"
     if (arguments.root is None) == (arguments.transforms is None):
         raise DataError("expected either ROOT (a data set's directory) or --transforms FILE, got both or neither.")
     if not 0 <= arguments.video_share < 1:
         raise DataError(f"--video-share: expected a share in [0, 1), got {arguments.video_share}.")
+    if not 0 <= arguments.coarse < 1:
+        raise DataError(f"--coarse: expected a share in [0, 1), got {arguments.coarse}.")
+    if arguments.leave_out < 2:
+        raise DataError(f"--leave-out: expected one still in 2 or more, got {arguments.leave_out}.")
     if arguments.root is not None:
+        if opaque:
+            raise DataError("--extent scene: a data set's sequences show an object. Use --transforms FILE.")
         data = ObjectData(arguments.root)
         out = Path(arguments.out) if arguments.out else data.root / "scene.ply"
-        return data.name, gather_object(data, video_share=arguments.video_share), out
+        return data.name, gather_object(data, video_share=arguments.video_share), _cloud(arguments.points), out
     path = Path(arguments.transforms)
     out = Path(arguments.out) if arguments.out else path.parent / "scene.ply"
-    return path.parent.name or out.stem, gather_stills(path), out
+    material = gather_stills(
+        path, every=arguments.leave_out, opaque=opaque, longest=arguments.longest, coarse=arguments.coarse
+    )
+    beside = path.parent / "points.npz"
+    points = str(beside) if opaque and arguments.points is None and beside.is_file() else arguments.points
+    return path.parent.name or out.stem, material, _cloud(points), out
 
 
 def _renderer(name: str) -> Renderer:
@@ -117,32 +167,58 @@ def _renderer(name: str) -> Renderer:
     return ReferenceRenderer()
 
 
-def _points(path: str | None) -> Tensor | None:
+def _cloud(path: str | None) -> PointCloud | None:
     if path is None:
         return None
     import torch
 
-    from gausim.data.records import read_array
+    from gausim.core.errors import DataError
+    from gausim.engine.splat_start import PointCloud
+    from gausim.io.npz import read_npz
 
-    return torch.from_numpy(read_array(Path(path), "points")).float()
+    try:
+        arrays = read_npz(Path(path), ["points", "colors"])
+    except ValueError as error:
+        raise DataError(f"{path}: cannot be read as npz ({error}).") from error
+    points, colors = arrays.get("points"), arrays.get("colors")
+    if points is None or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
+        raise DataError(f"{path}: expected an array 'points' (P, 3) of floats. Take the points.npz that `poses` wrote.")
+    if colors is None:
+        return PointCloud(torch.from_numpy(points).float())
+    if colors.shape != points.shape or colors.dtype != "uint8":
+        raise DataError(f"{path}: array 'colors' must be {points.shape} of uint8, got {colors.shape} {colors.dtype}.")
+    return PointCloud(torch.from_numpy(points).float(), torch.from_numpy(colors).float() / 255)
 
 
 def _fit(
-    material: Material, renderer: Renderer, options: ReconstructionOptions, points: Tensor | None, name: str
+    material: Material,
+    renderer: Renderer,
+    options: ReconstructionOptions,
+    cloud: PointCloud | None,
+    name: str,
+    partial: Partial,
 ) -> GaussianScene:
+    from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from gausim.engine.reconstruction import reconstruct
+    from gausim.engine.reconstruction import Reconstruction, reconstruct
 
+    begun = partial.read()
+    if begun is not None:
+        print(f"goes on from step {int(begun['done'])} of an interrupted reconstruction")
     state = TextColumn("{task.completed}/{task.total}  {task.fields[state]}")
-    with Progress(TextColumn("reconstruct"), BarColumn(), state, TimeRemainingColumn()) as bar:
-        task = bar.add_task("", total=options.iterations, state="carving the visual hull")
+    every = max(1, options.iterations // SAVES)
+    with Progress(
+        TextColumn("reconstruct"), BarColumn(), state, TimeRemainingColumn(), console=Console(stderr=True)
+    ) as bar:
+        task = bar.add_task("", total=options.iterations, state="placing the first kernels")
 
-        def show(step: int, state: dict[str, float]) -> None:
-            text = f"loss {state['loss']:.5f}  kernels {state['kernels']:.0f}"
-            bar.update(task, completed=step + 1, state=text)
+        def show(run: Reconstruction) -> None:
+            bar.update(task, completed=run.done, state=f"loss {run.loss:.5f}  kernels {run.splats.count}")
+            if run.done % every == 0:
+                partial.write(run.state())
 
-        return reconstruct(material.train, renderer, options, points=points, name=name, progress=show)
+        return reconstruct(material.train, renderer, options, cloud=cloud, name=name, progress=show, begun=begun)
 
 
 def _record(scene: GaussianScene, options: ReconstructionOptions, figures: dict, seconds: dict) -> dict:
@@ -165,19 +241,23 @@ def _write_json(path: Path, record: dict) -> None:
 
 
 def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...], path: Path) -> None:
-    """Truth above, rendering in the middle, four times the difference below, for the first measured set."""
+    """Truth above, rendering in the middle, four times the difference below: stills left out, then trained on."""
     import torch
 
     from gausim.data.images import composite, write_rgba
     from gausim.engine.stills import draw_rest
 
-    images = sets[0]
-    count = len(images.images)
-    chosen = images.select([i * count // COMPARED for i in range(COMPARED)] if count > COMPARED else range(count))
-    truth, _ = composite(chosen.images)
-    drawn = draw_rest(scene, renderer, chosen.cameras)
-    rows = [torch.cat(list(x), dim=1) for x in (truth, drawn, (4 * (drawn - truth).abs()).clamp(0, 1))]
-    rgb = torch.cat(rows, dim=0)
+    size = sets[0].cameras.width, sets[0].cameras.height
+    alike = [s for s in sets if (s.cameras.width, s.cameras.height) == size]
+    counts = (LEFT_OUT_COMPARED, COMPARED - LEFT_OUT_COMPARED) if len(alike) > 1 else (COMPARED,)
+    columns = []
+    for images, count in zip(alike, counts, strict=False):
+        total = len(images.images)
+        chosen = images.select(sorted({i * total // count for i in range(count)}))
+        truth, _ = composite(chosen.images)
+        drawn = draw_rest(scene, renderer, chosen.cameras)
+        columns += [torch.cat(x) for x in zip(truth, drawn, (4 * (drawn - truth).abs()).clamp(0, 1), strict=True)]
+    rgb = torch.cat(columns, dim=1)
     pixels = (torch.cat((rgb, torch.ones_like(rgb[..., :1])), -1) * 255).round().to(torch.uint8)
     write_rgba(path, pixels)
 

@@ -60,8 +60,13 @@ def over_black(frames, rgb, alpha):  # type: ignore[no-untyped-def]
         rgb[3 * i + 2] = np.float32(frames[4 * i + 2]) / full * a
 
 
-def read_rgba(path: Path, size: tuple[int, int]) -> np.ndarray:
+def read_rgba(path: Path, size: tuple[int, int], *, opaque: bool = False) -> np.ndarray:
     """Decodes one 8-bit RGBA image of ``size`` = (width, height) to (H, W, 4).
+
+    Args:
+        path: the file.
+        size: that it must have.
+        opaque: alpha is 255 everywhere, whatever the file says; RGB will do.
 
     Raises:
         DataError: the file is missing, no image, of another size or depth, or has no alpha.
@@ -71,6 +76,8 @@ def read_rgba(path: Path, size: tuple[int, int]) -> np.ndarray:
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise DataError(f"{path}: cannot be decoded as an image. Re-export the frame as PNG.")
+    if opaque and pixels.ndim == 3 and pixels.shape[-1] in (3, 4):
+        pixels = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_BGR2BGRA)
     expected = (size[1], size[0], 4)
     if pixels.shape != expected or pixels.dtype != np.uint8:
         channels = {2: "gray"}.get(pixels.ndim) or {3: "RGB", 4: "RGBA"}.get(pixels.shape[-1], "?")
@@ -82,11 +89,13 @@ def read_rgba(path: Path, size: tuple[int, int]) -> np.ndarray:
     return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA)
 
 
-def read_rgba_into(paths: Sequence[Path], targets: Sequence[np.ndarray], size: tuple[int, int]) -> None:
-    """Decodes each path into the (H, W, 4) array of the same index, several at a time."""
+def read_rgba_into(
+    paths: Sequence[Path], targets: Sequence[np.ndarray], size: tuple[int, int], *, opaque: bool = False
+) -> None:
+    """Decodes each path into the (H, W, 4) array of the same index, several at a time (see :func:`read_rgba`)."""
 
     def decode(item: tuple[Path, np.ndarray]) -> None:
-        item[1][...] = read_rgba(item[0], size)
+        item[1][...] = read_rgba(item[0], size, opaque=opaque)
 
     with ThreadPoolExecutor(DECODER_THREADS) as pool:
         for _ in pool.map(decode, zip(paths, targets, strict=True)):

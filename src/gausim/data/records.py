@@ -42,7 +42,7 @@ class Stills:
         images: straight-alpha RGBA.
         cameras: one per image.
         train: indices to reconstruct from.
-        heldout: indices of every tenth image, left out to measure the reconstruction on.
+        heldout: indices of those left out to measure the reconstruction on, every tenth unless told otherwise.
     """
 
     images: UInt8[Tensor, "N H W 4"]
@@ -51,13 +51,22 @@ class Stills:
     heldout: tuple[int, ...]
 
 
-def read_stills(path: Path) -> Stills:
-    """Reads all images named by a ``transforms.json`` of the rest scene, and splits them."""
+def read_stills(path: Path, *, every: int = STILLS_PER_HELDOUT, opaque: bool = False) -> Stills:
+    """Reads all images named by a ``transforms.json`` of the rest scene, and splits them.
+
+    Args:
+        path: the file.
+        every: one still in so many is left out of the training ones.
+        opaque: take all of every image, whatever its alpha says; images without alpha will do.
+
+    Raises:
+        DataError: an image or pose is unusable.
+    """
     posed = read_transforms(path)
     cameras = posed.cameras
     images = np.empty((len(posed.frames), cameras.height, cameras.width, 4), np.uint8)
-    read_rgba_into([f.path for f in posed.frames], list(images), (cameras.width, cameras.height))
-    heldout = tuple(range(STILLS_PER_HELDOUT - 1, len(images), STILLS_PER_HELDOUT))
+    read_rgba_into([f.path for f in posed.frames], list(images), (cameras.width, cameras.height), opaque=opaque)
+    heldout = tuple(range(every - 1, len(images), every))
     train = tuple(sorted(set(range(len(images))) - set(heldout)))
     return Stills(torch.from_numpy(images), cameras, train, heldout)
 

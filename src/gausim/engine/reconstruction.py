@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn import functional
 
-from gausim.core import ConfigError, DataError, DivergenceError, GaussianScene, Renderer
+from gausim.core import ConfigError, DivergenceError, GaussianScene, Renderer
 from gausim.data.images import composite
+from gausim.engine.splat_start import PointCloud, Start, start_object, start_open
 from gausim.engine.splats import LearningRates, Splats
 from gausim.engine.stills import ImageSet
-from gausim.losses.image import structural_similarity
-from gausim.ops.visual_hull import VoxelHull, carve, farthest_points, project
+from gausim.losses.image import ImageLoss
 
 # Adam's step sizes fall to these shares of their start, exponentially: positions as in 3DGS, the rest less.
 FINAL_MEANS_RATE = 0.01
 FINAL_RATE = 0.1
 SSIM_WINDOW = 11
-# Opaque foreground is what initial colours are read from; the rim mixes in what lies behind.
-OPAQUE = 200
 # Pixels around the masks' bounding box that the structural loss sees as well.
 CROP_MARGIN = 6
+# Steps between two looks at the largest sizes that kernels may have.
+LIMIT_EVERY = 10
+# Steps of which one asks what kernels the image's error lies under; it costs another rendering.
+BLAME_EVERY = 4
+# Looks at the mean loss over a whole run that early stopping makes.
+LOOKS = 20
+# A look is better if the loss fell by this share.
+BETTER = 2e-3
 
 
 @dataclass(frozen=True)
@@ -35,27 +41,34 @@ class ReconstructionOptions:
     Attributes:
         kernels: number of kernels aimed at (pruning may leave fewer).
         iterations: optimiser steps, one image each.
+        extent: ``object``: what the masks show, within their visual hull; ``scene``: everything in the images.
         sh_degree: degree of the spherical harmonics, 0..3.
         hull_resolution: voxels along the longest side of the visual hull.
         hull_margin: voxels by which a kernel's centre may leave the hull.
-        start_share: share of the kernels placed at the start; splitting adds the rest.
+        missing_masks: share of the views whose masks may miss a part that all others show.
+        start_share: share of the kernels placed at the start; splitting adds the rest. An open scene starts with all
+            of its points.
         rounds: times that kernels are pruned and split.
         minimum_opacity: kernels below are pruned.
-        maximum_scale: ceiling of a standard deviation [mean distances between neighbours at the start].
+        maximum_scale: ceiling of a standard deviation [mean distances between neighbours at the start]; of objects.
         ssim_weight: share of D-SSIM against L1 (3DGS: 0.2).
         alpha_weight: weight of the L1 error of alpha against the mask.
         anisotropy_limit: r of the penalty mean(max(s_max / s_min, r) - r) (PhysGaussian).
         anisotropy_weight: its weight.
         random_background: composite over a random colour in every step instead of black.
+        patience: stop early where the mean loss over a twentieth of the steps was not better so many times in a row,
+            after the last round; 0 never stops.
         seed: of everything random.
         rates: Adam's step sizes.
     """
 
     kernels: int = 2000
     iterations: int = 4000
+    extent: Literal["object", "scene"] = "object"
     sh_degree: int = 1
     hull_resolution: int = 96
     hull_margin: int = 1
+    missing_masks: float = 0.0
     start_share: float = 0.6
     rounds: int = 8
     minimum_opacity: float = 0.05
@@ -65,16 +78,27 @@ class ReconstructionOptions:
     anisotropy_limit: float = 3.0
     anisotropy_weight: float = 0.02
     random_background: bool = True
+    patience: int = 3
     seed: int = 0
     rates: LearningRates = field(default_factory=LearningRates)
 
     def __post_init__(self) -> None:
         """Checks the ranges, or raises :class:`ConfigError`."""
-        for name in ("kernels", "iterations", "hull_resolution"):
+        for name in ("kernels", "iterations", "hull_resolution", "rounds"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"reconstruction: {name} must be at least 1, got {getattr(self, name)}.")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ConfigError(f"reconstruction: sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}.")
+        for name in ("missing_masks", "minimum_opacity", "ssim_weight"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"reconstruction: {name} must be in [0, 1), got {getattr(self, name)}.")
+
+    @property
+    def round_steps(self) -> tuple[int, ...]:
+        """Steps after which kernels are pruned and split: between 10 % and 70 % of the way."""
+        first, last = 0.1 * self.iterations, 0.7 * self.iterations
+        steps = {int(first + (last - first) * i / max(1, self.rounds - 1)) for i in range(self.rounds)}
+        return tuple(sorted(steps))
 
 
 def reconstruct(
@@ -82,144 +106,258 @@ def reconstruct(
     renderer: Renderer,
     options: ReconstructionOptions,
     *,
-    points: Float[Tensor, "P 3"] | None = None,
+    cloud: PointCloud | None = None,
     name: str = "scene",
-    progress: Callable[[int, dict[str, float]], None] | None = None,
+    progress: Callable[[Reconstruction], None] | None = None,
+    begun: Mapping[str, Tensor] | None = None,
 ) -> GaussianScene:
     """Fits Gaussians to images by L1 + D-SSIM + mask loss (3DGS, with the mask against floaters).
 
-    Kernels start on the surface of the visual hull (or on given points), are split where the images pull most and
-    pruned where they are transparent, never seen or outside the hull: the dynamics moves every kernel that is left.
+    Kernels of an object start on the surface of its visual hull (or on the points in it), those of an open scene on
+    the points. They are split where the images' error is largest and pruned where they are transparent, never seen or
+    out of bounds: the dynamics moves every kernel that is left.
 
     Args:
         sets: training images; the hull is carved from the first set.
         renderer: what draws the Gaussians.
         options: see there.
-        points: where to start instead of the hull's surface [scene units].
+        cloud: points to start from; an open scene needs them.
         name: name of the scene.
-        progress: called after every step with its number and {"loss": ..., "kernels": ...}.
+        progress: called after every step.
+        begun: :meth:`Reconstruction.state` of an interrupted one with the same arguments, to go on from.
 
     Returns:
         The scene: all kernels simulated and foreground, none pinned.
 
     Raises:
-        DataError: no body projects into all masks.
+        ConfigError: an open scene without points.
+        DataError: no body projects into all masks, no points lie in it, or points of a scene have no colours.
         DivergenceError: the loss stopped being finite.
     """
-    generator = torch.Generator().manual_seed(options.seed)
-    first = sets[0]
-    masks = first.images[..., 3] > 0
-    hull = carve(masks, first.cameras.viewmats, first.cameras.Ks, options.hull_resolution)
-    if hull is None:
-        raise DataError(
-            f"{name}: the visual hull of {len(masks)} masks is empty; expected a body that all views see. "
-            "Check that the alpha channel is the object's mask and that the poses belong to the images."
-        )
-    splats, spacing = _initial_splats(first, hull, options, points)
-    hull = hull.dilated(options.hull_margin)
-    rounds = _round_steps(options)
-    for step, (image_set, i) in enumerate(_draw(sets, options.iterations, generator)):
-        loss = _loss(splats, renderer, image_set, i, options, generator)
-        if not math.isfinite(float(loss.detach())):
-            raise DivergenceError(f"{name}: reconstruction loss is {float(loss)} at step {step}. Lower the rates.")
-        loss.backward()
-        done = step / options.iterations
-        splats.step({"means": FINAL_MEANS_RATE**done, "": FINAL_RATE**done})
-        _limit_scales(splats, options.maximum_scale * spacing)
-        if step in rounds:
-            _prune(splats, hull, options)
-            _densify(splats, options.kernels, rounds.index(step), len(rounds))
-            splats.forget()
+    run = Reconstruction(sets, renderer, options, cloud=cloud, name=name)
+    if begun is not None:
+        run.restore(begun)
+    while not run.finished:
+        run.step()
         if progress is not None:
-            progress(step, {"loss": float(loss.detach()), "kernels": splats.count})
-    splats.keep(_inside(splats, hull) & (torch.sigmoid(splats["opacity"]) > options.minimum_opacity))
-    return splats.scene(name)
+            progress(run)
+    return run.scene()
 
 
-def _draw(sets: Sequence[ImageSet], steps: int, generator: torch.Generator) -> Iterator[tuple[ImageSet, int]]:
-    """Draws images: the set by its share, within a set every image once before any comes again."""
-    shares = torch.tensor([s.share for s in sets])
-    queues: list[list[int]] = [[] for _ in sets]
-    for _ in range(steps):
-        k = int(torch.multinomial(shares, 1, generator=generator))
-        if not queues[k]:
-            queues[k] = torch.randperm(len(sets[k].images), generator=generator).tolist()
-        yield sets[k], queues[k].pop()
+class Reconstruction:
+    """A reconstruction under way.
+
+    Attributes:
+        splats: the kernels.
+        done: steps made.
+        loss: of the latest step.
+    """
+
+    def __init__(
+        self,
+        sets: Sequence[ImageSet],
+        renderer: Renderer,
+        options: ReconstructionOptions,
+        *,
+        cloud: PointCloud | None,
+        name: str,
+    ) -> None:
+        """Places the first kernels (see :func:`reconstruct`)."""
+        self._sets, self._renderer, self._options, self._name = list(sets), renderer, options, name
+        self._start = start = _start(sets[0], options, cloud, name)
+        self.splats = Splats(
+            start.points, start.colors, start.scales, sh_degree=options.sh_degree, opacity=0.8, rates=options.rates,
+            extent=start.extent,
+        )  # fmt: skip
+        self._generator = torch.Generator().manual_seed(options.seed)
+        self._queues: list[list[int]] = [[] for _ in sets]
+        self._similarity = ImageLoss(balance=0.0, window=SSIM_WINDOW, pixels=1 / 3, crop=False)
+        self._patience = _Patience(options)
+        self.done, self.loss = 0, math.nan
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps are made, or more would not help."""
+        return self.done >= self._options.iterations or self._patience.over
+
+    def step(self) -> None:
+        """One image.
+
+        Raises:
+            DivergenceError: the loss is not finite, or pruning left nothing.
+        """
+        images, i = self._draw()
+        background = self._background()
+        truth, mask = composite(images.images[i], background)
+        rgb, alpha = self._render(images, i, background, self.splats.drawable(images.cameras.centers[i]))
+        loss = self._loss(rgb, alpha, truth, mask)
+        self.loss = float(loss.detach())
+        if not math.isfinite(self.loss):
+            raise DivergenceError(
+                f"{self._name}: reconstruction loss is {self.loss} at step {self.done}. Lower the rates."
+            )
+        loss.backward()
+        if self.done % BLAME_EVERY == 0 and self.done < self._options.round_steps[-1]:
+            self._blame(images, i, background, (rgb.detach() - truth).abs().mean(-1))
+        share = self.done / self._options.iterations
+        self.splats.step({"means": FINAL_MEANS_RATE**share, "": FINAL_RATE**share})
+        if self.done % LIMIT_EVERY == 0:
+            self._limit()
+        rounds = self._options.round_steps
+        if self.done in rounds:
+            self._prune()
+            self._densify(rounds.index(self.done), len(rounds))
+            self.splats.forget()
+        self._patience.note(self.done, self.loss)
+        self.done += 1
+
+    def scene(self) -> GaussianScene:
+        """The kernels that are opaque and within bounds."""
+        self._limit()
+        opaque = torch.sigmoid(self.splats["opacity"].detach()) > self._options.minimum_opacity
+        self.splats.keep(self._inside() & opaque)
+        return self.splats.scene(self._name)
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that a reconstruction with the same arguments needs to go on bit by bit."""
+        queues = {f"queue_{k}": torch.tensor(queue, dtype=torch.int64) for k, queue in enumerate(self._queues)}
+        return {
+            **self.splats.state(),
+            **queues,
+            "done": torch.tensor(self.done),
+            "generator": self._generator.get_state(),
+            "patience": self._patience.state(),
+        }
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on from :meth:`state`."""
+        self.splats.restore(state)
+        self._queues = [state[f"queue_{k}"].tolist() for k in range(len(self._queues))]
+        self.done = int(state["done"])
+        self._generator.set_state(state["generator"])
+        self._patience.restore(state["patience"])
+
+    def _draw(self) -> tuple[ImageSet, int]:
+        """An image: the set by its share, within a set every image once before any comes again."""
+        done = self.done / self._options.iterations
+        shares = torch.tensor([s.share * (s.span[0] <= done < s.span[1]) for s in self._sets])
+        k = int(torch.multinomial(shares, 1, generator=self._generator))
+        if not self._queues[k]:
+            self._queues[k] = torch.randperm(len(self._sets[k].images), generator=self._generator).tolist()
+        return self._sets[k], self._queues[k].pop()
+
+    def _background(self) -> Float[Tensor, " 3"]:
+        random = torch.rand(3, generator=self._generator)
+        return random if self._options.random_background else torch.zeros(3)
+
+    def _render(
+        self, images: ImageSet, i: int, background: Tensor, drawable: tuple[Tensor, Tensor, Tensor, Tensor]
+    ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+        cameras = images.cameras
+        means, covars, colors, opacities = drawable
+        camera = cameras.viewmats[None, i : i + 1], cameras.Ks[None, i : i + 1]
+        drawn = self._renderer(
+            means[None], covars[None], colors[None, None], opacities[None], *camera, (cameras.width, cameras.height),
+            background=background,
+        )  # fmt: skip
+        return drawn.rgb[0, 0], drawn.alpha[0, 0]
+
+    def _blame(self, images: ImageSet, i: int, background: Tensor, error: Float[Tensor, "H W"]) -> None:
+        """Notes the share of every kernel in the image's error: the sum over pixels of its weight times the error.
+
+        That is the gradient of sum(error * rgb) with respect to a gray kernel's colour. Unlike the gradient of its
+        position it does not cancel within a large kernel (Rota Bulo et al., Revising Densification, 2024).
+        """
+        means, covars, colors, opacities = (x.detach() for x in self.splats.drawable(images.cameras.centers[i]))
+        gray = torch.zeros_like(colors).requires_grad_()
+        rgb, _ = self._render(images, i, background, (means, covars, gray, opacities))
+        (share,) = torch.autograd.grad(rgb, gray, error[..., None].expand_as(rgb))
+        self.splats.blame(share.mean(-1))
+
+    def _loss(self, rgb: Tensor, alpha: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
+        options = self._options
+        loss = (1 - options.ssim_weight) * (rgb - truth).abs().mean()
+        loss = loss + options.alpha_weight * (alpha - mask).abs().mean()
+        if options.ssim_weight > 0:
+            rows, columns = _crop(mask > 0)
+            first, second = (x[rows, columns].contiguous()[None, None] for x in (rgb, truth))
+            share = first.shape[2] * first.shape[3] / mask.numel()  # outside both are background: D-SSIM is zero there
+            loss = loss + options.ssim_weight * share * self._similarity(first, second)[0]
+        ratio = (self.splats["log_scales"].amax(-1) - self.splats["log_scales"].amin(-1)).exp()
+        return loss + options.anisotropy_weight * (ratio - options.anisotropy_limit).clamp_min(0).mean()
+
+    def _inside(self) -> Bool[Tensor, " K"]:
+        return self._start.bounds.contains(self.splats["means"].detach())
+
+    @torch.no_grad()
+    def _limit(self) -> None:
+        largest = self._start.bounds.largest(self.splats["means"].detach())
+        self.splats["log_scales"].copy_(torch.minimum(self.splats["log_scales"], largest.log()[:, None]))
+
+    def _prune(self) -> None:
+        opaque = torch.sigmoid(self.splats["opacity"].detach()) > self._options.minimum_opacity
+        seen = self.splats.seen
+        keep = opaque & seen & self._inside()
+        if keep.sum() < 2:
+            raise DivergenceError(
+                f"reconstruction: only {int(keep.sum())} of {len(keep)} kernels are left after pruning (opaque: "
+                f"{int(opaque.sum())}, seen: {int(seen.sum())}). Check masks and poses, or take more iterations."
+            )
+        self.splats.keep(keep)
+
+    def _densify(self, done: int, rounds: int) -> None:
+        """Splits kernels that cover most of the images' error, so that the last round but one reaches the budget."""
+        missing = self._options.kernels - self.splats.count
+        count = min(math.ceil(missing / max(1, rounds - 1 - done)), self.splats.count)
+        if count > 0 and done < rounds - 1:
+            self.splats.split(self.splats.error.topk(count).indices)
 
 
-def _round_steps(options: ReconstructionOptions) -> list[int]:
-    """Steps after which kernels are pruned and split: between 10 % and 70 % of the way."""
-    first, last = 0.1 * options.iterations, 0.7 * options.iterations
-    return sorted({int(first + (last - first) * i / max(1, options.rounds - 1)) for i in range(options.rounds)})
+class _Patience:
+    """Tells when the mean loss over a stretch of steps has stopped falling."""
+
+    def __init__(self, options: ReconstructionOptions) -> None:
+        self._allowed, self._length = options.patience, max(1, options.iterations // LOOKS)
+        self._first = options.round_steps[-1] + 1
+        self._sum, self._count, self._best, self._worse = 0.0, 0, math.inf, 0
+
+    @property
+    def over(self) -> bool:
+        return self._allowed > 0 and self._worse >= self._allowed
+
+    def note(self, step: int, loss: float) -> None:
+        if step < self._first:
+            return
+        self._sum, self._count = self._sum + loss, self._count + 1
+        if self._count < self._length:
+            return
+        mean = self._sum / self._count
+        self._worse = 0 if mean < (1 - BETTER) * self._best else self._worse + 1
+        self._best, self._sum, self._count = min(self._best, mean), 0.0, 0
+
+    def state(self) -> Tensor:
+        return torch.tensor([self._sum, self._count, self._best, self._worse], dtype=torch.float64)
+
+    def restore(self, state: Tensor) -> None:
+        self._sum, self._best = float(state[0]), float(state[2])
+        self._count, self._worse = int(state[1]), int(state[3])
 
 
-def _initial_splats(
-    images: ImageSet, hull: VoxelHull, options: ReconstructionOptions, points: Tensor | None
-) -> tuple[Splats, float]:
-    """Balls spread over the surface (or the given points), and their mean distance to their neighbours."""
-    surface, normals = hull.surface()
-    if points is not None:
-        normals = torch.zeros_like(points)
-        surface = points.float()
-    index = farthest_points(surface, max(2, round(options.start_share * options.kernels)))
-    chosen, normals = surface[index], normals[index]
-    distance = torch.cdist(chosen, chosen).topk(min(4, len(chosen)), largest=False).values[:, 1:].mean(-1)
-    splats = Splats(
-        chosen,
-        _surface_colors(chosen, normals, images),
-        0.6 * distance.clamp_min(1e-3 * hull.spacing),
-        sh_degree=options.sh_degree,
-        opacity=0.8,
-        rates=options.rates,
-        extent=hull.diagonal,
+def _start(images: ImageSet, options: ReconstructionOptions, cloud: PointCloud | None, name: str) -> Start:
+    if options.extent == "scene":
+        if cloud is None:
+            raise ConfigError(f"{name}: an open scene starts from points. Give those that `poses` found (points.npz).")
+        return start_open(images, cloud, name=name)
+    return start_object(
+        images,
+        round(options.start_share * options.kernels),
+        resolution=options.hull_resolution,
+        margin=options.hull_margin,
+        missing=options.missing_masks,
+        ceiling=options.maximum_scale,
+        cloud=cloud,
+        name=name,
     )
-    return splats, float(distance.mean())
-
-
-def _surface_colors(
-    points: Float[Tensor, "K 3"], normals: Float[Tensor, "K 3"], images: ImageSet
-) -> Float[Tensor, "K 3"]:
-    """Mean colour over the views that a point's normal faces; occlusion by other parts is left to the optimiser."""
-    pixels, _ = project(points, images.cameras.viewmats, images.cameras.Ks)
-    total, weight = torch.zeros_like(points), torch.full((len(points), 1), 1e-6)
-    mean = images.images[..., :3][images.images[..., 3] > OPAQUE].float().mean(0) / 255
-    for view, center in enumerate(images.cameras.centers):
-        x, y = pixels[view].floor().long().unbind(-1)
-        x, y = x.clamp(0, images.cameras.width - 1), y.clamp(0, images.cameras.height - 1)
-        rgba = images.images[view, y, x]
-        facing = (normals * functional.normalize(center - points, dim=-1)).sum(-1).clamp_min(1e-3)
-        w = (facing**4 * (rgba[:, 3] > OPAQUE))[:, None]
-        total, weight = total + w * rgba[:, :3].float() / 255, weight + w
-    return (total + 1e-6 * mean) / weight
-
-
-def _loss(
-    splats: Splats,
-    renderer: Renderer,
-    images: ImageSet,
-    i: int,
-    options: ReconstructionOptions,
-    generator: torch.Generator,
-) -> Tensor:
-    cameras = images.cameras
-    background = torch.rand(3, generator=generator) if options.random_background else torch.zeros(3)
-    means, covars, colors, opacities = splats.drawable(cameras.centers[i])
-    size = (cameras.width, cameras.height)
-    camera = cameras.viewmats[None, i : i + 1], cameras.Ks[None, i : i + 1]
-    drawn = renderer(
-        means[None], covars[None], colors[None, None], opacities[None], *camera, size, background=background
-    )
-    rgb, alpha = drawn.rgb[0, 0], drawn.alpha[0, 0]
-    truth, mask = composite(images.images[i], background)
-    loss = (1 - options.ssim_weight) * (rgb - truth).abs().mean() + options.alpha_weight * (alpha - mask).abs().mean()
-    if options.ssim_weight > 0:
-        rows, columns = _crop(mask > 0)
-        first, second = (x[rows, columns].permute(2, 0, 1).contiguous() for x in (rgb, truth))
-        share = first[0].numel() / mask.numel()  # outside the crop both are background: D-SSIM is about zero there
-        similarity = structural_similarity(first, second, SSIM_WINDOW).mean()
-        loss = loss + options.ssim_weight * share * (1 - similarity) / 2
-    ratio = (splats["log_scales"].amax(-1) - splats["log_scales"].amin(-1)).exp()
-    return loss + options.anisotropy_weight * (ratio - options.anisotropy_limit).clamp_min(0).mean()
 
 
 def _crop(mask: Bool[Tensor, "H W"]) -> tuple[slice, slice]:
@@ -230,31 +368,3 @@ def _crop(mask: Bool[Tensor, "H W"]) -> tuple[slice, slice]:
         low, high = (int(used[0]), int(used[-1]) + 1) if len(used) else (0, size)
         slices.append(slice(max(0, low - CROP_MARGIN), min(size, max(high, low + SSIM_WINDOW) + CROP_MARGIN)))
     return slices[0], slices[1]
-
-
-@torch.no_grad()
-def _limit_scales(splats: Splats, ceiling: float) -> None:
-    splats["log_scales"].clamp_max_(math.log(ceiling))
-
-
-def _inside(splats: Splats, hull: VoxelHull) -> Bool[Tensor, " K"]:
-    return hull.contains(splats["means"].detach())
-
-
-def _prune(splats: Splats, hull: VoxelHull, options: ReconstructionOptions) -> None:
-    opaque = torch.sigmoid(splats["opacity"].detach()) > options.minimum_opacity
-    keep = opaque & splats.seen & _inside(splats, hull)
-    if keep.sum() < 2:
-        raise DivergenceError(
-            f"reconstruction: only {int(keep.sum())} of {splats.count} kernels are left after pruning (opaque: "
-            f"{int(opaque.sum())}, seen: {int(splats.seen.sum())}). Check masks and poses, or take more iterations."
-        )
-    splats.keep(keep)
-
-
-def _densify(splats: Splats, budget: int, done: int, rounds: int) -> None:
-    """Splits the kernels that the images pull most, so that the last round but one reaches the budget."""
-    missing = budget - splats.count
-    count = min(math.ceil(missing / max(1, rounds - 1 - done)), splats.count)
-    if count > 0 and done < rounds - 1:
-        splats.split(splats.pull.topk(count).indices)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -19,6 +19,8 @@ from gausim.ops.spherical_harmonics import C0, evaluate_sh
 SPLIT_SHRINK = 1.6
 # Halves move this many standard deviations apart from the old centre.
 SPLIT_OFFSET = 0.6
+# What torch.optim.Adam keeps for a parameter.
+ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class Splats:
             rate = getattr(rates, name) * (extent if name == "means" else 1.0)
             groups.append({"params": [value.float().requires_grad_()], "lr": rate, "base": rate, "name": name})
         self.optimizer = torch.optim.Adam(groups, eps=1e-15)
-        self._pull, self._hits = torch.zeros(count), torch.zeros(count)
+        self._error, self._seen = torch.zeros(count), torch.zeros(count, dtype=torch.bool)
 
     def __getitem__(self, name: str) -> Tensor:
         return next(g["params"][0] for g in self.optimizer.param_groups if g["name"] == name)
@@ -96,12 +98,12 @@ class Splats:
     @property
     def seen(self) -> Bool[Tensor, " K"]:
         """Kernels that received any gradient since :meth:`forget`."""
-        return self._hits > 0
+        return self._seen
 
     @property
-    def pull(self) -> Float[Tensor, " K"]:
-        """Mean length of the positions' gradient over the steps in which the kernel was seen."""
-        return self._pull / self._hits.clamp_min(1)
+    def error(self) -> Float[Tensor, " K"]:
+        """The largest error noted by :meth:`blame` since :meth:`forget`."""
+        return self._error
 
     def sh(self) -> Float[Tensor, "K B 3"]:
         """All colour coefficients."""
@@ -124,25 +126,47 @@ class Splats:
         covars = covariance_from_scales(self["log_scales"], self["quats"])
         return self["means"], covars, evaluate_sh(self.sh(), directions), torch.sigmoid(self["opacity"])
 
+    def blame(self, error: Float[Tensor, " K"]) -> None:
+        """Notes how much of an image's error lies under each kernel."""
+        self._error = torch.maximum(self._error, error)
+
     def step(self, decay: dict[str, float]) -> None:
         """One Adam step with the base step sizes times ``decay`` (by name, "" for all others)."""
         gradient = self["means"].grad
         if gradient is not None:
-            length = gradient.norm(dim=-1)
-            self._pull += length
-            self._hits += length > 0
+            self._seen |= (gradient != 0).any(-1)
         for group in self.optimizer.param_groups:
             group["lr"] = group["base"] * decay.get(group["name"], decay[""])
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
 
+    def state(self) -> dict[str, Tensor]:
+        """Parameters, Adam's moments and what has been noted: everything that changes."""
+        state = {"error": self._error, "seen": self._seen}
+        for group in self.optimizer.param_groups:
+            (value,), name = group["params"], group["name"]
+            state[name] = value.detach()
+            state |= {f"{name}.{key}": kept for key, kept in self.optimizer.state[value].items()}
+        return {name: value.clone() for name, value in state.items()}
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on from :meth:`state`."""
+        for group in self.optimizer.param_groups:
+            self.optimizer.state.pop(group["params"][0], None)
+            value, name = state[group["name"]].clone().requires_grad_(), group["name"]
+            group["params"] = [value]
+            kept = {key: state[f"{name}.{key}"].clone() for key in ADAM_STATE if f"{name}.{key}" in state}
+            if kept:
+                self.optimizer.state[value] = kept
+        self._error, self._seen = state["error"].clone(), state["seen"].clone()
+
     @torch.no_grad()
     def keep(self, mask: Bool[Tensor, " K"]) -> None:
-        """Drops the other kernels; what is known about the pull on those that stay is kept."""
-        pull, hits = self._pull[mask], self._hits[mask]
+        """Drops the other kernels; what has been noted of those that stay is kept."""
+        error, seen = self._error[mask], self._seen[mask]
         if not mask.all():
             self._change(lambda value: value[mask])
-        self._pull, self._hits = pull, hits
+        self._error, self._seen = error, seen
 
     @torch.no_grad()
     def split(self, index: Int[Tensor, " n"]) -> None:
@@ -173,5 +197,5 @@ class Splats:
         self.forget()
 
     def forget(self) -> None:
-        """Starts afresh to gather what is seen and pulled."""
-        self._pull, self._hits = torch.zeros(self.count), torch.zeros(self.count)
+        """Starts afresh to gather what is seen and where errors are."""
+        self._error, self._seen = torch.zeros(self.count), torch.zeros(self.count, dtype=torch.bool)

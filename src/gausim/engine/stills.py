@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -14,10 +14,13 @@ from torch.nn import functional
 from gausim.core import Cameras, DataError, GaussianScene, Renderer
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData
-from gausim.data.records import Stills, read_stills
+from gausim.data.records import STILLS_PER_HELDOUT, Stills, read_stills
 from gausim.metrics.psnr import PSNR, ForegroundPSNR
 from gausim.metrics.ssim import SSIM
 from gausim.render.draw import draw
+
+# Images that are drawn and compared together: photos of several megapixels fill memory.
+MEASURED_AT_ONCE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,16 +32,18 @@ class ImageSet:
         images: straight-alpha RGBA.
         cameras: one per image.
         share: weight of the set when training draws images.
+        span: part of the steps in which training draws from it, from and to [shares of all steps].
     """
 
     name: str
     images: UInt8[Tensor, "N H W 4"]
     cameras: Cameras
     share: float = 1.0
+    span: tuple[float, float] = (0.0, 1.0)
 
     def select(self, index: Sequence[int]) -> ImageSet:
         """The images at these indices."""
-        return ImageSet(self.name, self.images[list(index)], self.cameras.select(list(index)), self.share)
+        return replace(self, images=self.images[list(index)], cameras=self.cameras.select(list(index)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,16 +54,44 @@ class Material:
     measure: tuple[ImageSet, ...]
 
 
-def gather_stills(path: Path) -> Material:
-    """The stills of one ``transforms.json``; every tenth is left out and measured.
+def gather_stills(
+    path: Path,
+    *,
+    every: int = STILLS_PER_HELDOUT,
+    opaque: bool = False,
+    longest: int | None = None,
+    coarse: float = 0.0,
+) -> Material:
+    """The stills of one ``transforms.json``; some are left out and measured.
+
+    Args:
+        path: the file.
+        every: one still in so many is left out.
+        opaque: everything in the images counts, not only what their alpha shows.
+        longest: reduce them to at most so many pixels along the longer side.
+        coarse: share of the steps, the first ones, on stills of half that size: a quarter of the work.
 
     Raises:
         DataError: fewer than two stills, or an image or pose is unusable.
     """
-    stills = read_stills(path)
+    stills = read_stills(path, every=every, opaque=opaque)
     if len(stills.images) < 2:
         raise DataError(f"{path}: {len(stills.images)} stills; expected at least two views of the object.")
-    return Material((_part(stills, stills.train, "stills"),), _left_out(stills))
+    train = _part(stills, stills.train, "stills to train on")
+    left_out = _left_out(stills)
+    side = max(stills.cameras.width, stills.cameras.height)
+    if longest is not None and side > longest:
+        train, left_out = _scaled(train, longest / side), tuple(_scaled(s, longest / side) for s in left_out)
+    measured = (*left_out, train) if stills.heldout else left_out
+    if not coarse:
+        return Material((train,), measured)
+    half = replace(_scaled(train, 0.5), span=(0.0, coarse))
+    return Material((half, replace(train, span=(coarse, 1.0))), measured)
+
+
+def _scaled(images: ImageSet, factor: float) -> ImageSet:
+    width, height = (max(1, round(length * factor)) for length in (images.cameras.width, images.cameras.height))
+    return replace(reduced(images, (width, height), share=images.share), name=images.name)
 
 
 def gather_object(data: ObjectData, *, video_share: float = 0.5) -> Material:
@@ -137,13 +170,14 @@ def draw_rest(scene: GaussianScene, renderer: Renderer, cameras: Cameras) -> Flo
 
 def measure(scene: GaussianScene, renderer: Renderer, images: ImageSet) -> dict[str, float]:
     """PSNR [dB] of the whole image and of the foreground, and SSIM, over black: means over the images."""
-    truth, alpha = composite(images.images)
-    drawn = draw_rest(scene, renderer, images.cameras)
-    result = {}
-    for metric in (PSNR(), ForegroundPSNR(), SSIM()):
-        metric.update(drawn, truth, alpha > 0)
-        result[metric.key] = float(metric.compute())
-    return result
+    metrics = (PSNR(), ForegroundPSNR(), SSIM())
+    for start in range(0, len(images.images), MEASURED_AT_ONCE):
+        part = images.select(range(start, min(start + MEASURED_AT_ONCE, len(images.images))))
+        truth, alpha = composite(part.images)
+        drawn = draw_rest(scene, renderer, part.cameras)
+        for metric in metrics:
+            metric.update(drawn, truth, alpha > 0)
+    return {metric.key: float(metric.compute()) for metric in metrics}
 
 
 def _part(stills: Stills, index: Sequence[int], name: str, *, share: float = 1.0) -> ImageSet:

@@ -97,21 +97,33 @@ def search_cube(
 
 
 def carve(
-    masks: Bool[Tensor, "V H W"], viewmats: Float[Tensor, "V 4 4"], Ks: Float[Tensor, "V 3 3"], resolution: int
+    masks: Bool[Tensor, "V H W"],
+    viewmats: Float[Tensor, "V 4 4"],
+    Ks: Float[Tensor, "V 3 3"],
+    resolution: int,
+    *,
+    missing: float = 0.0,
 ) -> VoxelHull | None:
     """Visual hull with about ``resolution`` voxels along its longest side; None if nothing is left.
 
-    Views are unanimous: one mask that misses a part removes it. Pixels outside an image veto nothing, so an object
-    that leaves some images survives.
+    Pixels outside an image veto nothing, so an object that leaves some images survives.
+
+    Args:
+        masks: foreground.
+        viewmats: world to camera (OpenCV).
+        Ks: intrinsics [pixels].
+        resolution: voxels along the longest side.
+        missing: share of the views whose masks may miss a part; 0: one mask that misses it removes it.
     """
     middle, half = search_cube(viewmats, Ks, (masks.shape[2], masks.shape[1]))
-    coarse = _carve_box(masks, viewmats, Ks, middle - half, middle + half, 2 * half / _COARSE_RESOLUTION)
+    vetoes = int(missing * len(masks))
+    coarse = _carve_box(masks, viewmats, Ks, middle - half, middle + half, 2 * half / _COARSE_RESOLUTION, vetoes)
     if not coarse.occupied.any():
         return None
     index = coarse.occupied.nonzero()
     low = coarse.origin + (index.amin(0) - 1) * coarse.spacing
     high = coarse.origin + (index.amax(0) + 1) * coarse.spacing
-    return _carve_box(masks, viewmats, Ks, low, high, float((high - low).max()) / resolution)
+    return _carve_box(masks, viewmats, Ks, low, high, float((high - low).max()) / resolution, vetoes)
 
 
 def _carve_box(
@@ -121,10 +133,11 @@ def _carve_box(
     low: Float[Tensor, " 3"],
     high: Float[Tensor, " 3"],
     spacing: float,
+    vetoes: int,
 ) -> VoxelHull:
     axes = [torch.arange(float(low[i]), float(high[i]) + spacing / 2, spacing) for i in range(3)]
     points = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1)
-    occupied = _inside_masks(points.reshape(-1, 3), masks, viewmats, Ks)
+    occupied = _inside_masks(points.reshape(-1, 3), masks, viewmats, Ks, vetoes)
     return VoxelHull(occupied.reshape(points.shape[:3]), points[0, 0, 0], spacing)
 
 
@@ -133,9 +146,11 @@ def _inside_masks(
     masks: Bool[Tensor, "V H W"],
     viewmats: Float[Tensor, "V 4 4"],
     Ks: Float[Tensor, "V 3 3"],
+    vetoes: int,
 ) -> Bool[Tensor, " N"]:
     height, width = masks.shape[1:]
     alive, seen = torch.arange(points.shape[0]), torch.zeros(points.shape[0])
+    against = torch.zeros(points.shape[0], dtype=torch.int32)
     # View by view, each on what the earlier ones left over: ten times less work than all points in all views.
     for view in range(masks.shape[0]):
         pixels, depth = project(points[alive], viewmats[view : view + 1], Ks[view : view + 1])
@@ -143,7 +158,8 @@ def _inside_masks(
         visible = (depth[0] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
         covered = masks[view, y.clamp(0, height - 1), x.clamp(0, width - 1)]
         seen[alive[visible]] += 1
-        alive = alive[covered | ~visible]
+        against[alive[visible & ~covered]] += 1
+        alive = alive[against[alive] <= vetoes]
     inside = torch.zeros(points.shape[0], dtype=torch.bool)
     inside[alive] = seen[alive] >= _MINIMUM_SEEN * masks.shape[0]
     return inside
