@@ -64,7 +64,7 @@ def test_broken_configurations_are_named(tmp_path: Path, text: str, what: str) -
 def test_a_real_stage_runs_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     TOY["write_toy_object"](tmp_path / "toy", frames=9)
     config = _config(tmp_path, "{work: work, stages: {pack: {root: toy, margin: 1}}}")
-    assert command.main([str(config)]) == 0 and "packed: 2 sequences" in capsys.readouterr().out
+    assert command.main([str(config)]) == 0 and "made: 2 sequences" in capsys.readouterr().out
     assert verify(tmp_path / "work" / "pack") == []
     assert command.main([str(config)]) == 0 and "there already" in capsys.readouterr().out
     config.write_text(config.read_text().replace("margin: 1", "margin: 2"))
