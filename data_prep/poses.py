@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from data_prep.cameras.mapping import MappingOptions
+    from data_prep.cameras.output import Straighteners
     from data_prep.cameras.sources import Posed
     from data_prep.cameras.world import Similarity
     from gausim.io.colmap_files import PointTable
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 # Raise when the same inputs and settings give another result than before.
 REVISION = 1
 PACKAGES = ("pycolmap", "numpy", "opencv-python-headless", "pillow")
+# So many images are named where a camera is not among them.
+_NAMED = 6
 T = TypeVar("T")
 
 
@@ -91,7 +94,7 @@ def _make(
 ) -> dict[str, Any]:
     """Does the stage's work in ``work``."""
     from data_prep.cameras.mapping import forget
-    from data_prep.cameras.output import Straighteners, key_of, write_points, write_sequence, write_stills
+    from data_prep.cameras.output import Straighteners, key_of, write_points, write_stills
     from data_prep.cameras.report import draw_cameras, reprojection
 
     found, points, results = _found(work, sources, material, mapping, tick)
@@ -100,23 +103,8 @@ def _make(
     moved = [replace(shot, viewmat=move.viewmat(shot.viewmat)) for shot in found]
     tracks = points.tracks
     results["points"] = {"count": len(tracks), "mean_track": float(tracks.mean()) if len(tracks) else None}
-    by_name = {key_of(shot.photo.name): shot for shot in moved}
-    used: set[str] = set()
-    sequences, left_out = {}, {}
-    straighteners = Straighteners()
-    for folder, names in material.sequences.items():
-        cameras, missing = _cameras_of(folder, names, by_name, used)
-        if missing:
-            left_out[folder.name] = missing
-            continue
-        target = work / "sequences" / folder.name
-        frames = write_sequence(target, {n: folder / n for n in cameras}, cameras, material.fps, straighteners, tick)
-        sequences[folder.name] = {"cameras": list(cameras), "frames": frames}
-    if material.sequences and not sequences:
-        raise DataError(
-            f"{next(iter(material.sequences)).parent}: no sequence has poses of all its cameras (missing: {left_out}). "
-            "Their first frames must show the same scene as the stills, from places that stills were taken near."
-        )
+    straighteners, used = Straighteners(), set[str]()
+    sequences, left_out = _write_sequences(work, sources, material, moved, straighteners, used, tick)
     stills = [shot for shot in moved if key_of(shot.photo.name) not in used] or moved
     write_stills(work, stills, straighteners, tick)
     xyz = move.points(points.xyz)
@@ -126,6 +114,40 @@ def _make(
         draw_cameras(temporary, moved, xyz, colors, f"{len(moved)} cameras, {len(xyz)} points")
     forget(work)
     return {**results, "stills": len(stills), "sequences": sequences, "sequences_without_poses": left_out}
+
+
+def _write_sequences(
+    work: Path, sources: Sources, material: Material, moved: list[Posed], straighteners: Straighteners, used: set[str],
+    tick: Tick,
+) -> tuple[dict[str, Any], dict[str, list[str]]]:  # fmt: skip
+    """Writes the sequences whose cameras have poses; returns what is to be told of them, and what the others lack.
+
+    ``used`` gets the keys of the images that are fixed cameras, and so no stills.
+    """
+    from data_prep.cameras.output import key_of, write_sequence
+
+    by_name = {key_of(shot.photo.name): shot for shot in moved}
+    sequences, left_out = {}, {}
+    for folder, names in material.sequences.items():
+        cameras, missing = _cameras_of(folder, names, by_name, used)
+        if missing:
+            left_out[folder.name] = missing
+            continue
+        target = work / "sequences" / folder.name
+        frames = write_sequence(target, {n: folder / n for n in cameras}, cameras, material.fps, straighteners, tick)
+        sequences[folder.name] = {"cameras": list(cameras), "frames": frames}
+    if material.sequences and not sequences:
+        remedy = (
+            "Their first frames must show the same scene as the stills, from places that stills were taken near."
+            if sources.kind == "mapping"
+            else "A fixed camera cam_0 of seq_000 is the image seq_000/cam_0 or cam_0 of what is taken over, which has "
+            f"{', '.join(sorted(by_name)[:_NAMED])}."
+        )
+        raise DataError(
+            f"{next(iter(material.sequences)).parent}: no sequence has poses of all its cameras (missing: {left_out}). "
+            + remedy
+        )
+    return sequences, left_out
 
 
 def _cameras_of(

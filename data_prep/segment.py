@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gausim.core import DataError
-from gausim.io.files import write_json
+from gausim.io.files import write_durably, write_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -94,11 +94,12 @@ def segment(
         raise DataError(f"{source}: expected a folder of pictures, or a film.")
     clips = [] if film else find_clips(source, kind=kind, every=every)
     pictures = {path.as_posix(): source / path for clip in clips for path in clip.paths}
+    carried = {} if film or every > 1 else _beside(source)
     stage = Stage(
         name="segment",
         revision=REVISION,
         inputs={
-            **({source.name: source} if film else pictures),
+            **({source.name: source} if film else {**pictures, **carried}),
             **{f"backend/{k}": v for k, v in backend.inputs.items()},
         },
         settings={
@@ -118,8 +119,7 @@ def segment(
             found = find_clips(work / FRAMES, kind="stills" if kind == "stills" else "film", every=every)
         run = _Run(work, backend, cleanup, _rate(source), advance)
         results = {clip.name: run.clip(clip) for clip in found}
-        if not film and every == 1:
-            _carry_poses(source, work, pictures)
+        _carry(carried, work, pictures)
         for folder in (RAW, FRAMES):
             shutil.rmtree(work / folder, ignore_errors=True)
         return {"backend": backend.name, "clips": results}
@@ -250,20 +250,28 @@ def _rate(source: Path) -> float:
     return 24.0
 
 
-def _carry_poses(source: Path, work: Path, pictures: Mapping[str, Path]) -> None:
-    """Copies ``transforms.json`` files with their pictures' new names, and ``dataset.json``."""
+def _beside(source: Path) -> dict[str, Path]:
+    """What belongs to the pictures, by its name: poses, facts, points."""
+    found = [*source.rglob("transforms.json"), *(source / name for name in ("dataset.json", "points.npz"))]
+    named = {path.relative_to(source).as_posix(): path for path in sorted(found) if path.is_file()}
+    return {name: path for name, path in named.items() if not any(part.startswith(".") for part in Path(name).parts)}
+
+
+def _carry(files: Mapping[str, Path], work: Path, pictures: Mapping[str, Path]) -> None:
+    """Copies what belongs to the pictures; ``transforms.json`` gets their new names."""
     from gausim.io.transforms import read_json
 
     done = {path.resolve() for path in pictures.values()}
-    for path in [*source.rglob("transforms.json"), source / "dataset.json"]:
-        if not path.is_file() or any(part.startswith(".") for part in path.relative_to(source).parts):
+    for name, path in files.items():
+        if path.suffix != ".json":
+            write_durably(work / name, path.read_bytes())
             continue
         data = read_json(path)
         for entry in data.get("frames", []) if isinstance(data.get("frames"), list) else []:
             named = entry.get("file_path") if isinstance(entry, dict) else None
             if isinstance(named, str) and (path.parent / named).resolve() in done:
                 entry["file_path"] = Path(named).with_suffix(".png").as_posix()
-        write_json(work / path.relative_to(source), data)
+        write_json(work / name, data)
 
 
 def main(argv: list[str] | None = None) -> int:
