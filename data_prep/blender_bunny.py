@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from data_prep.blender_env import Blender
-    from data_prep.blender_plan import Plan
+    from data_prep.blender.environment import Blender
+    from data_prep.blender.plan import Plan
 
 REVISION = 1
 SIZES = ("sequences", "frames", "views", "heldout", "stills", "samples", "points", "seed", "steps")
@@ -39,7 +39,7 @@ def make_set(
         force: replace a set of other settings.
 
     Returns:
-        The manifest (see :func:`data_prep.stage.run_stage`).
+        The manifest (see :func:`data_prep.common.stage.run_stage`).
 
     Raises:
         DataError: the mesh is unusable, or ``out`` holds something else.
@@ -48,8 +48,8 @@ def make_set(
     """
     from dataclasses import asdict
 
-    from data_prep.blender_work import make
-    from data_prep.stage import Stage, run_stage
+    from data_prep.blender.work import make
+    from data_prep.common.stage import Stage, run_stage
 
     settings = asdict(plan.checked())
     stage = Stage("blender_bunny", REVISION, {"mesh": mesh}, settings, packages=("numpy",))
@@ -63,7 +63,7 @@ def main(argv: list[str] | None = None) -> int:
 
     began = time.monotonic()
     try:
-        from data_prep.blender_env import default_environment, find_blender
+        from data_prep.blender.environment import default_environment, find_blender
 
         plan = _plan(arguments)
         out = arguments.out or Path("data") / plan.name
@@ -89,7 +89,7 @@ def main(argv: list[str] | None = None) -> int:
 def _plan(arguments: argparse.Namespace) -> Plan:
     from dataclasses import replace
 
-    from data_prep.blender_plan import Plan
+    from data_prep.blender.plan import Plan
 
     chosen: Mapping[str, Any] = {
         name: getattr(arguments, name)

@@ -11,7 +11,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.core.errors import DataError, GausSimError
+from data_prep.common.command import told
+from gausim.core.errors import DataError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,8 +37,8 @@ def read_poses(path: Path, images: Path | None = None) -> dict[str, np.ndarray]:
     except DataError:
         if images is None:
             raise
-        from data_prep.photos import list_images
-        from data_prep.pose_sources import factors, match_matrices, read_matrix
+        from data_prep.cameras.sources import factors, match_matrices, read_matrix
+        from data_prep.common.photos import list_images
 
         found = match_matrices(path, list_images(images))
         return _by_stem({photo.name: factors(read_matrix(m), str(m))[1] for photo, m in found.items()}, path)
@@ -77,29 +78,31 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("reference", type=Path, metavar="REFERENCE", help="with what")
     parser.add_argument("--images", type=Path, metavar="DIR", help="the photos, for projection matrices")
     arguments = parser.parse_args(argv)
+    return told(lambda: comparison(arguments.poses, arguments.reference, arguments.images))
+
+
+def comparison(poses: Path, reference: Path, images: Path | None) -> str:
+    """How far two sets of poses are from each other, for people.
+
+    Raises:
+        DataError: one cannot be read, or they have fewer than three photos in common.
+    """
     import numpy as np
 
-    from data_prep.world import compare
+    from data_prep.cameras.world import compare
 
-    try:
-        mine, other = (read_poses(p, arguments.images) for p in (arguments.poses, arguments.reference))
-        names = sorted(set(mine) & set(other))
-        if len(names) < 3:
-            raise DataError(
-                f"{arguments.reference}: has {len(names)} photos in common with {arguments.poses}, expected 3."
-            )
-        facts = compare(np.stack([mine[n] for n in names]), np.stack([other[n] for n in names]))
-    except GausSimError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(f"{len(names)} photos in common ({len(mine)} and {len(other)})")
+    mine, other = (read_poses(path, images) for path in (poses, reference))
+    names = sorted(set(mine) & set(other))
+    if len(names) < 3:
+        raise DataError(f"{reference}: has {len(names)} photos in common with {poses}, expected 3.")
+    facts = compare(np.stack([mine[n] for n in names]), np.stack([other[n] for n in names]))
     center, turn = (f"{kind}_error_{{}}_{unit}" for kind, unit in (("center", "percent"), ("rotation", "degree")))
-    print(
+    return (
+        f"{len(names)} photos in common ({len(mine)} and {len(other)})\n"
         f"centres      mean {facts[center.format('mean')]:.4f} %, largest {facts[center.format('max')]:.4f} % of the "
-        "largest distance between two cameras"
+        "largest distance between two cameras\n"
+        f"orientation  mean {facts[turn.format('mean')]:.4f}, largest {facts[turn.format('max')]:.4f} degrees"
     )
-    print(f"orientation  mean {facts[turn.format('mean')]:.4f}, largest {facts[turn.format('max')]:.4f} degrees")
-    return 0
 
 
 if __name__ == "__main__":

@@ -11,14 +11,18 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gausim.core.errors import ConfigError, DataError, GausSimError
+from data_prep.common.command import add_result, headline, told
+from data_prep.common.progress import Tick, silent
+from gausim.core.errors import ConfigError, DataError
+from gausim.io.files import write_json
 
 if TYPE_CHECKING:
-    from data_prep.ready import ReadyFiles
+    from data_prep.scenes.ready import ReadyFiles
 
 # Raise when the same inputs and settings give another result than before.
 REVISION = 1
@@ -58,7 +62,7 @@ def import_ready(
     image_masks: Path | None = None,
     video_masks: Path | None = None,
     force: bool = False,
-    tick: Any = None,
+    tick: Tick = silent,
 ) -> dict[str, Any]:
     """Runs the stage.
 
@@ -78,8 +82,8 @@ def import_ready(
         DataError: a file is missing or malformed, or the sequences have no camera in common.
         SceneError: the point cloud is no 3DGS scene, or a mask marks nothing.
     """
-    from data_prep.ready import find_files
-    from data_prep.stage import Stage, run_stage
+    from data_prep.common.stage import Stage, run_stage
+    from data_prep.scenes.ready import find_files
 
     files = find_files(root, image_masks, video_masks)
     unknown = sorted(set(options.heldout) - set(files.views))
@@ -88,12 +92,12 @@ def import_ready(
     stage = Stage(
         "import_ready", REVISION, files.inputs, asdict(options), ("numpy", "opencv-python-headless", "pycolmap")
     )
-    return run_stage(stage, out, lambda work: _make(work, files, options, tick or (lambda *_: None)), force=force)
+    return run_stage(stage, out, lambda work: _make(work, files, options, tick), force=force)
 
 
-def _make(work: Path, files: ReadyFiles, options: ReadyOptions, tick: Any) -> dict[str, Any]:
-    from data_prep.pose_output import Straighteners, write_points, write_sequence, write_stills
-    from data_prep.ready import sequence_poses
+def _make(work: Path, files: ReadyFiles, options: ReadyOptions, tick: Tick) -> dict[str, Any]:
+    from data_prep.cameras.output import Straighteners, write_points, write_sequence, write_stills
+    from data_prep.scenes.ready import sequence_poses
 
     straighteners = Straighteners()
     results: dict[str, Any] = {"stills": len(files.stills), "sequences": {}, "left_out": files.left_out}
@@ -119,9 +123,6 @@ def _make(work: Path, files: ReadyFiles, options: ReadyOptions, tick: Any) -> di
 
 
 def _facts(path: Path, files: ReadyFiles, options: ReadyOptions) -> None:
-    import json
-
-    from data_prep.stage import write_item
 
     facts = {
         "name": options.name or files.root.name,
@@ -133,15 +134,15 @@ def _facts(path: Path, files: ReadyFiles, options: ReadyOptions) -> None:
         "train_sequences": [name for name in files.sequences if name in files.train],
         "test_sequences": [name for name in files.sequences if name in files.test],
     }
-    write_item(path, json.dumps(facts, indent=1).encode() + b"\n")
+    write_json(path, facts)
 
 
 def _scene(work: Path, files: ReadyFiles, options: ReadyOptions) -> dict[str, int] | None:
     """Writes the scene with its masks, where there is one, and returns how many kernels they mark."""
     import torch
 
-    from data_prep.ready import read_pins
-    from data_prep.selecting import read_points
+    from data_prep.scenes.ready import read_pins
+    from data_prep.scenes.selections import read_points
     from gausim.io.ply import load_scene, save_scene
     from gausim.ops.selection import NearPoints, apply_masks
 
@@ -162,9 +163,9 @@ def _scene(work: Path, files: ReadyFiles, options: ReadyOptions) -> dict[str, in
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     arguments = _parser().parse_args(argv)
-    from data_prep.progress import bars
+    from data_prep.common.progress import bars
 
-    try:
+    def run() -> str:
         heldout = tuple(n.strip() for n in (arguments.heldout or "").split(",") if n.strip())
         options = ReadyOptions(arguments.fps, arguments.train_frames, heldout, arguments.near, arguments.name)
         with bars() as tick:
@@ -172,20 +173,22 @@ def main(argv: list[str] | None = None) -> int:
                 arguments.root, arguments.out, options, image_masks=arguments.image_masks,
                 video_masks=arguments.video_masks, force=arguments.force, tick=tick,
             )  # fmt: skip
-    except GausSimError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    results = manifest["results"]
-    print(f"{arguments.out}: {'made' if manifest['made'] else 'there already'}")
-    print(f"stills      {results['stills']}")
-    print(f"sequences   {len(results['sequences'])}: {', '.join(results['sequences'])}")
-    for name, why in results["left_out"].items():
-        print(f"left out    {name}: {why}")
-    scene = results["scene"]
-    print(f"scene       {scene if scene else 'none (no point_cloud.ply): reconstruct it'}")
+        return f"{headline(arguments.out, manifest)}\n{summary(manifest['results'])}"
+
+    return told(run)
+
+
+def summary(results: Mapping[str, Any]) -> str:
+    """A few lines about what was imported, for people."""
+    lines = [
+        f"stills      {results['stills']}",
+        f"sequences   {len(results['sequences'])}: {', '.join(results['sequences'])}",
+        *(f"left out    {name}: {why}" for name, why in results["left_out"].items()),
+        f"scene       {results['scene'] or 'none (no point_cloud.ply): reconstruct it'}",
+    ]
     if results["without_alpha"]:
-        print(f"no alpha    in {', '.join(results['without_alpha'])}: segment them next")
-    return 0
+        lines.append(f"no alpha    in {', '.join(results['without_alpha'])}: segment them next")
+    return "\n".join(lines)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -195,8 +198,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("root", type=Path, metavar="ROOT", help="folder of one object in the authors' layout")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the result")
-    parser.add_argument("--force", action="store_true", help="replace a result of other inputs or settings")
+    add_result(parser)
     group = parser.add_argument_group("masks of the images (white is the object)")
     group.add_argument("--image-masks", type=Path, metavar="DIR", help="of stills, named like them (ROOT/masks)")
     group.add_argument(

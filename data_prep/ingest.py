@@ -18,14 +18,16 @@ from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gausim.core import DataError, GausSimError
+from gausim.core import DataError
+from gausim.io.files import write_durably, write_json
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from data_prep.films import Film
-    from data_prep.sync import Alignment, Offsets
-    from data_prep.takes import Take
+    from data_prep.common.progress import Tick
+    from data_prep.films.film import Film
+    from data_prep.films.sync import Alignment, Offsets
+    from data_prep.films.takes import Take
 
 # Raise when the same films and settings give other frames than before.
 REVISION = 1
@@ -41,8 +43,6 @@ or a folder with the films of a single sequence; or a list file, with paths rela
                   "offsets": {"right": "7.3f"}, "start": 0.5, "duration": 2.0}]}
 
 Cameras become cam_0, cam_1 ... in the natural order of their names."""
-
-Advance = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ class Options:
 
 
 def ingest(
-    films: Path, out: Path, options: Options | None = None, *, force: bool = False, advance: Advance | None = None
+    films: Path, out: Path, options: Options | None = None, *, force: bool = False, advance: Tick | None = None
 ) -> dict[str, Any]:
     """Writes synchronised frames of all sequences.
 
     Args:
-        films: folder or list file, see :func:`data_prep.takes.find_takes`.
+        films: folder or list file, see :func:`data_prep.films.takes.find_takes`.
         out: directory of the result.
         options: what is chosen.
         force: replace a result of other films or settings.
@@ -88,8 +88,8 @@ def ingest(
     Raises:
         DataError: a film is unusable, or the films do not go together.
     """
-    from data_prep.stage import Stage, run_stage
-    from data_prep.takes import find_takes
+    from data_prep.common.stage import Stage, run_stage
+    from data_prep.films.takes import find_takes
 
     options = options or Options()
     takes = find_takes(films)
@@ -115,10 +115,8 @@ def ingest(
     return run_stage(stage, out, make, force=force)
 
 
-def _one_take(take: Take, folder: Path, options: Options, advance: Advance | None) -> dict[str, Any]:
+def _one_take(take: Take, folder: Path, options: Options, advance: Tick | None) -> dict[str, Any]:
     """Synchronises and writes one sequence; its ``sync.json``, written last, says that it is complete."""
-    from data_prep.stage import write_item
-
     marker = folder / "sync.json"
     if marker.is_file():
         found = json.loads(marker.read_bytes())
@@ -132,10 +130,10 @@ def _one_take(take: Take, folder: Path, options: Options, advance: Advance | Non
             film, alignment.frames[camera], folder / camera, options.max_side,
             lambda done, i=i: advance and advance(take.source, i * total // len(films) + done, total),  # type: ignore[misc]
         )  # fmt: skip
-    from data_prep.sync_sheet import write_sheet
+    from data_prep.films.sheet import write_sheet
 
     write_sheet(folder / "sync.png", thumbnails, found)
-    write_item(marker, json.dumps(found, indent=1).encode() + b"\n")
+    write_json(marker, found)
     return found
 
 
@@ -148,8 +146,8 @@ def synchronise(take: Take, options: Options) -> tuple[dict[str, Film], Alignmen
     Raises:
         DataError: a film is unusable, or the films do not go together.
     """
-    from data_prep.films import probe
-    from data_prep.sync import facts
+    from data_prep.films.film import probe
+    from data_prep.films.sync import facts
 
     films = {camera: probe(path) for camera, path in take.films.items()}
     try:
@@ -168,8 +166,8 @@ def synchronise(take: Take, options: Options) -> tuple[dict[str, Film], Alignmen
 
 
 def _placed(take: Take, films: Mapping[str, Film], options: Options) -> tuple[Offsets, Alignment]:
-    from data_prep.sync import align, measure
-    from data_prep.takes import offset_seconds
+    from data_prep.films.sync import align, measure
+    from data_prep.films.takes import offset_seconds
 
     given = {}
     for name, text in (take.offsets or options.offsets or {}).items():
@@ -212,8 +210,7 @@ def _write_camera(
     """Writes the frames of one camera that are not there yet; returns a small grey picture of each."""
     import cv2
 
-    from data_prep.films import pictures, upright
-    from data_prep.stage import write_item
+    from data_prep.films.film import pictures, upright
 
     places: dict[int, list[int]] = {}
     for place, index in enumerate(indices):
@@ -229,7 +226,7 @@ def _write_camera(
                 ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION])
                 if not ok:
                     raise DataError(f"{path}: cannot be encoded as PNG.")
-                write_item(path, data.tobytes())
+                write_durably(path, data.tobytes())
             small[place] = _reduced(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), THUMBNAIL)
         done(len(small))
         if len(small) == len(indices):
@@ -256,24 +253,15 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
     names = [name for name in Options.__dataclass_fields__]
     options = Options(**{name: getattr(arguments, name) for name in names})
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from data_prep.common.command import headline, told
+    from data_prep.common.progress import bars
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    try:
-        console = Console(stderr=True)
-        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-            task = progress.add_task("synchronising", total=None)
-            manifest = ingest(
-                arguments.films, arguments.out, options, force=arguments.force,
-                advance=lambda name, done, total: progress.update(task, description=name, completed=done, total=total),
-            )  # fmt: skip
-    except (GausSimError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(f"{arguments.out}: {'made' if manifest['made'] else 'there already'}")
-    print(summary(manifest["results"]))
-    return 0
+    def run() -> str:
+        with bars("synchronising") as tick:
+            manifest = ingest(arguments.films, arguments.out, options, force=arguments.force, advance=tick)
+        return f"{headline(arguments.out, manifest)}\n{summary(manifest['results'])}"
+
+    return told(run)
 
 
 def summary(results: Mapping[str, Any]) -> str:
@@ -295,6 +283,8 @@ def summary(results: Mapping[str, Any]) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from data_prep.common.command import add_result
+
     parser = argparse.ArgumentParser(
         prog="python -m data_prep.ingest", description=__doc__.split("\n")[0],
         epilog=LAYOUT, formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -302,8 +292,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "films", type=Path, metavar="FILMS", help="folder with a folder of films per sequence, or a list file"
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder of the result")
-    parser.add_argument("--force", action="store_true", help="replace a result of other films or settings")
+    add_result(parser)
     sync = parser.add_argument_group("synchronisation")
     sync.add_argument(
         "--sync", choices=METHODS, default="auto", help="method; auto takes the first that applies (%(default)s)"

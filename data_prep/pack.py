@@ -7,14 +7,18 @@ read from it where they lie, so that training never holds it in memory. ``gausim
 from __future__ import annotations
 
 import argparse
+import itertools
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from data_prep.stage import Stage, fingerprint, item, run_stage
-from gausim.core import DataError, GausSimError
+from data_prep.common.command import add_result, headline, told
+from data_prep.common.progress import Tick, bars, silent
+from data_prep.common.stage import Stage, fingerprint, run_stage
+from gausim.core import DataError
+from gausim.io.files import replacing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,7 +30,7 @@ REVISION = 1
 PARTS = ("dataset.json", "scene.ply", "scene.masks.npz", "scene.json", "rest_points.npz", "rest_mesh.npz", "static")
 
 
-def pack(root: Path, out: Path, *, margin: int = 2, force: bool = False) -> dict[str, Any]:
+def pack(root: Path, out: Path, *, margin: int = 2, force: bool = False, tick: Tick = silent) -> dict[str, Any]:
     """Packs one object.
 
     Args:
@@ -34,9 +38,10 @@ def pack(root: Path, out: Path, *, margin: int = 2, force: bool = False) -> dict
         out: the store to write, all of it or nothing.
         margin: transparent pixels kept around what the foreground touches.
         force: replace a store of other inputs or settings.
+        tick: told of the progress.
 
     Returns:
-        The manifest (see :func:`data_prep.stage.run_stage`).
+        The manifest (see :func:`data_prep.common.stage.run_stage`).
 
     Raises:
         DataError: a sequence is incomplete, an image unreadable, or ``out`` holds something else.
@@ -51,31 +56,30 @@ def pack(root: Path, out: Path, *, margin: int = 2, force: bool = False) -> dict
     names = [record.name for record in data.sequences]
     inputs = {str(path.relative_to(root)): path for path in _inputs(root, names)}
     stage = Stage("pack", REVISION, inputs, {"margin": margin}, packages=("numpy", "opencv-python-headless"))
-    return run_stage(stage, out, lambda work: _make(data, names, work, margin), force=force)
+    return run_stage(stage, out, lambda work: _make(data, names, work, margin, tick), force=force)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m data_prep.pack", description=__doc__.split("\n")[0])
     parser.add_argument("root", type=Path, metavar="ROOT", help="directory of the object (dataset.json, sequences/)")
-    parser.add_argument("--out", type=Path, required=True, metavar="STORE", help="store to write")
     parser.add_argument(
         "--margin", type=int, default=2, metavar="PIXELS",
         help="transparent pixels kept around what the foreground touches (default: %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--force", action="store_true", help="replace a store of other inputs or settings")
+    add_result(parser)
     arguments = parser.parse_args(argv)
-    try:
-        manifest = pack(arguments.root, arguments.out, margin=arguments.margin, force=arguments.force)
-    except GausSimError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    told = manifest["results"]
-    print(
-        f"{arguments.out}: {'packed' if manifest['made'] else 'there already'}: {told['sequences']} sequences, "
-        f"{told['frames']} images in {told['packed_bytes'] / 1e6:.1f} MB ({100 * told['share']:.0f} % of whole images)"
-    )
-    return 0
+
+    def run() -> str:
+        with bars() as tick:
+            manifest = pack(arguments.root, arguments.out, margin=arguments.margin, force=arguments.force, tick=tick)
+        found = manifest["results"]
+        return (
+            f"{headline(arguments.out, manifest)}: {found['sequences']} sequences, {found['frames']} images in "
+            f"{found['packed_bytes'] / 1e6:.1f} MB ({100 * found['share']:.0f} % of whole images)"
+        )
+
+    return told(run)
 
 
 def _inputs(root: Path, names: list[str]) -> Iterator[Path]:
@@ -88,18 +92,17 @@ def _inputs(root: Path, names: list[str]) -> Iterator[Path]:
             yield from sorted(path for path in folder.rglob("*") if path.is_file())
 
 
-def _make(data: ObjectData, names: list[str], work: Path, margin: int) -> Mapping[str, Any]:
-    from rich.console import Console
-    from rich.progress import Progress
-
+def _make(data: ObjectData, names: list[str], work: Path, margin: int, tick: Tick) -> Mapping[str, Any]:
     for part in PARTS:
         _copy(data.root / part, work / part)
     images = packed = whole = 0
-    with Progress(transient=True, console=Console(stderr=True)) as progress:
-        bar = progress.add_task("packing", total=len(names) * len(data.views))
-        for name in names:
-            made = _sequence(data, name, work / "sequences" / name, margin, lambda: progress.advance(bar))
-            images, packed, whole = (a + b for a, b in zip((images, packed, whole), made, strict=True))
+    steps = itertools.count(1)
+    for name in names:
+        made = _sequence(
+            data, name, work / "sequences" / name, margin,
+            lambda: tick("packing", next(steps), len(names) * len(data.views)),
+        )  # fmt: skip
+        images, packed, whole = (a + b for a, b in zip((images, packed, whole), made, strict=True))
     files = {str(p.relative_to(work)): fingerprint(p) for p in sorted(work.rglob("*")) if _kept(p)}
     return {
         "sequences": len(names), "frames": images, "packed_bytes": packed, "share": packed / whole, "files": files,
@@ -107,7 +110,7 @@ def _make(data: ObjectData, names: list[str], work: Path, margin: int) -> Mappin
 
 
 def _kept(path: Path) -> bool:
-    from data_prep.stage import PLAN
+    from data_prep.common.stage import PLAN
 
     return path.is_file() and path.name != PLAN
 
@@ -118,7 +121,7 @@ def _copy(source: Path, target: Path) -> None:
             if path.is_file():
                 _copy(path, target / path.relative_to(source))
     elif source.is_file() and not target.is_file():
-        with item(target) as temporary:
+        with replacing(target, typed=True) as temporary:
             shutil.copyfile(source, temporary)
 
 

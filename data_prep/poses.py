@@ -14,20 +14,26 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from data_prep.pose_material import Material, Sources
-from gausim.core.errors import DataError, GausSimError
+from data_prep.cameras.material import Material, Sources
+from data_prep.common.command import add_result, headline, told
+from data_prep.common.progress import Tick, silent
+from gausim.core.errors import DataError
+from gausim.io.files import replacing
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from data_prep.mapping import MappingOptions, Tick
-    from data_prep.pose_sources import Posed
-    from data_prep.world import Similarity
+    from data_prep.cameras.mapping import MappingOptions
+    from data_prep.cameras.output import Straighteners
+    from data_prep.cameras.sources import Posed
+    from data_prep.cameras.world import Similarity
     from gausim.io.colmap_files import PointTable
 
 # Raise when the same inputs and settings give another result than before.
 REVISION = 1
 PACKAGES = ("pycolmap", "numpy", "opencv-python-headless", "pillow")
+# So many images are named where a camera is not among them.
+_NAMED = 6
 T = TypeVar("T")
 
 
@@ -51,7 +57,7 @@ def find_poses(
     mapping: MappingOptions,
     world: WorldOptions | None = None,
     force: bool = False,
-    tick: Tick | None = None,
+    tick: Tick = silent,
 ) -> dict[str, Any]:
     """Runs the stage.
 
@@ -70,7 +76,7 @@ def find_poses(
         DataError: an input is missing or broken, or no poses can be found.
         ConfigError: options contradict each other.
     """
-    from data_prep.stage import Stage, run_stage
+    from data_prep.common.stage import Stage, run_stage
 
     world = world or WorldOptions()
     material = Material.of(sources)
@@ -80,19 +86,16 @@ def find_poses(
     if sources.kind == "projections":
         settings["scale"] = sources.scale
     stage = Stage("poses", REVISION, material.inputs, settings, PACKAGES)
-    return run_stage(
-        stage, out, lambda work: _make(work, sources, material, mapping, world, tick or (lambda *_: None)), force=force
-    )
+    return run_stage(stage, out, lambda work: _make(work, sources, material, mapping, world, tick), force=force)
 
 
 def _make(
     work: Path, sources: Sources, material: Material, mapping: MappingOptions, world: WorldOptions, tick: Tick
 ) -> dict[str, Any]:
     """Does the stage's work in ``work``."""
-    from data_prep.mapping import forget
-    from data_prep.pose_output import Straighteners, key_of, write_points, write_sequence, write_stills
-    from data_prep.pose_report import draw_cameras, reprojection
-    from data_prep.stage import item
+    from data_prep.cameras.mapping import forget
+    from data_prep.cameras.output import Straighteners, key_of, write_points, write_stills
+    from data_prep.cameras.report import draw_cameras, reprojection
 
     found, points, results = _found(work, sources, material, mapping, tick)
     move, results["world"] = _world(found, points, world, mapped=sources.kind == "mapping")
@@ -100,10 +103,31 @@ def _make(
     moved = [replace(shot, viewmat=move.viewmat(shot.viewmat)) for shot in found]
     tracks = points.tracks
     results["points"] = {"count": len(tracks), "mean_track": float(tracks.mean()) if len(tracks) else None}
+    straighteners, used = Straighteners(), set[str]()
+    sequences, left_out = _write_sequences(work, sources, material, moved, straighteners, used, tick)
+    stills = [shot for shot in moved if key_of(shot.photo.name) not in used] or moved
+    write_stills(work, stills, straighteners, tick)
+    xyz = move.points(points.xyz)
+    colors = _colors(found, points, sources)
+    write_points(work / "points.npz", points, xyz, colors)
+    with replacing(work / "cameras.png", typed=True) as temporary:
+        draw_cameras(temporary, moved, xyz, colors, f"{len(moved)} cameras, {len(xyz)} points")
+    forget(work)
+    return {**results, "stills": len(stills), "sequences": sequences, "sequences_without_poses": left_out}
+
+
+def _write_sequences(
+    work: Path, sources: Sources, material: Material, moved: list[Posed], straighteners: Straighteners, used: set[str],
+    tick: Tick,
+) -> tuple[dict[str, Any], dict[str, list[str]]]:  # fmt: skip
+    """Writes the sequences whose cameras have poses; returns what is to be told of them, and what the others lack.
+
+    ``used`` gets the keys of the images that are fixed cameras, and so no stills.
+    """
+    from data_prep.cameras.output import key_of, write_sequence
+
     by_name = {key_of(shot.photo.name): shot for shot in moved}
-    used: set[str] = set()
     sequences, left_out = {}, {}
-    straighteners = Straighteners()
     for folder, names in material.sequences.items():
         cameras, missing = _cameras_of(folder, names, by_name, used)
         if missing:
@@ -113,25 +137,23 @@ def _make(
         frames = write_sequence(target, {n: folder / n for n in cameras}, cameras, material.fps, straighteners, tick)
         sequences[folder.name] = {"cameras": list(cameras), "frames": frames}
     if material.sequences and not sequences:
+        remedy = (
+            "Their first frames must show the same scene as the stills, from places that stills were taken near."
+            if sources.kind == "mapping"
+            else "A fixed camera cam_0 of seq_000 is the image seq_000/cam_0 or cam_0 of what is taken over, which has "
+            f"{', '.join(sorted(by_name)[:_NAMED])}."
+        )
         raise DataError(
             f"{next(iter(material.sequences)).parent}: no sequence has poses of all its cameras (missing: {left_out}). "
-            "Their first frames must show the same scene as the stills, from places that stills were taken near."
+            + remedy
         )
-    stills = [shot for shot in moved if key_of(shot.photo.name) not in used] or moved
-    write_stills(work, stills, straighteners, tick)
-    xyz = move.points(points.xyz)
-    colors = _colors(found, points, sources)
-    write_points(work / "points.npz", points, xyz, colors)
-    with item(work / "cameras.png") as temporary:
-        draw_cameras(temporary, moved, xyz, colors, f"{len(moved)} cameras, {len(xyz)} points")
-    forget(work)
-    return {**results, "stills": len(stills), "sequences": sequences, "sequences_without_poses": left_out}
+    return sequences, left_out
 
 
 def _cameras_of(
     folder: Path, names: Sequence[str], by_name: dict[str, Posed], used: set[str]
 ) -> tuple[dict[str, Posed], list[str]]:
-    from data_prep.pose_output import sequence_cameras
+    from data_prep.cameras.output import sequence_cameras
 
     cameras, missing = sequence_cameras(folder, by_name, names)
     used.update(k for name in cameras for k in (f"{folder.name}/{name}", name) if k in by_name)
@@ -139,7 +161,7 @@ def _cameras_of(
 
 
 def _colors(found: list[Posed], points: PointTable, sources: Sources) -> np.ndarray:
-    from data_prep.pose_report import point_colors
+    from data_prep.cameras.report import point_colors
 
     return points.rgb if sources.kind == "colmap" else point_colors(found, points)
 
@@ -148,7 +170,7 @@ def _found(
     work: Path, sources: Sources, material: Material, mapping: MappingOptions, tick: Tick
 ) -> tuple[list[Posed], PointTable, dict[str, Any]]:
     """Poses in the world that they were found in, points, and what is to be told of them."""
-    from data_prep import pose_sources
+    from data_prep.cameras import sources as pose_sources
     from gausim.io.colmap import find_colmap, read_colmap
 
     points = pose_sources.no_points()
@@ -170,10 +192,10 @@ def _map(
     work: Path, material: Material, options: MappingOptions, tick: Tick
 ) -> tuple[list[Posed], PointTable, dict[str, Any]]:
     """Poses by structure from motion of the stills and the first frames of all videos."""
-    from data_prep.mapping import map_photos
-    from data_prep.photos import list_images, open_photo
-    from data_prep.pose_report import failures
-    from data_prep.pose_sources import from_model
+    from data_prep.cameras.mapping import map_photos
+    from data_prep.cameras.report import failures
+    from data_prep.cameras.sources import from_model
+    from data_prep.common.photos import list_images, open_photo
     from gausim.io.colmap import read_colmap
 
     photos, cameras = list(material.stills), {photo.name: "stills" for photo in material.stills}
@@ -213,7 +235,7 @@ def _world(
     found: list[Posed], points: PointTable, options: WorldOptions, *, mapped: bool
 ) -> tuple[Similarity, dict[str, Any]]:
     """The transform to the world that was asked for, and what is to be told of it."""
-    from data_prep.world_options import place
+    from data_prep.cameras.world_options import place
 
     return place(found, points, up=options.up, distances=options.distances, mapped=mapped)
 
@@ -221,21 +243,19 @@ def _world(
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     arguments = _parser().parse_args(argv)
-    from data_prep.mapping import MappingOptions
-    from data_prep.progress import bars
+    from data_prep.cameras.mapping import MappingOptions
+    from data_prep.common.progress import bars
 
-    try:
+    def run() -> str:
         sources, mapping = _picked(Sources, arguments), _picked(MappingOptions, arguments)
         world = WorldOptions(arguments.up, tuple((a, b, m) for a, b, m in arguments.distance))
         with bars() as tick:
             manifest = find_poses(
                 arguments.out, sources, mapping=mapping, world=world, force=arguments.force, tick=tick
             )
-    except GausSimError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(_told(arguments.out, manifest))
-    return 0
+        return _summary(arguments.out, manifest)
+
+    return told(run)
 
 
 def _picked(kind: type[T], arguments: argparse.Namespace) -> T:
@@ -243,12 +263,12 @@ def _picked(kind: type[T], arguments: argparse.Namespace) -> T:
     return kind(**{field.name: getattr(arguments, field.name) for field in fields(kind)})  # type: ignore[arg-type]
 
 
-def _told(out: Path, manifest: dict[str, Any]) -> str:
+def _summary(out: Path, manifest: dict[str, Any]) -> str:
     """What the command prints."""
     results = manifest["results"]
     error, world = results["reprojection"], results["world"]
     lines = [
-        f"{out}: {'made' if manifest['made'] else 'there already'}",
+        headline(out, manifest),
         f"registered     {results['registered']} of {results['images']} images",
     ]
     for photo in results["failed"]:
@@ -272,8 +292,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m data_prep.poses", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder of the result")
-    parser.add_argument("--force", action="store_true", help="replace a result of other inputs or settings")
+    add_result(parser)
     group = parser.add_argument_group("what is posed")
     add = group.add_argument
     add("--images", type=Path, metavar="DIR", help="photos of the rest state")

@@ -6,16 +6,18 @@
       poses: {images: photos/flower, sequences: "{ingest}"}
       segment: {pictures: "{poses}", backend: onnx, onnx: isnet.onnx}
 
-Keys are the options of ``python -m data_prep.STAGE`` (films, pictures, scene and root are arguments of its command);
-``true`` is a flag, a list several values. ``{STAGE}`` in a value is the directory of an earlier stage; a text that
-names a file or folder beside the configuration becomes its path. A stage whose result is there already is not run
-again; what was interrupted goes on.
+Keys are the options of ``python -m data_prep.STAGE`` (films, pictures, scene of select, and root are arguments of its
+command); ``true`` is a flag, a list several values. ``{STAGE}`` in a value is the directory of an earlier stage; a text
+that names a file or folder beside the configuration becomes its path. A stage that runs twice has a name of its own
+each time: ``segment-films`` beside ``segment``. A stage whose result is there already is not run again; what was
+interrupted goes on.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,7 +31,9 @@ STAGES = {
     "ingest": ("films",),
     "poses": (),
     "segment": ("pictures",),
+    "reconstruct": ("root",),
     "select": ("scene",),
+    "assemble": ("pictures",),
     "pack": ("root",),
     "import_ready": ("root",),
 }
@@ -40,10 +44,12 @@ class Job:
     """One stage to run.
 
     Attributes:
-        stage: its name.
+        name: what the configuration calls it; its result is the folder of that name.
+        stage: which one.
         arguments: of its command, the directory of the result included.
     """
 
+    name: str
     stage: str
     arguments: tuple[str, ...]
 
@@ -66,15 +72,14 @@ def plan(config: Path) -> list[Job]:
     if not isinstance(stages, dict) or not stages:
         raise ConfigError(f"{config}: field 'stages' must be a mapping of stages, some of {', '.join(STAGES)}.")
     work, made, jobs = config.parent / data["work"], dict[str, Path](), []
-    for stage, options in stages.items():
-        if stage not in STAGES:
-            raise ConfigError(f"{config}: stages: no stage '{stage}'; expected some of {', '.join(STAGES)}.")
+    for name, options in stages.items():
+        stage = _stage_of(name, config)
+        where = f"{config}: stages.{name}"
         if not isinstance(options, dict):
-            raise ConfigError(f"{config}: stages.{stage}: expected a mapping of options, got {options!r}.")
-        where = f"{config}: stages.{stage}"
-        out = work / stage
-        jobs.append(Job(stage, (*_arguments(stage, options, made, config.parent, where), "--out", str(out))))
-        made[stage] = out
+            raise ConfigError(f"{where}: expected a mapping of options, got {options!r}.")
+        out = work / name
+        jobs.append(Job(name, stage, (*_arguments(stage, options, made, config.parent, where), "--out", str(out))))
+        made[name] = out
     return jobs
 
 
@@ -90,13 +95,11 @@ def prepare(config: Path, *, force: bool = False) -> int:
     """
     jobs = plan(config)
     for number, job in enumerate(jobs, 1):
-        print(f"[{number}/{len(jobs)}] {job.stage}", flush=True)
+        print(f"[{number}/{len(jobs)}] {job.name}", flush=True)
         command = importlib.import_module(f"data_prep.{job.stage}")
         status = int(command.main([*job.arguments, *(["--force"] if force else [])]))
         if status:
-            print(
-                f"error: stage {job.stage} of {config} has failed; the same command goes on from it.", file=sys.stderr
-            )
+            print(f"error: stage {job.name} of {config} has failed; the same command goes on from it.", file=sys.stderr)
             return status
     return 0
 
@@ -114,6 +117,17 @@ def main(argv: list[str] | None = None) -> int:
     except GausSimError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+
+
+def _stage_of(name: Any, config: Path) -> str:
+    """The stage that ``segment`` or ``segment-films`` means."""
+    match = re.fullmatch(r"([a-z_]+)(-[A-Za-z0-9_]+)*", name) if isinstance(name, str) else None
+    if match is None or match[1] not in STAGES:
+        raise ConfigError(
+            f"{config}: stages: no stage '{name}'; expected some of {', '.join(STAGES)}, with an addition such as "
+            "segment-films where one runs twice."
+        )
+    return match[1]
 
 
 def _arguments(stage: str, options: Mapping[str, Any], made: Mapping[str, Path], base: Path, where: str) -> list[str]:

@@ -17,14 +17,16 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gausim.core import DataError, GausSimError
+from gausim.core import DataError
+from gausim.io.files import write_durably, write_json
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from data_prep.clips import Clip
-    from data_prep.mask_cleanup import Cleanup
-    from data_prep.segmenters import MaskOf, Segmenter
+    from data_prep.common.progress import Tick
+    from data_prep.masks.cleanup import Cleanup
+    from data_prep.masks.clips import Clip
+    from data_prep.masks.segmenters import MaskOf, Segmenter
 
 # Raise when the same pictures and settings give other masks than before.
 REVISION = 1
@@ -32,8 +34,6 @@ BACKENDS = ("alpha", "background", "chroma", "onnx", "sam2")
 RAW, FRAMES, OVERLAYS = ".raw", ".frames", "overlays"
 # Below this overlap with the mask before, a frame is worth a look.
 STEADY = 0.8
-
-Advance = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def segment(
     kind: str = "auto",
     every: int = 1,
     force: bool = False,
-    advance: Advance | None = None,
+    advance: Tick | None = None,
 ) -> dict[str, Any]:
     """Writes the pictures of ``source`` with their masks as alpha.
 
@@ -86,19 +86,20 @@ def segment(
     Raises:
         DataError: a picture is unusable, or a folder's masks are all empty.
     """
-    from data_prep.clips import film_frames, find_clips, is_film
-    from data_prep.stage import Stage, run_stage
+    from data_prep.common.stage import Stage, run_stage
+    from data_prep.masks.clips import film_frames, find_clips, is_film
 
     film = is_film(source)
     if not film and not source.is_dir():
         raise DataError(f"{source}: expected a folder of pictures, or a film.")
     clips = [] if film else find_clips(source, kind=kind, every=every)
     pictures = {path.as_posix(): source / path for clip in clips for path in clip.paths}
+    carried = {} if film or every > 1 else _beside(source)
     stage = Stage(
         name="segment",
         revision=REVISION,
         inputs={
-            **({source.name: source} if film else pictures),
+            **({source.name: source} if film else {**pictures, **carried}),
             **{f"backend/{k}": v for k, v in backend.inputs.items()},
         },
         settings={
@@ -118,8 +119,7 @@ def segment(
             found = find_clips(work / FRAMES, kind="stills" if kind == "stills" else "film", every=every)
         run = _Run(work, backend, cleanup, _rate(source), advance)
         results = {clip.name: run.clip(clip) for clip in found}
-        if not film and every == 1:
-            _carry_poses(source, work, pictures)
+        _carry(carried, work, pictures)
         for folder in (RAW, FRAMES):
             shutil.rmtree(work / folder, ignore_errors=True)
         return {"backend": backend.name, "clips": results}
@@ -130,15 +130,14 @@ def segment(
 class _Run:
     """One run over all clips; the segmenter is made when the first mask is missing."""
 
-    def __init__(self, work: Path, backend: Backend, cleanup: Cleanup, fps: float, advance: Advance | None) -> None:
+    def __init__(self, work: Path, backend: Backend, cleanup: Cleanup, fps: float, advance: Tick | None) -> None:
         self._work, self._backend, self._cleanup, self._fps = work, backend, cleanup, fps
         self._advance = advance
         self._segmenter: Segmenter | None = None
 
     def clip(self, clip: Clip) -> dict[str, Any]:
         """Makes a clip's files; its figures, written last, say that it is complete."""
-        from data_prep.overlays import write_overlays
-        from data_prep.stage import write_item
+        from data_prep.masks.overlays import write_overlays
 
         marker = self._work / OVERLAYS / f"{clip.flat}.json"
         if marker.is_file():
@@ -149,14 +148,14 @@ class _Run:
         found = self._finish(clip)
         masks = [self._work / path.with_suffix(".png") for path in clip.paths]
         write_overlays(clip, masks, self._work / OVERLAYS, fps=self._fps)
-        write_item(marker, json.dumps(found, indent=1).encode() + b"\n")
+        write_json(marker, found)
         return found
 
     def _raw_masks(self, clip: Clip) -> None:
         """The backend's masks, each an 8-bit file; those of an interrupted attempt are kept."""
         import numpy as np
 
-        from data_prep.clips import write_picture
+        from data_prep.masks.clips import write_picture
 
         mask_of: MaskOf | None = None
         for i in range(len(clip)):
@@ -173,8 +172,8 @@ class _Run:
         """Cleans the masks, writes RGBA, and returns figures."""
         import numpy as np
 
-        from data_prep.clips import read_picture, write_picture
-        from data_prep.mask_cleanup import cleaned, matte, overlap, steady
+        from data_prep.masks.cleanup import cleaned, matte, overlap, steady
+        from data_prep.masks.clips import read_picture, write_picture
 
         def raw(index: int) -> np.ndarray:
             return read_picture(self._raw(clip, index))[..., 0].astype(np.float32) / 255
@@ -237,11 +236,11 @@ def _figures(clip: Clip, coverage: list[float], overlaps: list[float], border: l
 
 def _rate(source: Path) -> float:
     """Frames per second of the overlay: the film's, ingest's, or 24."""
-    from data_prep.clips import is_film
-    from data_prep.stage import MANIFEST, read_manifest
+    from data_prep.common.stage import MANIFEST, read_manifest
+    from data_prep.masks.clips import is_film
 
     if is_film(source):
-        from data_prep.films import probe
+        from data_prep.films.film import probe
 
         return float(probe(source).rate)
     if (source / MANIFEST).is_file():
@@ -251,48 +250,47 @@ def _rate(source: Path) -> float:
     return 24.0
 
 
-def _carry_poses(source: Path, work: Path, pictures: Mapping[str, Path]) -> None:
-    """Copies ``transforms.json`` files with their pictures' new names, and ``dataset.json``."""
-    from data_prep.stage import write_item
+def _beside(source: Path) -> dict[str, Path]:
+    """What belongs to the pictures, by its name: poses, facts, points."""
+    found = [*source.rglob("transforms.json"), *(source / name for name in ("dataset.json", "points.npz"))]
+    named = {path.relative_to(source).as_posix(): path for path in sorted(found) if path.is_file()}
+    return {name: path for name, path in named.items() if not any(part.startswith(".") for part in Path(name).parts)}
+
+
+def _carry(files: Mapping[str, Path], work: Path, pictures: Mapping[str, Path]) -> None:
+    """Copies what belongs to the pictures; ``transforms.json`` gets their new names."""
     from gausim.io.transforms import read_json
 
     done = {path.resolve() for path in pictures.values()}
-    for path in [*source.rglob("transforms.json"), source / "dataset.json"]:
-        if not path.is_file() or any(part.startswith(".") for part in path.relative_to(source).parts):
+    for name, path in files.items():
+        if path.suffix != ".json":
+            write_durably(work / name, path.read_bytes())
             continue
         data = read_json(path)
         for entry in data.get("frames", []) if isinstance(data.get("frames"), list) else []:
             named = entry.get("file_path") if isinstance(entry, dict) else None
             if isinstance(named, str) and (path.parent / named).resolve() in done:
                 entry["file_path"] = Path(named).with_suffix(".png").as_posix()
-        write_item(work / path.relative_to(source), json.dumps(data, indent=1).encode() + b"\n")
+        write_json(work / name, data)
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     arguments = _parser().parse_args(argv)
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from data_prep.common.command import headline, told
+    from data_prep.common.progress import bars
+    from data_prep.masks.options import make_backend, make_cleanup
 
-    from data_prep.segment_options import make_backend, make_cleanup
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    console = Console(stderr=True)
-    try:
+    def run() -> str:
         backend, cleanup = make_backend(arguments), make_cleanup(arguments)
-        with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-            task = progress.add_task("segmenting", total=None)
+        with bars("segmenting") as tick:
             manifest = segment(
                 arguments.pictures, arguments.out, backend, cleanup,
-                kind=arguments.kind, every=arguments.every, force=arguments.force,
-                advance=lambda name, done, total: progress.update(task, description=name, completed=done, total=total),
+                kind=arguments.kind, every=arguments.every, force=arguments.force, advance=tick,
             )  # fmt: skip
-    except (GausSimError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(f"{arguments.out}: {'made' if manifest['made'] else 'there already'}, by {backend.name}")
-    print(summary(manifest["results"]))
-    return 0
+        return f"{headline(arguments.out, manifest)}, by {backend.name}\n{summary(manifest['results'])}"
+
+    return told(run)
 
 
 def summary(results: Mapping[str, Any]) -> str:
@@ -316,7 +314,7 @@ def _some(what: str, names: list[str]) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from data_prep.segment_options import add_options
+    from data_prep.masks.options import add_options
 
     parser = argparse.ArgumentParser(prog="python -m data_prep.segment", description=__doc__.split("\n")[0])
     add_options(parser, BACKENDS)

@@ -20,7 +20,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gausim.core.errors import ConfigError, GausSimError
+from data_prep.common.command import add_result, headline, told
+from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -51,7 +52,7 @@ def select(
     Args:
         scene: 3DGS scene (PLY).
         out: folder of the result.
-        selections: by mask, texts as :func:`data_prep.selecting.parse_selection` reads them; other masks stay.
+        selections: by mask, texts as :func:`data_prep.scenes.selections.parse_selection` reads them; other masks stay.
         masks: its masks so far; those beside the scene when None.
         up: axis drawn upwards, with a minus sign where it points down.
         size: of each picture [pixels].
@@ -65,8 +66,8 @@ def select(
         DataError: a file of points is malformed.
         ConfigError: nothing is selected.
     """
-    from data_prep.selecting import parse_selection
-    from data_prep.stage import Stage, run_stage
+    from data_prep.common.stage import Stage, run_stage
+    from data_prep.scenes.selections import parse_selection
     from gausim.io.ply import masks_path
 
     unknown = sorted(set(selections) - set(MASKS))
@@ -107,7 +108,7 @@ def draw_masks(path: Path, scene: GaussianScene, *, up: str = "z", size: int = 3
     import cv2
     import numpy as np
 
-    from data_prep.photos import write_png
+    from data_prep.common.photos import write_png
 
     rows = []
     for name in MASKS:
@@ -147,21 +148,18 @@ def _sides(scene: GaussianScene, name: str, up: str, size: int) -> np.ndarray:
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     arguments = _parser().parse_args(argv)
-    try:
-        chosen = {name: getattr(arguments, name) for name in MASKS if getattr(arguments, name)}
+    chosen = {name: getattr(arguments, name) for name in MASKS if getattr(arguments, name)}
+
+    def run() -> str:
         manifest = select(
             arguments.scene, arguments.out, chosen, masks=arguments.masks, up=arguments.up, size=arguments.size,
             force=arguments.force,
         )  # fmt: skip
-    except GausSimError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    results = manifest["results"]
-    print(f"{arguments.out}: {'made' if manifest['made'] else 'there already'}")
-    for name in MASKS:
-        print(f"{name:<11} {results[name]['kernels']} of {results['kernels']} kernels")
-    print(f"look at     {arguments.out / 'masks.png'}")
-    return 0
+        results = manifest["results"]
+        lines = [f"{name:<11} {results[name]['kernels']} of {results['kernels']} kernels" for name in MASKS]
+        return "\n".join([headline(arguments.out, manifest), *lines, f"look at     {arguments.out / 'masks.png'}"])
+
+    return told(run)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -169,8 +167,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m data_prep.select", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scene", type=Path, metavar="SCENE", help="3DGS scene (PLY)")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the result")
-    parser.add_argument("--force", action="store_true", help="replace a result of other inputs or settings")
+    add_result(parser)
     group = parser.add_argument_group("masks (those not given stay as they are)")
     group.add_argument("--simulated", metavar="SELECTION", help="kernels that may move")
     group.add_argument("--pinned", metavar="SELECTION", help="simulated kernels that are held")

@@ -61,7 +61,7 @@ def main(argv: list[str] | None = None) -> int:
     if importlib.util.find_spec("mujoco") is None:
         print("error: MuJoCo simulates this set. Install it with `pip install 'gausim[synth]'`.", file=sys.stderr)
         return 2
-    from data_prep.writer import QUICK, Plan  # after --help: these take seconds to import
+    from data_prep.synthetic.writer import QUICK, Plan  # after --help: these take seconds to import
 
     chosen = {name: getattr(arguments, name) for name in ("resolution", "sequences", "frames", "kernels", "objects")}
     given = {name: value for name, value in chosen.items() if value is not None}
@@ -121,28 +121,27 @@ def _is_there(out: Path, manifest: dict[str, object], *, force: bool) -> bool:
 
 
 def _write_all(root: Path, settings: dict[str, object], *, workers: int) -> None:
-    from rich.progress import Progress
+    from data_prep.common.progress import bars
 
     objects, sequences = settings["objects"], settings["sequences"]
     assert isinstance(objects, list) and isinstance(sequences, int)
     jobs = [(name, part) for name in objects for part in (None, *range(sequences))]
-    with Progress(transient=True) as progress:
-        bar = progress.add_task("synthesizing", total=len(jobs))
+    with bars("synthesizing") as tick:
         if workers == 1:
-            for job in jobs:
+            for number, job in enumerate(jobs, 1):
                 _write_part(root, settings, *job)
-                progress.advance(bar)
+                tick("synthesizing", number, len(jobs))
             return
         # Not forked: a fork of a process with live threads (torch, rich) can hang.
         context = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context, initializer=_one_thread) as pool:
             submit: Callable[..., Future[None]] = pool.submit
             pending = [submit(_write_part, root, settings, *job) for job in jobs]
-            for done in as_completed(pending):
+            for number, done in enumerate(as_completed(pending), 1):
                 if done.exception() is not None:
                     pool.shutdown(cancel_futures=True)
                 done.result()
-                progress.advance(bar)
+                tick("synthesizing", number, len(jobs))
 
 
 def _one_thread() -> None:
@@ -162,7 +161,7 @@ def _write_part(root: Path, settings: dict[str, object], name: str, sequence: in
 
 @lru_cache(maxsize=8)
 def _subject(settings: str, name: str):  # type: ignore[no-untyped-def]  # its class is imported late
-    from data_prep.writer import Plan, SyntheticObject
+    from data_prep.synthetic.writer import Plan, SyntheticObject
 
     fields = json.loads(settings)
     return SyntheticObject(name, Plan(**{**fields, "objects": tuple(fields["objects"])}))

@@ -20,12 +20,12 @@ import cv2
 import numpy as np
 import pytest
 
-from data_prep import blender_env
+from data_prep.blender import environment as blender_env
+from data_prep.blender.environment import REQUIREMENTS, BlenderError, BlenderProcess, create_environment, find_blender
+from data_prep.blender.meshes import Mesh
+from data_prep.blender.plan import Plan, action, cage, camera, sequence_job, still_job, video_poses
+from data_prep.blender.surface import Surface, make_surface
 from data_prep.blender_bunny import main, make_set
-from data_prep.blender_env import REQUIREMENTS, BlenderError, BlenderProcess, create_environment, find_blender
-from data_prep.blender_plan import Plan, action, cage, camera, sequence_job, still_job, video_poses
-from data_prep.meshes import Mesh
-from data_prep.surface import Surface, make_surface
 from gausim.core import ConfigError, DataError
 from gausim.data.objects import ObjectData
 from gausim.data.verify import verify

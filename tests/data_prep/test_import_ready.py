@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from data_prep.import_ready import ReadyOptions, import_ready, main
-from data_prep.ready import read_pins
+from data_prep.scenes.ready import read_pins
 from gausim.core import ConfigError, DataError
 from gausim.data.objects import ObjectData
 from gausim.data.records import read_stills

@@ -19,12 +19,13 @@ import cv2
 import numpy as np
 import pytest
 
-from data_prep.films import probe
+from data_prep.common.photos import natural
+from data_prep.common.stage import read_manifest
+from data_prep.films.film import probe
+from data_prep.films.sync import align, measure
+from data_prep.films.takes import find_takes, offset_seconds
+from data_prep.films.timecode import label_of_frame
 from data_prep.ingest import Options, ingest, main
-from data_prep.stage import read_manifest
-from data_prep.sync import align, measure
-from data_prep.takes import find_takes, natural, offset_seconds
-from data_prep.timecode import label_of_frame
 from gausim.core import DataError
 
 NTSC = Fraction(30000, 1001)

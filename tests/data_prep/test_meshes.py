@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_prep.meshes import Mesh, read_mesh
-from data_prep.surface import farthest_points, make_surface, paint, refine
+from data_prep.blender.meshes import Mesh, read_mesh
+from data_prep.blender.surface import farthest_points, make_surface, paint, refine
 from gausim.core import DataError
 
 CORNERS = [(x, y, z) for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)]
@@ -180,7 +180,7 @@ def test_useless_surfaces_are_refused(tmp_path: Path, monkeypatch: pytest.Monkey
             make_surface(Mesh(vertices, np.array(TETRAHEDRON)), path, up="z", points=4, seed=0)
     with pytest.raises(DataError, match="too large"):
         make_surface(Mesh((POINTS - 0.5) * 3e308, np.array(TETRAHEDRON)), path, up="z", points=4, seed=0)
-    monkeypatch.setattr("data_prep.surface.MOST_TRIANGLES", 5000)
+    monkeypatch.setattr("data_prep.blender.surface.MOST_TRIANGLES", 5000)
     with pytest.raises(DataError, match="Remesh"):
         refine(Mesh(POINTS, np.array(TETRAHEDRON)), 1e-4)
 

@@ -30,16 +30,18 @@ def test_options_become_arguments_and_results_are_handed_on(tmp_path: Path) -> N
         work: work
         stages:
           ingest: {films: takes, sync: auto, start: 1.5}
-          segment: {pictures: "{ingest}/sequences", backend: chroma, no_grabcut: true, floor: 0.1, plate: false}
+          segment-films: {pictures: "{ingest}/sequences", backend: chroma, no_grabcut: true, floor: 0.1, plate: false}
           select: {scene: "a b.ply", pinned: "below z=0.33", point: [1, 2]}
         """,
     )
     work = tmp_path / "work"
     assert plan(config) == [
-        Job("ingest", (str(tmp_path / "takes"), "--sync", "auto", "--start", "1.5", "--out", str(work / "ingest"))),
-        Job("segment", (f"{work / 'ingest'}/sequences", "--backend", "chroma", "--no-grabcut", "--floor", "0.1",
-                        "--out", str(work / "segment"))),
-        Job("select", ("a b.ply", "--pinned", "below z=0.33", "--point", "1", "2", "--out", str(work / "select"))),
+        Job("ingest", "ingest", (str(tmp_path / "takes"), "--sync", "auto", "--start", "1.5",
+                                 "--out", str(work / "ingest"))),
+        Job("segment-films", "segment", (f"{work / 'ingest'}/sequences", "--backend", "chroma", "--no-grabcut",
+                                         "--floor", "0.1", "--out", str(work / "segment-films"))),
+        Job("select", "select", ("a b.ply", "--pinned", "below z=0.33", "--point", "1", "2",
+                                 "--out", str(work / "select"))),
     ]  # fmt: skip
 
 
@@ -50,6 +52,8 @@ def test_options_become_arguments_and_results_are_handed_on(tmp_path: Path) -> N
         ("stages: {pack: {}}", "expected the fields 'work'"),
         ("{work: w, stages: {}}", "field 'stages'"),
         ("{work: w, stages: {bake: {}}}", "no stage 'bake'"),
+        ("{work: w, stages: {segment-../x: {}}}", "no stage 'segment-../x'"),
+        ("{work: w, stages: {3: {}}}", "no stage '3'"),
         ("{work: w, stages: {pack: 3}}", "stages.pack: expected a mapping"),
         ("{work: w, stages: {pack: {root: {a: 1}}}}", "stages.pack.root: expected a text"),
         ("{work: w, stages: {pack: {root: '{poses}'}, poses: {}}}", "stages.pack.root.*'poses'.*before this one: none"),
@@ -64,7 +68,7 @@ def test_broken_configurations_are_named(tmp_path: Path, text: str, what: str) -
 def test_a_real_stage_runs_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     TOY["write_toy_object"](tmp_path / "toy", frames=9)
     config = _config(tmp_path, "{work: work, stages: {pack: {root: toy, margin: 1}}}")
-    assert command.main([str(config)]) == 0 and "packed: 2 sequences" in capsys.readouterr().out
+    assert command.main([str(config)]) == 0 and "made: 2 sequences" in capsys.readouterr().out
     assert verify(tmp_path / "work" / "pack") == []
     assert command.main([str(config)]) == 0 and "there already" in capsys.readouterr().out
     config.write_text(config.read_text().replace("margin: 1", "margin: 2"))

@@ -15,13 +15,23 @@ import numpy as np
 import pytest
 import torch
 
-from data_prep.clips import find_clips, read_picture
-from data_prep.mask_cleanup import UNTOUCHED, Cleanup, cleaned, fill_holes, keep_largest, matte, overlap, soften, steady
+from data_prep.common.stage import read_manifest
+from data_prep.masks.cleanup import (
+    UNTOUCHED,
+    Cleanup,
+    cleaned,
+    fill_holes,
+    keep_largest,
+    matte,
+    overlap,
+    soften,
+    steady,
+)
+from data_prep.masks.clips import find_clips, read_picture
+from data_prep.masks.onnx_segmenter import OnnxSegmenter
+from data_prep.masks.sam2_segmenter import Prompt, Sam2Segmenter, load_predictor, make_prompt
+from data_prep.masks.segmenters import BackgroundSegmenter, ChromaSegmenter
 from data_prep.segment import Backend, main, segment
-from data_prep.segment_onnx import OnnxSegmenter
-from data_prep.segment_sam2 import Prompt, Sam2Segmenter, load_predictor, make_prompt
-from data_prep.segmenters import BackgroundSegmenter, ChromaSegmenter
-from data_prep.stage import read_manifest
 from gausim.core import ConfigError, DataError
 
 SIZE = 96, 72

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from data_prep.common.stage import read_manifest
+from data_prep.scenes.selections import parse_selection, read_points
 from data_prep.select import main, select
-from data_prep.selecting import parse_selection, read_points
-from data_prep.stage import read_manifest
 from gausim.core import ConfigError, DataError, GaussianScene, SceneError
 from gausim.io.ply import load_scene, save_scene
 

@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from data_prep.stage import MANIFEST, Stage, item, read_manifest, run_stage, write_item
+from data_prep.common.stage import MANIFEST, Stage, read_manifest, run_stage
 from gausim.core import DataError
+from gausim.io.files import write_durably
 
 
 @pytest.fixture
@@ -20,7 +21,7 @@ def stage(tmp_path: Path) -> Stage:
 
 
 def make(work: Path) -> dict[str, Any]:
-    write_item(work / "a.txt", b"made")
+    write_durably(work / "a.txt", b"made")
     return {"frames": 6}
 
 
@@ -55,7 +56,7 @@ def test_another_result_is_replaced_only_by_force(stage: Stage, tmp_path: Path, 
 
 def test_what_was_interrupted_goes_on_and_is_no_result(stage: Stage, tmp_path: Path) -> None:
     def fail(work: Path) -> dict[str, Any]:
-        write_item(work / "first", b"1")
+        write_durably(work / "first", b"1")
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -73,7 +74,7 @@ def test_what_was_interrupted_goes_on_and_is_no_result(stage: Stage, tmp_path: P
 
 def test_interrupted_work_of_other_settings_is_not_taken_over(stage: Stage, tmp_path: Path) -> None:
     def fail(work: Path) -> dict[str, Any]:
-        write_item(work / "first", b"1")
+        write_durably(work / "first", b"1")
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -101,11 +102,3 @@ def test_missing_inputs_and_broken_manifests_are_named(stage: Stage, tmp_path: P
         (tmp_path / MANIFEST).write_text(text)
         with pytest.raises(DataError, match=what):
             read_manifest(tmp_path, "ingest")
-
-
-def test_an_item_is_whole_or_not_there(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError), item(tmp_path / "x.png") as temporary:
-        assert temporary.suffix == ".png"
-        temporary.write_bytes(b"half")
-        raise RuntimeError
-    assert list(tmp_path.iterdir()) == []

@@ -11,13 +11,13 @@ import torch
 if importlib.util.find_spec("mujoco") is None:
     pytest.skip("MuJoCo is not installed (extra 'synth')", allow_module_level=True)
 
-from data_prep.bodies import BODIES, Body
-from data_prep.elastic import ElasticBody, Material
-from data_prep.embedding import Embedding, _area_vector, _outer_faces, cover_surface
-from data_prep.pushes import push_field, pushed_motion, random_push
-from data_prep.rig import still_cameras, video_cameras
 from data_prep.synthesize import main
-from data_prep.writer import RECIPES
+from data_prep.synthetic.bodies import BODIES, Body
+from data_prep.synthetic.elastic import ElasticBody, Material
+from data_prep.synthetic.embedding import Embedding, _area_vector, _outer_faces, cover_surface
+from data_prep.synthetic.pushes import push_field, pushed_motion, random_push
+from data_prep.synthetic.rig import still_cameras, video_cameras
+from data_prep.synthetic.writer import RECIPES
 from gausim.core import DivergenceError, Trajectory
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.images import composite

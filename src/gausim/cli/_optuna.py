@@ -19,9 +19,10 @@ from omegaconf import DictConfig
 from gausim.cli._config import check_targets, instantiate
 from gausim.cli._sweep import BUSY, FAILED_BEFORE, OBJECTIVE, PRUNED, JobResult, Sweep
 from gausim.core.errors import ConfigError
-from gausim.engine.files import sole_writer, write_durably
+from gausim.engine.files import sole_writer
 from gausim.engine.judge import EpochJudge
 from gausim.engine.run import FREE_KEYS, RunDirectory
+from gausim.io.files import write_durably
 
 try:
     import optuna

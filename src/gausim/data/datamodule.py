@@ -7,7 +7,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
@@ -15,6 +14,7 @@ from gausim.core import ConfigError
 from gausim.data.curriculum import Curriculum
 from gausim.data.dataset import SequenceIndex, TrainingDataset, WholeSequenceDataset, collate
 from gausim.data.objects import ObjectData, find_objects
+from gausim.data.prefetch import PrefetchingLoader
 from gausim.data.sampler import SequenceBatchSampler
 from gausim.ops.selection import Selection
 
@@ -37,6 +37,7 @@ class ReadyDataModule(LightningDataModule):
         repeats: int = 1,
         curriculum: Curriculum | None = None,
         seed: int = 0,
+        prefetch: int = 1,
         names: Sequence[str] | None = None,
         sequences: int | Sequence[str] | None = None,
     ) -> None:
@@ -52,6 +53,7 @@ class ReadyDataModule(LightningDataModule):
             repeats: how many times each sequence is shown per epoch.
             curriculum: predicted steps per epoch; METHOD's when None.
             seed: of the order.
+            prefetch: batches read ahead of the one that is trained on; so many more are in memory.
             names: keep only the objects of these names.
             sequences: keep only so many sequences per object, or those of these names.
         """
@@ -59,6 +61,7 @@ class ReadyDataModule(LightningDataModule):
         self._root, self._names, self._sequences = root, names, sequences
         self._options: dict[str, Any] = {"scene": scene, "masks": masks, "selections": selections}
         self._batch_size, self._repeats, self._seed = batch_size, repeats, seed
+        self._prefetch = prefetch
         self.curriculum = curriculum if curriculum is not None else Curriculum()
         self._sampler: SequenceBatchSampler | None = None
 
@@ -106,14 +109,15 @@ class ReadyDataModule(LightningDataModule):
         return self.curriculum.steps(epoch)
 
     def train_dataloader(self) -> DataLoader:
-        """Batches of training samples; frames are decoded once and stay in memory, so no worker is needed."""
-        return DataLoader(
+        """Batches of training samples, read ahead by a thread.
+
+        Image files are decoded once and stay in memory, packed frames are read where they lie: no worker is needed.
+        """
+        return PrefetchingLoader(
             TrainingDataset(self.index),
             batch_sampler=self._ready_sampler(),
             collate_fn=collate,
-            num_workers=0,
-            # The loader draws a number per epoch; from the global generator, a resumed run would draw another count.
-            generator=torch.Generator(),
+            prefetch=self._prefetch,
         )
 
     def test_dataloader(self) -> DataLoader:

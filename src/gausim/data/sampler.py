@@ -51,7 +51,15 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         self._count, self._batch_size, self._repeats = count, batch_size, repeats
         self._curriculum, self._seed = curriculum, seed
         self._rank, self._world_size = rank, world_size
-        self.epoch, self.position = 0, 0
+        self.epoch = 0
+        # One attribute, so that an iteration that is still read ahead cannot move the position of the next epoch.
+        self._dealt = (0, 0)
+
+    @property
+    def position(self) -> int:
+        """Batches already dealt in the current epoch."""
+        epoch, dealt = self._dealt
+        return dealt if epoch == self.epoch else 0
 
     @property
     def sampler(self) -> SequenceBatchSampler:
@@ -61,7 +69,7 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
     def set_epoch(self, epoch: int) -> None:
         """Starts an epoch; naming the epoch that is under way (after a resume) keeps the position."""
         if epoch != self.epoch:
-            self.epoch, self.position = epoch, 0
+            self.epoch, self._dealt = epoch, (epoch, 0)
 
     def __len__(self) -> int:
         """Batches of a whole epoch."""
@@ -82,15 +90,13 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
 
     def __iter__(self) -> Iterator[list[SampleKey]]:
         """Yields this rank's share of each batch from the current position on; it may be empty."""
-        steps, order, size = self._curriculum.steps(self.epoch), self.order(self.epoch), self._batch_size
+        epoch, position, size = self.epoch, self.position, self._batch_size
+        steps, order = self._curriculum.steps(epoch), self.order(epoch)
         batches = [order[i : i + size][self._rank :: self._world_size] for i in range(0, len(order), size)]
-        if self.position >= len(batches):
-            self.position = 0
-        while self.position < len(batches):
-            batch = batches[self.position]
-            self.position += 1
-            yield [SampleKey(sequence, steps) for sequence in batch]
-        self.position = 0
+        for number in range(position if position < len(batches) else 0, len(batches)):
+            self._dealt = (epoch, number + 1)
+            yield [SampleKey(sequence, steps) for sequence in batches[number]]
+        self._dealt = (epoch, 0)
 
     def state_dict(self) -> dict[str, int]:
         """Epoch and number of batches already dealt in it."""
@@ -98,7 +104,8 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
 
     def load_state_dict(self, state: dict[str, int]) -> None:
         """Continues where ``state`` was taken."""
-        self.epoch, self.position = int(state["epoch"]), int(state["position"])
+        self.epoch = int(state["epoch"])
+        self._dealt = (self.epoch, int(state["position"]))
 
 
 def hash_seed(seed: int, epoch: int) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 from gausim.core import GausSimError
 from gausim.data.objects import ObjectData
 from gausim.data.records import SequenceRecord
+from gausim.io.files import sha256
 from gausim.io.packed import PIXELS, is_packed, read_packed
 from gausim.io.transforms import read_json
 
@@ -17,7 +17,6 @@ from gausim.io.transforms import read_json
 MANIFEST = "stage.json"
 CLOSED = "pack"
 FRAMES_AT_A_TIME = 8
-CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -117,13 +116,13 @@ def _manifest(root: Path, *, quick: bool) -> Iterator[Fault]:
     except (GausSimError, KeyError, TypeError, ValueError, AttributeError) as error:
         yield Fault(MANIFEST, f"lists no files ({error}). Make it again.")
         return
-    for name, (size, sha256) in known.items():
+    for name, (size, content) in known.items():
         file = root / name
         if not file.is_file():
             yield Fault(name, "is missing. Restore it, or make the set again.")
         elif file.stat().st_size != size:
             yield Fault(name, f"has {file.stat().st_size} bytes, {MANIFEST} says {size}. Make it again.")
-        elif not quick and _digest(file) != sha256:
+        elif not quick and sha256(file) != content:
             yield Fault(name, f"is not the file that {MANIFEST} lists (SHA-256 differs). Make it again.")
     if manifest.get("stage") != CLOSED:
         return
@@ -131,11 +130,3 @@ def _manifest(root: Path, *, quick: bool) -> Iterator[Fault]:
         name = str(file.relative_to(root))
         if name not in known and name != MANIFEST:
             yield Fault(name, f"is not in {MANIFEST}. Remove it, or pack the object again.")
-
-
-def _digest(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(CHUNK):
-            digest.update(block)
-    return digest.hexdigest()

@@ -14,7 +14,7 @@ from lightning.pytorch.plugins.io import CheckpointIO
 from torch import Tensor, nn
 
 from gausim.core import GaussianScene, RunError
-from gausim.engine.files import write_durably
+from gausim.io.files import write_durably
 
 LAST_CHECKPOINT, PREVIOUS_CHECKPOINT = "last.ckpt", "last.previous.ckpt"
 DIGEST = "digest"

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gausim.engine.files import write_durably
+from gausim.io.files import write_durably
 
 
 class EpochTable:

@@ -1,12 +1,11 @@
-"""Files that survive a crash: written durably, one writer per directory, errors of the disk told in words."""
+"""Run directories on a disk: one writer each, errors of the disk told in words."""
 
 from __future__ import annotations
 
 import errno
 import os
-import re
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,73 +18,6 @@ except ImportError:  # not on Windows; there nothing keeps a second process out
 
 # What a disk answers that will not take more: full, over quota, over a limit, write-protected, not for this user.
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
-_LEFTOVER = re.compile(r"\..+\.\d+\.tmp")
-
-
-def write_durably(
-    path: Path, data: bytes, *, check: Callable[[Path], None] | None = None, previous: Path | None = None
-) -> None:
-    """Writes a file so that a crash at any moment leaves the old content or the new one, never a mixture.
-
-    The bytes go to a temporary file in the same directory, reach the disk, are checked there, and only then take the
-    name; the directory's entry is flushed too.
-
-    Args:
-        path: the file.
-        data: its content.
-        check: raises if what was written is not good; called with the temporary file.
-        previous: where a file that ``path`` names already is kept; None replaces it.
-
-    Raises:
-        OSError: the disk refuses; the old file stays.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        if check is not None:
-            check(temporary)
-        if previous is not None and path.is_file():
-            _keep(path, previous)
-        os.replace(temporary, path)
-        _sync_directory(path.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _keep(path: Path, previous: Path) -> None:
-    """Names a file ``previous`` as well, so that ``path`` is there at every moment."""
-    link = previous.with_name(f".{previous.name}.{os.getpid()}.tmp")
-    link.unlink(missing_ok=True)
-    try:
-        os.link(path, link)
-    except OSError:
-        os.replace(path, previous)  # a file system without hard links: for a moment there is `previous` only
-        return
-    try:
-        os.replace(link, previous)
-    finally:
-        link.unlink(missing_ok=True)  # still there if both are one file already
-
-
-def _sync_directory(folder: Path) -> None:
-    if os.name != "posix":
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def remove_leftovers(folder: Path) -> None:
-    """Removes the temporary files of processes that were killed while writing. Call it as the only writer."""
-    for path in folder.glob(".*.tmp"):
-        if _LEFTOVER.fullmatch(path.name):
-            path.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -15,8 +15,8 @@ from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from PIL import Image
 
-from gausim.engine.files import write_durably
 from gausim.engine.media import Media
+from gausim.io.files import write_durably
 from gausim.io.video import read_video, video_rate, write_gif
 
 

@@ -16,10 +16,10 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
 from gausim.core import ConfigError
-from gausim.engine.files import write_durably
 from gausim.engine.loggers import error_plot
 from gausim.engine.media import Media
 from gausim.engine.randomness import undisturbed
+from gausim.io.files import write_durably
 
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient

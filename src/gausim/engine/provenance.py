@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 import subprocess
 from pathlib import Path
@@ -12,6 +11,7 @@ import torch
 
 import gausim
 from gausim.data.objects import ObjectData
+from gausim.io.files import sha256
 
 PACKAGE = Path(gausim.__file__).resolve().parent
 # A store's manifest says more than the facts of the object; the first that is there counts.
@@ -44,10 +44,7 @@ def data_provenance(data: ObjectData) -> dict[str, Any]:
 
 def file_hash(path: Path) -> str | None:
     """SHA-256 of a file in hexadecimal; None where there is no such file."""
-    if not path.is_file():
-        return None
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return sha256(path) if path.is_file() else None
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

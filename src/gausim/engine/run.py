@@ -24,13 +24,14 @@ from lightning.pytorch.utilities import rank_zero_only
 from gausim.core import ConfigError, GausSimError, RunError
 from gausim.engine.callbacks import EPOCHS, ExactResume, TimeBudget
 from gausim.engine.checkpoint import LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, AtomicCheckpointIO, check_resumable
-from gausim.engine.files import remove_leftovers, sole_writer, unwritable, write_durably
+from gausim.engine.files import sole_writer, unwritable
 from gausim.engine.launch import Crew
 from gausim.engine.layout import RanksStrategy
 from gausim.engine.memory import keep_freed_memory
 from gausim.engine.mlflow_log import MLFLOW_ID
 from gausim.engine.motion_watch import MOTION
 from gausim.engine.wandb_log import WANDB_ID
+from gausim.io.files import remove_leftovers, write_durably
 
 CONFIG, FINISHED, FAILED, LOCK = "config.yaml", "FINISHED", "FAILED", ".lock"
 EVALUATION, EVENTS = "evaluation/metrics.json", "events.jsonl"

@@ -13,10 +13,10 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
 from gausim.core import RunError
-from gausim.engine.files import write_durably
 from gausim.engine.loggers import CsvLog
 from gausim.engine.media import Media, media_of
 from gausim.engine.randomness import undisturbed
+from gausim.io.files import write_durably
 
 WANDB_ID = "wandb_id"
 # Seconds after which a server that does not answer is given up.

@@ -7,7 +7,6 @@ they are needed; nothing is decoded.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +18,13 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from gausim.core import Cameras, DataError
+from gausim.io.files import sha256
 from gausim.io.transforms import read_json
 
 SCHEMA = 1
 HEADER, PIXELS = "frames.json", "frames.bin"
 # Of a header; sequences beyond these sizes are a broken file rather than a film.
 MOST_FRAMES, MOST_PIXELS = 1_000_000, 1 << 16
-CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -96,11 +95,7 @@ class PackedFrames:
 
     def digest(self) -> str:
         """SHA-256 of ``frames.bin`` as it is."""
-        digest = hashlib.sha256()
-        with (self.folder / PIXELS).open("rb") as file:
-            while block := file.read(CHUNK):
-                digest.update(block)
-        return digest.hexdigest()
+        return sha256(self.folder / PIXELS)
 
 
 def is_packed(folder: Path) -> bool:
@@ -120,11 +115,11 @@ def read_packed(folder: Path) -> PackedFrames:
         raise DataError(f"{path}: schema is {data.get('schema')!r}, expected {SCHEMA}. Pack the sequence again.")
     count = _integer(data, "frames", path, 1, MOST_FRAMES)
     width, height = (_integer(data, key, path, 1, MOST_PIXELS) for key in ("width", "height"))
-    fps, size, sha256 = data.get("fps"), _integer(data, "bytes", path, 0, 1 << 62), data.get("sha256")
+    fps, size, content = data.get("fps"), _integer(data, "bytes", path, 0, 1 << 62), data.get("sha256")
     if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps < float("inf"):
         raise DataError(f"{path}: field 'fps' must be a positive number, got {fps!r}.")
-    if not isinstance(sha256, str) or len(sha256) != 64:
-        raise DataError(f"{path}: field 'sha256' must be 64 hexadecimal digits, got {sha256!r}.")
+    if not isinstance(content, str) or len(content) != 64:
+        raise DataError(f"{path}: field 'sha256' must be 64 hexadecimal digits, got {content!r}.")
     views = data.get("views")
     if not isinstance(views, list) or not views or not all(isinstance(v, dict) for v in views):
         raise DataError(f"{path}: field 'views' must be a non-empty list of objects.")
@@ -134,7 +129,7 @@ def read_packed(folder: Path) -> PackedFrames:
     if not pixels.is_file() or pixels.stat().st_size != size:
         found = f"{pixels.stat().st_size} bytes" if pixels.is_file() else "no such file"
         raise DataError(f"{pixels}: expected {size} bytes as {HEADER} says, got {found}. Pack the sequence again.")
-    return PackedFrames(folder, count, float(fps), cameras, crops, size, sha256)
+    return PackedFrames(folder, count, float(fps), cameras, crops, size, content)
 
 
 def _ascending(frames: Sequence[int]) -> bool:

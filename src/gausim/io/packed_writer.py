@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from gausim.core import Cameras, DataError
+from gausim.io.files import replacing, write_durably
 from gausim.io.packed import HEADER, PIXELS, SCHEMA, Crop
 
 
@@ -30,11 +30,9 @@ def write_packed(
     Raises:
         DataError: a view has another size than its camera or another number of frames than the first.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     crops: list[Crop] = []
     digest, offset, count = hashlib.sha256(), 0, 0
-    temporary = folder / f".{PIXELS}.tmp"
-    with temporary.open("wb") as file:
+    with replacing(folder / PIXELS) as temporary, temporary.open("wb") as file:
         for number, pixels in enumerate(views):
             count = count or len(pixels)
             expected = (count, cameras.height, cameras.width, 4)
@@ -47,13 +45,8 @@ def write_packed(
                 digest.update(content)
             crops.append(crop)
             offset += count * crop.frame_bytes
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, folder / PIXELS)
     text = header(cameras, crops, count=count, fps=fps, size=offset, sha256=digest.hexdigest())
-    temporary = folder / f".{HEADER}.tmp"
-    temporary.write_bytes(text)
-    os.replace(temporary, folder / HEADER)
+    write_durably(folder / HEADER, text)
 
 
 def bounding_crop(alpha: UInt8[np.ndarray, "F H W"], margin: int, offset: int) -> Crop:

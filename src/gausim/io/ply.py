@@ -6,7 +6,6 @@ The PLY holds what every 3DGS viewer reads; what the dynamics needs besides (mas
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from gausim.core.errors import SceneError
 from gausim.core.scene import GaussianScene
+from gausim.io.files import replacing
 from gausim.io.npz import read_npz
 
 MASK_SUFFIX = ".masks.npz"
@@ -113,7 +113,6 @@ def load_points(path: Path | str) -> np.ndarray:
 def save_scene(scene: GaussianScene, path: Path | str) -> None:
     """Writes the scene as little-endian float32 PLY in INRIA order, and its masks next to it; replaces atomically."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     rest_count = 3 * (scene.sh.shape[1] - 1)
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     names += [f"f_rest_{i}" for i in range(rest_count)]
@@ -125,18 +124,14 @@ def save_scene(scene: GaussianScene, path: Path | str) -> None:
     body = torch.cat([c.detach().cpu().float() for c in columns], dim=1).numpy().astype("<f4")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {scene.count}"]
     header += [f"property float {n}" for n in names] + ["end_header", ""]
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_bytes("\n".join(header).encode("ascii") + body.tobytes())
-    save_masks(scene, masks_path(path))
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        temporary.write_bytes("\n".join(header).encode("ascii") + body.tobytes())
+        save_masks(scene, masks_path(path))
 
 
 def save_masks(scene: GaussianScene, path: Path | str) -> None:
     """Writes simulated, pinned, foreground (bool) and volume_scale as npz without pickles; replaces atomically."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with temporary.open("wb") as file:
+    with replacing(Path(path)) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
             file,
             volume_scale=np.float64(scene.volume_scale),
@@ -144,7 +139,6 @@ def save_masks(scene: GaussianScene, path: Path | str) -> None:
             pinned=scene.pinned.cpu().numpy(),
             foreground=scene.foreground.cpu().numpy(),
         )
-    os.replace(temporary, path)
 
 
 def load_masks(scene: GaussianScene, path: Path | str) -> GaussianScene:

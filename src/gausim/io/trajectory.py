@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from gausim.core import DataError, Trajectory
+from gausim.io.files import write_durably
 
 FORMAT = "gausim.trajectory/1"
 _TENSORS = ("positions", "gradients", "rotations", "unit_of_kernel", "fps")
@@ -26,12 +26,9 @@ def save_trajectory(path: Path | str, trajectory: Trajectory, *, facts: Mapping[
         facts: texts for the header, e.g. object and sequence.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     tensors = {name: getattr(trajectory, name).detach().cpu().contiguous() for name in _TENSORS[:-1]}
     tensors["fps"] = torch.tensor(trajectory.fps, dtype=torch.float64)
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_bytes(save(tensors, metadata={**(facts or {}), "format": FORMAT}))
-    os.replace(temporary, path)
+    write_durably(path, save(tensors, metadata={**(facts or {}), "format": FORMAT}))
 
 
 def load_trajectory(path: Path | str) -> Trajectory:

@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float, Int
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from gausim.io.files import replacing
+
 # Neighbouring units get hues this far apart on the colour circle: the golden ratio never repeats.
 GOLDEN = 0.6180339887498949
 # Point area [points^2] for a thousand kernels; more kernels get smaller points.
@@ -60,10 +62,8 @@ def draw_clusters(
                 panel.invert_yaxis()
             if row == 0:
                 panel.set_title(name)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    figure.savefig(temporary, format="png", dpi=110)
-    temporary.replace(path)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
 
 
 def unit_colors(unit: Int[np.ndarray, " K"]) -> Float[np.ndarray, "K 3"]:

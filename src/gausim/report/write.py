@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from gausim.io.files import write_durably
 from gausim.report.media import Exhibit, object_figures
 from gausim.report.overview import make_sheets
 from gausim.report.page import html_page
@@ -64,7 +64,5 @@ def write_report(
 
 def _write(path: Path, text: str) -> Path:
     """Writes all or nothing, so that a reader never sees half a page."""
-    temporary = path.with_name(f".{path.name}.tmp")
-    temporary.write_text(text, encoding="utf-8", errors="replace")
-    os.replace(temporary, path)
+    write_durably(path, text.encode("utf-8", errors="replace"))
     return path

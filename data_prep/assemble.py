@@ -1,0 +1,264 @@
+"""Puts stills, sequences and the scene of one object into one directory, with ``dataset.json``, ready for training.
+
+PICTURES are results of `segment` (or of `poses`, where the pictures had alpha already, or of `import_ready`): posed
+stills become OUT/static, posed sequences OUT/sequences. Of several folders the later one replaces what the earlier ones
+have, so that films may be cut out in another way than stills. Without --scene the object is what `reconstruct` needs;
+with the scene of `select` it is complete, and is checked as `gausim verify` does before it takes its name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from data_prep.common.command import add_result, headline, told
+from data_prep.common.progress import Tick, bars, silent
+from gausim.core.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from data_prep.scenes.gathered import Gathered
+
+# Raise when the same inputs and settings give another result than before.
+REVISION = 1
+# The paper trains on the first 16 frames.
+TRAIN_FRAMES = 16
+# From so many cameras on, one is left out of training unless told otherwise.
+ENOUGH_VIEWS = 3
+MOST_FAULTS = 5
+SCENE = "scene.ply"
+
+
+@dataclass(frozen=True)
+class AssembleOptions:
+    """What the pictures do not say; None leaves it to a ``dataset.json`` beside them, or to the defaults.
+
+    Attributes:
+        name: of the object; the result's folder by default.
+        fps: frames per second of the sequences; what their ``transforms.json`` say by default.
+        heldout: cameras never to train on; the last one by default, none where there are fewer than three.
+        train_frames: frames 0..n-1 are trained on; 16, or as many as the shortest sequence has.
+    """
+
+    name: str | None = None
+    fps: float | None = None
+    heldout: tuple[str, ...] | None = None
+    train_frames: int | None = None
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        if self.fps is not None and not 0 < self.fps < 1e4:
+            raise ConfigError(f"--fps: expected frames per second, got {self.fps}.")
+        if self.train_frames is not None and self.train_frames < 2:
+            raise ConfigError(f"--train-frames: expected at least 2, got {self.train_frames}.")
+
+
+def assemble(
+    pictures: Sequence[Path],
+    out: Path,
+    options: AssembleOptions | None = None,
+    *,
+    scene: Path | None = None,
+    force: bool = False,
+    tick: Tick = silent,
+) -> dict[str, Any]:
+    """Runs the stage.
+
+    Args:
+        pictures: folders with posed RGBA pictures, see :func:`data_prep.scenes.gathered.gather`.
+        out: folder of the result, in the layout of docs/data.md.
+        options: what the pictures do not say.
+        scene: the rest scene (PLY, its masks beside it), or the folder of the stage that made it.
+        force: replace a result of other inputs or settings.
+        tick: told of the progress.
+
+    Returns:
+        The stage's manifest.
+
+    Raises:
+        DataError: there are no sequences, they do not go together, or the result would have faults.
+        ConfigError: an option does not suit the pictures.
+    """
+    from data_prep.common.stage import Stage, run_stage
+    from data_prep.scenes.gathered import gather
+
+    options = options or AssembleOptions()
+    found = gather(pictures)
+    if not found.sequences:
+        raise DataError(
+            f"{pictures[0]}: has no sequences, and dynamics are learned from them. For a scene from photos alone leave "
+            "this stage out: reconstruct the folder itself."
+        )
+    facts = dataset_facts(found, options, out.name)
+    files = {**dict(found.files()), **(_scene_files(scene) if scene is not None else {})}
+    stage = Stage("assemble", REVISION, files, {"facts": facts, **asdict(options)})
+    return run_stage(stage, out, lambda work: _make(work, out, found, files, facts, tick), force=force)
+
+
+def dataset_facts(found: Gathered, options: AssembleOptions, name: str) -> dict[str, Any]:
+    """The content of ``dataset.json``.
+
+    Args:
+        found: the pictures.
+        options: what they do not say.
+        name: of the object where nothing else names it.
+
+    Raises:
+        DataError: cameras or rates of the sequences differ, or a sequence is too short.
+        ConfigError: an option does not suit the pictures.
+    """
+    from data_prep.scenes.gathered import common_rate, common_views
+
+    given = _checked(found.facts)
+    views = common_views(found.sequences)
+    fps = options.fps or common_rate(found.sequences) or given.get("fps")
+    if fps is None:
+        raise ConfigError("--fps: the sequences do not say how many frames per second they have; state it.")
+    heldout = options.heldout
+    if heldout is None:
+        heldout = given.get("heldout_views", views[-1:] if len(views) >= ENOUGH_VIEWS else ())
+    unknown = [view for view in heldout if view not in views]
+    if unknown or len(set(heldout)) >= len(views):
+        raise ConfigError(f"--heldout {','.join(map(str, heldout))}: expected a part of the cameras {list(views)}.")
+    lengths = {name: _length(posed.frames) for name, posed in found.sequences.items()}
+    shortest = min(lengths, key=lambda name: lengths[name])
+    wanted = options.train_frames or given.get("train_frames", [0, min(TRAIN_FRAMES, lengths[shortest])])[1]
+    if not 2 <= wanted <= lengths[shortest]:
+        raise ConfigError(
+            f"--train-frames {wanted}: {shortest} has {lengths[shortest]} frames; expected 2 to {lengths[shortest]}, "
+            "or leave that sequence out."
+        )
+    return {
+        **given,
+        "name": options.name or given.get("name") or name,
+        "fps": fps,
+        "views": list(views),
+        "train_views": [view for view in views if view not in heldout],
+        "heldout_views": [view for view in views if view in heldout],
+        "train_frames": [0, wanted],
+    }
+
+
+def _checked(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """What a ``dataset.json`` beside the pictures says, where it is what it should be."""
+    heldout, frames = facts.get("heldout_views", []), facts.get("train_frames", [0, 2])
+    if not isinstance(heldout, list) or not all(isinstance(view, str) for view in heldout):
+        raise DataError(f"dataset.json: field 'heldout_views' must be a list of camera names, got {heldout!r}.")
+    if not isinstance(frames, list) or len(frames) != 2 or not all(type(n) is int for n in frames):
+        raise DataError(f"dataset.json: field 'train_frames' must be [0, first unseen frame], got {frames!r}.")
+    return dict(facts)
+
+
+def _length(frames: Sequence[Any]) -> int:
+    """Frames of the camera that has the fewest."""
+    counts: dict[str, int] = {}
+    for frame in frames:
+        counts[frame.camera] = counts.get(frame.camera, 0) + 1
+    return min(counts.values())
+
+
+def _scene_files(scene: Path) -> dict[str, Path]:
+    """The scene's files by their names in the object."""
+    from gausim.io.ply import masks_path
+
+    path = scene / SCENE if scene.is_dir() else scene
+    if not path.is_file():
+        raise DataError(f"{path}: not found. Expected the rest scene, as `reconstruct` or `select` writes it.")
+    masks = masks_path(path)
+    return {SCENE: path, **({masks_path(Path(SCENE)).name: masks} if masks.is_file() else {})}
+
+
+def _make(
+    work: Path, out: Path, found: Gathered, files: Mapping[str, Path], facts: Mapping[str, Any], tick: Tick
+) -> dict[str, Any]:
+    """Copies what is missing in ``work``, checks it, and tells what is there."""
+    from data_prep.common.stage import PLAN, fingerprint
+    from gausim.data.verify import verify
+    from gausim.io.files import replacing, write_json
+
+    for number, (name, path) in enumerate(files.items(), 1):
+        target = work / name
+        if not target.is_file():
+            with replacing(target) as temporary:
+                shutil.copyfile(path, temporary)
+        tick("copying", number, len(files))
+    write_json(work / "dataset.json", facts)
+    faults = verify(work)
+    if faults:
+        told_faults = [f"{fault.where}: {fault.what.replace(str(work), str(out))}" for fault in faults]
+        more = f" And {len(faults) - MOST_FAULTS} more." if len(faults) > MOST_FAULTS else ""
+        raise DataError(f"{out}: the object would have faults:\n  " + "\n  ".join(told_faults[:MOST_FAULTS]) + more)
+    listed = {
+        str(p.relative_to(work)): fingerprint(p) for p in sorted(work.rglob("*")) if p.is_file() and p.name != PLAN
+    }
+    return {
+        "stills": len(found.stills.frames) if found.stills is not None else 0,
+        "sequences": {name: _length(posed.frames) for name, posed in found.sequences.items()},
+        "facts": facts,
+        "scene": SCENE in files,
+        "files": listed,
+    }
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    arguments = _parser().parse_args(argv)
+
+    def run() -> str:
+        options = AssembleOptions(arguments.name, arguments.fps, arguments.heldout, arguments.train_frames)
+        with bars() as tick:
+            manifest = assemble(
+                arguments.pictures, arguments.out, options, scene=arguments.scene, force=arguments.force, tick=tick
+            )
+        return f"{headline(arguments.out, manifest)}\n{summary(manifest['results'], arguments.out)}"
+
+    return told(run)
+
+
+def summary(results: Mapping[str, Any], out: Path) -> str:
+    """A few lines about the object, for people."""
+    facts = results["facts"]
+    frames = sorted(results["sequences"].values())
+    length = str(frames[0]) if frames[0] == frames[-1] else f"{frames[0]} to {frames[-1]}"
+    trained, left = facts["train_views"], facts["heldout_views"]
+    lines = [
+        f"stills      {results['stills']}",
+        f"sequences   {len(frames)}, {length} frames at {facts['fps']:g} per second",
+        f"cameras     train {', '.join(trained)}; never trained on: {', '.join(left) or 'none'}",
+        f"frames      0 to {facts['train_frames'][1] - 1} are trained on",
+    ]
+    if results["scene"]:
+        return "\n".join([*lines, f"train       gausim train data=object data.root={out} name={facts['name']}"])
+    return "\n".join([*lines, f"scene       none yet: python -m data_prep.reconstruct {out} --out DIR"])
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m data_prep.assemble", description=__doc__.replace("``", ""),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument(
+        "pictures", type=Path, nargs="+", metavar="PICTURES", help="folders with posed RGBA stills and sequences"
+    )
+    add_result(parser)
+    parser.add_argument("--scene", type=Path, metavar="SCENE", help="rest scene (PLY, masks beside it), or its folder")
+    group = parser.add_argument_group("what the pictures do not say")
+    group.add_argument("--name", help="of the object (the result's folder)")
+    group.add_argument("--fps", type=float, help="frames per second (what transforms.json of the sequences says)")
+    group.add_argument("--heldout", type=_names, metavar="CAM,CAM",
+        help="cameras never to train on, or 'none' (the last of three or more)")  # fmt: skip
+    group.add_argument("--train-frames", type=int, metavar="N",
+        help=f"first frames to train on ({TRAIN_FRAMES}, or the shortest sequence)")  # fmt: skip
+    return parser
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return () if text == "none" else tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The paper's synthetic set: a mesh, a plan, and Blender in an environment of its own."""

@@ -1,0 +1,212 @@
+"""The work of ``data_prep.blender_bunny``: hands Blender what is missing of a set, and writes what describes it."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import json
+import shutil
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from data_prep.blender.environment import Blender, BlenderError
+from data_prep.blender.meshes import read_mesh
+from data_prep.blender.plan import (
+    FPS,
+    Plan,
+    action,
+    dataset_facts,
+    frame_name,
+    intrinsics,
+    sequence_job,
+    sequence_name,
+    still_job,
+    still_name,
+    still_poses,
+    video_poses,
+)
+from data_prep.blender.surface import Surface, make_surface
+from data_prep.common.stage import PLAN, fingerprint
+from gausim.core import DataError
+from gausim.data.images import read_rgba
+from gausim.io.files import write_durably, write_json
+from gausim.io.npz import read_npz
+
+FACTS = "dataset.json"
+STILLS_PER_JOB = 20
+OVERVIEW_FRAMES, OVERVIEW_SIDE = 5, 200
+
+
+def make(mesh: Path, work: Path, plan: Plan, blender: Blender, *, workers: int = 1) -> dict[str, Any]:
+    """Makes what is missing of a set in ``work``.
+
+    Returns:
+        What the manifest tells: Blender's versions, sequences, number of images, and every file with its hash.
+
+    Raises:
+        DataError: the mesh is unusable.
+        BlenderError: Blender gave up, or left out a picture.
+    """
+    surface = make_surface(read_mesh(mesh), mesh, up=plan.up, points=plan.points, seed=plan.seed)
+    # Absolute: Blender has a working directory of its own mind.
+    root = work.absolute()
+    versions = blender.versions()
+    _start(root, {**dataset_facts(plan, surface), "blender": versions})
+    _write_npz(root / "rest_mesh.npz", vars(surface))
+    stills = [range(i, min(i + STILLS_PER_JOB, plan.stills)) for i in range(0, plan.stills, STILLS_PER_JOB)]
+    jobs = [still_job(plan, surface, root, numbers) for numbers in stills]
+    jobs += [sequence_job(plan, surface, root, number) for number in range(plan.sequences)]
+    _run(jobs, blender, workers)
+    _describe_stills(root / "static", plan, surface)
+    sequences = [_describe_sequence(root, plan, surface, number) for number in range(plan.sequences)]
+    _write_overview(root, plan)
+    _sweep(root)
+    files = {str(p.relative_to(root)): fingerprint(p) for p in sorted(root.rglob("*")) if p.is_file()}
+    files.pop(PLAN, None)
+    images = plan.stills + plan.sequences * plan.frames * plan.views
+    return {"blender": versions, "sequences": sequences, "images": images, "files": files}
+
+
+def _start(root: Path, facts: Mapping[str, Any]) -> None:
+    """Empties the directory of what another Blender made, whose pictures would not be the same."""
+    try:
+        same = json.loads((root / FACTS).read_bytes())["blender"] == facts["blender"]
+    except (OSError, ValueError, KeyError, TypeError):
+        same = False
+    if not same:
+        for path in root.iterdir():
+            if path.is_dir():
+                shutil.rmtree(path)
+            elif path.name != PLAN:
+                path.unlink()
+    write_json(root / FACTS, facts)
+
+
+def _run(jobs: list[dict[str, Any]], blender: Blender, workers: int) -> None:
+    """Does the jobs, those of interrupted work only in part, several at a time; the first error ends all."""
+    from data_prep.common.progress import bars
+
+    stop = threading.Event()
+    total = sum(len(job["images"]) for job in jobs)
+    left = [job for job in map(_left, jobs) if job is not None]
+    done = itertools.count(total - sum(len(job["images"]) for job in left) + 1)
+    with bars("rendering") as tick:
+
+        def told(step: str) -> None:
+            if step == "image":
+                tick("rendering", next(done), total)
+
+        with ThreadPoolExecutor(workers) as pool:
+            pending = [pool.submit(_do, job, blender, told, stop) for job in left]
+            try:
+                finished, _ = wait(pending, return_when=FIRST_EXCEPTION)
+                failed = [future for future in pending if future in finished and future.exception() is not None]
+            finally:
+                if len([future for future in pending if future.done()]) < len(pending):
+                    stop.set()
+                    pool.shutdown(wait=False, cancel_futures=True)
+        if failed:
+            failed[0].result()
+
+
+def _left(job: dict[str, Any]) -> dict[str, Any] | None:
+    """What is left of a job; None where all is there."""
+    images = [image for image in job["images"] if not _is_there(Path(image["file"]))]
+    moved = job["motion"] is None or _is_there(Path(job["motion"]["file"]))
+    return None if moved and not images else {**job, "images": images}
+
+
+def _is_there(path: Path) -> bool:
+    return path.is_file() and path.stat().st_size > 0
+
+
+def _do(job: dict[str, Any], blender: Blender, told: Callable[[str], None], stop: threading.Event) -> None:
+    blender.run(job, told, stop)
+    rest = _left(job)
+    if rest is not None:
+        missing = [image["file"] for image in rest["images"]] or [job["motion"]["file"]]
+        raise BlenderError(f"{missing[0]}: Blender ended without writing it ({len(missing)} files are missing).")
+
+
+def _describe_stills(folder: Path, plan: Plan, surface: Surface) -> None:
+    frames = [
+        {"file_path": still_name(i), "transform_matrix": pose} for i, pose in enumerate(still_poses(plan, surface))
+    ]
+    write_json(folder / "transforms.json", {**intrinsics(plan.still_resolution), "frames": frames})
+
+
+def _describe_sequence(root: Path, plan: Plan, surface: Surface, number: int) -> dict[str, Any]:
+    """Writes ``meta.json`` and ``transforms.json``; returns what the manifest tells of the sequence."""
+    folder = root / "sequences" / sequence_name(number)
+    chosen, (strength, largest) = action(plan, surface, number), _motion(folder / "ground_truth.npz", plan)
+    percent = 100 * float(largest.max()) / surface.diagonal
+    meta = {
+        **chosen, "strength": strength, "largest_displacement_percent": round(percent, 3),
+        "largest_displacement_per_frame": [round(float(value), 4) for value in largest],
+    }  # fmt: skip
+    write_json(folder / "meta.json", meta)
+    frames = [
+        {
+            "file_path": frame_name(view, frame), "camera": view, "frame": frame, "time": frame / FPS,
+            "heldout": i >= plan.views - plan.heldout, "transform_matrix": pose,
+        }
+        for frame in range(plan.frames)
+        for i, (view, pose) in enumerate(zip(plan.view_names, video_poses(plan, surface), strict=True))
+    ]  # fmt: skip
+    write_json(folder / "transforms.json", {**intrinsics(plan.resolution), "fps": FPS, "frames": frames})
+    wanted = round(100 * chosen["amplitude"] / surface.diagonal, 3)
+    return {
+        "name": folder.name, "kind": chosen["kind"], "amplitude_wanted_percent": wanted,
+        "amplitude_percent": round(percent, 3),
+    }  # fmt: skip
+
+
+def _motion(path: Path, plan: Plan) -> tuple[float, np.ndarray]:
+    """Strength of the push and the largest displacement (F,) of each frame [scene units]."""
+    try:
+        arrays = read_npz(path, ["displacement", "strength"])
+        displacement, strength = arrays["displacement"], float(arrays["strength"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: cannot be read ({error}). Remove it and run the command again.") from error
+    if displacement.ndim != 3 or len(displacement) != plan.frames or not np.isfinite(displacement).all():
+        raise DataError(
+            f"{path}: field 'displacement' has shape {displacement.shape}, expected {plan.frames} finite frames. "
+            "Remove it and run the command again."
+        )
+    return strength, np.linalg.norm(displacement, axis=-1).max(1)
+
+
+def _write_overview(root: Path, plan: Plan) -> None:
+    """``overview.png``: a row for each of the first sequences' views, frames from left to right."""
+    frames = np.unique(np.linspace(0, plan.frames - 1, OVERVIEW_FRAMES).round().astype(int))
+    scale = OVERVIEW_SIDE / max(plan.resolution)
+    size = tuple(max(1, round(side * scale)) for side in plan.resolution)
+    rows = []
+    for number in range(min(plan.sequences, 6)):
+        folder, view = root / "sequences" / sequence_name(number), plan.view_names[number % plan.views]
+        pictures = [read_rgba(folder / frame_name(view, int(frame)), plan.resolution) for frame in frames]
+        shown = [picture[..., 2::-1] * (picture[..., 3:] / 255) for picture in pictures]
+        rows.append(np.hstack([cv2.resize(s.astype(np.uint8), size, interpolation=cv2.INTER_AREA) for s in shown]))
+    done, data = cv2.imencode(".png", np.vstack(rows))
+    if not done:
+        raise DataError(f"{root / 'overview.png'}: cannot be encoded.")
+    write_durably(root / "overview.png", data.tobytes())
+
+
+def _sweep(root: Path) -> None:
+    """Removes what a killed Blender left half."""
+    for path in root.rglob(".*"):
+        if path.is_file():
+            path.unlink()
+
+
+def _write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
+    held = io.BytesIO()
+    np.savez_compressed(held, **arrays)
+    write_durably(path, held.getvalue())

@@ -1,0 +1,1 @@
+"""Poses: found or taken over, without distortion, in a world with an up and a scale."""

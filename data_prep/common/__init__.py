@@ -1,0 +1,1 @@
+"""What the stages share: all or nothing, photos, progress, the command line."""

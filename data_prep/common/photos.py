@@ -1,0 +1,117 @@
+"""Photos as the stages read them: which there are, their size and focal length, their pixels the right way up."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gausim.core.errors import DataError
+from gausim.io.files import write_durably
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+# Tags of the EXIF standard.
+_ORIENTATION, _EXIF, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
+# Orientations that turn the picture by a quarter.
+_QUARTER = (5, 6, 7, 8)
+# COLMAP's own rule: the longer side of a 35 mm frame.
+_FRAME_35MM = 35.0
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One photo.
+
+    Attributes:
+        name: unique among those of a run; a path with ``/``.
+        path: the file.
+        width: the right way up [pixels].
+        height: the right way up [pixels].
+        focal: by its EXIF data, None where there are none [pixels].
+    """
+
+    name: str
+    path: Path
+    width: int
+    height: int
+    focal: float | None
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The image files in a folder, in natural order (2 before 10).
+
+    Raises:
+        DataError: there is no such folder, or no image in it.
+    """
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder. Expected one with photos.")
+    found = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
+    if not found:
+        raise DataError(f"{folder}: no images here (looked for {', '.join(SUFFIXES)}).")
+    return sorted(found, key=lambda p: natural(p.name))
+
+
+def natural(name: str) -> list[tuple[int, int, str]]:
+    """Sorting key by which frame_2 comes before frame_10."""
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return [(0, int(part), "") if part[0] in "0123456789" else (1, 0, part) for part in parts]
+
+
+def open_photo(path: Path, name: str) -> Photo:
+    """Size and focal length of a photo, without decoding it.
+
+    Raises:
+        DataError: it is missing or no image.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+            exif = image.getexif()
+            turned = exif.get(_ORIENTATION) in _QUARTER
+            focal_35mm = exif.get_ifd(_EXIF).get(_FOCAL_35MM)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise DataError(f"{path}: cannot be read as an image ({error}). Export it again.") from error
+    size = (height, width) if turned else (width, height)
+    focal = None
+    if isinstance(focal_35mm, int | float) and 0 < focal_35mm < 1e4:
+        focal = focal_35mm / _FRAME_35MM * max(size)
+    return Photo(name, path, *size, focal)
+
+
+def read_photo(photo: Photo) -> np.ndarray:
+    """(H, W, 3) uint8 BGR the right way up, or (H, W, 4) BGRA where the file has alpha.
+
+    Raises:
+        DataError: it cannot be decoded, or is of another size than its header says.
+    """
+    import cv2
+
+    pixels = cv2.imread(str(photo.path), cv2.IMREAD_COLOR)
+    if pixels is None:
+        raise DataError(f"{photo.path}: cannot be decoded as an image. Export it again.")
+    if photo.path.suffix.lower() in (".png", ".webp", ".tif", ".tiff"):
+        raw = cv2.imread(str(photo.path), cv2.IMREAD_UNCHANGED)
+        if raw is not None and raw.ndim == 3 and raw.shape[2] == 4 and raw.dtype == np.uint8:
+            pixels = raw
+    if pixels.shape[:2] != (photo.height, photo.width):
+        found = f"{pixels.shape[1]}x{pixels.shape[0]}"
+        raise DataError(f"{photo.path}: header says {photo.width}x{photo.height}, pixels are {found}. Export it again.")
+    return pixels
+
+
+def write_png(path: Path, pixels: np.ndarray) -> None:
+    """Writes (H, W), (H, W, 3) BGR or (H, W, 4) BGRA uint8 as PNG, all of it or nothing.
+
+    Raises:
+        DataError: it cannot be written.
+    """
+    import cv2
+
+    good, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 4])
+    if not good:
+        raise DataError(f"{path}: cannot be encoded as PNG (shape {pixels.shape}, {pixels.dtype}).")
+    write_durably(path, data.tobytes())

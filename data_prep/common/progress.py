@@ -1,0 +1,42 @@
+"""Progress of a stage on standard error: one bar per step, none where nobody watches."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+# What a bar shows: step, how much of it is done, how much there is.
+Tick = Callable[[str, int, int], None]
+
+
+@contextmanager
+def bars(waiting: str | None = None) -> Iterator[Tick]:
+    """A function that is told (step, done, of how many); each step has a bar until it is done. Threads may call it.
+
+    Args:
+        waiting: what is shown until the first step begins.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        known: dict = {}
+        lock = threading.Lock()
+        first = None if waiting is None else progress.add_task(waiting, total=None)
+
+        def tick(step: str, done: int, total: int) -> None:
+            if first is not None:
+                progress.update(first, visible=False)
+            with lock:
+                if step not in known:
+                    known[step] = progress.add_task(step, total=total)
+            progress.update(known[step], completed=done, total=total, visible=done < total)
+
+        yield tick
+
+
+def silent(step: str, done: int, total: int) -> None:
+    """Tells nobody."""

@@ -1,0 +1,173 @@
+"""What the stages from film to data set have in common: all or nothing, resumable, with a manifest of what was done.
+
+A stage reads files and writes one directory. It works in a hidden directory beside it, which takes the final name only
+when everything is there, so a directory without ``stage.json`` is never a result. Work that was interrupted goes on
+where it was, as long as inputs and settings are the same; each item of it is a file that is written at once
+(:func:`gausim.io.files.replacing`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import gausim
+from gausim.core.errors import DataError
+from gausim.io.files import remove_leftovers, sha256, write_durably, write_json
+
+MANIFEST = "stage.json"
+PLAN = "plan.json"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage with everything that its result depends on.
+
+    Attributes:
+        name: of the stage, as in ``python -m data_prep.NAME``.
+        revision: raised when the same inputs and settings give another result than before.
+        inputs: files it reads, by the names that the manifest gives them.
+        settings: everything that was chosen; plain data (as JSON knows it).
+        packages: libraries whose versions may matter; recorded, not compared.
+    """
+
+    name: str
+    revision: int
+    inputs: Mapping[str, Path]
+    settings: Mapping[str, Any]
+    packages: Sequence[str] = field(default=())
+
+    def key(self) -> dict[str, Any]:
+        """What decides whether a result is of this stage: name, revision, settings and the inputs' hashes.
+
+        Raises:
+            DataError: an input is missing.
+        """
+        settings = json.loads(json.dumps(self.settings))
+        inputs = {name: fingerprint(path) for name, path in sorted(self.inputs.items())}
+        return {"stage": self.name, "revision": self.revision, "settings": settings, "inputs": inputs}
+
+
+def run_stage(
+    stage: Stage, out: Path, make: Callable[[Path], Mapping[str, Any]], *, force: bool = False
+) -> dict[str, Any]:
+    """Brings ``out`` to the state that the stage describes, unless it is there already.
+
+    Args:
+        stage: what is to be done.
+        out: directory of the result.
+        make: does it in the directory that it is given, where items of an interrupted attempt may lie; returns what is
+            worth telling (plain data), which the manifest keeps as ``results``.
+        force: replace a result of other inputs or settings.
+
+    Returns:
+        The manifest; ``"made"`` (not in the file) tells whether there was anything to do.
+
+    Raises:
+        DataError: ``out`` holds something else; nothing was touched.
+    """
+    key = stage.key()
+    known = _known(out, key, force=force)
+    if known is not None:
+        return {**known, "made": False}
+    work = out.with_name(f".{out.name}.{stage.name}.work")
+    _open_work(work, key)
+    results = json.loads(json.dumps(make(work)))
+    manifest = {**key, "versions": versions(stage.packages), "results": results}
+    write_durably(work / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True).encode() + b"\n")
+    _replace(out, work)
+    (out / PLAN).unlink()
+    return {**manifest, "made": True}
+
+
+def read_manifest(folder: Path, stage: str | None = None) -> dict[str, Any]:
+    """The manifest of a finished stage.
+
+    Raises:
+        DataError: it is missing, broken, or of another stage than asked for.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        raise DataError(f"{path}: not found. Is this a finished stage? Run `python -m data_prep.{stage or 'STAGE'}`.")
+    try:
+        manifest = json.loads(path.read_bytes())
+        found = manifest["stage"]
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path}: not the manifest of a stage ({error}). Make the stage again with --force.") from error
+    if stage is not None and found != stage:
+        raise DataError(f"{path}: stage is '{found}', expected '{stage}'.")
+    assert isinstance(manifest, dict)
+    return manifest
+
+
+def fingerprint(path: Path) -> dict[str, Any]:
+    """Size and SHA-256 of a file.
+
+    Raises:
+        DataError: there is no such file.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: not found, or not a file.")
+    return {"bytes": path.stat().st_size, "sha256": sha256(path)}
+
+
+def versions(packages: Sequence[str]) -> dict[str, str]:
+    """Versions of gausim, Python and the packages; ``absent`` for one that is not installed."""
+    found = {"gausim": gausim.__version__, "python": platform.python_version()}
+    for name in packages:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "absent"
+    return found
+
+
+def _known(out: Path, key: Mapping[str, Any], *, force: bool) -> dict[str, Any] | None:
+    """The manifest in ``out`` if it is of this key; None where the stage has to be made."""
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return None
+    if not (out / MANIFEST).is_file():
+        raise DataError(
+            f"{out}: exists and is not the result of a stage ({MANIFEST} is missing). Choose another --out."
+        )
+    manifest = read_manifest(out)
+    different = [name for name in key if manifest.get(name) != key[name]]
+    if not different:
+        return manifest
+    if force:
+        return None
+    raise DataError(
+        f"{out / MANIFEST}: a result of other {', '.join(different)} is there. Choose another --out, or replace "
+        "it with --force."
+    )
+
+
+def _open_work(work: Path, key: Mapping[str, Any]) -> None:
+    """An empty working directory, or the one of an interrupted attempt at the very same."""
+    plan = work / PLAN
+    try:
+        same = json.loads(plan.read_bytes()) == key
+    except (OSError, ValueError):
+        same = False
+    if same:
+        remove_leftovers(work, deep=True)
+    else:
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
+        write_json(plan, key)
+
+
+def _replace(out: Path, work: Path) -> None:
+    old = out.with_name(f".{out.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if out.exists():
+        os.replace(out, old)
+    os.replace(work, out)
+    shutil.rmtree(old, ignore_errors=True)

@@ -1,0 +1,1 @@
+"""Foreground masks: what makes them, what cleans them, pictures to check them."""

@@ -1,0 +1,1 @@
+"""Scenes of kernels: selections as texts, and the layout of READY."""

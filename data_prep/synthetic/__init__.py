@@ -1,0 +1,1 @@
+"""The embedded synthetic set: bodies that MuJoCo moves, covered with Gaussians."""

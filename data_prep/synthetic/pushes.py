@@ -1,0 +1,65 @@
+"""How sequences start: random pokes (local) and drags (wide), as initial velocities scaled to an amplitude."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from data_prep.synthetic.bodies import Array, Body
+from data_prep.synthetic.elastic import ElasticBody
+
+# Frames within which a push reaches its full amplitude: half a period of the slowest object.
+FIRST_SWING = 12
+TRIAL_SPEED = 1.0  # [diagonals / s], of about the size that the amplitudes ask for
+
+
+@dataclass(frozen=True)
+class Push:
+    """One push.
+
+    Attributes:
+        kind: ``poke`` (Gaussian falloff around a point) or ``drag`` (grows with height).
+        point: where [scene units].
+        direction: where to, unit length.
+        amplitude: largest displacement that it causes, as a fraction of the body's diagonal.
+    """
+
+    kind: str
+    point: tuple[float, float, float]
+    direction: tuple[float, float, float]
+    amplitude: float
+
+
+def random_push(body: Body, kind: str, rng: np.random.Generator) -> Push:
+    """A push of the upper half of a body, mostly sideways, of 5 to 8 % of its diagonal."""
+    height = np.ptp(body.nodes[:, 2])
+    upper = np.flatnonzero(body.nodes[:, 2] > body.nodes[:, 2].min() + 0.5 * height)
+    point = body.nodes[rng.choice(upper)]
+    angle, lift = rng.uniform(0, 2 * np.pi), rng.uniform(-0.5, 0.5) if kind == "poke" else 0.0
+    direction = np.array([np.cos(angle), np.sin(angle), lift]) / np.hypot(1.0, lift)
+    return Push(kind, tuple(point.tolist()), tuple(direction.tolist()), float(rng.uniform(0.05, 0.08)))
+
+
+def push_field(body: Body, push: Push) -> Array:
+    """Shape (N, 3) of the initial velocity of a push, zero at held nodes."""
+    height = (body.nodes[:, 2] - body.nodes[:, 2].min()) / np.ptp(body.nodes[:, 2])
+    weight = height**1.5
+    if push.kind == "poke":
+        # As wide as a thumb on a cup: narrower pokes put their energy into modes faster than the camera.
+        width = 0.28 * body.diagonal
+        distance = np.linalg.norm(body.nodes - np.array(push.point), axis=1)
+        weight = height * np.exp(-0.5 * (distance / width) ** 2)
+    field = weight[:, None] * np.array(push.direction)
+    field[body.held] = 0.0
+    return field
+
+
+def pushed_motion(body: Body, elastic: ElasticBody, push: Push, frames: int) -> Array:
+    """Motion (frames, N, 3) of a body after a push, scaled to the push's amplitude by a trial swing."""
+    velocity = push_field(body, push)
+    velocity *= TRIAL_SPEED * body.diagonal / np.abs(velocity).max()
+    swing = elastic.simulate(velocity, FIRST_SWING)
+    peak = np.linalg.norm(swing - body.nodes, axis=-1).max() / body.diagonal
+    # The bodies are soft enough for their response to be nearly linear: one trial hits the amplitude within a tenth.
+    return elastic.simulate(velocity * (push.amplitude / peak), frames)

@@ -1,0 +1,79 @@
+"""Cameras around an object, and images of its states by the reference renderer."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from torch import Tensor
+
+from data_prep.synthetic.bodies import Array
+from gausim.core import Cameras, GaussianScene
+from gausim.render.draw import draw
+from gausim.render.reference import ReferenceRenderer
+
+FIELD_OF_VIEW = math.radians(40.0)
+MARGIN = 1.0  # the sphere around the bounding box overstates the object; what is left is room for its motion
+GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+# Azimuth and elevation [degree] of the five video cameras; the last one is never trained on.
+VIDEO_ANGLES = ((-60.0, 18.0), (30.0, 18.0), (120.0, 18.0), (210.0, 40.0), (75.0, 30.0))
+
+
+def look_at(
+    azimuth: Array, elevation: Array, center: Array, radius: float, size: int, names: tuple[str, ...]
+) -> Cameras:
+    """Cameras on a sphere [radian] that look at ``center`` with z up; the bounding sphere fills the image."""
+    distance = MARGIN * radius / math.sin(FIELD_OF_VIEW / 2)
+    back = np.stack((np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)), -1)
+    right = np.stack((-np.sin(azimuth), np.cos(azimuth), np.zeros_like(azimuth)), -1)
+    rotation = np.stack((right, -np.cross(back, right), -back), 1)  # rows: x right, y down, z forward
+    viewmats = np.tile(np.eye(4), (len(azimuth), 1, 1))
+    viewmats[:, :3, :3] = rotation
+    viewmats[:, :3, 3] = -np.einsum("vij,vj->vi", rotation, center + distance * back)
+    focal = size / (2 * math.tan(FIELD_OF_VIEW / 2))
+    intrinsics = torch.tensor([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
+    return Cameras(torch.from_numpy(viewmats).float(), intrinsics.expand(len(azimuth), 3, 3).clone(), size, size, names)
+
+
+def video_cameras(center: Array, radius: float, size: int, names: tuple[str, ...]) -> Cameras:
+    """The first ``len(names) - 1`` training cameras and the held-out one."""
+    angles = np.radians([*VIDEO_ANGLES[: len(names) - 1], VIDEO_ANGLES[-1]])
+    return look_at(angles[:, 0], angles[:, 1], center, radius, size, names)
+
+
+def still_cameras(center: Array, radius: float, size: int, count: int) -> Cameras:
+    """Cameras spread evenly over the upper dome, from level to 70 degrees up."""
+    highest = math.sin(math.radians(70.0))
+    elevation = np.array([math.asin((i + 0.5) / count * highest) for i in range(count)])
+    names = tuple(f"{i:04d}" for i in range(count))
+    azimuth = np.array([i * GOLDEN_ANGLE for i in range(count)])
+    return look_at(azimuth, elevation, center, radius, size, names)
+
+
+def photograph(
+    scene: GaussianScene, positions: Array, gradients: Array, cameras: Cameras
+) -> UInt8[Tensor, "F V H W 4"]:
+    """Straight-alpha RGBA of F states of a scene.
+
+    Args:
+        scene: K kernels at rest.
+        positions: (F, K, 3) kernel means [scene units].
+        gradients: (F, K, 3, 3) deformation gradient at each kernel.
+        cameras: V views.
+    """
+    u, _, vt = np.linalg.svd(gradients)
+    with torch.inference_mode():
+        drawn = draw(
+            ReferenceRenderer(),
+            scene,
+            torch.from_numpy(positions).float(),
+            torch.from_numpy(gradients).float(),
+            torch.from_numpy(u @ vt).float(),
+            torch.arange(scene.count),
+            cameras,
+        )
+        alpha = drawn.alpha.clamp(0, 1)[..., None]
+        rgb = torch.where(alpha > 0.5 / 255, drawn.rgb / alpha.clamp_min(0.5 / 255), 0.0)
+        return (torch.cat((rgb, alpha), -1).clamp(0, 1) * 255 + 0.5).to(torch.uint8)

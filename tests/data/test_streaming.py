@@ -1,0 +1,230 @@
+"""Training streams: read ahead within bounds, each rank its share, every frame once; measuring shows what is there."""
+
+from __future__ import annotations
+
+import threading
+import time
+import tracemalloc
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from data_prep.pack import pack
+from gausim.core import Cameras, ConfigError, DataError
+from gausim.data import frames as frames_module
+from gausim.data.curriculum import Curriculum
+from gausim.data.datamodule import ReadyDataModule
+from gausim.data.prefetch import read_ahead
+from gausim.data.records import SequenceRecord
+from gausim.io.packed import HEADER, PIXELS, Crop
+from gausim.io.packed_writer import header
+
+
+@pytest.fixture(scope="module")
+def mixed(tmp_path_factory: pytest.TempPathFactory, tiny: SimpleNamespace) -> Path:
+    """Two objects; the second has other cameras, rate and lengths of sequences."""
+    root = tmp_path_factory.mktemp("mixed")
+    tiny.object(root / "apple", name="apple", sequences=3)
+    pear = tiny.object(root / "pear", name="pear", sequences=2)
+
+    def fewer(data: dict) -> None:
+        data.update(views=["cam_0", "cam_1"], train_views=["cam_0"], heldout_views=["cam_1"], fps=50,
+                    train_frames=[0, 9])  # fmt: skip
+
+    tiny.edit(pear / "dataset.json", fewer)
+    for number, count in enumerate((9, 14)):
+
+        def shorter(data: dict, count: int = count) -> None:
+            data["fps"] = 50
+            data["frames"] = [f for f in data["frames"] if f["camera"] != "cam_2" and f["frame"] < count]
+
+        tiny.edit(pear / "sequences" / f"seq_{number:03d}" / "transforms.json", shorter)
+    return root
+
+
+def stream(root: Path, **options: object) -> ReadyDataModule:
+    settings: dict = {"batch_size": 2, "curriculum": Curriculum(t_max=5), **options}
+    data = ReadyDataModule(root, **settings)
+    data.setup("fit")
+    return data
+
+
+def epoch(data: ReadyDataModule, number: int) -> list[list[tuple[int, int]]]:
+    loader = data.train_dataloader()
+    loader.batch_sampler.set_epoch(number)  # type: ignore[union-attr]
+    return [[(s.sequence_id, int(s.frames[-1, 0, -1, -1, 2]) - 3) for s in batch] for batch in loader]
+
+
+@pytest.mark.parametrize("prefetch", [1, 2, 7])
+def test_reading_ahead_changes_nothing(mixed: Path, prefetch: int) -> None:
+    plain, ahead = stream(mixed, prefetch=0, repeats=3), stream(mixed, prefetch=prefetch, repeats=3)
+    for number in (0, 2):
+        found = epoch(ahead, number)
+        assert found == epoch(plain, number) and len(found) == 8
+        # The last frame that a sample shows is T = epoch + 1; frames carry their number.
+        assert {last for batch in found for _, last in batch} == {number + 1}
+
+
+def test_at_most_so_many_items_are_read_ahead() -> None:
+    made = 0
+
+    def source() -> Iterator[int]:
+        nonlocal made
+        for item in range(12):
+            made += 1
+            yield item
+
+    ahead = read_ahead(source(), 3)
+    for asked in range(1, 10):
+        assert next(ahead) == asked - 1
+        limit = time.monotonic() + 5
+        while made < min(12, asked + 3) and time.monotonic() < limit:
+            time.sleep(0.001)
+        time.sleep(0.005)  # long enough for a reader without bounds to run away
+        assert made == min(12, asked + 3)
+    assert list(ahead) == [9, 10, 11]
+
+
+def test_an_error_comes_where_it_happened_and_threads_end() -> None:
+    before = threading.active_count()
+
+    def broken() -> Iterator[int]:
+        yield from (0, 1)
+        raise DataError("cam_0/0002.png: torn")
+
+    ahead, seen = read_ahead(broken(), 4), []
+    with pytest.raises(DataError, match="torn"):
+        seen += [next(ahead), next(ahead)]
+        next(ahead)
+    assert seen == [0, 1]
+    left = read_ahead(iter(range(100)), 2)
+    next(left)
+    left.close()
+    assert threading.active_count() == before
+
+
+def test_an_epoch_that_is_left_does_not_move_the_next(mixed: Path) -> None:
+    data = stream(mixed, prefetch=3, repeats=4)
+    expected = epoch(stream(mixed, prefetch=0, repeats=4), 1)
+    loader = data.train_dataloader()
+    left = iter(loader)
+    next(left)
+    loader.batch_sampler.set_epoch(1)  # type: ignore[union-attr]
+    assert [[s.sequence_id for s in b] for b in loader] == [[i for i, _ in b] for b in expected]
+
+
+def test_prefetch_below_zero_is_refused(mixed: Path) -> None:
+    with pytest.raises(ConfigError, match=r"data\.prefetch: .*got -1"):
+        stream(mixed, prefetch=-1).train_dataloader()
+
+
+def test_memory_is_bounded_by_the_batches_in_flight(tmp_path: Path, tiny: SimpleNamespace) -> None:
+    """A packed set of ten batches: over three epochs no more than the batches in flight are in memory."""
+    root = tiny.object(tmp_path / "large", sequences=1)
+    sequences, frames, views, side = 10, 16, ("cam_0", "cam_1", "cam_2"), 160
+    (root / "sequences" / "seq_000").rename(tmp_path / "small")
+    cameras = tiny.cameras(views, width=side, height=side)
+    block = frames * 4 * side * side
+    for number in range(sequences):
+        _sparse_sequence(root / "sequences" / f"seq_{number:03d}", cameras, frames, side, block)
+    data = stream(root, batch_size=1, prefetch=1, curriculum=Curriculum(t_start=15))
+    loader = data.train_dataloader()
+    batch = frames * 2 * 4 * side * side  # two training views
+    tracemalloc.start()
+    try:
+        peaks = []
+        for number in range(3):
+            loader.batch_sampler.set_epoch(number)  # type: ignore[union-attr]
+            tracemalloc.reset_peak()
+            shown = sum(len(b) for b in loader)
+            peaks.append(tracemalloc.get_traced_memory()[1])
+            assert shown == sequences
+    finally:
+        tracemalloc.stop()
+    # In use, and one read ahead; a batch more while the consumer drops the old one for the new one.
+    assert max(peaks) < 3.5 * batch < sequences * batch / 2
+
+
+def _sparse_sequence(folder: Path, cameras: Cameras, frames: int, side: int, block: int) -> None:
+    folder.mkdir(parents=True)
+    crops = [Crop(0, 0, side, side, view * block) for view in range(3)]
+    with (folder / PIXELS).open("wb") as file:
+        file.truncate(3 * block)
+    (folder / HEADER).write_bytes(header(cameras, crops, count=frames, fps=24.0, size=3 * block, sha256="0" * 64))
+
+
+@pytest.mark.parametrize("world", [2, 3])
+def test_a_rank_reads_only_its_share(mixed: Path, monkeypatch: pytest.MonkeyPatch, world: int) -> None:
+    read: list[tuple[str, str]] = []
+    original = SequenceRecord.frames
+
+    def noted(self: SequenceRecord, *args: object) -> object:
+        read.append((self.root.parent.parent.name, self.name))
+        return original(self, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(SequenceRecord, "frames", noted)
+    shares = []
+    for rank in range(world):
+        data = ReadyDataModule(mixed, batch_size=3, curriculum=Curriculum(t_max=5), prefetch=2)
+        data.trainer = SimpleNamespace(global_rank=rank, world_size=world)  # type: ignore[assignment]
+        data.setup("fit")
+        read.clear()
+        shown = [(s.object_name, s.sequence_name) for batch in data.train_dataloader() for s in batch]
+        assert sorted(read) == sorted(shown) and len(set(read)) == len(read)
+        shares.append(shown)
+    every = sorted(s for share in shares for s in share)
+    assert every == sorted([("apple", f"seq_{i:03d}") for i in range(3)] + [("pear", f"seq_{i:03d}") for i in range(2)])
+
+
+def test_a_growing_rollout_reads_no_frame_twice(mixed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded: list[Path] = []
+    original = frames_module.read_rgba_into
+
+    def noted(paths: list[Path], *args: object) -> None:
+        decoded.extend(paths)
+        original(paths, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(frames_module, "read_rgba_into", noted)
+    data = stream(mixed, repeats=2)
+    for number in range(6):
+        epoch(data, number)
+        assert len(set(decoded)) == len(decoded) == (number + 2 if number < 5 else 6) * (3 * 2 + 2 * 1)
+
+
+def test_measuring_shows_every_frame_once_and_nothing_else(mixed: Path) -> None:
+    batches = list(stream(mixed).test_dataloader())
+    assert [len(batch) for batch in batches] == [1] * 5
+    assert [(s.object_name, s.sequence_name, tuple(s.frames.shape[:2])) for (s,) in batches] == [
+        *(("apple", f"seq_{i:03d}", (20, 3)) for i in range(3)),
+        ("pear", "seq_000", (9, 2)),
+        ("pear", "seq_001", (14, 2)),
+    ]
+    for (sample,) in batches:
+        numbers = sample.frames[:, :, -1, -1, 2].numpy() - 3
+        assert np.array_equal(numbers, np.repeat(np.arange(len(numbers))[:, None], numbers.shape[1], 1))
+
+
+def test_one_batch_holds_objects_of_other_rates_views_and_lengths(mixed: Path) -> None:
+    (batch,) = list(stream(mixed, batch_size=5).train_dataloader())
+    found = {(s.object_name, s.fps, tuple(s.frames.shape[:2])) for s in batch}
+    assert found == {("apple", 24.0, (2, 2)), ("pear", 50.0, (2, 1))}
+
+
+def test_a_packed_and_an_unpacked_object_train_together(mixed: Path, tmp_path: Path) -> None:
+    pack(mixed / "pear", tmp_path / "pear")
+    both = stream(mixed)
+    half = ReadyDataModule([mixed / "apple", tmp_path / "pear"], batch_size=2, curriculum=Curriculum(t_max=5))
+    half.setup("fit")
+    for number in (0, 3):
+        for one, other in zip(_whole(both, number), _whole(half, number), strict=True):
+            assert one[0] == other[0] and np.array_equal(one[1], other[1])
+
+
+def _whole(data: ReadyDataModule, number: int) -> list[tuple[str, np.ndarray]]:
+    loader = data.train_dataloader()
+    loader.batch_sampler.set_epoch(number)  # type: ignore[union-attr]
+    # Colours of fully transparent pixels are not kept by packing.
+    return [(s.sequence_name, (s.frames * (s.frames[..., 3:] > 0)).numpy()) for batch in loader for s in batch]

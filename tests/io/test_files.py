@@ -1,0 +1,65 @@
+"""Files are there whole or not at all, and killed writers leave nothing behind."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+from gausim.io.files import remove_leftovers, replacing, sha256, write_durably, write_json
+
+
+def test_a_file_is_whole_or_not_there(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError), replacing(tmp_path / "x.png", typed=True) as temporary:
+        assert temporary.suffix == ".png" and temporary.parent == tmp_path
+        temporary.write_bytes(b"half")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_leaves_the_old_content(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "x.bin"
+    write_durably(path, b"old")
+    with pytest.raises(OSError), replacing(path) as temporary:
+        temporary.write_bytes(b"new")
+        raise OSError
+    assert path.read_bytes() == b"old" and [p.name for p in path.parent.iterdir()] == ["x.bin"]
+    write_durably(path, b"new", previous=path.with_name("before.bin"))
+    assert path.read_bytes() == b"new" and path.with_name("before.bin").read_bytes() == b"old"
+
+
+def test_leftovers_of_killed_writers_go_and_nothing_else(tmp_path: Path) -> None:
+    kept = ["a.tmp", ".notes.tmp", "frames.bin", ".a.png.tmp.bak", "deep/.x.tmp"]
+    gone = [".last.ckpt.4711.tmp", ".0001.png.12.tmp.png"]
+    for name in [*kept, *gone, *(f"deep/{n}" for n in gone)]:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    remove_leftovers(tmp_path)
+    assert all((tmp_path / "deep" / name).exists() for name in gone)
+    remove_leftovers(tmp_path, deep=True)
+    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()) == sorted(kept)
+
+
+def test_what_replacing_leaves_when_it_is_killed_is_a_leftover(tmp_path: Path) -> None:
+    for typed in (False, True):
+        if (child := os.fork()) == 0:
+            with replacing(tmp_path / "x.png", typed=typed) as temporary:
+                temporary.write_bytes(b"half")
+                os._exit(0)
+        os.waitpid(child, 0)
+    assert len(list(tmp_path.iterdir())) == 2 and not (tmp_path / "x.png").exists()
+    remove_leftovers(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_hashes_and_json(tmp_path: Path) -> None:
+    write_json(tmp_path / "x.json", {"a": [1, 2.5]})
+    content = (tmp_path / "x.json").read_bytes()
+    assert json.loads(content) == {"a": [1, 2.5]} and content.endswith(b"\n")
+    assert sha256(tmp_path / "x.json") == hashlib.sha256(content).hexdigest()
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "y.json", {"a": float("nan")})
+    assert not (tmp_path / "y.json").exists()
