@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gausim.cli.inspect import add_pin_options, pinned_by
+from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from gausim.core import GaussianScene, Renderer
@@ -41,19 +41,63 @@ def main(argv: list[str]) -> int:
         The exit status.
 
     Raises:
+        ConfigError: not one source.
         DataError: images, poses or masks are unusable.
         SceneError: the pins select no kernel.
     """
-    arguments = _parser().parse_args(argv)
+    parser = argparse.ArgumentParser(prog="gausim reconstruct", description=HELP)
+    add = parser.add_argument
+    add("root", nargs="?", metavar="ROOT", help="directory of the object (dataset.json, static/, sequences/)")
+    add("--transforms", metavar="FILE", help="transforms.json of the stills, where there is no data set")
+    add("--out", metavar="SCENE.ply", help="scene to write; default ROOT/scene.ply")
+    add_fit_options(parser)
+    add_pin_options(parser)
+    arguments = parser.parse_args(argv)
+    if (arguments.root is None) == (arguments.transforms is None):
+        raise ConfigError("expected either ROOT (a data set's directory) or --transforms FILE, got both or neither.")
+    if arguments.root is not None:
+        source, default = Path(arguments.root) / "dataset.json", Path(arguments.root) / "scene.ply"
+    else:
+        source, default = Path(arguments.transforms), Path(arguments.transforms).parent / "scene.ply"
+    print(fit_scene(source, Path(arguments.out or default), arguments).text)
+    return 0
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What a reconstruction has given.
+
+    Attributes:
+        record: kernels, figures on every set of images, options, times; plain data.
+        text: the same in words.
+    """
+
+    record: dict[str, Any]
+    text: str
+
+
+def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> Fitted:
+    """Reconstructs and writes the scene, its figures (JSON) and a picture (PNG) beside it.
+
+    Args:
+        source: ``dataset.json`` of an object or ``transforms.json`` of stills.
+        out: the scene file.
+        arguments: those of :func:`add_fit_options` and :func:`gausim.cli.inspect.add_pin_options`.
+
+    Raises:
+        DataError: images, poses or masks are unusable.
+        SceneError: the pins select no kernel.
+    """
     import torch
 
     from gausim.engine.reconstruction_state import Partial, identity
     from gausim.engine.stills import measure
+    from gausim.io.files import write_json
     from gausim.io.ply import save_scene
 
     torch.set_num_threads(arguments.threads)
     options = _options(arguments)
-    name, material, cloud, out = _inputs(arguments, options)
+    name, material, cloud = _inputs(source, arguments, options)
     renderer = _renderer(arguments.renderer)
     start, cpu = time.perf_counter(), time.process_time()
     partial = Partial(out, identity(material.train, options, cloud))
@@ -64,19 +108,15 @@ def main(argv: list[str]) -> int:
     partial.remove()
     figures = {images.name: {"images": len(images.images), **measure(scene, renderer, images)}
                for images in material.measure}  # fmt: skip
-    _write_json(out.with_suffix(".json"), _record(scene, options, figures, seconds))
-    picture = out.with_suffix(".png")
-    _compare(scene, renderer, material.measure, picture)
-    _print_result(scene, figures, seconds, out, picture)
-    return 0
+    record = _record(scene, options, figures, seconds)
+    write_json(out.with_suffix(".json"), record)
+    _compare(scene, renderer, material.measure, out.with_suffix(".png"))
+    return Fitted(record, _told(record, out))
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="gausim reconstruct", description=HELP)
+def add_fit_options(parser: argparse.ArgumentParser) -> None:
+    """Adds what a scene is fitted with."""
     add = parser.add_argument
-    add("root", nargs="?", metavar="ROOT", help="directory of the object (dataset.json, static/, sequences/)")
-    add("--transforms", metavar="FILE", help="transforms.json of the stills, where there is no data set")
-    add("--out", metavar="SCENE.ply", help="scene to write; default ROOT/scene.ply")
     add("--extent", default="object", choices=("object", "scene"),
         help="object: what the stills' alpha shows; scene: everything in them (default %(default)s)")  # fmt: skip
     add("--kernels", type=int, metavar="N", help="Gaussians aimed at (default 2000, of a scene 30000)")
@@ -103,8 +143,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--renderer", default="cpu", choices=("cpu", "reference"), help="default %(default)s")
     add("--threads", type=int, default=1, help="processor threads (default %(default)s)")
     add("--seed", type=int, default=0, help="of everything random (default %(default)s)")
-    add_pin_options(parser)
-    return parser
 
 
 def _options(arguments: argparse.Namespace) -> ReconstructionOptions:
@@ -126,35 +164,30 @@ def _options(arguments: argparse.Namespace) -> ReconstructionOptions:
 
 
 def _inputs(
-    arguments: argparse.Namespace, options: ReconstructionOptions
-) -> tuple[str, Material, PointCloud | None, Path]:
-    from gausim.core.errors import DataError
+    source: Path, arguments: argparse.Namespace, options: ReconstructionOptions
+) -> tuple[str, Material, PointCloud | None]:
     from gausim.data.objects import ObjectData
     from gausim.engine.stills import gather_object, gather_stills
 
     opaque = options.extent == "scene"
-    if (arguments.root is None) == (arguments.transforms is None):
-        raise DataError("expected either ROOT (a data set's directory) or --transforms FILE, got both or neither.")
-    if not 0 <= arguments.video_share < 1:
-        raise DataError(f"--video-share: expected a share in [0, 1), got {arguments.video_share}.")
-    if not 0 <= arguments.coarse < 1:
-        raise DataError(f"--coarse: expected a share in [0, 1), got {arguments.coarse}.")
+    for flag, share in (("--video-share", arguments.video_share), ("--coarse", arguments.coarse)):
+        if not 0 <= share < 1:
+            raise DataError(f"{flag}: expected a share in [0, 1), got {share}.")
     if arguments.leave_out < 2:
         raise DataError(f"--leave-out: expected one still in 2 or more, got {arguments.leave_out}.")
-    if arguments.root is not None:
+    if source.name == "dataset.json":
         if opaque:
-            raise DataError("--extent scene: a data set's sequences show an object. Use --transforms FILE.")
-        data = ObjectData(arguments.root)
-        out = Path(arguments.out) if arguments.out else data.root / "scene.ply"
-        return data.name, gather_object(data, video_share=arguments.video_share), _cloud(arguments.points), out
-    path = Path(arguments.transforms)
-    out = Path(arguments.out) if arguments.out else path.parent / "scene.ply"
+            raise DataError(
+                "--extent scene: a data set's sequences show an object. Take the transforms.json of stills."
+            )
+        data = ObjectData(source.parent)
+        return data.name, gather_object(data, video_share=arguments.video_share), _cloud(arguments.points)
     material = gather_stills(
-        path, every=arguments.leave_out, opaque=opaque, longest=arguments.longest, coarse=arguments.coarse
+        source, every=arguments.leave_out, opaque=opaque, longest=arguments.longest, coarse=arguments.coarse
     )
-    beside = path.parent / "points.npz"
+    beside = source.parent / "points.npz"
     points = str(beside) if opaque and arguments.points is None and beside.is_file() else arguments.points
-    return path.parent.name or out.stem, material, _cloud(points), out
+    return source.parent.name or "scene", material, _cloud(points)
 
 
 def _renderer(name: str) -> Renderer:
@@ -172,7 +205,6 @@ def _cloud(path: str | None) -> PointCloud | None:
         return None
     import torch
 
-    from gausim.core.errors import DataError
     from gausim.engine.splat_start import PointCloud
     from gausim.io.npz import read_npz
 
@@ -234,12 +266,6 @@ def _record(scene: GaussianScene, options: ReconstructionOptions, figures: dict,
     }
 
 
-def _write_json(path: Path, record: dict) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(json.dumps(record, indent=1) + "\n")
-    temporary.replace(path)
-
-
 def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...], path: Path) -> None:
     """Truth above, rendering in the middle, four times the difference below: stills left out, then trained on."""
     import torch
@@ -262,10 +288,11 @@ def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...
     write_rgba(path, pixels)
 
 
-def _print_result(scene: GaussianScene, figures: dict, seconds: dict, out: Path, picture: Path) -> None:
-    print(f"{scene.count} kernels, {int(scene.pinned.sum())} pinned, {seconds['cpu_seconds']:.0f} CPU-s")
-    print(f"{'measured on':<34} {'images':>6} {'PSNR':>8} {'foreground':>11} {'SSIM':>7}")
-    for name, row in figures.items():
+def _told(record: dict, out: Path) -> str:
+    lines = [f"{record['kernels']} kernels, {record['pinned']} pinned, {record['cpu_seconds']:.0f} CPU-s"]
+    lines.append(f"{'measured on':<34} {'images':>6} {'PSNR':>8} {'foreground':>11} {'SSIM':>7}")
+    for name, row in record["measured"].items():
         decibel = f"{row['psnr']:>5.2f} dB {row['psnr_foreground']:>8.2f} dB"
-        print(f"{name:<34} {row['images']:>6} {decibel} {row['ssim']:>7.4f}")
-    print(f"scene      {out}\npicture    {picture} (truth, rendering, 4 x difference)")
+        lines.append(f"{name:<34} {row['images']:>6} {decibel} {row['ssim']:>7.4f}")
+    lines.append(f"scene      {out}\npicture    {out.with_suffix('.png')} (truth, rendering, 4 x difference)")
+    return "\n".join(lines)

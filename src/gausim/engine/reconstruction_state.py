@@ -12,10 +12,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from gausim.engine.files import write_durably
 from gausim.engine.reconstruction import ReconstructionOptions
 from gausim.engine.splat_start import PointCloud
 from gausim.engine.stills import ImageSet
+from gausim.io.files import write_durably
 
 # Raise when the same arguments give another reconstruction than before.
 REVISION = 1

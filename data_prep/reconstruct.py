@@ -1,0 +1,112 @@
+"""Fits the Gaussians of the rest scene to posed stills.
+
+ROOT is what `segment` or `poses` wrote (transforms.json with its pictures), or an object (dataset.json). With masks the
+kernels cover the object, within the visual hull of the masks; with --extent scene everything in the photos, beginning
+with the points that `poses` found. The result is OUT/scene.ply, OUT/scene.json (PSNR and SSIM, also on stills left out)
+and OUT/scene.png: look at it. `gausim reconstruct` does the same without a manifest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from data_prep.common.command import add_result, headline, told
+from gausim.cli.inspect import add_pin_options
+from gausim.cli.reconstruct import add_fit_options, fit_scene
+from gausim.core.errors import DataError
+
+# Raise when the same inputs and settings give another result than before.
+REVISION = 1
+# Arguments that change how fast the result comes, not what it is, or where it goes.
+_OUTSIDE = ("root", "out", "force", "threads", "points")
+PACKAGES = ("torch", "numpy", "numba", "opencv-python-headless", "safetensors")
+
+
+def reconstruct(root: Path, out: Path, arguments: argparse.Namespace, *, force: bool = False) -> dict[str, Any]:
+    """Runs the stage.
+
+    Args:
+        root: folder with ``transforms.json`` or ``dataset.json``.
+        out: folder of the result.
+        arguments: those of :func:`gausim.cli.reconstruct.add_fit_options` and of the pins.
+        force: replace a result of other inputs or settings.
+
+    Returns:
+        The stage's manifest; its results are the record that ``scene.json`` holds.
+
+    Raises:
+        DataError: images, poses, masks or points are unusable.
+        SceneError: the pins select no kernel.
+    """
+    from data_prep.common.stage import Stage, run_stage
+
+    source = _source(root)
+    settings = {key: value for key, value in vars(arguments).items() if key not in _OUTSIDE}
+    settings = {key: str(value) if isinstance(value, Path) else value for key, value in settings.items()}
+    stage = Stage("reconstruct", REVISION, _files(source, arguments), settings, PACKAGES)
+
+    def make(work: Path) -> Mapping[str, Any]:
+        return fit_scene(source, work / "scene.ply", arguments).record
+
+    return run_stage(stage, out, make, force=force)
+
+
+def _source(root: Path) -> Path:
+    for name in ("dataset.json", "transforms.json"):
+        if (root / name).is_file():
+            return root / name
+    raise DataError(
+        f"{root}: neither dataset.json nor transforms.json is here. Expected what `segment` or `poses` wrote."
+    )
+
+
+def _files(source: Path, arguments: argparse.Namespace) -> dict[str, Path]:
+    """Everything that is read, by its name below the source's folder."""
+    from gausim.io.transforms import read_transforms
+
+    root = source.parent
+    files = [source]
+    if source.name == "dataset.json":
+        files += sorted(
+            p for p in root.rglob("*") if p.is_file() and p.relative_to(root).parts[0] in ("static", "sequences")
+        )
+    else:
+        files += [frame.path for frame in read_transforms(source).frames]
+    points = Path(arguments.points) if arguments.points else root / "points.npz"
+    named = {str(path.relative_to(root)): path for path in files}
+    return {**named, "points": points} if arguments.points or points.is_file() else named
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    arguments = _parser().parse_args(argv)
+
+    def run() -> str:
+        manifest = reconstruct(arguments.root, arguments.out, arguments, force=arguments.force)
+        results = manifest["results"]
+        lines = [f"{name}: {row['psnr']:.2f} dB, foreground {row['psnr_foreground']:.2f} dB, SSIM {row['ssim']:.3f}"
+                 for name, row in results["measured"].items()]  # fmt: skip
+        kernels = f"{results['kernels']} kernels"
+        return "\n".join([headline(arguments.out, manifest), kernels, *lines, f"look at {arguments.out / 'scene.png'}"])
+
+    return told(run)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m data_prep.reconstruct", description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("root", type=Path, metavar="ROOT", help="folder with transforms.json or dataset.json")
+    add_result(parser)
+    add_fit_options(parser)
+    add_pin_options(parser)
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
