@@ -14,6 +14,9 @@ from data_prep.films.takes import FILMS
 from gausim.core import DataError
 from gausim.io.files import write_durably
 
+# Pictures that stages draw for people, and the file that lies beside them.
+SHEETS = {"sync.png": "sync.json", "cameras.png": "stage.json"}
+
 
 @dataclass(frozen=True)
 class Clip:
@@ -68,7 +71,7 @@ def find_clips(root: Path, *, kind: str = "auto", every: int = 1) -> list[Clip]:
     for path in root.rglob("*"):
         relative = path.relative_to(root)
         hidden = any(part.startswith(".") for part in relative.parts)
-        if path.suffix.lower() in SUFFIXES and path.is_file() and not hidden and path.name != "sync.png":
+        if path.suffix.lower() in SUFFIXES and path.is_file() and not hidden and not _drawn_by_a_stage(path):
             folders.setdefault(relative.parent.as_posix().removeprefix("."), []).append(relative)
     if not folders:
         raise DataError(f"{root}: no pictures in it. Pictures are files such as {', '.join(SUFFIXES[:4])}.")
@@ -81,6 +84,11 @@ def find_clips(root: Path, *, kind: str = "auto", every: int = 1) -> list[Clip]:
         moving = kind == "film" or (kind == "auto" and "sequences" in Path(name).parts)
         clips.append(Clip(name, root, tuple(paths[::every]), moving))
     return clips
+
+
+def _drawn_by_a_stage(path: Path) -> bool:
+    """Whether a picture only tells of a stage's work: it lies beside the record of that work."""
+    return path.name in SHEETS and (path.parent / SHEETS[path.name]).is_file()
 
 
 def film_frames(film: Path, folder: Path) -> None:

@@ -447,8 +447,12 @@ def test_pictures_of_all_kinds_are_read(tmp_path: Path) -> None:
 
 
 def test_clips_are_found_in_natural_order(tmp_path: Path) -> None:
-    for name in ("b/10.png", "b/9.png", "sequences/seq_000/cam_0/0.png", ".hidden/1.png", "sequences/seq_000/sync.png"):
+    sheets = ("sequences/seq_000/sync.png", "cameras.png")
+    for name in ("b/10.png", "b/9.png", "sequences/seq_000/cam_0/0.png", ".hidden/1.png", *sheets):
         write(tmp_path / name, picture(0))
+    assert [c.name for c in find_clips(tmp_path)] == ["", "b", "sequences/seq_000", "sequences/seq_000/cam_0"]
+    for name in ("sequences/seq_000/sync.json", "stage.json"):  # stages drew them, and say so beside
+        (tmp_path / name).write_text("{}")
     clips = find_clips(tmp_path)
     assert [(c.name, c.moving) for c in clips] == [("b", False), ("sequences/seq_000/cam_0", True)]
     assert [p.name for p in clips[0].paths] == ["9.png", "10.png"]
