@@ -130,7 +130,7 @@ def test_a_resumed_fit_equals_an_uninterrupted_one(
     assert (
         notes[0][:-1] == notes[1][:-1]
         and "minutes of processor time" in notes[0][-1]
-        and not any("iterations" in note for note in notes[0])
+        and not any(" had " in note for note in notes[0])
     )
     tables = [Path(f"outputs/{run}/seed_0/epochs.csv").read_text() for run in ("whole", "cut")]
     assert len({tuple(r.rsplit(",", 1)[0] for r in t.splitlines()) for t in tables}) == 1  # all but the seconds
@@ -147,7 +147,8 @@ def test_a_budget_walks_through_all_stages_and_says_what_was_cut(
     budget = ["trainer.max_minutes=0.3", "trainer.clock=cpu"]
     train.main(["model=spring_mass", *SMALL["spring_mass"], *long, *budget, *arguments])
     notes = load_run(Path("outputs/toy/seed_0")).module.notes()  # type: ignore[operator]
-    cut = [note for note in notes if "iterations per sequence" in note]
+    cut = [note for note in notes if " had " in note and "iterations per sequence" in note]
+    assert any("is of 40 iterations per sequence; the original takes 100" in note for note in notes)
     assert len(cut) == 2 and all("0 of its" not in note for note in cut)
     assert json.loads(Path("outputs/toy/seed_0/FINISHED").read_text())["notes"] == notes
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.distance import pdist
 
 from gausim.ops import clustering
-from gausim.ops.clustering import CLUSTERINGS, ball_clusters, complete_linkage_clusters
+from gausim.ops.clustering import CLUSTERINGS, ball_clusters, complete_linkage_clusters, k_means
 
 
 def _cloud(count: int = 150, seed: int = 0) -> np.ndarray:
@@ -66,3 +66,24 @@ def test_a_centre_moves_only_as_far_as_its_farthest_member_allows() -> None:
     points = np.concatenate(([[0, 0, 0], [0.1, -0.98, 0], [0.1, 1.48, 0]], crowd, second))
     labels = ball_clusters(points, 2.0)
     assert labels.tolist() == [0, 0, 1] + [0] * 10 + [1] * 40
+
+
+def test_k_means_finds_groups_and_is_a_fixed_point() -> None:
+    generator = np.random.default_rng(0)
+    middles = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4], [4, 4, 4]])
+    points = np.concatenate([m + 0.3 * generator.standard_normal((30, 3)) for m in middles])
+    centres = k_means(points, 5)
+    groups = np.array([points[30 * i : 30 * (i + 1)].mean(0) for i in range(5)])
+    nearest = np.linalg.norm(centres[:, None] - groups[None], axis=-1)
+    assert sorted(nearest.argmin(1)) == list(range(5))
+    assert nearest.min(1).max() < 1e-12  # each centre is the mean of the points nearest to it
+    many = k_means(points, 40)
+    owner = np.linalg.norm(points[:, None] - many[None], axis=-1).argmin(1)
+    spread = np.square(points - many[owner]).sum()
+    assert len(np.unique(owner)) == 40
+    assert (
+        spread < 0.3 * np.square(points - centres[np.linalg.norm(points[:, None] - centres, axis=-1).argmin(1)]).sum()
+    )
+    order = generator.permutation(len(points))
+    assert np.allclose(np.sort(k_means(points[order], 5), axis=0), np.sort(centres, axis=0))
+    assert np.array_equal(k_means(points[:4], 7), points[:4])

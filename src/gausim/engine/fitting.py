@@ -211,6 +211,11 @@ class FittedModule(GausSimModule):
         """What a reader of the figures must know: of the method, of stages that were cut short, and the fit's cost."""
         notes = list(self.method.notes())
         for name, stage in self.plan.order:
+            if stage.iterations < stage.original:
+                notes.append(
+                    f"Stage {name} is of {stage.iterations} iterations per sequence; the original takes "
+                    f"{stage.original} or more."
+                )
             if round(self.made[name]) < stage.iterations:
                 notes.append(
                     f"Stage {name} had {self.made[name]:.0f} of its {stage.iterations} iterations per sequence."

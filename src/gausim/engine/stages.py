@@ -29,6 +29,7 @@ class Stage:
         penalties: weights of what the method offers to be minimised besides, by name.
         backprop_steps: gradients stop every so many frames; 0 lets them through the whole rollout.
         clip_norm: all gradients together are clipped at this norm; 0 does not clip.
+        original: iterations of the published method at least; where there are fewer here, tables say so. 0: not known.
     """
 
     iterations: int
@@ -39,6 +40,7 @@ class Stage:
     penalties: Mapping[str, float] = field(default_factory=dict)
     backprop_steps: int = 1
     clip_norm: float = 1.0
+    original: int = 0
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
