@@ -21,6 +21,7 @@ from typing import Any
 import gausim
 from gausim.core.errors import DataError
 from gausim.io.files import remove_leftovers, sha256, write_durably, write_json
+from gausim.io.plain_json import parse_json
 
 MANIFEST = "stage.json"
 PLAN = "plan.json"
@@ -79,7 +80,7 @@ def run_stage(
         return {**known, "made": False}
     work = out.with_name(f".{out.name}.{stage.name}.work")
     _open_work(work, key)
-    results = json.loads(json.dumps(make(work)))
+    results = json.loads(json.dumps(make(work), allow_nan=False))
     manifest = {**key, "versions": versions(stage.packages), "results": results}
     write_durably(work / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True).encode() + b"\n")
     _replace(out, work)
@@ -97,7 +98,7 @@ def read_manifest(folder: Path, stage: str | None = None) -> dict[str, Any]:
     if not path.is_file():
         raise DataError(f"{path}: not found. Is this a finished stage? Run `python -m data_prep.{stage or 'STAGE'}`.")
     try:
-        manifest = json.loads(path.read_bytes())
+        manifest = parse_json(path.read_bytes())
         found = manifest["stage"]
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: not the manifest of a stage ({error}). Make the stage again with --force.") from error
