@@ -18,7 +18,7 @@ DIRS ?= $(if $(filter-out file,$(origin RUN)),$(RUN),outputs)
 ARGS ?=
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install test test-slow test-notebooks lint format data demo dataset train evaluate simulate report benchmark clean
+.PHONY: help install test test-slow fuzz test-notebooks lint format data demo dataset train evaluate simulate report benchmark clean
 
 help: ## Show this text
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -41,6 +41,9 @@ test-slow: install ## Run the slow tests
 # One at a time: each is written for two cores, and compiling in two processes at once would compile twice.
 test-notebooks: install ## Execute the notebooks on the embedded synthetic data
 	$(ONE_THREAD) $(BIN)/python -m pytest --nbmake --nbmake-timeout=600 notebooks
+
+fuzz: install ## Feed 20,000 damaged files to the readers: make fuzz ARGS="--count 1000 --seed 7"
+	PYTHONPATH=. $(ONE_THREAD) $(BIN)/python tests/fuzz/run.py $(ARGS)
 
 lint: install ## Check style, formatting, types and import directions
 	$(BIN)/ruff check .

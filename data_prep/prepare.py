@@ -133,6 +133,10 @@ def _stage_of(name: Any, config: Path) -> str:
 def _arguments(stage: str, options: Mapping[str, Any], made: Mapping[str, Path], base: Path, where: str) -> list[str]:
     first, rest = [], []
     for key, value in options.items():
+        if not isinstance(key, str):
+            raise ConfigError(
+                f"{where}: {key!r} is no option's name; YAML takes words such as no, on and 1 for values."
+            )
         texts = [_text(v, made, base, f"{where}.{key}") for v in (value if isinstance(value, list) else [value])]
         if key in STAGES[stage]:
             first += texts

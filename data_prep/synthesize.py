@@ -41,7 +41,7 @@ def synthesize(out: Path, settings: dict[str, object], *, workers: int, force: b
     if _is_there(out, manifest, force=force):
         return False
     out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
+    temporary = out.with_name(f".{out.name}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         _write_all(temporary, settings, workers=workers)

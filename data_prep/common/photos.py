@@ -10,10 +10,11 @@ import numpy as np
 
 from gausim.core.errors import DataError
 from gausim.io.files import write_durably
+from gausim.io.pixels import decode, read_header
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 # Tags of the EXIF standard.
-_ORIENTATION, _EXIF, _FOCAL_35MM = 0x0112, 0x8769, 0xA405
+_ORIENTATION, _FOCAL_35MM = 0x0112, 0xA405
 # Orientations that turn the picture by a quarter.
 _QUARTER = (5, 6, 7, 8)
 # COLMAP's own rule: the longer side of a 35 mm frame.
@@ -65,16 +66,13 @@ def open_photo(path: Path, name: str) -> Photo:
     Raises:
         DataError: it is missing or no image.
     """
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            width, height = image.size
-            exif = image.getexif()
-            turned = exif.get(_ORIENTATION) in _QUARTER
-            focal_35mm = exif.get_ifd(_EXIF).get(_FOCAL_35MM)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise DataError(f"{path}: cannot be read as an image ({error}). Export it again.") from error
+    header = read_header(path)
+    if header is None:
+        raise DataError(
+            f"{path}: {'cannot be read as an image' if path.is_file() else 'no such file'}. Export it again."
+        )
+    width, height, focal_35mm = header.width, header.height, header.exif.get(_FOCAL_35MM)
+    turned = header.exif.get(_ORIENTATION) in _QUARTER
     size = (height, width) if turned else (width, height)
     focal = None
     if isinstance(focal_35mm, int | float) and 0 < focal_35mm < 1e4:
@@ -90,11 +88,11 @@ def read_photo(photo: Photo) -> np.ndarray:
     """
     import cv2
 
-    pixels = cv2.imread(str(photo.path), cv2.IMREAD_COLOR)
+    pixels = decode(photo.path, cv2.IMREAD_COLOR)
     if pixels is None:
         raise DataError(f"{photo.path}: cannot be decoded as an image. Export it again.")
     if photo.path.suffix.lower() in (".png", ".webp", ".tif", ".tiff"):
-        raw = cv2.imread(str(photo.path), cv2.IMREAD_UNCHANGED)
+        raw = decode(photo.path)
         if raw is not None and raw.ndim == 3 and raw.shape[2] == 4 and raw.dtype == np.uint8:
             pixels = raw
     if pixels.shape[:2] != (photo.height, photo.width):

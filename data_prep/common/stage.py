@@ -21,6 +21,7 @@ from typing import Any
 import gausim
 from gausim.core.errors import DataError
 from gausim.io.files import remove_leftovers, sha256, write_durably, write_json
+from gausim.io.plain_json import parse_json
 
 MANIFEST = "stage.json"
 PLAN = "plan.json"
@@ -76,14 +77,18 @@ def run_stage(
     key = stage.key()
     known = _known(out, key, force=force)
     if known is not None:
+        shutil.rmtree(_old(out), ignore_errors=True)  # of a replacement that was killed at its very end
         return {**known, "made": False}
     work = out.with_name(f".{out.name}.{stage.name}.work")
-    _open_work(work, key)
-    results = json.loads(json.dumps(make(work)))
-    manifest = {**key, "versions": versions(stage.packages), "results": results}
-    write_durably(work / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True).encode() + b"\n")
+    manifest = _finished(work, key)
+    if manifest is None:
+        _open_work(work, key)
+        results = json.loads(json.dumps(make(work), allow_nan=False))
+        manifest = {**key, "versions": versions(stage.packages), "results": results}
+        write_durably(work / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True).encode() + b"\n")
+    # From here on the work is whole; an attempt that is killed below only has to take the name.
+    (work / PLAN).unlink(missing_ok=True)
     _replace(out, work)
-    (out / PLAN).unlink()
     return {**manifest, "made": True}
 
 
@@ -97,7 +102,7 @@ def read_manifest(folder: Path, stage: str | None = None) -> dict[str, Any]:
     if not path.is_file():
         raise DataError(f"{path}: not found. Is this a finished stage? Run `python -m data_prep.{stage or 'STAGE'}`.")
     try:
-        manifest = json.loads(path.read_bytes())
+        manifest = parse_json(path.read_bytes())
         found = manifest["stage"]
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: not the manifest of a stage ({error}). Make the stage again with --force.") from error
@@ -149,6 +154,18 @@ def _known(out: Path, key: Mapping[str, Any], *, force: bool) -> dict[str, Any] 
     )
 
 
+def _finished(work: Path, key: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The manifest of work that is whole and of this key, but was killed before it took its name."""
+    if not (work / MANIFEST).is_file():
+        return None
+    manifest = read_manifest(work)
+    return manifest if all(manifest.get(name) == key[name] for name in key) else None
+
+
+def _old(out: Path) -> Path:
+    return out.with_name(f".{out.name}.old")
+
+
 def _open_work(work: Path, key: Mapping[str, Any]) -> None:
     """An empty working directory, or the one of an interrupted attempt at the very same."""
     plan = work / PLAN
@@ -165,7 +182,7 @@ def _open_work(work: Path, key: Mapping[str, Any]) -> None:
 
 
 def _replace(out: Path, work: Path) -> None:
-    old = out.with_name(f".{out.name}.old")
+    old = _old(out)
     shutil.rmtree(old, ignore_errors=True)
     if out.exists():
         os.replace(out, old)

@@ -101,7 +101,7 @@ def probe(path: Path) -> Film:
             label, count = _timecode_label(container, stream)
         with av.open(str(path)) as container:
             first = next(container.decode(_video_stream(path, container)), None)
-    except (FFmpegError, OSError) as error:
+    except (FFmpegError, OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read as a film ({error}). Copy it again from the camera.") from error
     if first is None:
         raise DataError(f"{path}: no frame can be decoded. Copy it again from the camera.")
@@ -131,7 +131,7 @@ def pictures(film: Film) -> Iterator[tuple[int, av.VideoFrame]]:
                 if frame.pts in index and not frame.is_corrupt:
                     done += 1
                     yield index[frame.pts], frame
-    except (FFmpegError, OSError) as error:
+    except (FFmpegError, OSError, ValueError) as error:
         raise DataError(
             f"{film.path}: frame {done}: cannot be decoded ({error}). Copy the film again from the camera."
         ) from error
@@ -173,7 +173,7 @@ def sound(film: Film) -> tuple[np.ndarray, float]:
                 blocks += [(start, part.to_ndarray()[0]) for part in resampler.resample(frame)]
                 if start - blocks[0][0] > SOUND_SECONDS * rate:
                     break
-    except (FFmpegError, OSError) as error:
+    except (FFmpegError, OSError, ValueError) as error:
         raise DataError(f"{film.path}: its sound cannot be decoded ({error}). Choose another --sync.") from error
     if not blocks:
         raise DataError(f"{film.path}: its sound is empty. Choose another --sync.")
@@ -198,8 +198,13 @@ def _laid_out(path: Path, blocks: list[tuple[int, np.ndarray]], rate: int) -> tu
 
 def _video_stream(path: Path, container: av.container.InputContainer) -> av.VideoStream:
     for stream in container.streams.video:
-        if not stream.disposition & stream.disposition.attached_pic:  # a cover is no film
-            return stream
+        if stream.disposition & stream.disposition.attached_pic:  # a cover is no film
+            continue
+        if stream.codec_context is None:
+            raise DataError(
+                f"{path}: its video has a codec that is unknown here. Convert it to H.264, or copy it again."
+            )
+        return stream
     raise DataError(f"{path}: holds no video stream.")
 
 

@@ -13,6 +13,7 @@ from data_prep.common.photos import SUFFIXES, natural
 from data_prep.films.takes import FILMS
 from gausim.core import DataError
 from gausim.io.files import write_durably
+from gausim.io.pixels import decode
 
 # Pictures that stages draw for people, and the file that lies beside them.
 SHEETS = {"sync.png": "sync.json", "cameras.png": "stage.json"}
@@ -115,7 +116,7 @@ def read_picture(path: Path) -> np.ndarray:
     Raises:
         DataError: it cannot be decoded, or its values are no integers of 8 or 16 bit.
     """
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    pixels = decode(path)
     if pixels is None:
         raise DataError(f"{path}: cannot be decoded as a picture. Export it again as PNG.")
     if pixels.dtype == np.uint16:

@@ -5,7 +5,6 @@ Needs the package ``sam2`` and a checkpoint that lies on this machine; neither c
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
@@ -19,6 +18,7 @@ import numpy as np
 from data_prep.masks.clips import Clip
 from data_prep.masks.segmenters import MaskOf
 from gausim.core import ConfigError, DataError
+from gausim.io.plain_json import parse_json
 
 # The predictor reads JPEG files only; at this quality they differ from the frames by less than a camera's noise.
 JPEG_QUALITY = 98
@@ -159,7 +159,7 @@ def read_prompts(path: Path) -> dict[str, Prompt]:
         DataError: the file is missing or malformed.
     """
     try:
-        data = json.loads(path.read_text())
+        data = parse_json(path.read_bytes())
         return {
             str(name): make_prompt(entry.get("box"), entry.get("points", []), f"{path}: '{name}'")
             for name, entry in data.items()

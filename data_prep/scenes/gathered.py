@@ -9,6 +9,7 @@ from typing import Any
 
 from data_prep.common.photos import natural
 from gausim.core.errors import DataError
+from gausim.io.pixels import read_header
 from gausim.io.transforms import PosedImages, read_json, read_transforms
 
 TRANSFORMS, FACTS, POINTS = "transforms.json", "dataset.json", "points.npz"
@@ -88,17 +89,18 @@ def _sequences(folder: Path) -> list[Path]:
 
 def _posed(folder: Path) -> PosedImages:
     """Reads a ``transforms.json`` and looks at one picture of each of its folders."""
-    from PIL import Image
-
     posed = read_transforms(folder / TRANSFORMS)
     for frame in {frame.path.parent: frame for frame in reversed(posed.frames)}.values():
-        try:
-            with Image.open(frame.path) as image:
-                mode = image.mode
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-            raise DataError(f"{frame.path}: cannot be read as an image ({error}).") from error
-        if mode != "RGBA":
-            raise DataError(f"{frame.path}: expected 8-bit RGBA, got {mode}. Cut the object out with `segment` first.")
+        header = read_header(frame.path)
+        if header is None:
+            what = (
+                "cannot be read as an image" if frame.path.is_file() else "not found, though transforms.json names it"
+            )
+            raise DataError(f"{frame.path}: {what}. Export it again.")
+        if header.mode != "RGBA":
+            raise DataError(
+                f"{frame.path}: expected 8-bit RGBA, got {header.mode}. Cut the object out with `segment` first."
+            )
     return posed
 
 

@@ -13,6 +13,7 @@ from data_prep.cameras.sources import Posed, fitted
 from data_prep.common.photos import Photo, list_images, natural, open_photo
 from gausim.core.errors import DataError
 from gausim.io.colmap import ColmapImage, ColmapModel, colmap_files, find_colmap, read_colmap
+from gausim.io.plain_json import parse_json
 from gausim.io.transforms import read_json
 
 _VIDEO = re.compile(r"(seq_[0-9]+)_(cam_[0-9]+)")
@@ -204,11 +205,9 @@ def read_pins(path: Path, count: int) -> np.ndarray:
     Raises:
         DataError: it is anything else, or a number is no kernel's.
     """
-    import json
-
     try:
-        data = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
+        data = parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read as JSON ({error}).") from error
     if isinstance(data, dict):
         lists = [value for value in data.values() if isinstance(value, list)]
@@ -217,9 +216,9 @@ def read_pins(path: Path, count: int) -> np.ndarray:
         raise DataError(f"{path}: expected a list of kernel numbers.")
     if all(isinstance(v, bool) for v in data) and len(data) == count:
         return np.array(data)
-    wrong = next((v for v in data if isinstance(v, bool) or not isinstance(v, int) or not 0 <= v < count), None)
-    if wrong is not None:
-        raise DataError(f"{path}: '{wrong!r:.40}' is no kernel; expected whole numbers from 0 to {count - 1}.")
+    wrong = [v for v in data if isinstance(v, bool) or not isinstance(v, int) or not 0 <= v < count]
+    if wrong:
+        raise DataError(f"{path}: '{wrong[0]!r:.40}' is no kernel; expected whole numbers from 0 to {count - 1}.")
     pins = np.zeros(count, bool)
     pins[data] = True
     return pins

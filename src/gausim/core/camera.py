@@ -33,7 +33,7 @@ class Cameras:
     names: tuple[str, ...]
 
     def validated(self, source: str) -> Cameras:
-        """Returns itself, or raises :class:`DataError` naming ``source`` and the camera whose rotation is not one."""
+        """Returns itself, or raises :class:`DataError` naming ``source`` and the camera whose pose is none."""
         r = self.viewmats[:, :3, :3].double()
         error = (r @ r.mT - torch.eye(3, dtype=r.dtype)).abs().amax((-1, -2))
         for i, name in enumerate(self.names):
@@ -43,6 +43,8 @@ class Cameras:
                     f"(R R^T - I up to {float(error[i]):.3g}, det {float(torch.det(r[i])):.3g}; expected 0 and 1). "
                     "Remove scale and reflection from the pose."
                 )
+            if not torch.isfinite(self.viewmats[i]).all() or not torch.isfinite(self.Ks[i]).all():
+                raise DataError(f"{source}: pose or lens of '{name}' holds numbers beyond float32. Export it again.")
         return self
 
     @property

@@ -14,6 +14,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from gausim.core import DataError
+from gausim.io.pixels import decode, read_header
 from gausim.ops.compiled import fits
 from gausim.ops.jit import KERNEL
 
@@ -73,7 +74,13 @@ def read_rgba(path: Path, size: tuple[int, int], *, opaque: bool = False) -> np.
     """
     if not path.is_file():
         raise DataError(f"{path}: no such image, though its transforms.json names it. Restore or re-export it.")
-    pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    header = read_header(path)
+    if header is not None and (header.width, header.height) != size:
+        raise DataError(
+            f"{path}: expected {size[0]}x{size[1]} RGBA (8 bit), got {header.width}x{header.height} {header.mode}. "
+            "Re-export the frame at the size of its camera."
+        )
+    pixels = decode(path)
     if pixels is None:
         raise DataError(f"{path}: cannot be decoded as an image. Re-export the frame as PNG.")
     if opaque and pixels.ndim == 3 and pixels.shape[-1] in (3, 4):

@@ -133,11 +133,17 @@ class SequenceRecord:
 
 
 def read_array(path: Path, field: str) -> np.ndarray:
-    """One array of an npz file without pickles, or :class:`DataError` that names file and field."""
+    """One array of finite numbers of an npz file without pickles, or :class:`DataError` that names file and field."""
     try:
         arrays = read_npz(path, [field])
     except ValueError as error:
         raise DataError(f"{path}: cannot be read as npz ({error}).") from error
     if field not in arrays:
         raise DataError(f"{path}: array '{field}' is missing.")
-    return arrays[field]
+    values = arrays[field]
+    if values.dtype.kind not in "biuf":
+        raise DataError(f"{path}: array '{field}' holds {values.dtype}, expected numbers.")
+    with np.errstate(over="ignore"):
+        if values.dtype.kind == "f" and not np.isfinite(values.astype(np.float32, copy=False)).all():
+            raise DataError(f"{path}: array '{field}' holds values that are no finite numbers in float32.")
+    return values

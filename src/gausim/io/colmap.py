@@ -203,7 +203,11 @@ def _points(path: Path) -> PointTable:
     table = read_points(path)
     for field in ("xyz", "error"):
         values = getattr(table, field)
-        good = (np.isfinite(values) & (np.abs(values) <= _LARGEST)).reshape(len(table.ids), -1).all(1)
+        good = (
+            (np.isfinite(values) & (np.abs(values) <= _LARGEST))
+            .reshape(len(table.ids), 3 if field == "xyz" else 1)
+            .all(1)
+        )
         if not good.all():
             first = int(np.argmin(good))
             raise DataError(

@@ -82,14 +82,17 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
             f"{path}: properties 'rot_0'..'rot_3' are all zero for {int(zero.sum())} of {len(zero)} vertices "
             f"(first: vertex {int(zero.nonzero()[0])}); expected a non-zero quaternion. Remove them or export again."
         )
-    scene = GaussianScene.create(
-        means=_stack(values, ["x", "y", "z"]),
-        log_scales=_stack(values, [f"scale_{i}" for i in range(3)]),
-        quats=quats,
-        opacity_logits=torch.from_numpy(values["opacity"]),
-        sh=_sh_from_columns(values, rest),
-        name=path.stem if name is None else name,
-    )
+    try:
+        scene = GaussianScene.create(
+            means=_stack(values, ["x", "y", "z"]),
+            log_scales=_stack(values, [f"scale_{i}" for i in range(3)]),
+            quats=quats,
+            opacity_logits=torch.from_numpy(values["opacity"]),
+            sh=_sh_from_columns(values, rest),
+            name=path.stem if name is None else name,
+        )
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from error
     side = masks_path(path) if masks is None else Path(masks)
     return load_masks(scene, side) if masks is not None or side.is_file() else scene
 

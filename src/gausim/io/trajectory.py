@@ -69,6 +69,13 @@ def _check(path: Path, tensors: dict[str, Tensor]) -> None:
         actual = tuple(tensors[name].shape)
         if actual != tuple(shape):
             raise DataError(f"{path}: tensor '{name}' has shape {actual}, expected {tuple(shape)}. Export it again.")
+    for name in (*_TENSORS[:3], "fps"):
+        if not tensors[name].is_floating_point() or not torch.isfinite(tensors[name]).all():
+            raise DataError(f"{path}: tensor '{name}' holds values that are no finite numbers. Simulate it again.")
     index = tensors["unit_of_kernel"]
     if index.is_floating_point() or (len(index) and not 0 <= int(index.min()) <= int(index.max()) < units[0]):
         raise DataError(f"{path}: tensor 'unit_of_kernel' must hold indices of {units[0]} units. Export it again.")
+    if float(tensors["fps"]) <= 0:
+        raise DataError(
+            f"{path}: tensor 'fps' is {float(tensors['fps'])}, expected a positive number. Export it again."
+        )

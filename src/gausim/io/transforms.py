@@ -8,17 +8,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import Cameras, DataError
+from gausim.io.pixels import read_header
+from gausim.io.plain_json import parse_json
 
 # Camera models without distortion, or whose distortion is checked to be zero.
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 # OpenGL looks along -z with y up, OpenCV along +z with y down.
+_LONGEST_NAME = 255
 OPENGL_TO_OPENCV = (1.0, -1.0, -1.0, 1.0)
 
 
@@ -116,7 +118,7 @@ def _lens_fields(k: Float[Tensor, "3 3"]) -> dict[str, float]:
 def read_json(path: Path) -> dict[str, Any]:
     """Reads a JSON object, or raises :class:`DataError` that names the file."""
     try:
-        data = json.loads(path.read_text())
+        data = parse_json(path.read_bytes())
     except FileNotFoundError:
         raise DataError(f"{path}: no such file. Check the data set's root.") from None
     except (OSError, ValueError) as error:
@@ -138,6 +140,9 @@ def _frame(folder: Path, entry: dict[str, Any], field: str) -> PosedFrame:
     name = entry.get("file_path")
     if not isinstance(name, str) or not name:
         raise DataError(f"{field}: field 'file_path' must name an image, got {name!r}.")
+    # A file system holds no longer names; asking it for one is an error of its own kind.
+    if any(len(part) > _LONGEST_NAME for part in name.split("/")) or "\0" in name:
+        raise DataError(f"{field}: field 'file_path' is no name of a file: {name!r:.60}.")
     path = folder / name
     if not path.suffix:
         path = path.with_suffix(".png")  # Blender's own files leave the extension out
@@ -159,10 +164,10 @@ def _size(fields: dict[str, Any], image: Path, field: str, *, fallback: tuple[in
         return size
     if fallback is not None:
         return fallback
-    pixels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
-    if pixels is None:
+    found = read_header(image)
+    if found is None:
         raise DataError(f"{field}: has no 'w' and 'h', and {image} cannot be read to find them.")
-    return pixels.shape[1], pixels.shape[0]
+    return found.width, found.height
 
 
 def viewmat_of(entry: dict[str, Any], field: str) -> Float[Tensor, "4 4"]:

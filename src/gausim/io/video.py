@@ -93,7 +93,7 @@ def read_video(path: Path | str) -> Iterator[np.ndarray]:
                 raise DataError(f"{path}: holds no video stream.")
             for frame in container.decode(video=0):
                 yield frame.to_ndarray(format="rgb24")
-    except (FFmpegError, OSError) as error:
+    except (FFmpegError, OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be decoded as video ({error}). Check the file.") from error
 
 
@@ -106,7 +106,7 @@ def video_rate(path: Path | str) -> float:
     try:
         with av.open(str(path)) as container:
             rate = container.streams.video[0].average_rate if container.streams.video else None
-    except (FFmpegError, OSError) as error:
+    except (FFmpegError, OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read as video ({error}). Check the file.") from error
     if not rate:
         raise DataError(f"{path}: holds no video stream with a frame rate.")

@@ -46,6 +46,7 @@ from typing import Any
 import numpy as np
 
 from gausim.core import RunError
+from gausim.io.plain_json import parse_json
 from gausim.report.curves import ERROR_3D, IMAGE_ENERGY, POINT_ARRAYS, POINT_ENERGY, STATIC, TRUTH, ObjectCurves
 
 SCHEMA = "gausim.evaluation/1"
@@ -186,7 +187,7 @@ def load_summary(path: Path) -> dict[str, Any]:
         RunError: it is missing, no JSON or of another schema.
     """
     try:
-        summary = json.loads(path.read_text())
+        summary = parse_json(path.read_bytes())
     except FileNotFoundError:
         raise RunError(f"{path}: no such file. Write it with `gausim evaluate RUN`.") from None
     except ValueError as error:

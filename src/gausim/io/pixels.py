@@ -1,0 +1,65 @@
+"""Decodes image files by OpenCV, after a look at their size: a few bytes may claim gigabytes."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+# Tag of the sub-directory of EXIF data.
+_EXIF = 0x8769
+
+
+def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
+    """Pixels of an image as ``cv2.imread`` gives them (BGR, rows first); None where it cannot be decoded.
+
+    Args:
+        path: the file.
+        flags: of ``cv2.imread``.
+    """
+    if read_header(path) is None:
+        return None
+    try:
+        return cv2.imread(str(path), flags)
+    except (cv2.error, MemoryError):
+        return None
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What an image file states before its pixels.
+
+    Attributes:
+        width: as stored [pixels].
+        height: as stored [pixels].
+        mode: Pillow's name of the channels, e.g. ``RGBA``.
+        exif: camera's facts by tag, those of the sub-directory included.
+    """
+
+    width: int
+    height: int
+    mode: str
+    exif: Mapping[int, Any]
+
+
+def read_header(path: Path) -> ImageHeader | None:
+    """Reads the header of an image file, without decoding it; None where it is no image.
+
+    Nor is one of more than 178 million pixels, where Pillow takes the header for damaged.
+    """
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as image:
+                tags = image.getexif()
+                exif = {**tags, **tags.get_ifd(_EXIF)}
+                return ImageHeader(image.width, image.height, image.mode, exif)
+    except Exception:  # Pillow's readers raise whatever a damaged file makes them run into
+        return None

@@ -1,0 +1,162 @@
+"""Stages killed at any place: no half result, and the same command ends with what an uninterrupted one makes."""
+
+from __future__ import annotations
+
+import json
+import os
+import runpy
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from gausim.data.verify import verify
+
+ROOT = Path(__file__).parents[2]
+CAPTURE = runpy.run_path(str(Path(__file__).with_name("test_assemble.py")))["Capture"]
+ROOM = runpy.run_path(str(Path(__file__).with_name("test_poses.py")))
+READY = runpy.run_path(str(ROOT / "tests" / "fuzz" / "corpus.py"))["_ready"]
+Run = Callable[..., dict[str, Any]]
+SHARES = (0.0, 0.3, 0.6, 0.9, 1.0)
+
+
+@pytest.fixture(scope="module")
+def run() -> Iterator[Run]:
+    """Runs a stage in a child of its own."""
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, str(Path(__file__).with_name("killed_stages.py"))]
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}, stdin=subprocess.PIPE,
+                          stdout=subprocess.PIPE, text=True) as server:  # fmt: skip
+        assert server.stdin and server.stdout
+
+        def ask(stage: str, argv: list[str], die: int | None = None) -> dict[str, Any]:
+            server.stdin.write(json.dumps({"stage": stage, "argv": argv, "die": die}) + "\n")
+            server.stdin.flush()
+            return dict(json.loads(server.stdout.readline()))
+
+        yield ask
+        server.stdin.close()
+
+
+@pytest.fixture(scope="module")
+def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[list[str], Path, int]]:
+    """Per stage: its arguments but --out, what it makes when nobody kills it, and the places it passes."""
+    folder = tmp_path_factory.mktemp("stages")
+    capture = CAPTURE(folder / "capture")
+    capture.write_films()
+    from gausim.io.ply import save_scene
+
+    save_scene(capture.toy.scene, folder / "rest" / "scene.ply")
+    list(READY(folder))
+    whole = {stage: folder / "whole" / stage for stage in
+             ("ingest", "poses", "segment", "select", "assemble", "pack", "import_ready")}  # fmt: skip
+    arguments = {
+        "ingest": [capture.folder / "takes", "--sync", "offsets", "--offsets", "cam_0=0,cam_1=2f,cam_2=0"],
+        "poses": ["--transforms", capture.folder / "photos/calibration.json", "--sequences", whole["ingest"]],
+        "segment": [whole["poses"], *"--backend chroma --key 00b140 --no-grabcut --components 0".split()],
+        "select": [folder / "rest" / "scene.ply", "--pinned", "below z=0.1", "--size", "64"],
+        "assemble": [whole["segment"], "--scene", whole["select"], "--name", "toy"],
+        "pack": [whole["assemble"]],
+        "import_ready": [folder / "ready", "--train-frames", "2"],
+    }
+    found = {}
+    for stage, values in arguments.items():
+        argv = [str(value) for value in values]
+        done = run(stage, [*argv, "--out", str(whole[stage])])
+        assert done["status"] == 0, done["output"]
+        found[stage] = (argv, whole[stage], done["places"])
+    return found
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def check(run: Run, stage: str, argv: list[str], whole: Path, places: int, share: float, folder: Path) -> None:
+    out = folder / "result"
+    command = [*argv, "--out", str(out)]
+    killed = run(stage, command, die=min(places - 1, round(share * (places - 1))))
+    assert killed["status"] == -signal.SIGKILL, killed["output"]
+    if out.exists():  # killed after it had taken its name: then it is whole
+        assert contents(out) == contents(whole)
+    again = run(stage, command)
+    assert again["status"] == 0, again["output"]
+    assert contents(out) == contents(whole)
+    assert [p.name for p in folder.iterdir()] == ["result"]  # nothing is left lying about
+
+
+STAGES = ("ingest", "poses", "segment", "select", "assemble", "pack", "import_ready")
+
+
+@pytest.mark.parametrize("share", [0.5])
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_killed_in_its_middle_goes_on(run: Run, jobs: dict, tmp_path: Path, stage: str, share: float) -> None:
+    check(run, stage, *jobs[stage], share, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", SHARES)
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_killed_at_five_places(run: Run, jobs: dict, tmp_path: Path, stage: str, share: float) -> None:
+    check(run, stage, *jobs[stage], share, tmp_path)
+
+
+def test_every_place_near_the_end_of_a_stage(run: Run, jobs: dict, tmp_path: Path) -> None:
+    """Where the manifest is written and the result takes its name, with and without a result that is replaced."""
+    argv, whole, places = jobs["pack"]
+    for place in range(places - 6, places):
+        check(run, "pack", argv, whole, places, place / (places - 1), _fresh(tmp_path / f"new_{place}"))
+    for back in range(1, 8):
+        folder = _fresh(tmp_path / f"force_{back}")
+        assert run("pack", [*argv, "--margin", "0", "--out", str(folder / "result")])["status"] == 0
+        before = contents(folder / "result")
+        command = [*argv, "--force", "--out", str(folder / "result")]
+        # A replacement passes one place more than a first result: the old one steps aside.
+        killed = run("pack", command, die=places + 1 - back)
+        assert killed["status"] == -signal.SIGKILL
+        if (folder / "result").exists():
+            assert contents(folder / "result") in (before, contents(whole))
+        assert run("pack", command)["status"] == 0 and run("pack", command)["status"] == 0
+        assert contents(folder / "result") == contents(whole) and verify(folder / "result") == []
+        assert [p.name for p in folder.iterdir()] == ["result"]
+
+
+def _fresh(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", SHARES)
+def test_mapping_killed_at_five_places(run: Run, tmp_path_factory: pytest.TempPathFactory, share: float) -> None:
+    folder = tmp_path_factory.mktemp("mapping")
+    photos = folder / "photos"
+    photos.mkdir()
+    rng = np.random.default_rng(3)
+    wall = cv2.GaussianBlur(rng.normal(128, 260, (400, 400)).astype(np.float32), (0, 0), 2.2)
+    walls = np.stack([np.roll(wall, 97 * i, 0)[:: (-1) ** i] for i in range(3)])
+    for i, azimuth in enumerate(ROOM["AZIMUTHS"]):
+        cv2.imwrite(str(photos / f"{i}.png"), ROOM["photograph_room"](ROOM["room_viewmat"](azimuth), walls))
+    argv = ["--images", str(photos), "--camera-model", "SIMPLE_PINHOLE", "--features", "1500", "--feature-size", "320"]
+    done = run("poses", [*argv, "--out", str(folder / "whole")])
+    assert done["status"] == 0, done["output"]
+    (folder / "killed").mkdir()
+    check(run, "poses", argv, folder / "whole", done["places"], share, folder / "killed")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", SHARES)
+def test_synthesize_killed_at_five_places(run: Run, tmp_path: Path, share: float) -> None:
+    sizes = "--quick --objects pudding_soft --sequences 1 --frames 16 --resolution 24 --kernels 60 --workers 1".split()
+    done = run("synthesize", [*sizes, "--out", str(tmp_path / "whole")])
+    assert done["status"] == 0, done["output"]
+    (tmp_path / "killed").mkdir()
+    check(run, "synthesize", sizes, tmp_path / "whole", done["places"], share, tmp_path / "killed")
+    shutil.rmtree(tmp_path / "whole")

@@ -1,0 +1,258 @@
+"""The readers of the product that take files from anywhere, and a small good file for each."""
+
+from __future__ import annotations
+
+import json
+import runpy
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+import torch
+
+from data_prep.cameras.sources import read_lens_transforms, read_projections
+from data_prep.common.photos import open_photo, read_photo
+from data_prep.common.stage import read_manifest
+from data_prep.films.film import pictures, probe, upright
+from data_prep.films.takes import find_takes
+from data_prep.import_ready import ReadyOptions, import_ready
+from data_prep.masks.clips import read_picture
+from data_prep.pack import pack
+from data_prep.prepare import plan
+from data_prep.scenes.gathered import gather
+from data_prep.scenes.ready import read_pins
+from gausim.core.errors import GausSimError
+from gausim.data.images import read_rgba
+from gausim.data.objects import ObjectData
+from gausim.data.records import read_array, read_stills
+from gausim.data.verify import verify
+from gausim.engine.run import RunDirectory
+from gausim.io.colmap import read_colmap
+from gausim.io.ply import load_masks, load_points, load_scene
+from gausim.io.trajectory import load_trajectory, save_trajectory
+from gausim.io.transforms import read_json, read_transforms
+from gausim.io.video import read_video, video_rate
+from gausim.report.summary import SCHEMA, load_summary
+
+TESTS = Path(__file__).parents[1]
+TOY = runpy.run_path(str(TESTS / "toy_object.py"))
+COLMAP = runpy.run_path(str(TESTS / "colmap_files.py"))
+SCENE = TOY["toy_scene"]()
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One way to read a file.
+
+    Attributes:
+        name: what it is called.
+        file: the file that is damaged.
+        kind: how, see :func:`mutations.mutated`.
+        read: reads it (and what it needs beside it); what it returns has to be finite.
+        weight: damaged files in proportion to the others'.
+    """
+
+    name: str
+    file: Path
+    kind: str
+    read: Callable[[Path], Any]
+    weight: int = 4
+
+
+def readers(folder: Path) -> list[Reader]:
+    """Writes the good files into ``folder`` and lists who reads them."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    made = (_scenes, _object, _store, _posed, _colmap, _ready, _images, _films, _settings)
+    return [reader for make in made for reader in make(folder)]
+
+
+def _scenes(folder: Path) -> Iterator[Reader]:
+    toy = TOY["ToyObject"](folder / "scene", SCENE)
+    (folder / "scene").mkdir()
+    from gausim.io.ply import save_scene
+
+    path = folder / "scene" / "scene.ply"
+    save_scene(SCENE, path)
+    yield Reader("scene", path, "text", load_scene, 8)
+    text = folder / "scene_text" / "scene.ply"
+    save_scene(replace(SCENE, name="text"), text)
+    head, body = path.read_bytes().split(b"end_header\n")
+    head = head.replace(b"binary_little_endian", b"ascii")
+    table = np.frombuffer(body, "<f4").reshape(-1, head.count(b"property"))
+    rows = "\n".join(" ".join(map(repr, row)) for row in table.tolist())
+    text.write_bytes(head + b"end_header\n" + rows.encode() + b"\n")
+    yield Reader("scene, text", text, "text", load_scene)
+    yield Reader("points", text, "text", load_points)
+    yield Reader("masks", path.with_name("scene.masks.npz"), "npz", lambda p: load_masks(SCENE, p))
+    save_trajectory(folder / "scene" / "t.safetensors", toy.truth("seq_000", 3), facts={"object": "toy"})
+    yield Reader("trajectory", folder / "scene" / "t.safetensors", "binary", load_trajectory, 8)
+
+
+def _object(folder: Path) -> Iterator[Reader]:
+    toy = TOY["write_toy_object"](folder / "object", frames=8)
+    root, sequence = toy.root, toy.root / "sequences" / "seq_000"
+
+    def whole(_: Path) -> Any:
+        data = ObjectData(root)
+        record = data.sequences[0]
+        return data.facts, record.cameras, record.frames(range(1)), data.ground_truth(record), data.rest_points
+
+    yield Reader("dataset.json", root / "dataset.json", "json", whole, 6)
+    yield Reader("transforms of a sequence", sequence / "transforms.json", "json", whole, 6)
+    yield Reader("ground truth", sequence / "ground_truth.npz", "npz", whole)
+    yield Reader("rest points", root / "rest_points.npz", "npz", whole)
+    yield Reader("array", root / "rest_points.npz", "npz", lambda p: read_array(p, "points"), 2)
+    yield Reader("frame", sequence / "cam_0" / "0000.png", "png", whole)
+    yield Reader("any json", root / "dataset.json", "json", read_json, 2)
+
+
+def _store(folder: Path) -> Iterator[Reader]:
+    root = TOY["write_toy_object"](folder / "packing", frames=8).root
+    pack(root, folder / "store")
+    place = folder / "store" / "sequences" / "seq_001"
+
+    def frames(_: Path) -> Any:
+        record = ObjectData(folder / "store").sequences[1]
+        return record.cameras, record.frames(range(record.count))
+
+    def verified(path: Path) -> Any:
+        """Names faults instead of raising: the manifest and what it lists cannot be damaged unnoticed."""
+        faults = verify(folder / "store", quick=False)
+        if faults:
+            raise GausSimError(f"{folder}: " + "; ".join(f"{fault.where}: {fault.what}" for fault in faults))
+
+    yield Reader("packed header", place / "frames.json", "json", frames, 8)
+    yield Reader("packed pixels", place / "frames.bin", "binary", verified, 1)
+    yield Reader("store's manifest", folder / "store" / "stage.json", "json", lambda p: read_manifest(p.parent), 2)
+    yield Reader("verify", folder / "store" / "stage.json", "json", verified, 1)
+
+
+def _posed(folder: Path) -> Iterator[Reader]:
+    root = folder / "posed"
+    (root / "images").mkdir(parents=True)
+    views = TOY["cameras"]()
+    pixels = TOY["rgba"](SCENE, TOY["ToyObject"](root, SCENE).truth("seq_000", 1))[0]
+    from gausim.data.images import write_rgba
+    from gausim.io.transforms import write_transforms
+
+    for name, image in zip(views.names, pixels, strict=True):
+        write_rgba(root / "images" / f"{name}.png", image)
+    path = root / "transforms.json"
+    write_transforms(path, views, [{"file_path": f"images/{name}.png"} for name in views.names])
+    yield Reader("stills", path, "json", lambda p: (read_transforms(p), read_stills(p)), 6)
+    yield Reader("lenses", path, "json", read_lens_transforms)
+    yield Reader("assembled", path, "json", lambda p: gather([p.parent]), 2)
+    matrices = root / "matrices"
+    matrices.mkdir()
+    for name, viewmat, k in zip(views.names, views.viewmats, views.Ks, strict=True):
+        np.savetxt(matrices / f"{name}_P.txt", (k @ viewmat[:3]).numpy())
+    first = matrices / f"{views.names[0]}_P.txt"
+    yield Reader("projection", first, "text", lambda p: read_projections(p.parent, root / "images", 1.0))
+
+
+def _colmap(folder: Path) -> Iterator[Reader]:
+    for suffix in ("binary", "text"):
+        place = folder / f"colmap_{suffix}"
+        COLMAP[f"write_{suffix}"](place, *COLMAP["small_model"]())
+        for path in sorted(place.iterdir()):
+            yield Reader(f"colmap {path.name}", path, suffix, lambda p: read_colmap(p.parent), 6)
+
+
+def _ready(folder: Path) -> Iterator[Reader]:
+    root, size = folder / "ready", (32, 24)
+    names = ["still.png", "seq_00001_cam_00000.png", "seq_00001_cam_00001.png"]
+    images = {i: (name, 1, *COLMAP["turntable"](0.5 * i), []) for i, name in enumerate(names)}
+    cameras = {1: ("PINHOLE", *size, [60.0, 60.0, 16.0, 12.0])}
+    COLMAP["write_binary"](root / "sparse" / "0", cameras, images, COLMAP["small_model"]()[2])
+    for name in names:
+        _picture(root / "images" / name, size)
+    for camera in ("cam_00000", "cam_00001"):
+        for frame in range(2):
+            _picture(root / "video_images" / f"seq_00001_{camera}" / f"{frame:05d}.png", size)
+    (root / "meta.json").write_text(
+        json.dumps({"train": ["seq_00001"], "test": [], "invalid": [], "force_invalid": []})
+    )
+    pins = folder / "pin_mask.json"
+    pins.write_text(json.dumps([0, 3, 5]))
+    out = folder / "ready_out"
+
+    def imported(_: Path) -> Any:
+        import shutil
+
+        try:
+            return import_ready(root, out, ReadyOptions(train_frames=2))["results"]
+        finally:
+            for path in (out, out.with_name(f".{out.name}.import_ready.work")):
+                shutil.rmtree(path, ignore_errors=True)
+
+    yield Reader("meta.json", root / "meta.json", "json", imported, 1)
+    yield Reader("pin_mask.json", pins, "json", lambda p: read_pins(p, 36))
+
+
+def _picture(path: Path, size: tuple[int, int]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = np.arange(size[1] * size[0] * 3).reshape(size[1], size[0], 3) % 251
+    cv2.imwrite(str(path), rows.astype(np.uint8))
+
+
+def _images(folder: Path) -> Iterator[Reader]:
+    place = folder / "images"
+    rgba = np.random.default_rng(0).integers(0, 255, (24, 32, 4)).astype(np.uint8)
+    for suffix in ("png", "jpg", "tif", "bmp", "webp"):
+        path = place / f"p.{suffix}"
+        _picture(path, (32, 24))
+        kind = "png" if suffix == "png" else "binary"
+        yield Reader(f"photo {suffix}", path, kind, lambda p: read_photo(open_photo(p, p.name)))
+        yield Reader(f"picture {suffix}", path, kind, read_picture)
+    cv2.imwrite(str(place / "rgba.png"), rgba)
+    yield Reader("rgba", place / "rgba.png", "png", lambda p: read_rgba(p, (32, 24)), 8)
+
+
+def _films(folder: Path) -> Iterator[Reader]:
+    place = folder / "films"
+    place.mkdir()
+    for suffix in ("mp4", "mkv"):
+        path = place / f"film.{suffix}"
+        with av.open(str(path), "w") as film:
+            video = film.add_stream("libx264", rate=Fraction(25))
+            video.width, video.height, video.pix_fmt = 32, 24, "yuv420p"
+            video.options = {"preset": "ultrafast"}
+            for k in range(5):
+                pixels = np.full((24, 32, 3), 40 * k, np.uint8)
+                film.mux(video.encode(av.VideoFrame.from_ndarray(pixels, format="rgb24")))
+            film.mux(video.encode())
+
+        def ingested(p: Path) -> Any:
+            found = probe(p)
+            return found, [upright(found, frame) for _, frame in pictures(found)]
+
+        yield Reader(f"film {suffix}", path, "binary", ingested, 2)
+        yield Reader(f"video {suffix}", path, "binary", lambda p: (video_rate(p), list(read_video(p))), 2)
+    takes = place / "takes.json"
+    cameras = {"left": "film.mp4", "right": "film.mkv"}
+    take = {"name": "poke", "cameras": cameras, "offsets": {"right": "7.3f"}, "start": 0.5, "duration": 2.0}
+    takes.write_text(json.dumps({"sequences": [take]}))
+    yield Reader("list of films", takes, "json", find_takes)
+
+
+def _settings(folder: Path) -> Iterator[Reader]:
+    place = folder / "settings"
+    place.mkdir()
+    config = place / "object.yaml"
+    config.write_text(
+        "work: work\nstages:\n  ingest: {films: takes, sync: auto, start: 1.5}\n"
+        '  segment-films: {pictures: "{ingest}/sequences", no_grabcut: true}\n  pack: {root: [a, 2]}\n'
+    )
+    yield Reader("stages", config, "text", plan)
+    run = place / "config.yaml"
+    run.write_text("name: demo\nseed: 0\nmodel:\n  simulator: {_target_: gausim.X, layers: 2}\n  list: [1, 2.5]\n")
+    yield Reader("run's configuration", run, "text", lambda p: str(RunDirectory(p.parent).config()))
+    summary = place / "metrics.json"
+    summary.write_text(json.dumps({"objects": {"toy": {"psnr": {"seen": 30.5}}}, "schema": SCHEMA}))
+    yield Reader("summary", summary, "json", lambda p: str(load_summary(p)), 2)
