@@ -102,7 +102,7 @@ class Viewer:
         self.hands = Hands(self.server, self.live, self.placing, subject.interaction.units, subject.masses)
         self.page = Page(
             self.server, self.live, self.hands, modes=self._painter.modes, title=subject.title,
-            down=subject.up[1:] if subject.up.startswith("-") else f"-{subject.up}", sessions=subject.sessions,
+            down=f"+{subject.up[1:]}" if subject.up.startswith("-") else f"-{subject.up}", sessions=subject.sessions,
             repaint=self.repaint, forget_scales=self._painter.forget,
         )  # fmt: skip
         self.sights = Sights(self.server, self.placing, subject)

@@ -57,7 +57,10 @@ class Hands:
         self.notice: Callable[[], None] = lambda: None
         self._label = server.scene.add_label("/weight", "", visible=False)
         self.choose_level(self.first_level)
+        # What a ray may pass a kernel's centre by: the kernel's own size, and a little for the hand [page units].
+        self._reach = scene.log_scales.float().cpu().exp().amax(-1) * placing.scale + 0.004 * SIZE
         server.scene.on_rect_select(modifier="shift")(self._brushed)
+        server.scene.on_click()(self._clicked)
 
     @property
     def level_names(self) -> tuple[str, ...]:
@@ -123,7 +126,7 @@ class Hands:
             "/dots", centres, (255, 120, 0), point_size=0.012 * SIZE, point_shape="circle",
             visible=self._shown_handles,
         )  # fmt: skip
-        handle.on_click(self._clicked)
+        # No click on the handles: viser outlines what can be clicked. Clicks are found along their ray instead.
         handle.on_drag("left")(self._dragged)
         handle.on_drag("left", modifier="cmd/ctrl")(self._flicked)
         return handle
@@ -177,9 +180,15 @@ class Hands:
         return Whole() if self._level is None else Unit(self._level + 1, int(self._movable[instance]))
 
     async def _clicked(self, event: Any) -> None:
-        chosen = self._selected_by(event.instance_index)
-        if chosen is not None:
-            self.select(chosen)
+        if self._page is None:
+            return
+        kernel = first_hit(self._page, self._reach, event.ray_origin, event.ray_direction, self._free)
+        if kernel is None:
+            self.select(None)
+        elif self._level is None:
+            self.select(Whole())
+        elif int(self._index[kernel]) >= 0:
+            self.select(Unit(self._level + 1, int(self._index[kernel])))
 
     async def _brushed(self, event: Any) -> None:
         if self._page is None:
@@ -239,6 +248,32 @@ class Hands:
 
     def _hide(self) -> None:
         self._label.visible = False
+
+
+def first_hit(
+    points: Float[Tensor, "K 3"],
+    reach: Float[Tensor, " K"],
+    origin: Sequence[float],
+    direction: Sequence[float],
+    among: Bool[Tensor, " K"],
+) -> int | None:
+    """The first of some kernels that a ray passes, or None.
+
+    Args:
+        points: centres of all kernels.
+        reach: how far from a centre still counts.
+        origin: where the ray begins.
+        direction: where it leads; of any length but zero.
+        among: only these kernels.
+    """
+    along = points.new_tensor([float(v) for v in direction])
+    if not float(along.norm()) > 0:
+        return None
+    away = points - points.new_tensor([float(v) for v in origin])
+    depth = away @ (along / along.norm())
+    passed = (away - depth[:, None] * along / along.norm()).norm(dim=-1)
+    hit = (among & (depth > 0) & (passed <= reach)).nonzero()[:, 0]
+    return int(hit[depth[hit].argmin()]) if len(hit) else None
 
 
 def in_rectangle(
