@@ -45,6 +45,7 @@ COMMANDS: dict[str, Command] = {
     "export": Command(
         "gausim.cli.export", "Write a motion as PLY, OpenUSD, safetensors, viser, HTML, MP4 or GIF, and read it back."
     ),
+    "view": Command("gausim.cli.view", "Show a run or a scene in the browser and pull it about."),
     "report": Command("gausim.cli.report", "Compare runs and sweeps: one HTML page, Markdown, LaTeX and CSV."),
 }
 

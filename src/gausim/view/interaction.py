@@ -195,6 +195,11 @@ class Interaction:
         return self._stepper.unit_of_kernel
 
     @property
+    def masses(self) -> Float[Tensor, " K"]:
+        """Of the kernels, up to a common factor."""
+        return self._masses
+
+    @property
     def fps(self) -> float:
         """Frames per second."""
         return self._stepper.fps
