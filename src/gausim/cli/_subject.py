@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
+from gausim.cli._live import REST, energy_ceiling, open_interaction
 from gausim.core import ConfigError, GaussianScene, SimState, Trajectory
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from torch import Tensor
-
     from gausim.cli._foresee import RunObject, TrainedPrediction
     from gausim.cli._run import LoadedRun
     from gausim.view.app import Subject
@@ -23,7 +21,6 @@ if TYPE_CHECKING:
 
 # The model of a bare scene: untrained, its network is silent and the elastic template moves the object alone.
 BARE_MODEL = "gausim"
-REST = "rest"
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +29,12 @@ class Playable:
 
     Attributes:
         interaction: what is pushed.
-        masses: of the kernels.
         predict: what it foresees of the recorded sequences; None for a bare scene.
         item: the run's object; None for a bare scene.
         run: the run; None for a bare scene.
     """
 
     interaction: Interaction
-    masses: Float[Tensor, " K"]
     predict: TrainedPrediction | None = None
     item: RunObject | None = None
     run: LoadedRun | None = None
@@ -63,58 +58,14 @@ def playable_run(
         keep: so many of the latest frames are kept; None keeps all.
 
     Raises:
-        DataError: there is no such object.
-        ConfigError: there is no such sequence.
+        DataError: there is no such object or sequence.
+        ConfigError: the model cannot be simulated on its own.
     """
     from gausim.cli._foresee import TrainedPrediction, run_objects
-    from gausim.view.interaction import STANDARD_GRAVITY, Interaction
-    from gausim.view.session import MadeWith
 
     item = run_objects(run, [name] if name is not None else None)[0]
-    module = run.module
-    scene = cast(Any, module.simulator).scenes[item.scene_id]
-    predict = TrainedPrediction(run, item)
-    sequence_id = _sequence_id(item, sequence)
-    initial, dynamics, masses = _method(run, item, scene, sequence_id)
-    made_with = MadeWith.of(scene, module.model, initial, name=sequence, run=Path(run.run_dir).name)
-    interaction = Interaction(
-        scene, dynamics, masses, initial, made_with=made_with, units=predict.units,
-        gravity=STANDARD_GRAVITY if gravity is None else gravity,
-        keep=keep,
-    )  # fmt: skip
-    return Playable(interaction, masses, predict, item, run)
-
-
-def _sequence_id(item: RunObject, sequence: str) -> int | None:
-    names = [record.name for record in item.data.sequences]
-    if sequence == REST:
-        return None
-    if sequence not in names:
-        raise ConfigError(f"--sequence {sequence!r}: expected {REST!r} or one of {names}.")
-    return item.first_sequence + names.index(sequence)
-
-
-def _method(
-    run: LoadedRun, item: RunObject, scene: GaussianScene, sequence_id: int | None
-) -> tuple[SimState, Any, Float[Tensor, " K"]]:
-    """Initial state, dynamics and masses."""
-    from gausim.core import FittedDynamics
-    from gausim.engine.contracts import Foreseeing
-    from gausim.engine.fitting import FittedModule
-    from gausim.ops.covariance import kernel_volumes
-
-    module = run.module
-    if isinstance(module, FittedModule):
-        first = item.first_sequence if sequence_id is None else sequence_id
-        volumes = kernel_volumes(scene.log_scales, scene.volume_scale) * scene.simulated
-        return SimState(scene.means, scene.means), FittedDynamics(module.method, first), volumes
-    if not isinstance(module.model, Foreseeing):
-        raise ConfigError(f"{run.run_dir}: {module.method_name} cannot be simulated. View a run of another model.")
-    dynamics = cast(Any, module.model).dynamics(item.scene_id)
-    previous = scene.means
-    if sequence_id is not None:
-        previous = cast(Any, module.initial_states).previous(sequence_id).detach().to(scene.means)
-    return SimState(scene.means, previous), dynamics, dynamics.masses
+    interaction = open_interaction(run, name=name, sequence=sequence, gravity=gravity, keep=keep)
+    return Playable(interaction, TrainedPrediction(run, item), item, run)
 
 
 def playable_scene(
@@ -124,25 +75,28 @@ def playable_scene(
 
     Raises:
         SceneError: nothing is pinned.
+        ConfigError: the frame rate is not positive and finite.
     """
     import torch
 
     from gausim.cli._config import compose, instantiate
-    from gausim.engine.contracts import Hierarchical
     from gausim.ops.selection import require_pinned
     from gausim.view.interaction import STANDARD_GRAVITY, Interaction
     from gausim.view.session import MadeWith
 
+    if not (math.isfinite(fps) and fps > 0):
+        raise ConfigError(f"--fps {fps}: expected frames per second > 0.")
     require_pinned(scene)
     torch.manual_seed(seed)
     model = instantiate(compose(f"model/{BARE_MODEL}").model.simulator)(scenes=[scene], fps=[fps])
     dynamics, initial = model.dynamics(0), SimState(scene.means, scene.means)
-    units: Sequence[Int[Tensor, " K"]] = model.units_of_kernels(0) if isinstance(model, Hierarchical) else ()
+    dynamics.energy_ceiling = energy_ceiling(model, 0, ())
+    made_with = MadeWith.of(scene, model, initial, settings=BARE_MODEL, run="untrained")
     interaction = Interaction(
-        scene, dynamics, dynamics.masses, initial, made_with=MadeWith.of(scene, model, initial, run="untrained"),
-        units=tuple(units), gravity=STANDARD_GRAVITY if gravity is None else gravity, keep=keep,
+        scene, dynamics, dynamics.masses, initial, made_with=made_with, units=tuple(model.units_of_kernels(0)),
+        gravity=STANDARD_GRAVITY if gravity is None else gravity, keep=keep,
     )  # fmt: skip
-    return Playable(interaction, dynamics.masses)
+    return Playable(interaction)
 
 
 def takes_of(made: Playable, beside: Playable | None, frames: int | None) -> list[Take]:
@@ -188,7 +142,7 @@ def subject_of(made: Playable, *, title: str, beside: Playable | None, up: str, 
         films = Films(records, made.interaction.scene, made.run.renderer)
         cameras = next(iter(records.values())).cameras
     return Subject(
-        title=title, interaction=made.interaction, masses=made.masses, takes=takes_of(made, beside, None),
+        title=title, interaction=made.interaction, takes=takes_of(made, beside, None),
         companion=None if beside is None else companion_of(beside, _name_of(beside)), films=films, cameras=cameras,
         up=up, sessions=sessions,
     )  # fmt: skip

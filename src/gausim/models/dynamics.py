@@ -18,9 +18,9 @@ if TYPE_CHECKING:
 class SceneDynamics:
     """Rolls one scene of a :class:`GausSim` out, without gradients and in evaluation mode."""
 
-    def __init__(self, model: GausSim, scene_id: int) -> None:
-        """Binds ``model`` to its scene number ``scene_id``."""
-        self.model, self.scene_id = model, scene_id
+    def __init__(self, model: GausSim, scene_id: int, *, energy_ceiling: float | None = None) -> None:
+        """Binds ``model`` to its scene number ``scene_id``; the ceiling is one of :class:`SceneStepper`."""
+        self.model, self.scene_id, self.energy_ceiling = model, scene_id, energy_ceiling
 
     @property
     @torch.no_grad()
@@ -41,4 +41,4 @@ class SceneDynamics:
 
     def stepper(self, initial: SimState) -> SceneStepper:
         """Begins at a state; every step is one of :meth:`rollout`."""
-        return SceneStepper(self.model, self.scene_id, initial)
+        return SceneStepper(self.model, self.scene_id, initial, energy_ceiling=self.energy_ceiling)

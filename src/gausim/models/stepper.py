@@ -47,8 +47,19 @@ class SceneStepper:
     takes_forces: bool = True
 
     @torch.no_grad()
-    def __init__(self, model: GausSim, scene_id: int, initial: SimState) -> None:
-        """Begins at ``initial``, a state of the model's scene number ``scene_id``."""
+    def __init__(
+        self, model: GausSim, scene_id: int, initial: SimState, *, energy_ceiling: float | None = None
+    ) -> None:
+        """Begins at ``initial``, a state of the model's scene number ``scene_id``.
+
+        Args:
+            model: with whatever limit on energy it has.
+            scene_id: of the scene.
+            initial: where it begins.
+            energy_ceiling: the highest energy that forces can reach (:class:`gausim.models.passive.EnergyGuard`), for
+                models that know one; None: any.
+        """
+        self._ceiling = energy_ceiling
         batch = model.batch((scene_id,))
         member = batch.members[0]
         identity = torch.eye(3).to(initial.positions).expand(member.units.stop - member.units.start, 3, 3)
@@ -103,4 +114,4 @@ class SceneStepper:
     def _made_guard(self, prepared: Prepared) -> EnergyGuard | None:
         if not (self._model.passive_frames and self._model.knows_energy):
             return None
-        return EnergyGuard(self._model, prepared, self._model.passive_frames)
+        return EnergyGuard(self._model, prepared, self._model.passive_frames, ceiling=self._ceiling)

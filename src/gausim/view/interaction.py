@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -195,6 +195,11 @@ class Interaction:
         return self._stepper.unit_of_kernel
 
     @property
+    def masses(self) -> Float[Tensor, " K"]:
+        """Masses of the kernels, up to a common factor."""
+        return self._masses
+
+    @property
     def fps(self) -> float:
         """Frames per second."""
         return self._stepper.fps
@@ -213,6 +218,17 @@ class Interaction:
     def acting(self) -> tuple[str, ...]:
         """Names of the forces that act."""
         return tuple(self._forces)
+
+    def pushes(self) -> list[tuple[Bool[Tensor, " K"], tuple[float, float, float], str]]:
+        """What acts before the next step: kernels, acceleration [scene units / s^2] and kind."""
+        found = [(push.mask, push.acceleration, "force") for push in self._forces.values()]
+        found += [(push.mask, push.acceleration, "impulse") for push in self._impulses]
+        if self._wind is not None:
+            found.append((self._free, _scaled(self._wind.direction, self._wind_strength() * self.gravity), "wind"))
+        if self._steady is not None:
+            steady = _scaled(self._steady.direction, self._steady.weights * self.gravity)
+            found.append((self._free, steady, "gravity"))
+        return found
 
     def act(self, event: Event) -> None:
         """Does something before the next step, and records it.
@@ -285,18 +301,19 @@ class Interaction:
                 _scaled(self._steady.direction, self._steady.weights * self.gravity)
             )
         if self._wind is not None:
-            strength = self._wind.weights * self.gravity * (1 + self._wind.gusts * self._gust())
-            blown = acceleration.new_tensor(_scaled(self._wind.direction, strength))
+            blown = acceleration.new_tensor(_scaled(self._wind.direction, self._wind_strength() * self.gravity))
             acceleration += self._exposure[:, None] * blown
         most = self.most_force * self.gravity
         acceleration *= (most / acceleration.norm(dim=-1, keepdim=True).clamp_min(most)).clamp_max(1.0)
         return acceleration * (self._masses * (self._free & ~self.held))[:, None]
 
-    def _gust(self) -> float:
-        """How far the wind is above its mean now, in -1..1."""
+    def _wind_strength(self) -> float:
+        """Of the wind now, gusts included [weights]."""
+        if self._wind is None:
+            return 0.0
         seconds = self.tick / self.fps
         waves = (math.sin(2 * math.pi * f * seconds + p) for f, p in zip(_GUSTS, self._phases, strict=True))
-        return sum(waves) / len(_GUSTS)
+        return self._wind.weights * (1 + self._wind.gusts * sum(waves) / len(_GUSTS))
 
     # ----------------------------------------------------------------------------------------------------- sanity
 
@@ -323,13 +340,20 @@ class Interaction:
                 )
 
 
-def replay(interaction: Interaction, session: ForceSession, *, other_model: bool = False) -> Trajectory:
+def replay(
+    interaction: Interaction,
+    session: ForceSession,
+    *,
+    other_model: bool = False,
+    watch: Callable[[Interaction], None] | None = None,
+) -> Trajectory:
     """Does what a session says, from the initial state; the result has all its frames, bit for bit those recorded.
 
     Args:
         interaction: begins anew.
         session: what to do.
         other_model: the method or the initial state may differ from the recorded ones; then so do the numbers.
+        watch: is shown the interaction before every step, with what acts in it, and after the last.
 
     Raises:
         DataError: the session is of another scene, frame rate, method or initial state, or too long for the memory.
@@ -348,6 +372,8 @@ def replay(interaction: Interaction, session: ForceSession, *, other_model: bool
     for tick in range(session.steps + 1):
         while pending and pending[0].at == tick:
             interaction.act(pending.popleft().event)
+        if watch is not None:
+            watch(interaction)
         if tick < session.steps:
             frames.append(interaction.step())
     return trajectory_of(frames, interaction._stepper)

@@ -191,15 +191,32 @@ class MadeWith:
     run: str = ""
 
     @staticmethod
-    def of(scene: GaussianScene, model: object, initial: SimState, *, name: str = "rest", run: str = "") -> MadeWith:
-        """Hashes a scene, a method (its state dict if it is a torch module, else its type) and an initial state."""
+    def of(
+        scene: GaussianScene,
+        model: object,
+        initial: SimState,
+        *,
+        settings: str = "",
+        name: str = "rest",
+        run: str = "",
+    ) -> MadeWith:
+        """Hashes what the numbers of a simulation depend on.
+
+        Args:
+            scene: the rest scene.
+            model: the method: its state dict if it is a torch module, else its type.
+            initial: the initial state.
+            settings: of the method, whatever its state dict does not say.
+            name: of the initial state.
+            run: name of the run.
+        """
         masks = (scene.simulated, scene.pinned)
         gaussians = (scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh)
         numbers = dict(sorted(model.state_dict().items())) if isinstance(model, Module) else {}
         return MadeWith(
             scene.name,
             digest("scene", *gaussians, *masks),
-            digest(type(model).__name__, *numbers, *(v for v in numbers.values() if isinstance(v, Tensor))),
+            digest(type(model).__name__, settings, *numbers, *(v for v in numbers.values() if isinstance(v, Tensor))),
             digest("initial", initial.positions, initial.previous),
             name,
             run,
