@@ -116,7 +116,7 @@ def play(viewer: Viewer, page: Any, folder: Path, interaction: Interaction) -> N
 
 def test_page_is_dragged_reset_and_replayed(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
     interaction = make_interaction(keep=None)
-    subject = Subject("a column", interaction, interaction._masses, sessions=tmp_path / "sessions")
+    subject = Subject("a column", interaction, sessions=tmp_path / "sessions")
     with served(subject) as viewer, chromium(tmp_path) as page:
         play(viewer, page, tmp_path, interaction)
 
@@ -124,8 +124,7 @@ def test_page_is_dragged_reset_and_replayed(make_interaction: Callable[..., Inte
 @pytest.mark.slow
 def test_real_splats_are_dragged_reset_and_replayed(data_root: Path, tmp_path: Path) -> None:
     scene = load_scene(data_root / "splats" / "playbot_lod3.ply")
-    floor = float(scene.means[:, 1].quantile(0.75))
-    scene = apply_masks(scene, pinned=parse_half_space(f"y={floor}", above=True))
+    scene = apply_masks(scene, pinned=parse_half_space("y=-0.12", above=True))
     made = playable_scene(scene, fps=30.0, seed=0, keep=None)
     subject = subject_of(made, title="playbot", beside=None, up="-y", sessions=tmp_path / "sessions")
     with served(subject) as viewer, chromium(tmp_path) as page:

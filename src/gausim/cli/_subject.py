@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gausim.core import GaussianScene, SimState, Trajectory
+from gausim.cli._live import REST, energy_ceiling, open_interaction
+from gausim.core import ConfigError, GaussianScene, SimState, Trajectory
 
 if TYPE_CHECKING:
-    from jaxtyping import Float, Int
-    from torch import Tensor
-
     from gausim.cli._foresee import RunObject, TrainedPrediction
     from gausim.cli._run import LoadedRun
     from gausim.view.app import Subject
@@ -31,14 +29,12 @@ class Playable:
 
     Attributes:
         interaction: what is pushed.
-        masses: of the kernels.
         predict: what it foresees of the recorded sequences; None for a bare scene.
         item: the run's object; None for a bare scene.
         run: the run; None for a bare scene.
     """
 
     interaction: Interaction
-    masses: Float[Tensor, " K"]
     predict: TrainedPrediction | None = None
     item: RunObject | None = None
     run: LoadedRun | None = None
@@ -48,7 +44,7 @@ def playable_run(
     run: LoadedRun,
     *,
     name: str | None = None,
-    sequence: str = "rest",
+    sequence: str = REST,
     gravity: float | None = None,
     keep: int | None = 0,
 ) -> Playable:
@@ -66,11 +62,10 @@ def playable_run(
         ConfigError: the model cannot be simulated on its own.
     """
     from gausim.cli._foresee import TrainedPrediction, run_objects
-    from gausim.cli._live import open_interaction
 
     item = run_objects(run, [name] if name is not None else None)[0]
-    interaction = open_interaction(run, name=item.data.name, sequence=sequence, gravity=gravity, keep=keep)
-    return Playable(interaction, interaction.masses, TrainedPrediction(run, item), item, run)
+    interaction = open_interaction(run, name=name, sequence=sequence, gravity=gravity, keep=keep)
+    return Playable(interaction, TrainedPrediction(run, item), item, run)
 
 
 def playable_scene(
@@ -80,27 +75,28 @@ def playable_scene(
 
     Raises:
         SceneError: nothing is pinned.
+        ConfigError: the frame rate is not positive and finite.
     """
     import torch
 
     from gausim.cli._config import compose, instantiate
-    from gausim.cli._live import energy_ceiling
-    from gausim.engine.contracts import Hierarchical
     from gausim.ops.selection import require_pinned
     from gausim.view.interaction import STANDARD_GRAVITY, Interaction
     from gausim.view.session import MadeWith
 
+    if not (math.isfinite(fps) and fps > 0):
+        raise ConfigError(f"--fps {fps}: expected frames per second > 0.")
     require_pinned(scene)
     torch.manual_seed(seed)
     model = instantiate(compose(f"model/{BARE_MODEL}").model.simulator)(scenes=[scene], fps=[fps])
     dynamics, initial = model.dynamics(0), SimState(scene.means, scene.means)
     dynamics.energy_ceiling = energy_ceiling(model, 0, ())
-    units: Sequence[Int[Tensor, " K"]] = model.units_of_kernels(0) if isinstance(model, Hierarchical) else ()
+    made_with = MadeWith.of(scene, model, initial, settings=BARE_MODEL, run="untrained")
     interaction = Interaction(
-        scene, dynamics, dynamics.masses, initial, made_with=MadeWith.of(scene, model, initial, run="untrained"),
-        units=tuple(units), gravity=STANDARD_GRAVITY if gravity is None else gravity, keep=keep,
+        scene, dynamics, dynamics.masses, initial, made_with=made_with, units=tuple(model.units_of_kernels(0)),
+        gravity=STANDARD_GRAVITY if gravity is None else gravity, keep=keep,
     )  # fmt: skip
-    return Playable(interaction, dynamics.masses)
+    return Playable(interaction)
 
 
 def takes_of(made: Playable, beside: Playable | None, frames: int | None) -> list[Take]:
@@ -146,7 +142,7 @@ def subject_of(made: Playable, *, title: str, beside: Playable | None, up: str, 
         films = Films(records, made.interaction.scene, made.run.renderer)
         cameras = next(iter(records.values())).cameras
     return Subject(
-        title=title, interaction=made.interaction, masses=made.masses, takes=takes_of(made, beside, None),
+        title=title, interaction=made.interaction, takes=takes_of(made, beside, None),
         companion=None if beside is None else companion_of(beside, _name_of(beside)), films=films, cameras=cameras,
         up=up, sessions=sessions,
     )  # fmt: skip

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt32
-from torch import Tensor
+from jaxtyping import UInt32
 
 from gausim.core import Cameras
 from gausim.view.coloring import VIEW, Legend, Painter, highlighted
@@ -40,7 +39,6 @@ class Subject:
     Attributes:
         title: one line for the page.
         interaction: what is simulated.
-        masses: of the kernels.
         takes: recordings that can be played.
         companion: another method beside it, or None.
         films: the recorded videos, or None.
@@ -51,7 +49,6 @@ class Subject:
 
     title: str
     interaction: Interaction
-    masses: Float[Tensor, " K"]
     takes: Sequence[Take] = ()
     companion: Companion | None = None
     films: Films | None = None
@@ -89,7 +86,7 @@ class Viewer:
         scene = subject.interaction.scene
         self.server = GuardedServer(door, label="gausim")
         self.placing = Placing.of(scene)
-        self._painter = Painter(scene, subject.interaction.units, subject.masses)
+        self._painter = Painter(scene, subject.interaction.units, subject.interaction.masses)
         self._companion = subject.companion
         self._painted: Latest[_Painted] = Latest()
         self._simulated: Latest[Shown] = Latest()
@@ -99,7 +96,7 @@ class Viewer:
         )  # fmt: skip
         self.server.scene.set_up_direction(f"{'' if subject.up.startswith('-') else '+'}{subject.up}")  # type: ignore[arg-type]
         self.server.scene.world_axes.visible = False
-        self.hands = Hands(self.server, self.live, self.placing, subject.interaction.units, subject.masses)
+        self.hands = Hands(self.server, self.live, self.placing, subject.interaction.units, subject.interaction.masses)
         self.page = Page(
             self.server, self.live, self.hands, modes=self._painter.modes, title=subject.title,
             down=f"+{subject.up[1:]}" if subject.up.startswith("-") else f"-{subject.up}", sessions=subject.sessions,
@@ -127,7 +124,7 @@ class Viewer:
         self._other_placing = Placing(
             self.placing.centre, self.placing.scale, (float(offset[0]), float(offset[1]), float(offset[2]))
         )
-        self._other_painter = Painter(other.scene, other.units, subject.masses.new_ones(other.scene.count))
+        self._other_painter = Painter(other.scene, other.units, other.masses)
         self.server.scene.add_label(
             "/name_beside", subject.companion.name, position=tuple(offset + SIZE * 0.6 * self.sights.up)
         )

@@ -196,7 +196,7 @@ class Interaction:
 
     @property
     def masses(self) -> Float[Tensor, " K"]:
-        """Of the kernels, up to a common factor."""
+        """Masses of the kernels, up to a common factor."""
         return self._masses
 
     @property
