@@ -1,6 +1,7 @@
 """gausim: learn, compare and play with neural simulators of elastic objects made of 3D Gaussians.
 
-``gausim.load_run(RUN)`` gives a trained run back: model, scenes, data, renderer (:class:`gausim.cli._run.LoadedRun`).
+``gausim.load(RUN)`` gives a learned object that can be pushed, watched and drawn (:class:`gausim.api.Simulation`);
+``gausim.load_run(RUN)`` a trained run: model, scenes, data, renderer (:class:`gausim.cli._run.LoadedRun`).
 """
 
 from importlib import import_module
@@ -8,9 +9,11 @@ from typing import Any
 
 __version__ = "0.1.0"
 
+_LATE = {"load": "gausim.api", "load_run": "gausim.cli._run"}
+
 
 def __getattr__(name: str) -> Any:
-    """``load_run``, imported when it is first asked for: it needs torch, which ``import gausim`` does not wait for."""
-    if name == "load_run":
-        return import_module("gausim.cli._run").load_run
+    """Imported when first asked for: they need torch, which ``import gausim`` does not wait for."""
+    if name in _LATE:
+        return getattr(import_module(_LATE[name]), name)
     raise AttributeError(f"module 'gausim' has no attribute {name!r}")

@@ -8,6 +8,7 @@ from functools import partial
 import torch
 
 from gausim.core import GaussianScene, SimState
+from gausim.models.dynamics import SceneDynamics
 from gausim.models.elastic import ElasticTemplate
 from gausim.models.passive import EnergyGuard
 from gausim.models.simulator import GausSim, Step
@@ -107,3 +108,30 @@ def test_a_template_without_energy_has_no_guard(make_scene: MakeScene, make_mode
     moved = model.dynamics().rollout(SimState(scene.means, scene.means), 3)
     model.passive_frames = 0
     assert torch.equal(moved.positions, model.dynamics().rollout(SimState(scene.means, scene.means), 3).positions)
+
+
+def test_a_ceiling_bounds_what_forces_do(make_scene: MakeScene, make_model: MakeModel) -> None:
+    """A steady force that takes the explicit springs beyond their stability throws the object away without it."""
+    scene = make_scene()
+    model = _model(make_model, scene, scale=0.002)
+    still = SimState(scene.means, scene.means)
+    push = 60.0 * model.dynamics().masses[:, None] * torch.tensor([0.3, 1.0, 0.2])
+    small = model.dynamics().rollout(still, 6, forces=lambda n: 0.2 * push if n < 2 else None)
+    ceiling = max(_energies(model, small.positions))
+
+    def pushed(energy_ceiling: float | None) -> torch.Tensor:
+        return (
+            SceneDynamics(model, 0, energy_ceiling=energy_ceiling).rollout(still, 80, forces=lambda _: push).positions
+        )
+
+    free, bound = pushed(None), pushed(ceiling)
+    assert max(_energies(model, free)) > 20 * ceiling
+    found = _energies(model, bound)
+    assert max(found) <= ceiling * (1 + 1e-4) and max(found) > 0.2 * ceiling
+    pinned = scene.pinned | ~scene.simulated
+    assert torch.equal(bound[:, pinned], scene.means[pinned].expand(81, -1, -1))
+    assert torch.equal(pushed(1e9), free)
+    gentle = SceneDynamics(model, 0, energy_ceiling=2 * ceiling).rollout(
+        still, 6, forces=lambda n: 0.2 * push if n < 2 else None
+    )
+    assert torch.equal(gentle.positions, small.positions)

@@ -14,7 +14,7 @@ GOOD, NAN, INF = (torch.full((4, 3), x) for x in (1.0, float("nan"), float("inf"
 
 def watched(interval: int, positions: dict[int, torch.Tensor], forces: dict[int, torch.Tensor]) -> int:
     """A rollout of 10 steps as the simulator's; returns how many steps were computed."""
-    w = Watch("cup", 10, torch.device("cpu"))
+    w = Watch("cup", torch.device("cpu"))
     w.interval = interval
     w.positions(0, GOOD, positions.get(0, GOOD))
     for n in range(10):
@@ -56,6 +56,27 @@ def test_asks_at_its_interval(interval: int, steps: int) -> None:
         watched(interval, {4: NAN}, {})
 
 
+@pytest.mark.parametrize("bad", [None, 299, 300])
+@pytest.mark.parametrize("interval", [1, 64])
+def test_long_rollouts_need_no_more_room(interval: int, bad: int | None) -> None:
+    w = Watch("cup", torch.device("cpu"))
+    w.interval = interval
+    rows = w._notes.shape
+
+    def run() -> None:
+        for n in range(301):
+            w.positions(n, NAN if n == bad else GOOD)
+            w.ask(n)
+        w.ask(300, now=True)
+
+    if bad is None:
+        run()
+    else:
+        with pytest.raises(DivergenceError, match=f"frame {bad}"):
+            run()
+    assert w._notes.shape == rows
+
+
 def test_on_the_cpu_every_frame_is_looked_at() -> None:
-    assert Watch("cup", 1, torch.device("cpu")).interval == 1
+    assert Watch("cup", torch.device("cpu")).interval == 1
     assert watch.INTERVAL > 1

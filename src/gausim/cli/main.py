@@ -42,6 +42,10 @@ COMMANDS: dict[str, Command] = {
         "Measure the speed of rendering, stepping, training and clustering as ratios within one run.",
     ),
     "simulate": Command("gausim.cli.simulate", "Roll a run forward and write videos, figures and trajectories."),
+    "view": Command("gausim.cli.view", "Show a run or a scene in the browser and pull it about."),
+    "export": Command(
+        "gausim.cli.export", "Write a motion as PLY, OpenUSD, safetensors, viser, HTML, MP4 or GIF, and read it back."
+    ),
     "report": Command("gausim.cli.report", "Compare runs and sweeps: one HTML page, Markdown, LaTeX and CSV."),
 }
 

@@ -35,12 +35,17 @@ def main(argv: list[str]) -> int:
         DataError: an object, sequence or view that is not there.
         DivergenceError: the prediction left the finite numbers.
     """
+    from gausim.cli._force_words import has_forces
+    from gausim.core.errors import ConfigError
+
     parser = _parser()
     arguments = parser.parse_args(argv)
     if (arguments.run is None) == (arguments.scene is None):
         parser.error("expected either a RUN or --scene SCENE.ply")
     parse_background(arguments.background)  # refuses a wrong one before the long work
     if arguments.scene is not None:
+        if arguments.session or has_forces(arguments):
+            raise ConfigError("--scene: forces act on a RUN only. Leave --scene out, or the forces.")
         from gausim.cli._simulate_scene import simulate_scene
 
         return simulate_scene(arguments)
@@ -49,6 +54,10 @@ def main(argv: list[str]) -> int:
 
     run = load_run(arguments.run)
     state_of(run)
+    if arguments.session or has_forces(arguments):
+        from gausim.cli._simulate_forces import simulate_forces
+
+        return simulate_forces(run, arguments)
     folder = Path(arguments.out) if arguments.out else Path(run.run_dir) / "simulation"
     for item in run_objects(run, arguments.object):
         _simulate_object(run, item, arguments, folder / item.data.name)
@@ -56,12 +65,16 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from gausim.cli._force_words import EPILOG, add_force_options
     from gausim.cli.inspect import add_pin_options
 
     parser = argparse.ArgumentParser(
         prog="gausim simulate",
-        description=f"{HELP} Per sequence: trajectory.safetensors, errors.png, and per view an MP4 (ground truth | "
-        "prediction | error), space-time slices and a contact sheet.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=f"{HELP}\nPer sequence: trajectory.safetensors, errors.png, and per view an MP4 (ground truth |\n"
+        "prediction | error), space-time slices and a contact sheet. With forces or a session:\n"
+        "trajectory.safetensors, session.json, and per view an MP4 with the forces drawn, and a sheet.",
+        epilog=EPILOG,
     )
     add = parser.add_argument
     add("run", metavar="RUN", type=Path, nargs="?", help="run directory of `gausim train`")
@@ -74,6 +87,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--brighten", type=float, default=1.0, metavar="GAIN", help="gain of the pictures; numbers are never touched")
     add("--slow", type=float, default=1.0, metavar="FACTOR", help="slow motion of the videos, e.g. 3")
     add("--gif", action="store_true", help="write GIFs besides")
+    add_force_options(parser)
     bare = parser.add_argument_group("a scene without a run")
     bare.add_argument("--scene", type=Path, metavar="SCENE.ply", help="simulate this scene instead of a run")
     bare.add_argument("--random-weights", action="store_true", help="with an untrained network (needed with --scene)")

@@ -3,7 +3,17 @@
 from gausim.core.camera import Cameras
 from gausim.core.errors import BusyError, ConfigError, DataError, DivergenceError, GausSimError, RunError, SceneError
 from gausim.core.fitted import FittedDynamics, FittedMethod, FittedState, TakesOver
-from gausim.core.protocols import Dynamics, Forces, Rendered, Renderer
+from gausim.core.protocols import (
+    Dynamics,
+    Forces,
+    Rendered,
+    Renderer,
+    Steppable,
+    SteppedFrame,
+    Stepper,
+    roll_out,
+    trajectory_of,
+)
 from gausim.core.scene import GaussianScene
 from gausim.core.state import SimState, Trajectory
 
@@ -25,6 +35,11 @@ __all__ = [
     "RunError",
     "SceneError",
     "SimState",
+    "Steppable",
+    "SteppedFrame",
+    "Stepper",
     "TakesOver",
     "Trajectory",
+    "roll_out",
+    "trajectory_of",
 ]

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from gausim.core.errors import ConfigError, DivergenceError
-from gausim.core.protocols import Forces
+from gausim.core.protocols import Forces, SteppedFrame, roll_out
 from gausim.core.scene import GaussianScene
 from gausim.core.state import SimState, Trajectory
 
@@ -127,22 +127,60 @@ class FittedDynamics:
             DivergenceError: the prediction left the finite numbers; names the frame.
         """
         if forces is not None:
-            raise ConfigError(f"{self.method.name}: takes no forces. Simulate without them, or with a model that does.")
-        scene_id = self.method.scene_of_sequence[self.sequence_id]
-        state = self.method.begin(self.sequence_id)
-        states = [replace(state, positions=initial.positions.to(state.positions))]
-        for _ in range(steps):
-            state = self.method.advance(state)
-            if not bool(torch.isfinite(state.positions).all()):
-                raise DivergenceError(
-                    f"{self.method.name}: the prediction of '{self.method.scenes[scene_id].name}' is not finite at "
-                    f"frame {state.frame}. Fit it again with smaller rates (model.plan.stages.STAGE.rates)."
-                )
-            states.append(state)
-        return Trajectory(
-            torch.stack([s.positions for s in states]),
-            torch.stack([s.gradients for s in states]),
-            torch.stack([s.rotations for s in states]),
-            self.method.unit_of_kernel(scene_id),
-            self.method.fps[scene_id],
-        )
+            raise ConfigError(no_forces(self.method))
+        return roll_out(self.stepper(initial), steps)
+
+    def stepper(self, initial: SimState) -> FittedStepper:
+        """Begins at frame 0; only the positions of ``initial`` count."""
+        return FittedStepper(self.method, self.sequence_id, initial)
+
+
+class FittedStepper:
+    """A fitted method frame by frame: :class:`gausim.core.Stepper` that takes no forces.
+
+    Attributes:
+        state: the two latest positions.
+        frame: the latest frame.
+        unit_of_kernel: the unit of each kernel.
+        fps: frames per second.
+        takes_forces: False.
+    """
+
+    takes_forces: bool = False
+
+    def __init__(self, method: FittedMethod, sequence_id: int, initial: SimState) -> None:
+        """Begins ``method``'s sequence ``sequence_id`` at the positions of ``initial``."""
+        self._method, self._scene_id = method, method.scene_of_sequence[sequence_id]
+        self._inner = method.begin(sequence_id)
+        positions = initial.positions.to(self._inner.positions)
+        self.state = SimState(positions, positions)
+        self.frame = SteppedFrame(positions, self._inner.gradients, self._inner.rotations)
+        self.unit_of_kernel: Int[Tensor, " K"] = method.unit_of_kernel(self._scene_id)
+        self.fps: float = method.fps[self._scene_id]
+
+    def step(self, force: Tensor | None = None, *, held: Tensor | None = None) -> SteppedFrame:
+        """The next frame.
+
+        Raises:
+            ConfigError: a force or held kernels are given.
+            DivergenceError: the prediction left the finite numbers; names the frame.
+        """
+        if force is not None or held is not None:
+            raise ConfigError(no_forces(self._method))
+        self._inner = made = self._method.advance(self._inner)
+        if not bool(torch.isfinite(made.positions).all()):
+            raise DivergenceError(
+                f"{self._method.name}: the prediction of '{self._method.scenes[self._scene_id].name}' is not finite at "
+                f"frame {made.frame}. Fit it again with smaller rates (model.plan.stages.STAGE.rates)."
+            )
+        self.state = SimState(made.positions, self.state.positions)
+        self.frame = SteppedFrame(made.positions, made.gradients, made.rotations)
+        return self.frame
+
+    def settle(self) -> None:
+        """Nothing: every step says at once what is wrong."""
+
+
+def no_forces(method: FittedMethod) -> str:
+    """Why a fitted method cannot be pushed, in words."""
+    return f"{method.name}: takes no forces. Simulate without them, or with a model that does."

@@ -1,12 +1,13 @@
-"""The two contracts between rooms: what a method of dynamics offers and what a renderer offers."""
+"""The contracts between rooms: what a method of dynamics offers, also frame by frame, and what a renderer offers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from jaxtyping import Float
+import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core.state import SimState, Trajectory
@@ -23,6 +24,99 @@ class Dynamics(Protocol):
     def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
         """Predicts ``steps`` frames after ``initial``; the result has steps + 1 frames, the initial one first."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class SteppedFrame:
+    """One frame of a scene, as a :class:`gausim.core.Trajectory` holds many.
+
+    Attributes:
+        positions: kernel means [scene units].
+        gradients: accumulated deformation gradients of the N units that carry kernels.
+        rotations: their rotations.
+    """
+
+    positions: Float[Tensor, "K 3"]
+    gradients: Float[Tensor, "N 3 3"]
+    rotations: Float[Tensor, "N 3 3"]
+
+
+@runtime_checkable
+class Stepper(Protocol):
+    """Dynamics that go on frame by frame, so that what pushes can depend on what is seen."""
+
+    @property
+    def state(self) -> SimState:
+        """The two latest positions of all kernels."""
+        ...
+
+    @property
+    def frame(self) -> SteppedFrame:
+        """The latest frame; before the first step the initial one."""
+        ...
+
+    @property
+    def unit_of_kernel(self) -> Int[Tensor, " K"]:
+        """The unit of each kernel, a row of the frames' gradients and rotations."""
+        ...
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        ...
+
+    @property
+    def takes_forces(self) -> bool:
+        """Whether :meth:`step` may be given a force and held kernels."""
+        ...
+
+    def step(
+        self, force: Float[Tensor, "K 3"] | None = None, *, held: Bool[Tensor, " K"] | None = None
+    ) -> SteppedFrame:
+        """The next frame.
+
+        Args:
+            force: per kernel [mass * scene units / s^2].
+            held: kernels that stay where they are during this step, beside those that the scene pins.
+
+        Raises:
+            ConfigError: a force or held kernels, which this method does not take.
+            DivergenceError: a position or force is not finite; some methods say so only some frames later.
+        """
+        ...
+
+    def settle(self) -> None:
+        """Raises what is still unsaid: a DivergenceError if any frame so far is not finite."""
+        ...
+
+
+@runtime_checkable
+class Steppable(Dynamics, Protocol):
+    """Dynamics that can be stepped; their rollout makes the same steps, bit for bit."""
+
+    def stepper(self, initial: SimState) -> Stepper:
+        """Begins at a state, whose frame has identity gradients."""
+        ...
+
+
+def roll_out(stepper: Stepper, steps: int, forces: Forces | None = None) -> Trajectory:
+    """Makes ``steps`` steps; the result has steps + 1 frames, the stepper's present one first."""
+    frames = [stepper.frame]
+    for number in range(steps):
+        frames.append(stepper.step(forces(number) if forces is not None else None))
+    stepper.settle()
+    return trajectory_of(frames, stepper)
+
+
+def trajectory_of(frames: Sequence[SteppedFrame], stepper: Stepper) -> Trajectory:
+    """Frames of a stepper as one trajectory."""
+    return Trajectory(
+        torch.stack([f.positions for f in frames]),
+        torch.stack([f.gradients for f in frames]),
+        torch.stack([f.rotations for f in frames]),
+        stepper.unit_of_kernel,
+        stepper.fps,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,8 +113,14 @@ def load_points(path: Path | str) -> np.ndarray:
     return np.stack([_finite_column(path, table, n) for n in ("x", "y", "z")], axis=-1)
 
 
-def save_scene(scene: GaussianScene, path: Path | str) -> None:
-    """Writes the scene as little-endian float32 PLY in INRIA order, and its masks next to it; replaces atomically."""
+def save_scene(scene: GaussianScene, path: Path | str, *, masks: bool = True) -> None:
+    """Writes the scene as little-endian float32 PLY in INRIA order, and its masks next to it; replaces atomically.
+
+    Args:
+        scene: what to write.
+        path: the PLY file.
+        masks: write ``<stem>.masks.npz``, too.
+    """
     path = Path(path)
     rest_count = 3 * (scene.sh.shape[1] - 1)
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -129,7 +135,8 @@ def save_scene(scene: GaussianScene, path: Path | str) -> None:
     header += [f"property float {n}" for n in names] + ["end_header", ""]
     with replacing(path) as temporary:
         temporary.write_bytes("\n".join(header).encode("ascii") + body.tobytes())
-        save_masks(scene, masks_path(path))
+        if masks:
+            save_masks(scene, masks_path(path))
 
 
 def save_masks(scene: GaussianScene, path: Path | str) -> None:

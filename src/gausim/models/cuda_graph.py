@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import ConfigError, SimState
+from gausim.core import ConfigError, SimState, SteppedFrame
 
 WARM_UP = 3  # steps before a capture: lazy initialisation and autotuning must be over (PyTorch's notes on CUDA graphs)
 
@@ -33,21 +32,6 @@ class Predicted(Protocol):
 
 
 StepFunction = Callable[[SimState, Tensor | None], Predicted]
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One predicted frame.
-
-    Attributes:
-        positions: x_{t+1} of all kernels [scene units].
-        gradients: accumulated deformation gradients of the units.
-        rotations: their rotations.
-    """
-
-    positions: Float[Tensor, "K 3"]
-    gradients: Float[Tensor, "N 3 3"]
-    rotations: Float[Tensor, "N 3 3"]
 
 
 class GraphedStep:
@@ -77,10 +61,10 @@ class GraphedStep:
         self._step, self._capture = step, capture
         self._state = SimState(torch.zeros_like(rest), torch.zeros_like(rest))
         self._force = torch.zeros_like(rest)
-        self._graphs: dict[bool, tuple[torch.cuda.CUDAGraph, Frame]] = {}
+        self._graphs: dict[bool, tuple[torch.cuda.CUDAGraph, SteppedFrame]] = {}
 
     @torch.no_grad()
-    def __call__(self, state: SimState, force: Float[Tensor, "K 3"] | None = None) -> Frame:
+    def __call__(self, state: SimState, force: Float[Tensor, "K 3"] | None = None) -> SteppedFrame:
         """Predicts the next frame; the result is a copy of its own.
 
         Args:
@@ -103,12 +87,12 @@ class GraphedStep:
         graph.replay()
         return _copy(result)
 
-    def _compute(self, pushed: bool) -> Frame:
+    def _compute(self, pushed: bool) -> SteppedFrame:
         """What is captured."""
         made = self._step(self._state, self._force if pushed else None)
-        return Frame(made.positions, made.gradients, made.rotations)
+        return SteppedFrame(made.positions, made.gradients, made.rotations)
 
-    def _record(self, pushed: bool) -> tuple[torch.cuda.CUDAGraph, Frame]:
+    def _record(self, pushed: bool) -> tuple[torch.cuda.CUDAGraph, SteppedFrame]:
         device = self._force.device
         aside = torch.cuda.Stream(device)
         aside.wait_stream(torch.cuda.current_stream(device))
@@ -129,5 +113,5 @@ class GraphedStep:
         return graph, result
 
 
-def _copy(frame: Frame) -> Frame:
-    return Frame(frame.positions.clone(), frame.gradients.clone(), frame.rotations.clone())
+def _copy(frame: SteppedFrame) -> SteppedFrame:
+    return SteppedFrame(frame.positions.clone(), frame.gradients.clone(), frame.rotations.clone())

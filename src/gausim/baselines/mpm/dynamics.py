@@ -16,7 +16,7 @@ from gausim.baselines.mpm.filling import Filling, fill_interior
 from gausim.baselines.mpm.mapping import SceneMapping
 from gausim.baselines.mpm.particles import Particles, ParticleState
 from gausim.baselines.mpm.solver import MPMSolver
-from gausim.core import Forces, GaussianScene, SimState, Trajectory
+from gausim.core import ConfigError, Forces, GaussianScene, SimState, SteppedFrame, Trajectory, roll_out
 from gausim.ops.covariance import covariance_from_scales, kernel_volumes
 from gausim.ops.deformation import determinant, polar_rotation
 
@@ -143,15 +143,11 @@ class MPMDynamics:
             ConfigError: the configured number of substeps violates the bound of the time step.
             DivergenceError: a particle left the domain or is not finite.
         """
-        state = self.start(initial)
-        identity = torch.eye(3).to(initial.positions).expand(len(self._index) + 1, 3, 3)
-        positions, gradients = [initial.positions], [identity]
-        for number in range(steps):
-            state = self.advance(state, number, forces(number) if forces is not None else None)
-            positions.append(self.kernel_positions(state, initial))
-            gradients.append(self.unit_gradients(state))
-        stacked = torch.stack(gradients)
-        return Trajectory(torch.stack(positions), stacked, rotations(stacked), self.unit_of_kernel, self.fps)
+        return roll_out(self.stepper(initial), steps, forces)
+
+    def stepper(self, initial: SimState) -> MPMStepper:
+        """Begins at a state; every step is one of :meth:`rollout`."""
+        return MPMStepper(self, initial)
 
     def kernel_positions(self, state: ParticleState, initial: SimState) -> Float[Tensor, "K 3"]:
         """Positions of all kernels of the scene; what is not simulated or is pinned stays [scene units]."""
@@ -176,6 +172,51 @@ class MPMDynamics:
         other = copy.copy(self)
         other.young_modulus = torch.cat((young_modulus, young_modulus[self._follow.kernels[:, 0]]))
         return other
+
+
+class MPMStepper:
+    """The material points of one scene, frame by frame: :class:`gausim.core.Stepper`.
+
+    Attributes:
+        state: the two latest positions of all kernels [scene units].
+        frame: the latest frame.
+        unit_of_kernel: the unit of each kernel.
+        fps: frames per second.
+        takes_forces: True; no kernels can be held beside those that the scene pins.
+    """
+
+    takes_forces: bool = True
+
+    def __init__(self, dynamics: MPMDynamics, initial: SimState) -> None:
+        """Begins at ``initial``."""
+        self._dynamics, self._initial, self._number = dynamics, initial, 0
+        self._particles = dynamics.start(initial)
+        unit_of_kernel = dynamics.unit_of_kernel
+        identity = torch.eye(3).to(initial.positions).expand(len(dynamics._index) + 1, 3, 3)
+        self.state, self.frame = initial, SteppedFrame(initial.positions, identity, identity)
+        self.unit_of_kernel: Int[Tensor, " K"] = unit_of_kernel
+        self.fps: float = dynamics.fps
+
+    @torch.no_grad()
+    def step(self, force: Float[Tensor, "K 3"] | None = None, *, held: Tensor | None = None) -> SteppedFrame:
+        """The next frame.
+
+        Raises:
+            ConfigError: kernels to hold, or the configured number of substeps violates the bound of the time step.
+            DivergenceError: a particle left the domain or is not finite.
+        """
+        if held is not None and bool(held.any()):
+            raise ConfigError("the material point method holds no more kernels than the scene pins. Unpin the others.")
+        self._particles = self._dynamics.advance(self._particles, self._number, force)
+        self._number += 1
+        positions = self._dynamics.kernel_positions(self._particles, self._initial)
+        gradients = self._dynamics.unit_gradients(self._particles)
+        self.state = SimState(positions, self.state.positions)
+        self.frame = SteppedFrame(positions, gradients, rotations(gradients))
+        return self.frame
+
+    def settle(self) -> None:
+        """Nothing: every step says at once what is wrong."""
 
 
 def rotations(gradients: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:

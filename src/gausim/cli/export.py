@@ -1,0 +1,357 @@
+"""`gausim export`: a motion as files for other programs, and from their files back."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gausim.core.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from gausim.cli._run import LoadedRun
+    from gausim.core import Cameras, GaussianScene, Renderer, Trajectory
+
+HELP = "Write a motion as PLY, OpenUSD, safetensors, viser, HTML, MP4 or GIF, and read it back."
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of file.
+
+    Attributes:
+        suffix: of the file; empty for a folder.
+        keeps: what of a motion is in it.
+        loses: what is not.
+        reader: what reads it here; empty: nothing.
+    """
+
+    suffix: str
+    keeps: str
+    loses: str
+    reader: str = ""
+
+
+FORMATS: dict[str, Format] = {
+    "safetensors": Format(
+        ".safetensors",
+        "every number of the trajectory, bit for bit: positions, gradients and rotations per unit",
+        "the rest scene (keep SCENE.ply beside it)",
+        "gausim (--scene SCENE.ply), any safetensors reader",
+    ),
+    "ply": Format(
+        "",
+        "one 3DGS PLY per frame, name_0001.ply as SuperSplat's timeline plays; covariances as axes and lengths, turned "
+        "spherical harmonics, masks of the first frame",
+        "which unit a kernel belongs to; gradients",
+        "gausim, SuperSplat, every 3DGS viewer",
+    ),
+    "usd": Format(
+        ".usdc",
+        "one ParticleField3DGaussianSplat with time samples: positions, orientations, scales, opacities, turned "
+        "spherical harmonics, float32",
+        "masks, units, gradients",
+        "gausim, OpenUSD 26.3 or newer",
+    ),
+    "viser": Format(
+        ".viser",
+        "positions, covariances (float16), one colour per kernel and frame",
+        "spherical harmonics, masks, units",
+    ),
+    "html": Format(
+        ".html",
+        "as viser, in one page that plays in a browser without a network",
+        "spherical harmonics, masks, units",
+    ),
+    "mp4": Format(".mp4", "pictures of one camera", "everything else"),
+    "gif": Format(".gif", "pictures of one camera, 256 colours, whole hundredths of a second", "everything else"),
+}
+# What is made from a scene and a trajectory, not from scenes of single frames.
+_FROM_TRAJECTORY = ("safetensors", "viser", "html")
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What is exported.
+
+    Attributes:
+        name: of its files.
+        fps: frames per second.
+        frames: their number.
+        scenes: makes the deformed scenes, one at a time.
+        first: the first of them, or the rest scene.
+        trajectory: the same as a trajectory, where it came as one.
+        cameras: of the data set, where there is one.
+        renderer: of the run, where there is one.
+    """
+
+    name: str
+    fps: float
+    frames: int
+    scenes: Callable[[], Iterator[GaussianScene]]
+    first: GaussianScene
+    trajectory: Trajectory | None = None
+    cameras: Cameras | None = None
+    renderer: Renderer | None = None
+
+
+def main(argv: list[str]) -> int:
+    """Runs the command.
+
+    Args:
+        argv: the arguments after the command's name.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        ConfigError: arguments that do not go together, or an extra that is not installed.
+        RunError: the run is missing or has no checkpoint.
+        DataError: a source that is missing or broken.
+        SceneError: a scene that is missing or broken.
+        DivergenceError: the prediction left the finite numbers.
+    """
+    arguments = _parser().parse_args(argv)
+    motion = _opened(arguments)
+    if arguments.every != 1:
+        motion = _thinned(motion, arguments.every)
+    form = FORMATS[arguments.format]
+    path = Path(arguments.out) if arguments.out else Path(f"{motion.name}{form.suffix}")
+    if arguments.format in _FROM_TRAJECTORY and motion.trajectory is None:
+        raise ConfigError(
+            f"--format {arguments.format}: {arguments.source} holds frames without units, which make no trajectory. "
+            "Export from a run or a trajectory, or as ply, usd, mp4 or gif."
+        )
+    count = _WRITERS[arguments.format](motion, path, arguments)
+    print(f"wrote {path}: {count} frames of {motion.first.count} kernels at {motion.fps:g} frames per second")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    width = max(map(len, FORMATS))
+    rows = []
+    for name, form in FORMATS.items():
+        rows += [f"  {name:<{width}}  keeps  {form.keeps}", f"  {'':<{width}}  loses  {form.loses}"]
+        rows += [f"  {'':<{width}}  read by {form.reader}"] if form.reader else []
+    parser = argparse.ArgumentParser(
+        prog="gausim export",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        description=HELP,
+        epilog="formats:\n" + "\n".join(rows),
+    )
+    add = parser.add_argument
+    add("source", metavar="SOURCE", type=Path, help="a RUN; a trajectory.safetensors (with --scene); a folder of "
+        "name_0001.ply, ...; or a .usd, .usda, .usdc file")  # fmt: skip
+    add("--format", required=True, choices=list(FORMATS), help="what to write, see below")
+    add("--out", metavar="PATH", help="file to write (a folder for ply); default NAME.SUFFIX here")
+    add("--scene", type=Path, metavar="SCENE.ply", help="the rest scene of a trajectory")
+    add("--object", metavar="NAME", help="of a run; default its first")
+    add("--sequence", metavar="NAME", help="of a run; default its first")
+    add("--frames", type=_positive, metavar="N", help="frames to predict; default as many as were recorded")
+    add("--every", type=_positive, default=1, metavar="N", help="take every so many frames")
+    add("--fps", type=float, help="of a folder of PLY files that does not say it")
+    add("--up", default="z", choices=("y", "z"), help="vertical axis (default: z)")
+    pictures = parser.add_argument_group("mp4 and gif")
+    pictures.add_argument("--view", metavar="NAME", help="camera of the run's data set")
+    pictures.add_argument("--azimuth", type=float, default=30.0, metavar="DEGREE", help="of a camera about the "
+                          "vertical, where no --view is named (default: 30)")  # fmt: skip
+    pictures.add_argument("--size", type=_positive, default=480, metavar="PIXELS", help="height and width (480)")
+    pictures.add_argument("--background", default="black", metavar="COLOR", help="black, white or R,G,B in 0..1")
+    return parser
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected a positive number, got {text}")
+    return value
+
+
+# -------------------------------------------------------------------------------------------------------- sources
+
+
+def _opened(arguments: argparse.Namespace) -> Motion:
+    from gausim.io.usd import SUFFIXES
+
+    source: Path = arguments.source
+    if source.suffix in SUFFIXES:
+        return _from_usd(source)
+    if source.is_dir() and not (source / "config.yaml").is_file():
+        return _from_ply(source, arguments.fps)
+    if source.suffix == ".safetensors":
+        return _from_trajectory(source, arguments.scene)
+    return _from_run(arguments)
+
+
+def _from_usd(source: Path) -> Motion:
+    from gausim.io.usd import load_usd
+
+    clip = load_usd(source)
+    return Motion(source.stem, clip.fps, clip.frames, clip.scenes, next(clip.scenes()))
+
+
+def _from_ply(source: Path, fps: float | None) -> Motion:
+    from gausim.io.ply_sequence import load_ply_sequence
+
+    scenes, count, rate = load_ply_sequence(source, fps=fps)
+    return Motion(source.name, rate, count, lambda: load_ply_sequence(source, fps=fps)[0], next(scenes))
+
+
+def _from_trajectory(source: Path, scene_path: Path | None) -> Motion:
+    from gausim.io.ply import load_scene
+    from gausim.io.trajectory import load_trajectory
+
+    if scene_path is None:
+        raise ConfigError(f"{source}: a trajectory has no appearance; name its rest scene with --scene SCENE.ply.")
+    trajectory, scene = load_trajectory(source), load_scene(scene_path)
+    if trajectory.positions.shape[1] != scene.count:
+        raise DataError(f"{source}: has {trajectory.positions.shape[1]} kernels, but {scene_path} has {scene.count}.")
+    return _of_trajectory(source.stem, scene, trajectory)
+
+
+def _from_run(arguments: argparse.Namespace) -> Motion:
+    from gausim.cli._foresee import TrainedPrediction, head, run_objects, scene_of, state_of
+    from gausim.cli._run import load_run
+
+    run: LoadedRun = load_run(arguments.source)
+    state_of(run)
+    item = run_objects(run, None if arguments.object is None else [arguments.object])[0]
+    records = {record.name: record for record in item.data.sequences}
+    name = arguments.sequence or next(iter(records))
+    if name not in records:
+        raise DataError(f"{item.data.root}: has no sequence '{name}'; it has {list(records)}.")
+    predict = TrainedPrediction(run, item, frames=arguments.frames or 0)
+    trajectory = head(predict.full(records[name]), arguments.frames or records[name].count)
+    cameras = records[name].cameras
+    return _of_trajectory(
+        f"{item.data.name}_{name}", scene_of(run, item), trajectory, cameras=cameras, renderer=run.renderer
+    )
+
+
+def _of_trajectory(
+    name: str,
+    scene: GaussianScene,
+    trajectory: Trajectory,
+    *,
+    cameras: Cameras | None = None,
+    renderer: Renderer | None = None,
+) -> Motion:
+    from gausim.ops.deformed_scene import deformed_scene
+
+    def scenes() -> Iterator[GaussianScene]:
+        for state in zip(trajectory.positions, trajectory.gradients, trajectory.rotations, strict=True):
+            yield deformed_scene(scene, *state, trajectory.unit_of_kernel)
+
+    return Motion(name, trajectory.fps, trajectory.frames, scenes, scene, trajectory, cameras, renderer)
+
+
+def _thinned(motion: Motion, every: int) -> Motion:
+    from dataclasses import replace
+    from itertools import islice
+
+    trajectory = motion.trajectory
+    if trajectory is not None:
+        trajectory = replace(
+            trajectory,
+            positions=trajectory.positions[::every],
+            gradients=trajectory.gradients[::every],
+            rotations=trajectory.rotations[::every],
+            fps=trajectory.fps / every,
+        )
+    return replace(
+        motion,
+        fps=motion.fps / every,
+        frames=len(range(0, motion.frames, every)),
+        scenes=lambda: islice(motion.scenes(), 0, None, every),
+        trajectory=trajectory,
+    )
+
+
+# -------------------------------------------------------------------------------------------------------- writers
+
+
+def _write_safetensors(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
+    from gausim.io.trajectory import save_trajectory
+
+    assert motion.trajectory is not None
+    save_trajectory(path, motion.trajectory, facts={"object": motion.first.name})
+    return motion.frames
+
+
+def _write_ply(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
+    from gausim.io.ply_sequence import save_ply_sequence
+
+    return len(save_ply_sequence(path, motion.name, motion.scenes(), motion.fps))
+
+
+def _write_usd(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
+    from gausim.io.usd import save_usd
+
+    return save_usd(path, motion.scenes(), motion.fps, up=arguments.up)
+
+
+def _write_recording(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
+    from gausim.view.recording import record
+
+    assert motion.trajectory is not None
+    record(motion.first, motion.trajectory, path, kind=arguments.format, up=arguments.up)
+    return motion.frames
+
+
+def _write_pictures(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
+    from gausim.io.video import write_gif, write_video
+
+    pictures = _pictures(motion, arguments)
+    if arguments.format == "gif":
+        return write_gif(path, pictures, motion.fps)
+    return write_video(path, pictures, motion.fps).frames
+
+
+_WRITERS: dict[str, Callable[[Motion, Path, argparse.Namespace], int]] = {
+    "safetensors": _write_safetensors,
+    "ply": _write_ply,
+    "usd": _write_usd,
+    "viser": _write_recording,
+    "html": _write_recording,
+    "mp4": _write_pictures,
+    "gif": _write_pictures,
+}
+
+
+def _pictures(motion: Motion, arguments: argparse.Namespace) -> Iterator[np.ndarray]:
+    import torch
+
+    from gausim.cli._config import compose, instantiate
+    from gausim.cli.simulate import parse_background
+    from gausim.render.draw import draw, to_bytes
+
+    background, camera = parse_background(arguments.background), _camera(motion, arguments)
+    renderer = motion.renderer or instantiate(compose("render/cpu").render)
+    identity = torch.eye(3)[None, None]
+    for scene in motion.scenes():
+        units = torch.zeros(scene.count, dtype=torch.long)
+        with torch.no_grad():
+            made = draw(
+                renderer, scene, scene.means[None], identity, identity, units, camera, background=background,
+                mask=motion.first.foreground,
+            )  # fmt: skip
+        yield to_bytes(made.rgb[0, 0]).cpu().numpy()
+
+
+def _camera(motion: Motion, arguments: argparse.Namespace) -> Cameras:
+    from gausim.ops.orbit import orbit_cameras
+
+    if arguments.view is None:
+        size = (arguments.size, arguments.size)
+        means = motion.first.means[motion.first.foreground]
+        return orbit_cameras(means, azimuths=[arguments.azimuth], up=arguments.up, size=size)
+    names = [] if motion.cameras is None else list(motion.cameras.names)
+    if motion.cameras is None or arguments.view not in names:
+        raise DataError(
+            f"--view {arguments.view}: expected one of {names} (cameras of a run's data set), or --azimuth."
+        )
+    return motion.cameras.select([names.index(arguments.view)])

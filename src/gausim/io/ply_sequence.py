@@ -1,0 +1,115 @@
+"""A motion as numbered PLY files, name_0001.ply, name_0002.ply, ...: what SuperSplat's timeline plays."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from gausim.core import DataError, GaussianScene, SceneError
+from gausim.io.ply import load_scene, save_masks, save_scene
+
+# SuperSplat orders files by the number at the end of their names.
+_NAME = re.compile(r"(?P<stem>.+)_(?P<number>\d{4,6})\.ply")
+_LARGEST_FACTS = 1 << 16
+
+
+def save_ply_sequence(folder: Path | str, name: str, frames: Iterable[GaussianScene], fps: float) -> list[Path]:
+    """Writes one PLY per frame, NAME_0001.ply first, with NAME.masks.npz and NAME.json (frames per second) beside.
+
+    Args:
+        folder: is created; may hold no other frames of this name.
+        name: of the sequence.
+        frames: the deformed scenes; masks are taken from the first.
+        fps: frames per second.
+
+    Raises:
+        DataError: there are frames of this name already, or none to write.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    there = [path.name for _, path in _numbered(folder) if _stem(path) == name]
+    if there:
+        raise DataError(f"{folder}: holds '{there[0]}' already. Choose another folder or name, or delete its frames.")
+    written = []
+    for number, scene in enumerate(frames, start=1):
+        if number == 1:
+            save_masks(scene, folder / f"{name}.masks.npz")
+        written.append(folder / f"{name}_{number:04d}.ply")
+        save_scene(scene, written[-1], masks=False)
+    if not written:
+        raise DataError(f"{folder}: no frames to write; a sequence needs at least one.")
+    temporary = folder / f".{name}.json.{os.getpid()}.tmp"
+    temporary.write_text(json.dumps({"fps": fps, "frames": len(written)}) + "\n")
+    os.replace(temporary, folder / f"{name}.json")
+    return written
+
+
+def load_ply_sequence(folder: Path | str, *, fps: float | None = None) -> tuple[Iterator[GaussianScene], int, float]:
+    """Reads numbered PLY files, one at a time as they are asked for.
+
+    Args:
+        folder: with the files of one sequence.
+        fps: frames per second where no NAME.json says them.
+
+    Returns:
+        The scenes in the order of their numbers, how many there are, and frames per second.
+
+    Raises:
+        DataError: there are no such files, those of several sequences, a number is missing, or the frame rate is
+            unknown or wrong.
+        SceneError: (while reading) a file is unusable, or has another number of Gaussians than the first.
+    """
+    folder = Path(folder)
+    found = _numbered(folder)
+    stems = sorted({_stem(path) for _, path in found})
+    if len(stems) != 1:
+        what = f"frames of several sequences: {stems[:5]}" if stems else "no files NAME_0001.ply, NAME_0002.ply, ..."
+        raise DataError(f"{folder}: has {what}; expected those of one sequence.")
+    numbers = [number for number, _ in found]
+    if numbers != list(range(numbers[0], numbers[0] + len(numbers))):
+        missing = sorted(set(range(numbers[0], numbers[-1])) - set(numbers))
+        what = f"number {missing[0]} is missing" if missing else "a number stands there twice"
+        raise DataError(f"{folder}: {what}. Complete the sequence.")
+    rate = _rate(folder / f"{stems[0]}.json", fps)
+    return _scenes([path for _, path in found], folder / f"{stems[0]}.masks.npz"), len(found), rate
+
+
+def _scenes(paths: list[Path], masks: Path) -> Iterator[GaussianScene]:
+    count = None
+    for path in paths:
+        scene = load_scene(path, masks=masks if masks.is_file() else None)
+        count = scene.count if count is None else count
+        if scene.count != count:
+            raise SceneError(f"{path}: expected {count} Gaussians as in '{paths[0].name}', got {scene.count}.")
+        yield scene
+
+
+def _numbered(folder: Path) -> list[tuple[int, Path]]:
+    if not folder.is_dir():
+        raise DataError(f"{folder}: no such folder. Expected one with NAME_0001.ply, NAME_0002.ply, ...")
+    matches = [(match, path) for path in folder.iterdir() if (match := _NAME.fullmatch(path.name))]
+    return sorted((int(match["number"]), path) for match, path in matches)
+
+
+def _stem(path: Path) -> str:
+    match = _NAME.fullmatch(path.name)
+    return match["stem"] if match else ""
+
+
+def _rate(path: Path, fps: float | None) -> float:
+    if fps is None and path.is_file():
+        try:
+            if path.stat().st_size > _LARGEST_FACTS:
+                raise ValueError("too large")
+            fps = json.loads(path.read_text(encoding="utf-8"))["fps"]
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+            raise DataError(f"{path}: field 'fps' cannot be read ({error}). State the rate (--fps).") from error
+    if fps is None:
+        raise DataError(f"{path}: no such file, so the frame rate is unknown. State it (--fps).")
+    if not isinstance(fps, int | float) or isinstance(fps, bool) or not (math.isfinite(fps) and fps > 0):
+        raise DataError(f"{path}: field 'fps': expected a number > 0, got {str(fps)[:80]}.")
+    return float(fps)

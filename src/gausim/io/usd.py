@@ -1,0 +1,238 @@
+"""Moving Gaussians as OpenUSD: one ParticleField3DGaussianSplat with a time sample per frame (usd-core >= 26.3).
+
+Kept in float32: positions, orientations, scales, opacities, spherical harmonics. The schema knows no masks.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+
+from gausim.core import ConfigError, DataError, GaussianScene
+from gausim.core.scene import SH_COEFFICIENTS
+
+SUFFIXES = (".usd", ".usda", ".usdc")
+PRIM = "/Splats"
+_LARGEST, _MOST_FRAMES = 8 << 30, 100_000
+# Opacities closer to 0 or 1 than this have no finite logit in float32.
+_EDGE = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class UsdClip:
+    """Moving Gaussians of a file, read frame by frame.
+
+    Attributes:
+        path: the file.
+        fps: frames per second.
+        frames: their number.
+        up: vertical axis, ``y`` or ``z``.
+        stage: the open stage.
+        splats: its ParticleField3DGaussianSplat.
+        times: time code of every frame.
+    """
+
+    path: Path
+    fps: float
+    frames: int
+    up: str
+    stage: Any
+    splats: Any
+    times: tuple[float, ...]
+
+    def scenes(self) -> Iterator[GaussianScene]:
+        """The frames, one at a time; masks are the defaults (all simulated, none pinned).
+
+        Raises:
+            DataError: an attribute is missing, of another length than the others or out of range; names it.
+        """
+        count = None
+        for number, time in enumerate(self.times):
+            scene = _scene(self, time, f"{self.path}: frame {number}")
+            count = scene.count if count is None else count
+            if scene.count != count:
+                raise DataError(
+                    f"{self.path}: frame {number}: attribute 'positions' has {scene.count} Gaussians, expected {count}."
+                )
+            yield scene
+
+
+def save_usd(path: Path | str, frames: Iterable[GaussianScene], fps: float, *, up: str = "z") -> int:
+    """Writes moving Gaussians; replaces the file atomically. Returns the number of frames.
+
+    Args:
+        path: the file: .usd and .usdc are binary, .usda is text.
+        frames: deformed scenes of equal size.
+        fps: frames per second; frame n has time code n.
+        up: vertical axis, ``y`` or ``z``.
+
+    Raises:
+        ConfigError: usd-core is not installed, or the suffix or the axis is another.
+        DataError: there are no frames, or they differ in size.
+    """
+    pxr, path = _pxr(), Path(path)
+    if path.suffix not in SUFFIXES or up not in ("y", "z"):
+        raise ConfigError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}, and up y or z, got up {up}.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    stage = pxr.Usd.Stage.CreateNew(str(temporary))
+    try:
+        count = _write(pxr, stage, frames, path)
+        stage.SetFramesPerSecond(fps)
+        stage.SetTimeCodesPerSecond(fps)
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(count - 1)
+        pxr.UsdGeom.SetStageUpAxis(stage, up.upper())
+        pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.GetRootLayer().Save()
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return count
+
+
+def load_usd(path: Path | str) -> UsdClip:
+    """Opens moving Gaussians.
+
+    Raises:
+        ConfigError: usd-core is not installed.
+        DataError: the file is missing, no USD, refers to other files, or holds not exactly one
+            ParticleField3DGaussianSplat with a sensible frame rate.
+    """
+    pxr, path = _pxr(), Path(path)
+    if path.suffix not in SUFFIXES or not path.is_file():
+        raise DataError(f"{path}: no such file, or its name does not end in one of {', '.join(SUFFIXES)}.")
+    if path.stat().st_size > _LARGEST:
+        raise DataError(f"{path}: expected at most {_LARGEST >> 30} GiB, got {path.stat().st_size} bytes.")
+    try:
+        layer = pxr.Sdf.Layer.OpenAsAnonymous(str(path))
+    except pxr.Tf.ErrorException as error:
+        raise DataError(f"{path}: cannot be read as USD ({_first_line(error)}). Export it again.") from error
+    if layer is None:
+        raise DataError(f"{path}: cannot be read as USD. Export it again.")
+    # Nothing that a file names is opened: it could be any file of this machine.
+    if layer.GetCompositionAssetDependencies():
+        raise DataError(f"{path}: refers to other files; expected one that holds all by itself. Flatten it first.")
+    stage = pxr.Usd.Stage.Open(layer)
+    found = [prim for prim in stage.Traverse() if prim.GetTypeName() == "ParticleField3DGaussianSplat"]
+    if len(found) != 1:
+        raise DataError(f"{path}: has {len(found)} prims ParticleField3DGaussianSplat, expected one.")
+    splats = pxr.UsdVol.ParticleField3DGaussianSplat(found[0])
+    times = tuple(splats.GetPositionsAttr().GetTimeSamples()) or (0.0,)
+    fps = float(stage.GetTimeCodesPerSecond())
+    steps = np.diff(times)
+    if len(times) > _MOST_FRAMES or not np.isfinite(times).all() or (len(steps) and not np.allclose(steps, steps[0])):
+        raise DataError(f"{path}: attribute 'positions': expected at most {_MOST_FRAMES} samples at equal distances.")
+    rate = fps / float(steps[0]) if len(steps) else fps
+    if not (math.isfinite(rate) and rate > 0):
+        raise DataError(f"{path}: field 'timeCodesPerSecond' is {fps}, expected a number > 0.")
+    up = str(pxr.UsdGeom.GetStageUpAxis(stage)).lower()
+    return UsdClip(path, rate, len(times), up, stage, splats, times)
+
+
+def _write(pxr: Any, stage: Any, frames: Iterable[GaussianScene], path: Path) -> int:
+    vt, count, first = pxr.Vt, 0, None
+    splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, PRIM)
+    stage.SetDefaultPrim(splats.GetPrim())
+    positions, orientations = splats.CreatePositionsAttr(), splats.CreateOrientationsAttr()
+    scales, extent = splats.CreateScalesAttr(), splats.CreateExtentAttr()
+    sh, last_sh = splats.CreateRadianceSphericalHarmonicsCoefficientsAttr(), None
+    for count, scene in enumerate(frames, start=1):
+        if first is None:
+            first = scene
+            splats.CreateRadianceSphericalHarmonicsDegreeAttr(scene.sh_degree)
+            splats.CreateOpacitiesAttr(vt.FloatArray.FromNumpy(_numpy(torch.sigmoid(scene.opacity_logits))))
+        if scene.count != first.count or scene.sh.shape != first.sh.shape:
+            raise DataError(f"{path}: frame {count - 1} has {scene.count} Gaussians, expected {first.count}.")
+        time, means, lengths = count - 1, _numpy(scene.means), _numpy(scene.log_scales.exp())
+        quats = _numpy(scene.quats / scene.quats.norm(dim=-1, keepdim=True))
+        positions.Set(vt.Vec3fArray.FromNumpy(means), time)
+        orientations.Set(_quaternions(pxr, quats), time)
+        scales.Set(vt.Vec3fArray.FromNumpy(lengths), time)
+        reach = 3 * lengths.max(-1, keepdims=True)
+        box = np.stack([(means - reach).min(0), (means + reach).max(0)]).astype(np.float32)
+        extent.Set(vt.Vec3fArray.FromNumpy(box), time)
+        # Colours that do not turn are written once.
+        if last_sh is None or not torch.equal(last_sh, scene.sh):
+            sh.Set(vt.Vec3fArray.FromNumpy(_numpy(scene.sh).reshape(-1, 3)), time)
+            last_sh = scene.sh
+    if first is None:
+        raise DataError(f"{path}: no frames to write; a clip needs at least one.")
+    return count
+
+
+def _scene(clip: UsdClip, time: float, source: str) -> GaussianScene:
+    splats = clip.splats
+    means = _array(splats.GetPositionsAttr(), time, source, width=3)
+    count = len(means)
+    degree = splats.GetRadianceSphericalHarmonicsDegreeAttr().Get()
+    if degree not in SH_COEFFICIENTS:
+        raise DataError(f"{source}: attribute 'radiance:sphericalHarmonicsDegree': expected 0..3, got {degree}.")
+    basis = SH_COEFFICIENTS[degree]
+    held = _array(splats.GetRadianceSphericalHarmonicsCoefficientsAttr(), time, source, width=3, count=count * basis)
+    scales = _array(splats.GetScalesAttr(), time, source, width=3, count=count)
+    quats = _array(splats.GetOrientationsAttr(), time, source, width=4, count=count)
+    opacities = _array(splats.GetOpacitiesAttr(), time, source, width=1, count=count)[:, 0]
+    if not (scales > 0).all() or not ((opacities >= 0) & (opacities <= 1)).all():
+        raise DataError(f"{source}: attributes 'scales' and 'opacities': expected values > 0 and in 0..1.")
+    if not np.linalg.norm(quats, axis=-1).all():
+        raise DataError(f"{source}: attribute 'orientations': expected quaternions that are not zero.")
+    logits = np.clip(opacities.astype(np.float64), _EDGE, 1 - _EDGE)
+    return GaussianScene.create(
+        means=torch.from_numpy(means),
+        log_scales=torch.from_numpy(scales).log(),
+        # Vt stores the imaginary parts first.
+        quats=torch.from_numpy(np.ascontiguousarray(quats[:, [3, 0, 1, 2]])),
+        opacity_logits=torch.from_numpy(np.log(logits / (1 - logits)).astype(np.float32)),
+        sh=torch.from_numpy(held.reshape(count, basis, 3)),
+        name=clip.path.stem,
+    )
+
+
+def _array(attribute: Any, time: float, source: str, *, width: int, count: int | None = None) -> np.ndarray:
+    """Values of an attribute at a time code, (count, width) float32, the sample before it where it has none there."""
+    name = attribute.GetName()
+    samples = attribute.GetTimeSamples()
+    held = max((t for t in samples if t <= time), default=samples[0] if samples else None)
+    value = attribute.Get() if held is None else attribute.Get(held)
+    try:
+        numbers = np.array(value, dtype=np.float32).reshape(-1, width) if value is not None else np.zeros((0, width))
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{source}: attribute '{name}' has another type than in the schema ({error}).") from error
+    if len(numbers) == 0 or (count is not None and len(numbers) != count):
+        expected = "some" if count is None else str(count)
+        raise DataError(f"{source}: attribute '{name}' has {len(numbers)} values, expected {expected}.")
+    if not np.isfinite(numbers).all():
+        raise DataError(f"{source}: attribute '{name}' is NaN or infinite. Export it again.")
+    return numbers.astype(np.float32)
+
+
+def _quaternions(pxr: Any, wxyz: np.ndarray) -> Any:
+    return pxr.Vt.QuatfArray.FromNumpy(np.ascontiguousarray(wxyz[:, [1, 2, 3, 0]]))
+
+
+def _numpy(value: torch.Tensor) -> np.ndarray:
+    return np.ascontiguousarray(value.detach().cpu().float().numpy())
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().splitlines()[-1][:200] if str(error).strip() else type(error).__name__
+
+
+def _pxr() -> Any:
+    try:
+        from pxr import Sdf, Tf, Usd, UsdGeom, UsdVol, Vt
+    except ImportError as error:
+        raise ConfigError("OpenUSD is not installed. Install it with `pip install gausim[usd]`.") from error
+    if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
+        raise ConfigError("usd-core: expected 26.3 or newer, which knows Gaussians. `pip install -U usd-core`.")
+
+    return SimpleNamespace(Sdf=Sdf, Tf=Tf, Usd=Usd, UsdGeom=UsdGeom, UsdVol=UsdVol, Vt=Vt)

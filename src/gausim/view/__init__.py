@@ -1,0 +1,1 @@
+"""Playing with a learned object: forces, sessions of them, and what shows them."""

@@ -1,0 +1,235 @@
+"""What an event acts on: a unit of the hierarchy, listed kernels, a ball, or the whole object."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Int
+from torch import Tensor
+
+from gausim.core import ConfigError, GaussianScene
+
+# Kernels that a list may name; more is a defect of the file, not a scene.
+MOST_KERNELS = 10_000_000
+
+
+@dataclass(frozen=True)
+class Whole:
+    """All simulated kernels."""
+
+    def mask(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]]) -> Bool[Tensor, " K"]:
+        """True for the kernels that are selected."""
+        return scene.simulated.clone()
+
+    def to_json(self) -> dict[str, Any]:
+        """As a session's file says it."""
+        return {"whole": True}
+
+
+@dataclass(frozen=True)
+class Unit:
+    """The kernels of one unit of the hierarchy.
+
+    Attributes:
+        level: 1 for the finest clusters, 2 for those of clusters, and so on; 0 for a kernel.
+        index: of the unit within its level.
+    """
+
+    level: int
+    index: int
+
+    def __post_init__(self) -> None:
+        if min(self.level, self.index) < 0:
+            raise ConfigError(f"selection: expected level and unit >= 0, got {self.level} and {self.index}.")
+
+    def mask(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]]) -> Bool[Tensor, " K"]:
+        """True for the kernels of the unit.
+
+        Args:
+            scene: the rest scene.
+            units: the unit of every kernel at levels 1, 2, ...; -1 for kernels of none.
+
+        Raises:
+            ConfigError: there is no such level or unit.
+        """
+        if self.level == 0:
+            return Kernels((self.index,)).mask(scene, units)
+        if self.level > len(units):
+            raise ConfigError(
+                f"selection of level {self.level}: '{scene.name}' has levels 0 to {len(units)} under this method. "
+                "Select kernels or a ball instead."
+            )
+        unit = units[self.level - 1]
+        chosen = unit == self.index
+        if not bool(chosen.any()):
+            raise ConfigError(
+                f"selection of unit {self.index}: level {self.level} of '{scene.name}' has units 0 to "
+                f"{int(unit.max())}."
+            )
+        return chosen
+
+    def to_json(self) -> dict[str, Any]:
+        """As a session's file says it."""
+        return {"level": self.level, "unit": self.index}
+
+
+@dataclass(frozen=True)
+class Kernels:
+    """Listed kernels.
+
+    Attributes:
+        numbers: of the kernels in the scene, ascending.
+    """
+
+    numbers: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if not self.numbers or min(self.numbers) < 0:
+            raise ConfigError("selection: field 'kernels': expected at least one kernel, all numbers >= 0.")
+        object.__setattr__(self, "numbers", tuple(sorted(set(self.numbers))))
+
+    def mask(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]]) -> Bool[Tensor, " K"]:
+        """True for these kernels.
+
+        Raises:
+            ConfigError: the scene has not so many.
+        """
+        if self.numbers[-1] >= scene.count:
+            raise ConfigError(
+                f"selection of kernel {self.numbers[-1]}: '{scene.name}' has kernels 0 to {scene.count - 1}."
+            )
+        chosen = torch.zeros(scene.count, dtype=torch.bool, device=scene.means.device)
+        chosen[list(self.numbers)] = True
+        return chosen
+
+    def to_json(self) -> dict[str, Any]:
+        """As a session's file says it: ranges, both ends included."""
+        ranges: list[list[int]] = []
+        for number in self.numbers:
+            if ranges and number == ranges[-1][1] + 1:
+                ranges[-1][1] = number
+            else:
+                ranges.append([number, number])
+        return {"kernels": ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in ranges)}
+
+
+@dataclass(frozen=True)
+class Ball:
+    """Simulated kernels whose rest position lies in a ball.
+
+    Attributes:
+        centre: its centre [scene units].
+        radius: its radius [diagonals of the scene].
+    """
+
+    centre: tuple[float, float, float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        vector("centre", self.centre)
+        if not 0 < self.radius < math.inf:
+            raise ConfigError(f"selection: field 'radius': expected a number > 0 [diagonals], got {self.radius!r}.")
+
+    def mask(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]]) -> Bool[Tensor, " K"]:
+        """True for the kernels inside.
+
+        Raises:
+            ConfigError: there are none.
+        """
+        away = (scene.means.double() - scene.means.new_tensor(self.centre, dtype=torch.float64)).norm(dim=-1)
+        chosen = scene.simulated & (away <= self.radius * scene.diagonal)
+        if not bool(chosen.any()):
+            nearest = float(away[scene.simulated].min()) / scene.diagonal
+            raise ConfigError(
+                f"selection of a ball: no kernel of '{scene.name}' lies within {self.radius:g} diagonals of "
+                f"{self.centre}; the nearest is {nearest:.3g} diagonals away."
+            )
+        return chosen
+
+    def to_json(self) -> dict[str, Any]:
+        """As a session's file says it."""
+        return {"centre": list(self.centre), "radius": self.radius}
+
+
+Selected = Whole | Unit | Kernels | Ball
+
+
+def selection_from_json(value: Any) -> Selected:
+    """Reads what ``to_json`` wrote.
+
+    Raises:
+        ConfigError: it is something else; names the field.
+    """
+    fields = set(value) if isinstance(value, Mapping) else set()
+    if fields == {"whole"} and value["whole"] is True:
+        return Whole()
+    if fields == {"level", "unit"}:
+        return Unit(whole("level", value["level"]), whole("unit", value["unit"]))
+    if fields == {"kernels"}:
+        return parse_kernels(value["kernels"])
+    if fields == {"centre", "radius"}:
+        return Ball(vector("centre", value["centre"]), number("radius", value["radius"]))
+    raise ConfigError(
+        'field \'on\': expected {"whole": true}, {"level": L, "unit": I}, {"kernels": "0-9, 12"} or '
+        f'{{"centre": [x, y, z], "radius": R}}, got {str(value)[:80]}.'
+    )
+
+
+def parse_kernels(text: Any) -> Kernels:
+    """Reads kernels as ``0-9, 12``.
+
+    Raises:
+        ConfigError: the text is of another form, or names too many.
+    """
+    expected = "field 'kernels': expected numbers and ranges, e.g. \"0-9, 12\""
+    if not isinstance(text, str):
+        raise ConfigError(f"{expected}, got {str(text)[:80]}.")
+    numbers: list[int] = []
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*(\d{1,9})(?:\s*-\s*(\d{1,9}))?\s*", part, re.ASCII)
+        if not match:
+            raise ConfigError(f"{expected}, got {part[:80]!r}.")
+        first, last = int(match[1]), int(match[2] or match[1])
+        if last < first or len(numbers) + last - first >= MOST_KERNELS:
+            raise ConfigError(f"{expected} with at most {MOST_KERNELS} kernels, got {part[:80]!r}.")
+        numbers.extend(range(first, last + 1))
+    return Kernels(tuple(numbers))
+
+
+def number(name: str, value: object) -> float:
+    """A finite number.
+
+    Raises:
+        ConfigError: it is something else; names the field.
+    """
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
+        raise ConfigError(f"field '{name}': expected a finite number, got {str(value)[:80]}.")
+    return float(value)
+
+
+def whole(name: str, value: object) -> int:
+    """A whole number.
+
+    Raises:
+        ConfigError: it is something else; names the field.
+    """
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise ConfigError(f"field '{name}': expected a whole number, got {str(value)[:80]}.")
+    return value
+
+
+def vector(name: str, value: object) -> tuple[float, float, float]:
+    """Three finite numbers.
+
+    Raises:
+        ConfigError: they are something else; names the field.
+    """
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        raise ConfigError(f"field '{name}': expected three numbers, got {str(value)[:80]}.")
+    x, y, z = (number(name, item) for item in value)
+    return x, y, z

@@ -1,0 +1,90 @@
+"""From a frame to what viser draws: placed, sized, coloured and packed into 32 bytes a kernel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt32
+from torch import Tensor
+
+from gausim.core import GaussianScene
+
+# Diagonal of the simulated kernels on the page. Covariances travel as float16, whose smallest step is 6e-8: at this
+# size a kernel of a thousandth of the diagonal keeps its variance to 1 %.
+SIZE = 4.0
+# Half a unit in the last place of float16, relative and for subnormal numbers.
+_ROUNDING, _SMALLEST = 2.0**-11, 2.0**-25
+# The largest variance that is drawn; 65504 is the largest float16.
+_LARGEST = 6e4
+
+
+@dataclass(frozen=True, eq=False)
+class Placing:
+    """Where the scene stands on the page: (x - centre) * scale + offset.
+
+    Attributes:
+        centre: middle of the simulated kernels' box at rest [scene units].
+        scale: page units per scene unit.
+        offset: of a scene beside another one [page units].
+    """
+
+    centre: Float[Tensor, " 3"]
+    scale: float
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    @staticmethod
+    def of(scene: GaussianScene, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Placing:
+        """Puts the simulated kernels into the middle, their diagonal :data:`SIZE` long."""
+        moving = scene.means[scene.simulated].float().cpu()
+        return Placing((moving.amax(0) + moving.amin(0)) / 2, SIZE / scene.diagonal, offset)
+
+    def to_page(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Scene points on the page."""
+        return (points.cpu() - self.centre.to(points.dtype)) * self.scale + points.new_tensor(self.offset).cpu()
+
+    def to_scene(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Points of the page in the scene."""
+        return (points - points.new_tensor(self.offset)) / self.scale + self.centre.to(points.dtype)
+
+
+def pack(
+    positions: Float[Tensor, "K 3"],
+    covars: Float[Tensor, "K 3 3"],
+    rgb: Float[Tensor, "K 3"],
+    opacities: Float[Tensor, " K"],
+    placing: Placing,
+) -> UInt32[np.ndarray, "K 8"]:
+    """Kernels as viser's buffer has them: centre (float32), nothing, covariance (6 float16), RGBA (uint8).
+
+    A covariance rounded to float16 may lose its positive definiteness; so much is added to its diagonal that it
+    cannot: twice the bound 3 * 2^-11 max(S) of the rounding's spectral norm is 0.3 % of the largest variance.
+    """
+    buffer = np.zeros((len(positions), 8), np.uint32)
+    buffer[:, :3] = placing.to_page(positions).contiguous().float().numpy().view(np.uint32)
+    buffer[:, 4:7] = half_covariances(covars.float().cpu() * placing.scale**2).view(np.uint32)
+    rgba = torch.cat((rgb, opacities[:, None].to(rgb)), -1)
+    buffer[:, 7:] = (rgba.clamp(0, 1) * 255 + 0.5).to(torch.uint8).contiguous().numpy().view(np.uint32)
+    return buffer
+
+
+def half_covariances(covars: Float[Tensor, "K 3 3"]) -> np.ndarray:
+    """(K, 6) xx xy xz yy yz zz in float16, positive definite where the covariances are positive semi-definite."""
+    largest = covars.diagonal(dim1=-2, dim2=-1).amax(-1)
+    covars = covars * (_LARGEST / largest.clamp_min(_LARGEST))[:, None, None]
+    margin = 2 * 3 * (_ROUNDING * largest.clamp_max(_LARGEST) + _SMALLEST)
+    upper = covars.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]].clone()
+    upper[:, [0, 3, 5]] += margin[:, None]
+    return upper.numpy().astype(np.float16)
+
+
+def unit_centres(
+    positions: Float[Tensor, "K 3"], units: Int[Tensor, " K"], masses: Float[Tensor, " K"], count: int
+) -> Float[Tensor, "N 3"]:
+    """Centres of mass of the units of a level; kernels of unit -1 belong to none."""
+    inside = units >= 0
+    index, mass = units[inside], masses[inside].to(positions)
+    total = positions.new_zeros(count).index_add(0, index, mass)
+    summed = positions.new_zeros(count, 3).index_add(0, index, positions[inside] * mass[:, None])
+    return summed / total.clamp_min(torch.finfo(positions.dtype).tiny)[:, None]

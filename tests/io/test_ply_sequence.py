@@ -1,0 +1,95 @@
+"""Numbered PLY files come back bit for bit, and incomplete or mixed folders are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from gausim.core import DataError, GaussianScene, SceneError
+from gausim.io.ply_sequence import load_ply_sequence, save_ply_sequence
+
+FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh", "simulated", "pinned", "foreground")
+
+
+def frames(count: int = 3, kernels: int = 20) -> list[GaussianScene]:
+    g = torch.Generator().manual_seed(0)
+    pinned = torch.arange(kernels) < 4
+    return [
+        GaussianScene.create(
+            means=torch.randn(kernels, 3, generator=g), log_scales=torch.randn(kernels, 3, generator=g),
+            quats=torch.randn(kernels, 4, generator=g), opacity_logits=torch.randn(kernels, generator=g),
+            sh=torch.randn(kernels, 4, 3, generator=g), pinned=pinned, volume_scale=3.0,
+        )
+        for _ in range(count)
+    ]  # fmt: skip
+
+
+def test_round_trip_is_exact(tmp_path: Path) -> None:
+    made = frames(12)
+    written = save_ply_sequence(tmp_path / "s", "cup_2", iter(made), 23.976)
+    assert [p.name for p in written][::11] == ["cup_2_0001.ply", "cup_2_0012.ply"]
+    assert {p.name for p in (tmp_path / "s").iterdir()} - {p.name for p in written} == {
+        "cup_2.masks.npz", "cup_2.json"
+    }  # fmt: skip
+    scenes, count, fps = load_ply_sequence(tmp_path / "s")
+    read = list(scenes)
+    assert count == len(read) == 12 and fps == 23.976
+    for a, b in zip(made, read, strict=True):
+        assert all(torch.equal(getattr(a, n), getattr(b, n)) for n in FIELDS) and b.volume_scale == 3.0
+
+
+def test_a_folder_of_others_needs_a_rate(tmp_path: Path) -> None:
+    save_ply_sequence(tmp_path, "a", frames(), 24.0)
+    (tmp_path / "a.json").unlink()
+    (tmp_path / "a.masks.npz").unlink()
+    with pytest.raises(DataError, match="frame rate is unknown. State it"):
+        load_ply_sequence(tmp_path)
+    scenes, _, fps = load_ply_sequence(tmp_path, fps=12)
+    assert fps == 12.0 and bool(next(scenes).simulated.all())
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", '{"fps": "24"}', '{"fps": NaN}', '{"fps": 0}', '{"fps": true}', "[" * 99999]
+)
+def test_broken_rates_are_refused(tmp_path: Path, text: str) -> None:
+    save_ply_sequence(tmp_path, "a", frames(), 24.0)
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(DataError, match="a.json: field 'fps'"):
+        load_ply_sequence(tmp_path)
+
+
+def test_incomplete_and_mixed_folders_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no such folder"):
+        load_ply_sequence(tmp_path / "none")
+    with pytest.raises(DataError, match="has no files NAME_0001.ply"):
+        load_ply_sequence(tmp_path)
+    with pytest.raises(DataError, match="no frames to write"):
+        save_ply_sequence(tmp_path / "e", "a", [], 24.0)
+    written = save_ply_sequence(tmp_path / "s", "a", frames(4), 24.0)
+    with pytest.raises(DataError, match="holds 'a_0001.ply' already"):
+        save_ply_sequence(tmp_path / "s", "a", frames(1), 24.0)
+    (tmp_path / "s" / "a_00002.ply").write_bytes(written[1].read_bytes())
+    with pytest.raises(DataError, match="stands there twice"):
+        load_ply_sequence(tmp_path / "s")
+    (tmp_path / "s" / "a_00002.ply").unlink()
+    written[2].unlink()
+    with pytest.raises(DataError, match="number 3 is missing"):
+        load_ply_sequence(tmp_path / "s")
+    save_ply_sequence(tmp_path / "s", "b", frames(1), 24.0)
+    with pytest.raises(DataError, match="several sequences: ..a., .b.."):
+        load_ply_sequence(tmp_path / "s")
+
+
+def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
+    first, second = frames(2)
+    fewer = replace(second.select(torch.arange(20) < 9), name="x")
+    save_ply_sequence(tmp_path, "a", [first, fewer], 24.0)
+    (tmp_path / "a.masks.npz").unlink()
+    with pytest.raises(SceneError, match="a_0002.ply: expected 20 Gaussians as in 'a_0001.ply', got 9"):
+        list(load_ply_sequence(tmp_path)[0])
+    (tmp_path / "a_0002.ply").write_bytes((tmp_path / "a_0001.ply").read_bytes()[:-5])
+    with pytest.raises(SceneError, match="truncated"):
+        list(load_ply_sequence(tmp_path)[0])

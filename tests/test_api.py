@@ -1,0 +1,81 @@
+"""`gausim.load`: the ten lines of the documentation, run as they stand there."""
+
+from __future__ import annotations
+
+import re
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import gausim
+from gausim.core import ConfigError, DataError
+from gausim.io.ply import save_scene
+from gausim.ops.orbit import orbit_cameras
+
+ROOT = Path(__file__).resolve().parents[1]
+PLAYED = runpy.run_path(str(Path(__file__).with_name("played.py")))
+
+
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory: pytest.TempPathFactory):
+    return PLAYED["played_run"](tmp_path_factory.mktemp("played"))
+
+
+@pytest.fixture
+def run(loaded, monkeypatch):
+    from gausim import api
+
+    monkeypatch.setattr(api, "load_run", lambda path: loaded)
+    return loaded
+
+
+def test_the_example_of_the_documentation(run, tmp_path: Path, monkeypatch) -> None:
+    text = (ROOT / "docs" / "interaction.md").read_text()
+    code = re.search(r"```python\n(import gausim\n.*?)```", text, re.DOTALL)
+    assert code is not None
+    lines = [line for line in code[1].splitlines() if line.strip()]
+    assert len(lines) <= 10
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    exec(compile("\n".join(lines), "interaction.md", "exec"), names)
+    sim, image = names["sim"], names["image"]
+    assert isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.shape == (32, 32, 3) and image.any()
+    assert (tmp_path / "push.json").is_file()
+    recorded = sim.trajectory
+    again = gausim.load(run.run_dir).replay("push.json")
+    assert torch.equal(again.positions, recorded.positions) and torch.equal(again.gradients, recorded.gradients)
+
+
+def test_pushes_draws_and_resets(run) -> None:
+    sim = gausim.load(run.run_dir, object="toy", sequence="seq_000")
+    rest = sim.interaction.scene.means
+    still = sim.render()
+    sim.apply_force(direction="x", weights=5)
+    sim.step(6)
+    assert float((sim.frame.positions - rest)[:, 0].max()) > 1e-3
+    names, bent = sim.cameras.names, sim.render(background=(1.0, 1.0, 1.0))
+    assert bent[0, 0].tolist() == [255] * 3 and still[0, 0].tolist() == [0] * 3
+    assert np.array_equal(sim.render(names[1]), sim.render(sim.cameras.select([1])))
+    orbit = orbit_cameras(rest, azimuths=[40.0], size=(32, 32))
+    assert np.array_equal(sim.render(40), sim.render(orbit)) and sim.render(40).any()
+    sim.release()
+    assert sim.interaction.acting == ()
+    sim.reset()
+    assert torch.equal(sim.frame.positions, rest) and np.array_equal(sim.render(), still)
+    with pytest.raises(DataError, match="view 'top': expected one of .'cam_0'"):
+        sim.render("top")
+    with pytest.raises(ConfigError, match="on=head"):
+        sim.apply_force("head", direction="x", weights=1)
+    with pytest.raises(DataError, match="no object"):
+        gausim.load(run.run_dir, object="cup")
+
+
+def test_it_is_the_rollout_where_nothing_acts(run, tmp_path: Path) -> None:
+    sim = gausim.load(run.run_dir, sequence="seq_001")
+    sim.step(10)
+    whole = run.module.foresee(1, 10)
+    assert torch.equal(sim.trajectory.positions, whole.positions)
+    save_scene(sim.interaction.scene, tmp_path / "s.ply")

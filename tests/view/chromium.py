@@ -1,0 +1,173 @@
+"""A headless Chromium driven through the DevTools protocol: pages, mouse, keyboard, pictures, requests."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+PROGRAM = "/usr/bin/chromium"
+needs_chromium = pytest.mark.skipif(
+    not Path(PROGRAM).is_file(), reason=f"{PROGRAM} is not there (apt-get install chromium)"
+)
+# Software GL: there is no screen and no graphics card.
+FLAGS = (
+    "--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--disable-gpu-sandbox", "--no-first-run",
+    "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
+    "--disable-features=Translate,OptimizationHints,MediaRouter", "--remote-allow-origins=*", "--mute-audio",
+)  # fmt: skip
+SHIFT = 8
+
+
+class Page:
+    """One page and what it asked the network for."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket, self._numbers = socket, itertools.count(1)
+        self.requests: list[str] = []
+        self.problems: list[str] = []
+        for domain in ("Page", "Network", "Runtime", "Log"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, timeout: float = 60.0, **parameters: Any) -> dict[str, Any]:
+        """Sends a command and waits for its result; events that come meanwhile are taken note of."""
+        number = next(self._numbers)
+        self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
+        end = time.monotonic() + timeout
+        while True:
+            message = json.loads(self._socket.recv(timeout=max(0.01, end - time.monotonic())))
+            if message.get("id") == number:
+                if "error" in message:
+                    raise RuntimeError(f"{method}: {message['error']}")
+                return message["result"]
+            self._note(message)
+
+    def _note(self, message: dict[str, Any]) -> None:
+        kind, facts = message.get("method"), message.get("params", {})
+        if kind == "Network.requestWillBeSent":
+            self.requests.append(facts["request"]["url"])
+        elif kind == "Network.webSocketCreated":
+            self.requests.append(facts["url"])
+        elif kind == "Runtime.exceptionThrown":
+            self.problems.append(facts["exceptionDetails"].get("exception", {}).get("description", "?"))
+        elif kind == "Log.entryAdded" and facts["entry"]["level"] == "error":
+            self.problems.append(f"{facts['entry']['text']} {facts['entry'].get('url', '')}")
+
+    def open(self, address: str) -> None:
+        self.call("Page.navigate", url=address)
+
+    def run(self, script: str) -> Any:
+        """The value of an expression in the page."""
+        found = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in found:
+            raise RuntimeError(str(found["exceptionDetails"]))
+        return found["result"].get("value")
+
+    def text(self) -> str:
+        return self.run("document.body ? document.body.innerText : ''") or ""
+
+    def wait(self, holds: Callable[[], Any], timeout: float = 60.0, what: str = "") -> Any:
+        """Waits until something holds and returns it."""
+        end = time.monotonic() + timeout
+        while True:
+            value = holds()
+            if value:
+                return value
+            if time.monotonic() > end:
+                raise TimeoutError(f"{what or holds}: not within {timeout} s; problems: {self.problems}")
+            time.sleep(0.1)
+
+    def picture(self, path: Path | str | None = None) -> bytes:
+        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+        if path is not None:
+            Path(path).write_bytes(data)
+        return data
+
+    def mouse(self, kind: str, x: float, y: float, *, held: bool = False, modifiers: int = 0, **more: Any) -> None:
+        self.call(
+            "Input.dispatchMouseEvent", type=kind, x=x, y=y, modifiers=modifiers, button="left" if held else "none",
+            buttons=1 if held and kind != "mouseReleased" else 0, clickCount=1 if held else 0, **more,
+        )  # fmt: skip
+
+    def press(self, x: float, y: float, modifiers: int = 0) -> None:
+        """Moves to a point and presses the left button there."""
+        for near in (-3, -1, 0):
+            self.mouse("mouseMoved", x + near, y, modifiers=modifiers)
+            time.sleep(0.05)
+        self.mouse("mousePressed", x, y, held=True, modifiers=modifiers)
+
+    def drag_to(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8, modifiers: int = 0) -> None:
+        """Moves with the button held."""
+        for step in range(1, steps + 1):
+            share = step / steps
+            x, y = (a + (b - a) * share for a, b in zip(start, end, strict=True))
+            self.mouse("mouseMoved", x, y, held=True, modifiers=modifiers)
+            time.sleep(0.04)
+
+    def release(self, x: float, y: float, modifiers: int = 0) -> None:
+        self.mouse("mouseReleased", x, y, held=True, modifiers=modifiers)
+
+    def click(self, x: float, y: float) -> None:
+        self.press(x, y)
+        self.release(x, y)
+
+    def press_button(self, label: str, elements: str = "button, [role=tab]") -> None:
+        """Clicks the panel's button or tab of this label."""
+        script = (
+            f"(() => {{ const b = [...document.querySelectorAll({json.dumps(elements)})].find(b => b.innerText.trim() "
+            f"=== {json.dumps(label)} && b.offsetParent); if (!b) return null; b.scrollIntoView({{block: 'nearest'}}); "
+            "const r = b.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; })()"
+        )
+        x, y = self.wait(lambda: self.run(script), 20, f"button {label!r}")
+        self.click(x, y)
+        time.sleep(0.3)
+
+
+@contextmanager
+def chromium(folder: Path, *, size: tuple[int, int] = (1280, 800), more: tuple[str, ...] = ()) -> Iterator[Page]:
+    """A fresh browser with one page."""
+    home = folder / "chromium"
+    home.mkdir(parents=True, exist_ok=True)
+    command = [PROGRAM, *FLAGS, *more, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={home}",
+               "--remote-debugging-port=0", "about:blank"]  # fmt: skip
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        port = _port(home / "DevToolsActivePort", process)
+        with connect(_page_address(port), max_size=1 << 28, open_timeout=20) as socket:
+            page = Page(socket)
+            page.call("Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1,
+                      mobile=False)  # fmt: skip
+            yield page
+    finally:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        shutil.rmtree(home, ignore_errors=True)
+
+
+def _port(file: Path, process: subprocess.Popen[bytes]) -> int:
+    end = time.monotonic() + 30
+    while time.monotonic() < end and process.poll() is None:
+        if file.is_file() and len(lines := file.read_text().splitlines()) >= 1 and lines[0]:
+            return int(lines[0])
+        time.sleep(0.1)
+    raise TimeoutError(f"chromium did not start (exit status {process.poll()})")
+
+
+def _page_address(port: int) -> str:
+    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+    with opener.open(f"http://127.0.0.1:{port}/json/list", timeout=20) as answer:
+        return next(item["webSocketDebuggerUrl"] for item in json.load(answer) if item["type"] == "page")

@@ -1,0 +1,187 @@
+"""The viewer in a real browser: the page loads, a drag moves the object where it goes, sessions replay bit for bit."""
+
+from __future__ import annotations
+
+import os
+import runpy
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("viser", reason="the extra 'view' is not installed")
+
+from gausim.cli._subject import playable_run, playable_scene, subject_of
+from gausim.core import Trajectory
+from gausim.io.ply import load_scene
+from gausim.ops.selection import apply_masks, parse_half_space
+from gausim.view.app import Subject, Viewer
+from gausim.view.guard import Door
+from gausim.view.interaction import Interaction, replay
+from gausim.view.recording import record
+from gausim.view.session import Force, load_session
+
+BROWSER = runpy.run_path(str(Path(__file__).parent / "chromium.py"))
+chromium, pytestmark = BROWSER["chromium"], BROWSER["needs_chromium"]
+
+
+@contextmanager
+def served(subject: Subject) -> Iterator[Viewer]:
+    viewer = Viewer(subject, Door(port=0))
+    viewer.start()
+    try:
+        yield viewer
+    finally:
+        viewer.stop()
+
+
+def on_screen(viewer: Viewer, point: torch.Tensor, size: tuple[int, int] = (1280, 800)) -> tuple[float, float]:
+    """Where a point of the page's scene is seen [pixels]."""
+    client = next(iter(viewer.server.get_clients().values()))
+    camera = client.camera
+    w, x, y, z = camera.wxyz
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    seen = rotation.T @ (point.double().numpy() - camera.position)
+    focal = size[1] / 2 / np.tan(camera.fov / 2)
+    return size[0] / 2 + focal * seen[0] / seen[2], size[1] / 2 + focal * seen[1] / seen[2]
+
+
+def play(viewer: Viewer, page: Any, folder: Path, interaction: Interaction) -> None:
+    """Drags the farthest part to the right, and checks what the issue asks for."""
+    page.open(viewer.url)
+    page.wait(lambda: "simulated" in page.text() and viewer.live.steps > 3, 60, "the page")
+    hands, live = viewer.hands, viewer.live
+    page.picture(folder / "loaded.png")
+    # The part that moves most: the one farthest from what is pinned.
+    scene = interaction.scene
+    centres = hands._centres(scene.means)
+    root = viewer.placing.to_page(scene.means[scene.pinned]).mean(0)
+    chosen = centres[(centres - root).norm(dim=-1).argmax()]
+    start = on_screen(viewer, chosen)
+    end = (start[0] + 160, start[1])
+    page.press(*start)
+    page.drag_to(start, end)
+    page.wait(lambda: live.interaction.acting, 10, "a force")
+    time.sleep(1.0)
+    page.picture(folder / "dragged.png")
+    force = next(e.event for e in reversed(interaction.session().entries) if isinstance(e.event, Force))
+    moved = interaction.frame.positions - scene.means
+    along = torch.tensor(force.direction) / torch.tensor(force.direction).norm()
+    mean = (moved[hands.mask] @ along).mean() / scene.diagonal
+    assert float(mean) > 1e-4, f"moved {float(mean):.2e} diagonals along the drag"
+    across = (moved[hands.mask].mean(0) / scene.diagonal - mean * along).norm()
+    assert float(mean) > float(across), "moved more across the drag than along it"
+    seen = on_screen(viewer, viewer.placing.to_page(interaction.frame.positions[hands.mask].mean(0)))
+    rest = on_screen(viewer, viewer.placing.to_page(scene.means[hands.mask].mean(0)))
+    assert seen[0] > rest[0], "did not move to the right on the screen"
+    page.release(*end)
+    page.wait(lambda: not live.interaction.acting, 10, "letting go")
+    page.press_button("Pause")
+    page.wait(lambda: not live.playing, 10, "a pause")
+    recorded = interaction.trajectory()
+    page.press_button("Session")
+    page.press_button("Save the session")
+    page.wait(lambda: viewer.page.saved, 10, "a saved session")
+    again = replay(interaction, load_session(viewer.page.saved[-1]))
+    assert again.frames == recorded.frames
+    for name in ("positions", "gradients", "rotations"):
+        assert torch.equal(getattr(again, name), getattr(recorded, name)), name
+    page.press_button("Play", "[role=tab]")
+    page.press_button("Reset")
+    page.wait(lambda: live.interaction.frame_number == 0, 10, "a reset")
+    assert torch.equal(interaction.frame.positions, scene.means)
+    time.sleep(0.5)
+    page.picture(folder / "reset.png")
+    ours = [text for text in page.problems if "passive event listener" not in text]  # viser's own
+    assert not ours, ours
+    outside = [
+        u for u in page.requests if not u.startswith((viewer.url, "data:", "blob:", viewer.url.replace("http", "ws")))
+    ]
+    assert not outside, outside
+    assert not live.message and viewer.server.traffic.junk == viewer.server.traffic.failed == 0
+
+
+def test_page_is_dragged_reset_and_replayed(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
+    interaction = make_interaction(keep=None)
+    subject = Subject("a column", interaction, sessions=tmp_path / "sessions")
+    with served(subject) as viewer, chromium(tmp_path) as page:
+        play(viewer, page, tmp_path, interaction)
+
+
+@pytest.mark.slow
+def test_real_splats_are_dragged_reset_and_replayed(data_root: Path, tmp_path: Path) -> None:
+    scene = load_scene(data_root / "splats" / "playbot_lod3.ply")
+    scene = apply_masks(scene, pinned=parse_half_space("y=-0.12", above=True))
+    made = playable_scene(scene, fps=30.0, seed=0, keep=None)
+    subject = subject_of(made, title="playbot", beside=None, up="-y", sessions=tmp_path / "sessions")
+    with served(subject) as viewer, chromium(tmp_path) as page:
+        play(viewer, page, tmp_path, made.interaction)
+
+
+@pytest.mark.slow
+def test_trained_run_is_dragged_reset_and_replayed(tmp_path: Path) -> None:
+    run_dir, data = os.environ.get("GAUSIM_TEST_RUN"), os.environ.get("GAUSIM_TEST_RUN_DATA")
+    if not run_dir:
+        pytest.skip("GAUSIM_TEST_RUN is not set: it names a trained run (GAUSIM_TEST_RUN_DATA: its data set)")
+    from gausim.cli._run import load_run
+
+    made = playable_run(load_run(run_dir, data={"root": data} if data else None), keep=None)
+    subject = subject_of(made, title="a run", beside=None, up="z", sessions=tmp_path / "sessions")
+    with served(subject) as viewer, chromium(tmp_path) as page:
+        play(viewer, page, tmp_path, made.interaction)
+
+
+def test_exported_page_plays_without_a_network(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
+    scene = make_interaction().scene
+    frames = 12
+    positions = scene.means.expand(frames, -1, -1).clone()
+    positions[:, :, 0] += torch.linspace(0, 0.6, frames)[:, None] * scene.diagonal
+    identity = torch.eye(3).expand(frames, 1, 3, 3)
+    unit = torch.zeros(scene.count, dtype=torch.long)
+    path = record(scene, Trajectory(positions, identity, identity, unit, 6.0), tmp_path / "column.html")
+    # Everything that any part of the page would send goes to this socket, workers included.
+    with socket.create_server(("127.0.0.1", 0)) as trap:
+        trap.settimeout(0.2)
+        asked: list[bytes] = []
+        ended = threading.Event()
+
+        def listen() -> None:
+            while not ended.is_set():
+                try:
+                    asked.append(trap.accept()[0].recv(200))
+                except TimeoutError:
+                    continue
+
+        thread = threading.Thread(target=listen)
+        thread.start()
+        try:
+            proxy = f"--proxy-server=http://127.0.0.1:{trap.getsockname()[1]}"
+            with chromium(tmp_path, more=(proxy, "--proxy-bypass-list=<-loopback>")) as page:
+                page.open(path.as_uri())
+                page.wait(lambda: page.run("!!document.querySelector('canvas')"), 30, "a picture")
+                page.wait(lambda: page.run("document.title").startswith("column"), 10, "its title")
+                pictures = []
+                for _ in range(6):
+                    time.sleep(0.4)
+                    pictures.append(page.picture(tmp_path / "export.png"))
+                assert len(set(pictures)) > 2, "nothing moves"
+                outside = [u for u in page.requests if not u.startswith(("file:", "data:", "blob:"))]
+                assert not outside, outside
+        finally:
+            ended.set()
+            thread.join()
+    of_page = [text for text in asked if b"google" not in text and b"gstatic" not in text]
+    assert not of_page, of_page
