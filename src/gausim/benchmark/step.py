@@ -117,7 +117,7 @@ def _paper(size: Size, options: Options) -> list[Row]:
     scene = cloud(size.kernels, "paper")
     radii = find_radii(scene, size.units)
     network = dict(size.network)
-    bound = _Bound(GausSim([scene], [24.0], radii=radii, clustering=CLUSTERING, **{**PAPER, **network}), 1, options)
+    bound = Bound(GausSim([scene], [24.0], radii=radii, clustering=CLUSTERING, **{**PAPER, **network}), 1, options)
     counts = " + ".join(str(level.count) for level in reversed(bound.batch.levels))
     case = f"step, {size.kernels} kernels, {counts} units"
     rows = [Row(case, "edges", float(bound.edges()), "1")]
@@ -133,11 +133,11 @@ def _paper(size: Size, options: Options) -> list[Row]:
     rows.append(Row(case, "kept for the backward pass", kept / 2**20, "MiB"))
     rows += [Row(case, f"forward, {name}", 1e3 * t, "ms") for name, t in medians(bound.parts(), options).items()]
     without = GausSim([scene], [24.0], radii=radii, clustering=CLUSTERING, **{**NO_HIERARCHY, **network})
-    return rows + _without(_Bound(without, 1, options), bound, forward["step"], both["step"], kept, size, options)
+    return rows + _without(Bound(without, 1, options), bound, forward["step"], both["step"], kept, size, options)
 
 
 def _without(
-    flat: _Bound, bound: _Bound, forward: float, both: float, kept: float, size: Size, options: Options
+    flat: Bound, bound: Bound, forward: float, both: float, kept: float, size: Size, options: Options
 ) -> list[Row]:
     """The same scene with every kernel predicted."""
     case = f"step, {size.kernels} kernels, no hierarchy"
@@ -164,7 +164,7 @@ def _training(size: Size, options: Options) -> list[Row]:
     template = functools.partial(ElasticTemplate, **TEMPLATE)
     settings = {**DEFAULT, **dict(size.network), "template": template}
     model = GausSim([scene], [24.0], radii=find_radii(scene, size.bunny_units), clustering=CLUSTERING, **settings)
-    bound = _Bound(model, size.batch, options, steps=size.steps)
+    bound = Bound(model, size.batch, options, steps=size.steps)
     counts = " + ".join(str(level.count) for level in reversed(bound.batch.levels))
     case = f"{size.steps} steps, {size.batch} x {size.bunny} kernels, {counts} units"
     rows = [Row(case, "edges", float(bound.edges()), "1")]
@@ -212,7 +212,7 @@ def _bent(batch: SceneBatch, amount: float) -> Tensor:
     return torch.where((batch.kernels.unit < 0)[:, None], batch.rest, bent)
 
 
-class _Bound:
+class Bound:
     """A simulator with random weights, a batch of its scene in motion, and what is timed of it."""
 
     def __init__(self, model: GausSim, members: int, options: Options, *, steps: int = 1) -> None:

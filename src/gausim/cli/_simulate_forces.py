@@ -13,11 +13,10 @@ from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     import numpy as np
-    from torch import Tensor
 
     from gausim.cli._foresee import RunObject
     from gausim.cli._run import LoadedRun
-    from gausim.core import Trajectory
+    from gausim.core import Cameras, Trajectory
     from gausim.view.arrows import Arrow
     from gausim.view.interaction import Interaction
     from gausim.view.session import ForceSession
@@ -130,7 +129,7 @@ def _write_view(
     from gausim.report.frames import brighten
 
     scene, record = scene_of(run, item), item.data.sequences[0]
-    cameras = record.cameras_of([view])
+    cameras = _sharp(record.cameras_of([view]))
     drawn = film(
         run.renderer, scene, trajectory, cameras,
         background=parse_background(arguments.background), mask=scene.foreground,
@@ -140,7 +139,7 @@ def _write_view(
     title = f"{item.data.name} {view}"
 
     def pictures() -> Iterator[np.ndarray]:
-        return _pictures(images, arrows, cameras.viewmats[0], cameras.Ks[0], title)
+        return _pictures(images, arrows, cameras, title)
 
     write_video(folder / f"{view}.mp4", pictures(), fps)
     if arguments.gif:
@@ -153,20 +152,30 @@ def _write_view(
     )  # fmt: skip
 
 
+def _sharp(cameras: Cameras) -> Cameras:
+    """The same views with as many pixels as a video's panel has, where the data set's have fewer."""
+    from gausim.core import Cameras
+    from gausim.report.frames import PANEL_HEIGHT
+
+    zoom = max(1.0, PANEL_HEIGHT / cameras.height)
+    Ks = cameras.Ks.clone()
+    Ks[:, :2] *= zoom
+    return Cameras(cameras.viewmats, Ks, round(cameras.width * zoom), round(cameras.height * zoom), cameras.names)
+
+
 def _pictures(
-    images: np.ndarray, arrows: Sequence[Sequence[Arrow]], viewmat: Tensor, K: Tensor, title: str
+    images: np.ndarray, arrows: Sequence[Sequence[Arrow]], cameras: Cameras, title: str
 ) -> Iterator[np.ndarray]:
     import numpy as np
 
-    from gausim.report.frames import PANEL_HEIGHT, enlarge, label_bar
+    from gausim.report.frames import label_bar
     from gausim.view.arrows import draw_arrows
 
-    zoom = max(1.0, PANEL_HEIGHT / images.shape[1])
     for number, image in enumerate(images):
-        large = draw_arrows(enlarge(image, zoom), arrows[number], viewmat, K, zoom)
+        shown = draw_arrows(image, arrows[number], cameras.viewmats[0], cameras.Ks[0])
         acting = ", ".join(dict.fromkeys(arrow.label for arrow in arrows[number]))
         text = f"{title}   {number}/{len(images) - 1}   {acting}"
-        yield np.concatenate((large, label_bar(text, large.shape[1])))
+        yield np.concatenate((shown, label_bar(text, shown.shape[1])))
 
 
 def _report(interaction: Interaction, trajectory: Trajectory) -> None:

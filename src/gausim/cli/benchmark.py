@@ -19,6 +19,7 @@ CASES = {
     "step": "one predicted frame at the paper's size, with and without hierarchy, part by part",
     "train": "whole optimiser steps, part by part; KEY=VALUE chooses the experiment as in `gausim train`",
     "data": "packed frames against decoding PNG; opening and streaming a set of the paper's size",
+    "interact": "an object that is pushed about: simulated frames per second, from the force to the browser's bytes",
     "cluster": "clusters of bounded diameter and neighbour search",
 }
 DEFAULT_OVERRIDES = ("experiment=demo",)

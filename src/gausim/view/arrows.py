@@ -52,7 +52,6 @@ def draw_arrows(
     arrows: Sequence[Arrow],
     viewmat: Float[Tensor, "4 4"],
     K: Float[Tensor, "3 3"],
-    zoom: float = 1.0,
 ) -> np.ndarray:
     """A copy of a (H, W, 3) uint8 picture of one camera with arrows over it.
 
@@ -60,15 +59,14 @@ def draw_arrows(
         image: the picture.
         arrows: what is drawn; those behind the camera are left out.
         viewmat: world to camera.
-        K: intrinsics of the picture before it was enlarged.
-        zoom: how much it was enlarged.
+        K: intrinsics of the picture [pixels].
     """
     drawn = np.ascontiguousarray(image).copy()
     for arrow in arrows:
         ends = torch.stack((arrow.start, arrow.end)).double() @ viewmat[:3, :3].double().T + viewmat[:3, 3].double()
         if float(ends[:, 2].min()) <= 1e-6:
             continue
-        pixels = (ends / ends[:, 2:]) @ K.double().T * zoom
+        pixels = (ends / ends[:, 2:]) @ K.double().T
         # OpenCV takes 32-bit coordinates; nothing so far outside is seen.
         a, b = ([int(v) for v in p[:2].clamp(-1e4, 1e4)] for p in pixels)
         for color, width in ((_OUTLINE, 5), (_COLOR, 2)):

@@ -1,0 +1,102 @@
+"""Benchmark: what a frame of an object that is pushed about costs, from the force to the bytes for the browser."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from gausim.benchmark.harness import Options, Row, medians, torch_threads
+from gausim.benchmark.step import Bound, cloud
+from gausim.core import GaussianScene, SimState
+from gausim.models.elastic import ElasticTemplate
+from gausim.models.simulator import GausSim
+from gausim.view.coloring import VIEW, Painter
+from gausim.view.interaction import Interaction
+from gausim.view.selections import Ball
+from gausim.view.session import Force, MadeWith
+from gausim.view.splats import Placing, pack
+
+SIZES = {False: (2_000, 20_000), True: (300,)}
+FPS = 24.0
+# Parts of a step by what they serve; `constants` are made once per session.
+GROUPS = {
+    "graph": ("aggregation", "edges", "features", "normalisers"),
+    "network": ("network",),
+    "propagation": ("template", "recursion and kernels"),
+}
+SH_DEGREE_3 = 16
+
+
+def run(options: Options) -> list[Row]:
+    """Simulated frames per second, and the time of a frame divided into parts; weights are those of no training."""
+    rows: list[Row] = []
+    with torch_threads(options.threads):
+        for count in SIZES[options.quick]:
+            rows += _frame(count, options)
+    return rows
+
+
+def build(count: int) -> tuple[GaussianScene, GausSim]:
+    """A scene with spherical harmonics of degree 3, and the simulator of ``conf/model/gausim.yaml``."""
+    scene = cloud(count, f"cloud{count}")
+    colors = 0.2 * torch.randn(count, SH_DEGREE_3, 3, generator=torch.Generator().manual_seed(0))
+    scene = GaussianScene.create(
+        means=scene.means, log_scales=scene.log_scales, quats=scene.quats, opacity_logits=scene.opacity_logits,
+        sh=colors, pinned=scene.pinned, name=scene.name,
+    )  # fmt: skip
+    template = partial(
+        ElasticTemplate, modes=48, solid=0.12, geometric=1.0, neighbours=24, damping="full", period=8.0, hidden=0
+    )
+    model = GausSim(
+        [scene], [FPS], radii=(0.13, 0.4), graph_radii=(2.0, 0.4), max_neighbours=8, edges="rest", rest_inputs=True,
+        hidden=32, layers=2, output_scale=0.01, zero_output=True, passive_frames=12, template=template,
+    )  # fmt: skip
+    return scene, model.eval()
+
+
+def _frame(count: int, options: Options) -> list[Row]:
+    scene, model = build(count)
+    model.to(options.device)
+    scene = scene.to(options.device)
+    initial, dynamics = SimState(scene.means, scene.means), model.dynamics(0)
+    units = [u.to(options.device) for u in model.units_of_kernels(0)]
+    made_with = MadeWith.of(scene, model, initial)
+    live = Interaction(scene, dynamics, dynamics.masses, initial, made_with=made_with, units=units)
+    x, y, z = scene.means[scene.means[:, 2].argmax()].tolist()
+    live.act(Force(Ball((x, y, z), 0.2), (1.0, 0.0, 0.0), 1.0))
+    painter, placing = Painter(scene, units, live.masses), Placing.of(scene)
+    eye, speed = torch.tensor([0.0, -3.0, 0.5]), torch.zeros(count)
+    live.step()
+
+    def paint() -> tuple[Tensor, Tensor]:
+        covars, rgb, _ = painter(live.frame, live.unit_of_kernel, speed, VIEW, eye)
+        return covars, rgb
+
+    covars, rgb = paint()
+    parts = Bound(model, 1, options).parts()
+    candidates: dict[str, Callable[[], object]] = {
+        "step": live.step,
+        "colours": paint,
+        "packing": lambda: pack(live.frame.positions.cpu(), covars, rgb, painter.opacities, placing),
+        **{name: parts[name] for names in GROUPS.values() for name in names},
+    }
+    times = medians(candidates, options, rounds=max(options.rounds, 15), warmup=3)
+    return _rows(f"{count} kernels, {sum(level.count for level in model.hierarchies[0].levels[1:])} units", times)
+
+
+def _rows(case: str, times: dict[str, float]) -> list[Row]:
+    split = {group: sum(times[name] for name in names) for group, names in GROUPS.items()}
+    rest = max(0.0, times["step"] - sum(split.values()))
+    split |= {"forces, energy, checks, coarse level": rest, "colours": times["colours"], "packing": times["packing"]}
+    whole = times["step"] + times["colours"] + times["packing"]
+    rows = [
+        Row(case, "simulated", 1 / times["step"], "frames/s"),
+        Row(case, "made one after the other", 1 / whole, "frames/s"),
+        Row(case, "step", times["step"], "s"),
+    ]
+    for name, seconds in split.items():
+        rows += [Row(case, name, seconds, "s"), Row(case, f"{name}, share", seconds / whole, "1", "step to packing")]
+    return rows

@@ -1,0 +1,141 @@
+"""Every format of `gausim export`, from a run and back from its files."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import pytest
+import torch
+
+from gausim.cli import _run, export
+from gausim.core import ConfigError, DataError
+from gausim.io.ply import load_scene, save_scene
+from gausim.io.ply_sequence import load_ply_sequence
+from gausim.io.trajectory import load_trajectory
+from gausim.io.video import read_video
+from gausim.ops.deformed_scene import deformed_scene
+
+PLAYED = runpy.run_path(str(Path(__file__).parents[1] / "played.py"))
+FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh", "pinned")
+
+
+@pytest.fixture(scope="module")
+def loaded(tmp_path_factory: pytest.TempPathFactory):
+    return PLAYED["played_run"](tmp_path_factory.mktemp("played"))
+
+
+@pytest.fixture
+def run(loaded, monkeypatch, tmp_path: Path):
+    monkeypatch.setattr(_run, "load_run", lambda path: loaded)
+    monkeypatch.chdir(tmp_path)
+    return loaded
+
+
+def test_a_trajectory_and_ply_files_come_back_bit_for_bit(run, tmp_path: Path, capsys) -> None:
+    scene, source = run.module.model.scenes[0], str(run.run_dir)
+    options = ["--sequence", "seq_001", "--frames", "6"]
+    assert export.main([source, "--format", "safetensors", *options]) == 0
+    assert "wrote toy_seq_001.safetensors: 6 frames of 36 kernels at 24 frames" in capsys.readouterr().out
+    trajectory, whole = load_trajectory("toy_seq_001.safetensors"), run.module.foresee(1, 5)
+    for name in ("positions", "gradients", "rotations", "unit_of_kernel"):
+        assert torch.equal(getattr(trajectory, name), getattr(whole, name))
+
+    assert export.main([source, "--format", "ply", "--out", "a", *options]) == 0
+    save_scene(scene, "rest.ply")
+    stored = ["toy_seq_001.safetensors", "--scene", "rest.ply"]
+    assert export.main([*stored, "--format", "ply", "--out", "b"]) == 0
+    expected = [
+        deformed_scene(scene, *state, whole.unit_of_kernel)
+        for state in zip(whole.positions, whole.gradients, whole.rotations, strict=True)
+    ]
+    for folder in ("a", "b"):
+        scenes, count, fps = load_ply_sequence(folder)
+        assert count == 6 and fps == 24.0
+        for read, made in zip(scenes, expected, strict=True):
+            assert all(torch.equal(getattr(read, n), getattr(made, n)) for n in FIELDS)
+    assert (tmp_path / "a" / "toy_seq_001_0006.ply").is_file()
+    assert export.main(["a", "--format", "ply", "--out", "c", "--every", "2"]) == 0
+    scenes, count, fps = load_ply_sequence("c")
+    assert count == 3 and fps == 12.0 and [torch.equal(s.means, expected[2 * i].means) for i, s in enumerate(scenes)]
+
+
+def test_usd_and_back(run) -> None:
+    pytest.importorskip("pxr", reason="needs usd-core (extra usd)")
+    assert export.main([str(run.run_dir), "--format", "usd", "--frames", "4", "--out", "m.usdc"]) == 0
+    assert export.main(["m.usdc", "--format", "ply", "--out", "p"]) == 0
+    scenes, count, fps = load_ply_sequence("p")
+    whole = run.module.foresee(0, 3)
+    assert count == 4 and fps == 24.0
+    for scene, positions in zip(scenes, whole.positions, strict=True):
+        assert torch.equal(scene.means, positions)
+    for form in ("safetensors", "html"):
+        with pytest.raises(ConfigError, match=f"--format {form}: m.usdc holds frames without units"):
+            export.main(["m.usdc", "--format", form])
+
+
+def test_pictures(run) -> None:
+    source = str(run.run_dir)
+    assert export.main([source, "--format", "mp4", "--frames", "5", "--view", "cam_1", "--out", "v.mp4"]) == 0
+    shown = list(read_video("v.mp4"))
+    assert len(shown) == 5 and shown[0].shape == (32, 32, 3) and shown[0].max() > 60
+    # A trajectory's frames are drawn as the run draws them: deformed scenes are the same Gaussians.
+    from gausim.render.draw import film
+
+    whole, record = run.module.foresee(0, 4), run.objects[0].sequences[0]
+    expected = film(run.renderer, run.module.model.scenes[0], whole, record.cameras_of(["cam_1"]))[:, 0].numpy()
+    assert abs(shown[4].astype(int) - expected[4].astype(int)).mean() < 3
+    assert export.main([source, "--format", "ply", "--frames", "3", "--out", "p"]) == 0
+    options = ["--size", "40", "--background", "white", "--azimuth", "90"]
+    assert export.main(["p", "--format", "gif", "--out", "v.gif", *options]) == 0
+    from PIL import Image
+
+    with Image.open("v.gif") as image:
+        assert image.n_frames == 3 and image.size == (40, 40) and min(image.convert("RGB").getpixel((0, 0))) > 245
+
+
+@pytest.mark.parametrize("form", ["viser", "html"])
+def test_recordings(run, form: str) -> None:
+    pytest.importorskip("viser", reason="needs viser (extra view)")
+    assert export.main([str(run.run_dir), "--format", form, "--frames", "3"]) == 0
+    assert Path(f"toy_seq_000.{form}").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("argv", "error", "message"),
+    [
+        (["RUN", "--format", "gif", "--view", "cam_9"], DataError, "--view cam_9: expected one of .'cam_0'"),
+        (["RUN", "--format", "ply", "--sequence", "x"], DataError, "has no sequence 'x'"),
+        (["RUN", "--format", "ply", "--object", "x"], DataError, "has no object"),
+        (["RUN", "--format", "usd", "--out", "m.txt"], ConfigError, "ends in .usd"),
+        (["t.safetensors", "--format", "ply"], ConfigError, "name its rest scene with --scene"),
+        (["t.safetensors", "--format", "ply", "--scene", "s.ply"], DataError, "t.safetensors: no such file"),
+        (["empty", "--format", "ply"], DataError, "no files NAME_0001.ply"),
+        (["none.usd", "--format", "ply"], DataError, "none.usd: no such file"),
+    ],
+)
+def test_what_cannot_be_exported(run, argv: list[str], error: type[Exception], message: str) -> None:
+    if "usd" in " ".join(argv):
+        pytest.importorskip("pxr", reason="needs usd-core (extra usd)")
+    Path("empty").mkdir()
+    argv = [str(run.run_dir) if word == "RUN" else word for word in argv]
+    with pytest.raises(error, match=message):
+        export.main(argv)
+
+
+def test_a_scene_of_another_object_is_refused(run) -> None:
+    assert export.main([str(run.run_dir), "--format", "safetensors", "--frames", "2", "--out", "t.safetensors"]) == 0
+    scene = run.module.model.scenes[0]
+    save_scene(scene.select(torch.arange(scene.count) < 9), "other.ply")
+    assert load_scene("other.ply").count == 9
+    with pytest.raises(DataError, match="has 36 kernels, but other.ply has 9"):
+        export.main(["t.safetensors", "--format", "gif", "--scene", "other.ply"])
+
+
+def test_help_lists_what_each_keeps_and_loses(capsys) -> None:
+    with pytest.raises(SystemExit):
+        export.main(["--help"])
+    shown = capsys.readouterr().out
+    for name, form in export.FORMATS.items():
+        assert f"  {name}" in shown and form.keeps in shown and form.loses in shown
+    assert set(export.FORMATS) == set(export._WRITERS)
