@@ -208,5 +208,7 @@ class Viewer:
                 if painted.beside is not None:
                     self._beside.buffer = painted.beside
             self.hands.follow(painted.shown)
-        self.page.refresh(painted.shown, painted.legend, self.server.traffic.displayed)
-        self.sights.refresh(painted.shown)
+        paused = not self.live.playing  # then this may be the last frame for long
+        displayed = 0.0 if paused else self.server.traffic.displayed
+        self.page.refresh(painted.shown, painted.legend, displayed, now=paused)
+        self.sights.refresh(painted.shown, now=paused)

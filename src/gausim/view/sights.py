@@ -138,14 +138,14 @@ class Sights:
             blank = np.zeros((8, 16, 3), np.uint8)
             self._picture = gui.add_image(blank, label="recorded | shown", format="png", visible=False)
 
-    def refresh(self, shown: Shown) -> None:
+    def refresh(self, shown: Shown, *, now: bool = False) -> None:
         """Draws the recorded and the shown frame of the chosen camera, where the shown one was recorded."""
         if self._films is None:
             return
-        now = time.monotonic()
-        if now - self._drawn < 1 / _PICTURES:
+        moment = time.monotonic()
+        if not now and moment - self._drawn < 1 / _PICTURES:
             return
-        self._drawn = now
+        self._drawn = moment
         sequence = self._takes.get(shown.source) if shown.source != LIVE else None
         view = self._view.value
         on = bool(self._on.value) and sequence is not None and view in self._films.views
