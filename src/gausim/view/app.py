@@ -28,8 +28,6 @@ from gausim.view.splats import SIZE, Placing, pack
 
 # Colours follow the camera so often while time stands [times per second].
 _VIEWS = 10.0
-# How far apart two objects side by side stand [diagonals].
-_APART = 1.15
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,16 +116,13 @@ class Viewer:
     def _place_beside(self, subject: Subject) -> None:
         if subject.companion is None:
             return
-        other = subject.companion.interaction
-        right = np.cross(self.sights.forward, self.sights.up)
-        offset = _APART * SIZE * right / max(float(np.linalg.norm(right)), 1e-9)
-        self._other_placing = Placing(
-            self.placing.centre, self.placing.scale, (float(offset[0]), float(offset[1]), float(offset[2]))
-        )
+        other, offset = subject.companion.interaction, self.sights.aside
+        at = (float(offset[0]), float(offset[1]), float(offset[2]))
+        self._other_placing = Placing(self.placing.centre, self.placing.scale, at)
         self._other_painter = Painter(other.scene, other.units, other.masses)
-        self.server.scene.add_label(
-            "/name_beside", subject.companion.name, position=tuple(offset + SIZE * 0.6 * self.sights.up)
-        )
+        top = float((self._other_placing.to_page(other.scene.means.float()) @ self.sights.vertical).max())
+        above = offset + (top + 0.06 * SIZE) * self.sights.up
+        self.server.scene.add_label("/name_beside", subject.companion.name, position=above, anchor="bottom-center")
 
     def _add(self, name: str, buffer: np.ndarray) -> Any:
         """Splats of a packed buffer."""
@@ -213,5 +208,7 @@ class Viewer:
                 if painted.beside is not None:
                     self._beside.buffer = painted.beside
             self.hands.follow(painted.shown)
-        self.page.refresh(painted.shown, painted.legend, self.server.traffic.displayed)
-        self.sights.refresh(painted.shown)
+        paused = not self.live.playing  # then this may be the last frame for long
+        displayed = 0.0 if paused else self.server.traffic.displayed
+        self.page.refresh(painted.shown, painted.legend, displayed, now=paused)
+        self.sights.refresh(painted.shown, now=paused)

@@ -7,6 +7,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from gausim.core import Cameras, GausSimError
 from gausim.view.shown import LIVE, Shown
@@ -20,6 +21,8 @@ _FREE = "Free"
 # Video frames are drawn so often at most [times per second].
 _PICTURES = 6.0
 _HEIGHT_OF_VIEW = 0.8
+# Two objects side by side stand this many widths apart.
+_APART = 1.25
 
 
 class Sights:
@@ -27,8 +30,10 @@ class Sights:
 
     Attributes:
         up: vertical direction.
+        vertical: the same as a tensor.
         forward: where one looks at first.
         first_position: from where [page units].
+        aside: where a companion stands from the object [page units]; zero without one.
     """
 
     def __init__(self, server: Any, placing: Placing, subject: Subject) -> None:
@@ -37,8 +42,14 @@ class Sights:
         self._cameras = subject.cameras
         self._takes = {take.name: take.sequence for take in subject.takes}
         self.up = np.array(_UP[subject.up], float)
+        self.vertical = torch.tensor(self.up, dtype=torch.float32)
         self.first_position, target, fov = self._first()
         self.forward = (target - self.first_position) / np.linalg.norm(target - self.first_position)
+        self.aside = np.zeros(3)
+        if subject.companion is not None:
+            self.aside = self._aside(subject)
+            target = target + self.aside / 2
+            self.first_position = target - self.forward * (1.8 * np.linalg.norm(self.first_position - target))
         camera = server.initial_camera
         camera.position, camera.look_at, camera.up = self.first_position, target, self.up
         camera.fov = fov
@@ -48,6 +59,15 @@ class Sights:
             self._add_cameras(self._cameras)
         if self._films is not None:
             self._add_films(self._films)
+
+    def _aside(self, subject: Subject) -> np.ndarray:
+        """To the right as one looks at first, by a little more than the object is wide."""
+        right = np.cross(self.forward, self.up)
+        right /= max(float(np.linalg.norm(right)), 1e-9)
+        scene = subject.interaction.scene
+        across = self._placing.to_page(scene.means[scene.foreground].float().cpu()).double().numpy() @ right
+        offset: np.ndarray = right * max(_APART * float(np.ptp(across)), 0.3 * SIZE)
+        return offset
 
     def _first(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Position, target and vertical field of view of the first look."""
@@ -118,14 +138,14 @@ class Sights:
             blank = np.zeros((8, 16, 3), np.uint8)
             self._picture = gui.add_image(blank, label="recorded | shown", format="png", visible=False)
 
-    def refresh(self, shown: Shown) -> None:
+    def refresh(self, shown: Shown, *, now: bool = False) -> None:
         """Draws the recorded and the shown frame of the chosen camera, where the shown one was recorded."""
         if self._films is None:
             return
-        now = time.monotonic()
-        if now - self._drawn < 1 / _PICTURES:
+        moment = time.monotonic()
+        if not now and moment - self._drawn < 1 / _PICTURES:
             return
-        self._drawn = now
+        self._drawn = moment
         sequence = self._takes.get(shown.source) if shown.source != LIVE else None
         view = self._view.value
         on = bool(self._on.value) and sequence is not None and view in self._films.views
