@@ -12,6 +12,9 @@ from gausim.cli.inspect import add_pin_options, pinned_by
 from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
     from gausim.core import GaussianScene, Renderer
     from gausim.engine.reconstruction import ReconstructionOptions
     from gausim.engine.reconstruction_state import Partial
@@ -23,6 +26,8 @@ HELP = "Fit the Gaussians of the rest scene to posed stills."
 # Images side by side in the comparison picture.
 COMPARED = 5
 LEFT_OUT_COMPARED = 2
+# Width of each of them at most [pixels].
+COLUMN = 480
 # Times that what is done so far is written while a scene is made.
 SAVES = 20
 # An open scene has parts of every size, seen through one another, and grows from few points.
@@ -282,10 +287,22 @@ def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...
         chosen = images.select(sorted({i * total // count for i in range(count)}))
         truth, _ = composite(chosen.images)
         drawn = draw_rest(scene, renderer, chosen.cameras)
-        columns += [torch.cat(x) for x in zip(truth, drawn, (4 * (drawn - truth).abs()).clamp(0, 1), strict=True)]
+        columns += [
+            _small(torch.cat(x)) for x in zip(truth, drawn, (4 * (drawn - truth).abs()).clamp(0, 1), strict=True)
+        ]
     rgb = torch.cat(columns, dim=1)
     pixels = (torch.cat((rgb, torch.ones_like(rgb[..., :1])), -1) * 255).round().to(torch.uint8)
     write_rgba(path, pixels)
+
+
+def _small(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
+    """At most :data:`COLUMN` pixels wide: photos of several megapixels make a picture that nothing opens."""
+    height, width = image.shape[:2]
+    if width <= COLUMN:
+        return image
+    from torch.nn.functional import adaptive_avg_pool2d
+
+    return adaptive_avg_pool2d(image.permute(2, 0, 1), (round(height * COLUMN / width), COLUMN)).permute(1, 2, 0)
 
 
 def _told(record: dict, out: Path) -> str:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from gausim.core import DataError, GaussianScene, SceneError
+from gausim.io.files import write_json
 from gausim.io.ply import load_scene, save_masks, save_scene
 
 # SuperSplat orders files by the number at the end of their names.
@@ -42,9 +42,7 @@ def save_ply_sequence(folder: Path | str, name: str, frames: Iterable[GaussianSc
         save_scene(scene, written[-1], masks=False)
     if not written:
         raise DataError(f"{folder}: no frames to write; a sequence needs at least one.")
-    temporary = folder / f".{name}.json.{os.getpid()}.tmp"
-    temporary.write_text(json.dumps({"fps": fps, "frames": len(written)}) + "\n")
-    os.replace(temporary, folder / f"{name}.json")
+    write_json(folder / f"{name}.json", {"fps": fps, "frames": len(written)})
     return written
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import os
 from pathlib import Path
 from typing import Literal
 
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 
 from gausim.core import DataError, DivergenceError, GaussianScene, SteppedFrame, Trajectory
+from gausim.io.files import write_durably
 from gausim.view.coloring import BASE, VIEW, Painter
 from gausim.view.guard import Door, GuardedServer
 from gausim.view.splats import SIZE, Placing, pack
@@ -68,10 +68,7 @@ def record(
     if isinstance(data, str):
         data = _sealed(data, scene.name).encode()
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)
+    write_durably(path, data)
     return path
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -21,6 +20,7 @@ from torch import Tensor
 from torch.nn import Module
 
 from gausim.core import ConfigError, DataError, GaussianScene, SimState
+from gausim.io.files import write_durably
 from gausim.view.selections import Selected, Whole, number, selection_from_json, vector, whole
 
 FORMAT = "gausim.session/1"
@@ -278,10 +278,7 @@ def save_session(session: ForceSession, path: Path | str) -> None:
     lines = [f"  {json.dumps(name)}: {json.dumps(value, allow_nan=False)}" for name, value in header.items()]
     events = ",\n".join("    " + json.dumps(_to_json(entry), allow_nan=False) for entry in session.entries)
     lines.append('  "events": [' + (f"\n{events}\n  ]" if events else "]"))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_durably(path, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
 
 
 def load_session(path: Path | str) -> ForceSession:
