@@ -110,12 +110,12 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> Fitted:
     scene = pinned_by(fitted, arguments.pin_below, arguments.pin_above)
     seconds = {"wall_seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - cpu}
     save_scene(scene, out)
-    partial.remove()
     figures = {images.name: {"images": len(images.images), **measure(scene, renderer, images)}
                for images in material.measure}  # fmt: skip
     record = _record(scene, options, figures, seconds)
     write_json(out.with_suffix(".json"), record)
     _compare(scene, renderer, material.measure, out.with_suffix(".png"))
+    partial.remove()
     return Fitted(record, _told(record, out))
 
 

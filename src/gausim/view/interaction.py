@@ -6,7 +6,6 @@ import math
 import random
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -23,8 +22,8 @@ from gausim.core import (
     Trajectory,
     trajectory_of,
 )
-from gausim.ops.covariance import kernel_volumes
 from gausim.ops.deformation import determinant
+from gausim.view.pushes import Push, exposure, scaled
 from gausim.view.selections import Selected
 from gausim.view.session import (
     MOST_EVENTS,
@@ -51,21 +50,10 @@ MOST_FORCE = 10.0
 FARTHEST = 10.0
 # |det G| / |G|^3 (Frobenius) of a flattened unit; 0.19 is none, and below this G S G^T is singular in float32.
 FLATTEST = 1e-6
-# The exposure of a kernel to wind over the mean one stays within this factor.
-_EXPOSURE = 4.0
 # Gusts are a sum of waves of these frequencies [Hz].
 _GUSTS = (0.35, 0.8, 1.7)
 # A trajectory that takes more memory is not built [bytes].
 _MOST_BYTES = 8 << 30
-
-
-@dataclass(eq=False)
-class _Push:
-    """A force that acts: acceleration vector of the kernels of a mask, and how many more steps."""
-
-    mask: Bool[Tensor, " K"]
-    acceleration: tuple[float, float, float]
-    left: int | None
 
 
 class Interaction:
@@ -125,7 +113,7 @@ class Interaction:
         self._rest = scene.means.to(initial.positions)
         self._free = (scene.simulated & ~scene.pinned).to(self._rest.device)
         self._diagonal = scene.diagonal
-        self._exposure = _exposure(scene, self._masses, self._free)
+        self._exposure = exposure(scene, self._masses, self._free)
         self._frames: deque[SteppedFrame] = deque(maxlen=keep)
         self.restart()
 
@@ -150,8 +138,8 @@ class Interaction:
         self.frame_number = 0
         self.broken: str | None = None
         self.held: Bool[Tensor, " K"] = torch.zeros_like(self._free)
-        self._forces: dict[str, _Push] = {}
-        self._impulses: list[_Push] = []
+        self._forces: dict[str, Push] = {}
+        self._impulses: list[Push] = []
         self._steady: Gravity | None = None
         self._wind: Wind | None = None
 
@@ -224,9 +212,9 @@ class Interaction:
         found = [(push.mask, push.acceleration, "force") for push in self._forces.values()]
         found += [(push.mask, push.acceleration, "impulse") for push in self._impulses]
         if self._wind is not None:
-            found.append((self._free, _scaled(self._wind.direction, self._wind_strength() * self.gravity), "wind"))
+            found.append((self._free, scaled(self._wind.direction, self._wind_strength() * self.gravity), "wind"))
         if self._steady is not None:
-            steady = _scaled(self._steady.direction, self._steady.weights * self.gravity)
+            steady = scaled(self._steady.direction, self._steady.weights * self.gravity)
             found.append((self._free, steady, "gravity"))
         return found
 
@@ -284,8 +272,8 @@ class Interaction:
             raise ConfigError(f"selection {on.to_json()}: expected kernels that can move, got only pinned ones.")
         return mask
 
-    def _push(self, on: Selected, direction: tuple[float, float, float], weights: float, frames: int | None) -> _Push:
-        return _Push(self._movable(on), _scaled(direction, weights * self.gravity), frames)
+    def _push(self, on: Selected, direction: tuple[float, float, float], weights: float, frames: int | None) -> Push:
+        return Push(self._movable(on), scaled(direction, weights * self.gravity), frames)
 
     # ----------------------------------------------------------------------------------------------------- forces
 
@@ -297,11 +285,9 @@ class Interaction:
         for push in (*self._forces.values(), *self._impulses):
             acceleration += push.mask[:, None] * acceleration.new_tensor(push.acceleration)
         if self._steady is not None:
-            acceleration += acceleration.new_tensor(
-                _scaled(self._steady.direction, self._steady.weights * self.gravity)
-            )
+            acceleration += acceleration.new_tensor(scaled(self._steady.direction, self._steady.weights * self.gravity))
         if self._wind is not None:
-            blown = acceleration.new_tensor(_scaled(self._wind.direction, self._wind_strength() * self.gravity))
+            blown = acceleration.new_tensor(scaled(self._wind.direction, self._wind_strength() * self.gravity))
             acceleration += self._exposure[:, None] * blown
         most = self.most_force * self.gravity
         acceleration *= (most / acceleration.norm(dim=-1, keepdim=True).clamp_min(most)).clamp_max(1.0)
@@ -392,19 +378,3 @@ def differences(interaction: Interaction, session: ForceSession) -> list[tuple[s
     if made.initial_hash != here.initial_hash:
         found.append((f"it begins at another state, '{made.initial}' and not '{here.initial}'", True))
     return found
-
-
-def _exposure(scene: GaussianScene, masses: Tensor, free: Tensor) -> Float[Tensor, " K"]:
-    """Acceleration of a kernel by wind over the mean one of the object: cross-section over mass, V^(2/3) / m."""
-    volume = kernel_volumes(scene.log_scales, scene.volume_scale).to(masses)
-    share = volume.pow(2 / 3) / masses.clamp_min(torch.finfo(masses.dtype).tiny)
-    share = torch.where(free, share, torch.zeros_like(share))
-    mean = (share * masses).sum() / (masses * free).sum()
-    share = torch.where(free, (share / mean).clamp(1 / _EXPOSURE, _EXPOSURE), torch.zeros_like(share))
-    return share * ((masses * free).sum() / (share * masses).sum())
-
-
-def _scaled(direction: tuple[float, float, float], length: float) -> tuple[float, float, float]:
-    x, y, z = direction
-    factor = length / math.hypot(x, y, z)
-    return x * factor, y * factor, z * factor
