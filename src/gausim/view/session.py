@@ -168,7 +168,6 @@ def save_session(session: ForceSession, path: Path | str) -> None:
     lines = [f"  {json.dumps(name)}: {json.dumps(value, allow_nan=False)}" for name, value in header.items()]
     events = ",\n".join("    " + json.dumps(_to_json(entry), allow_nan=False) for entry in session.entries)
     lines.append('  "events": [' + (f"\n{events}\n  ]" if events else "]"))
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_durably(path, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
 
 
