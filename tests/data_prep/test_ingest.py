@@ -428,7 +428,7 @@ def _list(text: str) -> Callable[[Path], Path]:
         (_list('{"sequences": []}'), "must be a list"),
         (_list('{"sequences": [3]}'), "expected an object"),
         (_list('{"sequences": [{"cameras": {"a": 1}}]}'), "'cameras' must map"),
-        (_list('{"sequences": [{"cameras": {"a": "x.mp4"}, "start": NaN}]}'), "'start'"),
+        (_list('{"sequences": [{"cameras": {"a": "x.mp4"}, "start": NaN}]}'), r"'sequences\[0\]\.start' is NaN"),
         (_list('{"sequences": [{"cameras": {"a": "x.mp4"}, "offset": {}}]}'), "expected an object of"),
         (_list('{"sequences": [{"cameras": {"a": "x.mp4"}, "offsets": {"a": true}}]}'), "'offsets' must map"),
     ],
