@@ -99,7 +99,7 @@ def read_lens_transforms(path: Path) -> list[Posed]:
             the lens is of a model that cannot be straightened.
     """
     from gausim.core import Cameras
-    from gausim.io.transforms import pinhole_of, read_json, viewmat_of
+    from gausim.io.transforms import image_name, pinhole_of, read_json, viewmat_of
 
     data = read_json(path)
     entries = data.get("frames")
@@ -108,10 +108,7 @@ def read_lens_transforms(path: Path) -> list[Posed]:
     posed, names = [], set()
     for i, entry in enumerate(entries):
         where, fields = f"{path}: frames[{i}]", {**data, **entry}
-        name = entry.get("file_path")
-        if not isinstance(name, str) or not name or not name.isprintable():
-            raise DataError(f"{where}: field 'file_path' must name an image, got {name!r:.80}.")
-        name = name if Path(name).suffix else f"{name}.png"
+        name = image_name(entry, where)
         if name in names:
             raise DataError(f"{where}: field 'file_path' '{name}' stands twice.")
         names.add(name)

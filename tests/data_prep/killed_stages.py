@@ -24,7 +24,7 @@ import gausim.data.verify
 import gausim.io.ply
 import gausim.render.cpu  # noqa: F401
 
-STAGES = ("ingest", "poses", "segment", "select", "assemble", "pack", "import_ready", "synthesize")
+STAGES = ("ingest", "poses", "segment", "reconstruct", "select", "assemble", "pack", "import_ready", "synthesize")
 PLACES = ((os, "replace"), (os, "fsync"), (Path, "unlink"), (shutil, "rmtree"))
 
 

@@ -56,11 +56,12 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
     save_scene(capture.toy.scene, folder / "rest" / "scene.ply")
     list(READY(folder))
     whole = {stage: folder / "whole" / stage for stage in
-             ("ingest", "poses", "segment", "select", "assemble", "pack", "import_ready")}  # fmt: skip
+             ("ingest", "poses", "segment", "reconstruct", "select", "assemble", "pack", "import_ready")}  # fmt: skip
     arguments = {
         "ingest": [capture.folder / "takes", "--sync", "offsets", "--offsets", "cam_0=0,cam_1=2f,cam_2=0"],
         "poses": ["--transforms", capture.folder / "photos/calibration.json", "--sequences", whole["ingest"]],
         "segment": [whole["poses"], *"--backend chroma --key 00b140 --no-grabcut --components 0".split()],
+        "reconstruct": [whole["segment"], *"--iterations 20 --kernels 60 --coarse 0 --leave-out 2".split()],
         "select": [folder / "rest" / "scene.ply", "--pinned", "below z=0.1", "--size", "64"],
         "assemble": [whole["segment"], "--scene", whole["select"], "--name", "toy"],
         "pack": [whole["assemble"]],
@@ -92,7 +93,7 @@ def check(run: Run, stage: str, argv: list[str], whole: Path, places: int, share
     assert [p.name for p in folder.iterdir()] == ["result"]  # nothing is left lying about
 
 
-STAGES = ("ingest", "poses", "segment", "select", "assemble", "pack", "import_ready")
+STAGES = ("ingest", "poses", "segment", "reconstruct", "select", "assemble", "pack", "import_ready")
 
 
 @pytest.mark.parametrize("share", [0.5])

@@ -34,15 +34,23 @@ from gausim.data.verify import verify
 from gausim.engine.run import RunDirectory
 from gausim.io.colmap import read_colmap
 from gausim.io.ply import load_masks, load_points, load_scene
+from gausim.io.ply_sequence import load_ply_sequence, save_ply_sequence
 from gausim.io.trajectory import load_trajectory, save_trajectory
 from gausim.io.transforms import read_json, read_transforms
 from gausim.io.video import read_video, video_rate
 from gausim.report.summary import SCHEMA, load_summary
+from gausim.view.events import Force, Pin, Reset
+from gausim.view.selections import Ball, Kernels
+from gausim.view.session import Entry, ForceSession, MadeWith, load_session, save_session
 
 TESTS = Path(__file__).parents[1]
 TOY = runpy.run_path(str(TESTS / "toy_object.py"))
 COLMAP = runpy.run_path(str(TESTS / "colmap_files.py"))
 SCENE = TOY["toy_scene"]()
+
+_MADE = MadeWith("toy", "0" * 64, "1" * 64, "2" * 64)
+_PUSH = Force(on=Ball((0.0, 0.0, 1.0), 0.2), direction=(1.0, 0.0, 0.0), weights=2.0, frames=3)
+SESSION = ForceSession(_MADE, 24.0, 8, (Entry(1, _PUSH), Entry(4, Pin(Kernels((1, 2)))), Entry(6, Reset())), 9.81)
 
 
 @dataclass(frozen=True)
@@ -92,6 +100,13 @@ def _scenes(folder: Path) -> Iterator[Reader]:
     yield Reader("masks", path.with_name("scene.masks.npz"), "npz", lambda p: load_masks(SCENE, p))
     save_trajectory(folder / "scene" / "t.safetensors", toy.truth("seq_000", 3), facts={"object": "toy"})
     yield Reader("trajectory", folder / "scene" / "t.safetensors", "binary", load_trajectory, 8)
+    save_session(SESSION, folder / "scene" / "pull.json")
+    yield Reader("session of forces", folder / "scene" / "pull.json", "json", load_session, 6)
+    frames = save_ply_sequence(folder / "frames", "toy", [SCENE, SCENE], 24.0)
+    yield Reader("PLY sequence", frames[1], "binary", lambda p: list(load_ply_sequence(p.parent)[0]))
+    yield Reader(
+        "rate of a PLY sequence", folder / "frames" / "toy.json", "json", lambda p: load_ply_sequence(p.parent)
+    )
 
 
 def _object(folder: Path) -> Iterator[Reader]:

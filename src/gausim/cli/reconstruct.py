@@ -73,7 +73,7 @@ class Fitted:
     """What a reconstruction has given.
 
     Attributes:
-        record: kernels, figures on every set of images, options, times; plain data.
+        record: kernels, figures on every set of images, options; plain data.
         text: the same in words.
     """
 
@@ -104,19 +104,19 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> Fitted:
     options = _options(arguments)
     name, material, cloud = _inputs(source, arguments, options)
     renderer = _renderer(arguments.renderer)
-    start, cpu = time.perf_counter(), time.process_time()
+    start = time.process_time()
     partial = Partial(out, identity(material.train, options, cloud))
     fitted = _fit(material, renderer, options, cloud, name, partial)
     scene = pinned_by(fitted, arguments.pin_below, arguments.pin_above)
-    seconds = {"wall_seconds": time.perf_counter() - start, "cpu_seconds": time.process_time() - cpu}
+    seconds = time.process_time() - start
     save_scene(scene, out)
     figures = {images.name: {"images": len(images.images), **measure(scene, renderer, images)}
                for images in material.measure}  # fmt: skip
-    record = _record(scene, options, figures, seconds)
+    record = _record(scene, options, figures)
     write_json(out.with_suffix(".json"), record)
     _compare(scene, renderer, material.measure, out.with_suffix(".png"))
     partial.remove()
-    return Fitted(record, _told(record, out))
+    return Fitted(record, _told(record, out, seconds))
 
 
 def add_fit_options(parser: argparse.ArgumentParser) -> None:
@@ -258,7 +258,7 @@ def _fit(
         return reconstruct(material.train, renderer, options, cloud=cloud, name=name, progress=show, begun=begun)
 
 
-def _record(scene: GaussianScene, options: ReconstructionOptions, figures: dict, seconds: dict) -> dict:
+def _record(scene: GaussianScene, options: ReconstructionOptions, figures: dict) -> dict:
     from dataclasses import asdict
 
     return {
@@ -267,7 +267,6 @@ def _record(scene: GaussianScene, options: ReconstructionOptions, figures: dict,
         "diagonal": scene.diagonal,
         "measured": figures,
         "options": asdict(options),
-        **seconds,
     }
 
 
@@ -305,8 +304,8 @@ def _small(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
     return adaptive_avg_pool2d(image.permute(2, 0, 1), (round(height * COLUMN / width), COLUMN)).permute(1, 2, 0)
 
 
-def _told(record: dict, out: Path) -> str:
-    lines = [f"{record['kernels']} kernels, {record['pinned']} pinned, {record['cpu_seconds']:.0f} CPU-s"]
+def _told(record: dict, out: Path, seconds: float) -> str:
+    lines = [f"{record['kernels']} kernels, {record['pinned']} pinned, {seconds:.0f} CPU-s"]
     lines.append(f"{'measured on':<34} {'images':>6} {'PSNR':>8} {'foreground':>11} {'SSIM':>7}")
     for name, row in record["measured"].items():
         decibel = f"{row['psnr']:>5.2f} dB {row['psnr_foreground']:>8.2f} dB"

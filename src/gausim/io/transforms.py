@@ -136,16 +136,23 @@ def number_field(fields: dict[str, Any], key: str, where: str) -> float:
     return float(value)
 
 
-def _frame(folder: Path, entry: dict[str, Any], field: str) -> PosedFrame:
+def image_name(entry: dict[str, Any], field: str) -> str:
+    """The image that an entry names, with its extension (Blender's own files leave it out).
+
+    Raises:
+        DataError: it names none, or what no file can be called.
+    """
     name = entry.get("file_path")
     if not isinstance(name, str) or not name:
-        raise DataError(f"{field}: field 'file_path' must name an image, got {name!r}.")
+        raise DataError(f"{field}: field 'file_path' must name an image, got {name!r:.80}.")
     # A file system holds no longer names; asking it for one is an error of its own kind.
-    if any(len(part) > _LONGEST_NAME for part in name.split("/")) or "\0" in name:
+    if any(len(part.encode()) > _LONGEST_NAME for part in name.split("/")) or not name.isprintable():
         raise DataError(f"{field}: field 'file_path' is no name of a file: {name!r:.60}.")
-    path = folder / name
-    if not path.suffix:
-        path = path.with_suffix(".png")  # Blender's own files leave the extension out
+    return name if Path(name).suffix else f"{name}.png"
+
+
+def _frame(folder: Path, entry: dict[str, Any], field: str) -> PosedFrame:
+    path = folder / image_name(entry, field)
     number = entry.get("frame")
     if number is not None and (not isinstance(number, int) or number < 0):
         raise DataError(f"{field}: field 'frame' must be a frame number from 0 on, got {number!r}.")
