@@ -160,7 +160,7 @@ def shell() -> PointCloud:
 def test_an_open_scene_grows_from_its_points(stills: ImageSet) -> None:
     photos, renderer = walled(stills), CpuRenderer(threads=1)
     options = ReconstructionOptions(
-        kernels=1000, iterations=400, extent="scene", rounds=6, minimum_opacity=0.01, anisotropy_limit=10.0
+        kernels=1000, iterations=250, extent="scene", rounds=6, minimum_opacity=0.01, anisotropy_limit=10.0
     )
     train, left_out = photos.select(range(20)), photos.select(range(20, 24))
     scene = reconstruct([train], renderer, options, cloud=shell())

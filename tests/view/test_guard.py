@@ -14,11 +14,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-import msgspec
 import pytest
 
 pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
+import msgspec
 import viser
 import websockets
 from websockets.asyncio.client import connect as connect_async
