@@ -67,13 +67,21 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
         "pack": [whole["assemble"]],
         "import_ready": [folder / "ready", "--train-frames", "2"],
     }
-    found = {}
-    for stage, values in arguments.items():
-        argv = [str(value) for value in values]
-        done = run(stage, [*argv, "--out", str(whole[stage])])
-        assert done["status"] == 0, done["output"]
-        found[stage] = (argv, whole[stage], done["places"])
-    return found
+
+    class Made(dict):
+        """Makes a stage, and those whose results it reads, when it is asked for."""
+
+        def __missing__(self, stage: str) -> tuple[list[str], Path, int]:
+            for other, result in whole.items():
+                if other != stage and other not in self and result in arguments[stage]:
+                    self[other]
+            argv = [str(value) for value in arguments[stage]]
+            done = run(stage, [*argv, "--out", str(whole[stage])])
+            assert done["status"] == 0, done["output"]
+            self[stage] = (argv, whole[stage], done["places"])
+            return self[stage]
+
+    return Made()
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -97,7 +105,7 @@ STAGES = ("ingest", "poses", "segment", "reconstruct", "select", "assemble", "pa
 
 
 @pytest.mark.parametrize("share", [0.5])
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", ("segment", "select", "import_ready"))
 def test_a_stage_killed_in_its_middle_goes_on(run: Run, jobs: dict, tmp_path: Path, stage: str, share: float) -> None:
     check(run, stage, *jobs[stage], share, tmp_path)
 
