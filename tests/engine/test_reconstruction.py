@@ -179,8 +179,9 @@ def test_error_is_blamed_on_the_kernels_under_it(stills: ImageSet) -> None:
     run = Reconstruction([stills], CpuRenderer(threads=1), TINY, cloud=None, name="balls")
     error, black = torch.zeros(SIZE, SIZE), torch.zeros(3)
     error[18:22, 18:22] = 0.5
-    run._blame(stills, 0, black, error)
-    means, covars, colors, opacities = (x.detach() for x in run.splats.drawable(stills.cameras.centers[0]))
+    drawable = run.splats.drawable(stills.cameras.centers[0])
+    run._blame(stills, 0, black, drawable, error)
+    means, covars, colors, opacities = (x.detach() for x in drawable)
     for k in run.splats.error.topk(3).indices.tolist():
         lit = torch.zeros_like(colors)
         lit[k] = 1.0

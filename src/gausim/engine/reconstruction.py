@@ -33,6 +33,9 @@ LOOKS = 20
 # A look is better if the loss fell by this share.
 BETTER = 2e-3
 
+# Means, covariances, colours and opacities of all kernels.
+Drawable = tuple[Tensor, Tensor, Tensor, Tensor]
+
 
 @dataclass(frozen=True)
 class ReconstructionOptions:
@@ -172,7 +175,7 @@ class Reconstruction:
         self._generator = torch.Generator().manual_seed(options.seed)
         self._queues: list[list[int]] = [[] for _ in sets]
         self._similarity = ImageLoss(balance=0.0, window=SSIM_WINDOW, pixels=1 / 3, crop=False)
-        self._patience = _Patience(options)
+        self._rounds, self._patience = options.round_steps, _Patience(options)
         self.done, self.loss = 0, math.nan
 
     @property
@@ -189,7 +192,8 @@ class Reconstruction:
         images, i = self._draw()
         background = self._background()
         truth, mask = composite(images.images[i], background)
-        rgb, alpha = self._render(images, i, background, self.splats.drawable(images.cameras.centers[i]))
+        drawable = self.splats.drawable(images.cameras.centers[i])
+        rgb, alpha = self._render(images, i, background, drawable)
         loss = self._loss(rgb, alpha, truth, mask)
         self.loss = float(loss.detach())
         if not math.isfinite(self.loss):
@@ -197,16 +201,15 @@ class Reconstruction:
                 f"{self._name}: reconstruction loss is {self.loss} at step {self.done}. Lower the rates."
             )
         loss.backward()
-        if self.done % BLAME_EVERY == 0 and self.done < self._options.round_steps[-1]:
-            self._blame(images, i, background, (rgb.detach() - truth).abs().mean(-1))
+        if self.done % BLAME_EVERY == 0 and self.done < self._rounds[-1]:
+            self._blame(images, i, background, drawable, (rgb.detach() - truth).abs().mean(-1))
         share = self.done / self._options.iterations
         self.splats.step({"means": FINAL_MEANS_RATE**share, "": FINAL_RATE**share})
         if self.done % LIMIT_EVERY == 0:
             self._limit()
-        rounds = self._options.round_steps
-        if self.done in rounds:
+        if self.done in self._rounds:
             self._prune()
-            self._densify(rounds.index(self.done), len(rounds))
+            self._densify(self._rounds.index(self.done), len(self._rounds))
             self.splats.forget()
         self._patience.note(self.done, self.loss)
         self.done += 1
@@ -251,7 +254,7 @@ class Reconstruction:
         return random if self._options.random_background else torch.zeros(3)
 
     def _render(
-        self, images: ImageSet, i: int, background: Tensor, drawable: tuple[Tensor, Tensor, Tensor, Tensor]
+        self, images: ImageSet, i: int, background: Tensor, drawable: Drawable
     ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
         cameras = images.cameras
         means, covars, colors, opacities = drawable
@@ -262,13 +265,15 @@ class Reconstruction:
         )  # fmt: skip
         return drawn.rgb[0, 0], drawn.alpha[0, 0]
 
-    def _blame(self, images: ImageSet, i: int, background: Tensor, error: Float[Tensor, "H W"]) -> None:
+    def _blame(
+        self, images: ImageSet, i: int, background: Tensor, drawable: Drawable, error: Float[Tensor, "H W"]
+    ) -> None:
         """Notes the share of every kernel in the image's error: the sum over pixels of its weight times the error.
 
         That is the gradient of sum(error * rgb) with respect to a gray kernel's colour. Unlike the gradient of its
         position it does not cancel within a large kernel (Rota Bulo et al., Revising Densification, 2024).
         """
-        means, covars, colors, opacities = (x.detach() for x in self.splats.drawable(images.cameras.centers[i]))
+        means, covars, colors, opacities = (x.detach() for x in drawable)
         gray = torch.zeros_like(colors).requires_grad_()
         rgb, _ = self._render(images, i, background, (means, covars, gray, opacities))
         (share,) = torch.autograd.grad(rgb, gray, error[..., None].expand_as(rgb))

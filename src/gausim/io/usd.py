@@ -6,7 +6,6 @@ Kept in float32: positions, orientations, scales, opacities, spherical harmonics
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import torch
 
 from gausim.core import ConfigError, DataError, GaussianScene
 from gausim.core.scene import SH_COEFFICIENTS
+from gausim.io.files import replacing
 
 SUFFIXES = (".usd", ".usda", ".usdc")
 PRIM = "/Splats"
@@ -81,10 +81,8 @@ def save_usd(path: Path | str, frames: Iterable[GaussianScene], fps: float, *, u
     pxr, path = _pxr(), Path(path)
     if path.suffix not in SUFFIXES or up not in ("y", "z"):
         raise ConfigError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}, and up y or z, got up {up}.")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    stage = pxr.Usd.Stage.CreateNew(str(temporary))
-    try:
+    with replacing(path, typed=True) as temporary:
+        stage = pxr.Usd.Stage.CreateNew(str(temporary))
         count = _write(pxr, stage, frames, path)
         stage.SetFramesPerSecond(fps)
         stage.SetTimeCodesPerSecond(fps)
@@ -93,9 +91,6 @@ def save_usd(path: Path | str, frames: Iterable[GaussianScene], fps: float, *, u
         pxr.UsdGeom.SetStageUpAxis(stage, up.upper())
         pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
         stage.GetRootLayer().Save()
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return count
 
 
