@@ -135,3 +135,10 @@ def test_a_ceiling_bounds_what_forces_do(make_scene: MakeScene, make_model: Make
         still, 6, forces=lambda n: 0.2 * push if n < 2 else None
     )
     assert torch.equal(gentle.positions, small.positions)
+    limited = []
+    for share in (0.01, 1.0):
+        stepper = SceneDynamics(model, 0, energy_ceiling=ceiling).stepper(still)
+        for _ in range(4):
+            stepper.step(share * push)
+        limited.append(stepper.limited)
+    assert limited[0] == 0 < limited[1] <= 4

@@ -44,10 +44,11 @@ def _model(scene: GaussianScene, *, seed: int = 0, passive: int = 6) -> GausSim:
     return model.eval()
 
 
-def _interaction(*, seed: int = 0, **options: object) -> Interaction:
+def _interaction(*, seed: int = 0, ceiling: float | None = None, **options: object) -> Interaction:
     scene = _scene()
     model, initial = _model(scene, seed=seed), SimState(scene.means, scene.means)
     dynamics = model.dynamics(0)
+    dynamics.energy_ceiling = ceiling
     made_with = MadeWith.of(scene, model, initial, run="toy")
     units = model.units_of_kernels(0)
     return Interaction(scene, dynamics, dynamics.masses, initial, made_with=made_with, units=units, **options)

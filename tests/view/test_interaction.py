@@ -110,7 +110,7 @@ def test_a_force_is_a_multiple_of_the_weight(make_column) -> None:
     scene = make_column()
 
     class Free:
-        fps, unit_of_kernel, takes_forces = 24.0, torch.zeros(scene.count, dtype=torch.long), True
+        fps, unit_of_kernel, takes_forces, limited = 24.0, torch.zeros(scene.count, dtype=torch.long), True, 0
 
         def __init__(self, initial: SimState) -> None:
             self.state, self._eye = initial, torch.eye(3)[None]
@@ -227,10 +227,25 @@ def test_numbers_out_of_range_are_refused(make_interaction, options) -> None:
         make_interaction(**options)
 
 
+def test_it_says_that_forces_act_in_part(make_interaction) -> None:
+    live = make_interaction(ceiling=1e-5)
+    live.act(Force(Whole(), (1.0, 0.0, 0.0), 0.01, frames=2))
+    live.step()
+    assert live.limited == 0 and not live.resisting
+    live.act(Force(Whole(), (1.0, 0.0, 0.0), 10.0, frames=8))
+    for _ in range(8):
+        live.step()
+    assert 0 < live.limited <= 8 and live.resisting
+    for _ in range(24):
+        live.step()
+    live.reset()
+    assert live.limited == 0 and not live.resisting
+
+
 class Broken:
     """Breaks in the second step, in one of several ways."""
 
-    takes_forces, fps = True, 24.0
+    takes_forces, fps, limited = True, 24.0, 0
 
     def __init__(self, live: Interaction, how: str) -> None:
         self._inner, self._how, self._steps = live._stepper, how, 0

@@ -144,9 +144,11 @@ class FittedStepper:
         unit_of_kernel: the unit of each kernel.
         fps: frames per second.
         takes_forces: False.
+        limited: 0.
     """
 
     takes_forces: bool = False
+    limited: int = 0
 
     def __init__(self, method: FittedMethod, sequence_id: int, initial: SimState) -> None:
         """Begins ``method``'s sequence ``sequence_id`` at the positions of ``initial``."""

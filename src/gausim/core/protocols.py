@@ -70,6 +70,11 @@ class Stepper(Protocol):
         """Whether :meth:`step` may be given a force and held kernels."""
         ...
 
+    @property
+    def limited(self) -> int:
+        """Frames so far whose forces acted in part only, or that were cut short, to keep within what was learned."""
+        ...
+
     def step(
         self, force: Float[Tensor, "K 3"] | None = None, *, held: Bool[Tensor, " K"] | None = None
     ) -> SteppedFrame:

@@ -53,13 +53,13 @@ class EnergyGuard:
         self._last: deque[float] = deque(maxlen=frames)
         self._ceiling = ceiling
         self._made: SteppedFrame | None = None
-        self.held, self.weakened, self.cut = 0, 0, 0
+        self.held, self.limited = 0, 0
 
     def step(self, step: StepFunction, state: SimState, force: Tensor | None) -> Predicted:
         """The next frame.
 
-        Counted are those whose correction was held back (:attr:`held`), whose force was too strong (:attr:`weakened`)
-        and that were cut short (:attr:`cut`).
+        Counted are those whose correction was held back (:attr:`held`) and those that the ceiling limited, their force
+        weakened or the step itself cut short (:attr:`limited`).
 
         Args:
             step: predicts with all of the correction.
@@ -77,6 +77,7 @@ class EnergyGuard:
         if energy > limit:
             result, energy = self._held_back(state, force, energy, limit)
         if self._ceiling is not None and energy > self._ceiling:
+            self.limited += 1
             if force is not None:
                 result, energy = self._weakened(state, force, self._ceiling)
             if energy > self._ceiling:
@@ -87,7 +88,6 @@ class EnergyGuard:
 
     def _weakened(self, state: SimState, force: Tensor, ceiling: float) -> tuple[Predicted, float]:
         """The template's step with the largest of some shares of the force that stays below the ceiling, or none."""
-        self.weakened += 1
         for share in WEAKER:
             made, energy = self._shared(state, share * force if share else None, 0.0)
             if energy <= ceiling:
@@ -99,7 +99,6 @@ class EnergyGuard:
 
         Below means in motion and if it stopped at once: E looks at the middle of a step, which its end may overtop.
         """
-        self.cut += 1
         limit = max(ceiling, self._energy(SimState(state.positions, state.positions)))
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):

@@ -73,6 +73,11 @@ class SceneStepper:
         prepared = model.prepare(batch)
         self._step, self._guard = self._function(prepared), self._made_guard(prepared)
 
+    @property
+    def limited(self) -> int:
+        """Frames so far that the energy's ceiling limited."""
+        return 0 if self._guard is None else self._guard.limited
+
     @torch.no_grad()
     def step(
         self, force: Float[Tensor, "K 3"] | None = None, *, held: Bool[Tensor, " K"] | None = None

@@ -134,6 +134,7 @@ class Interaction:
 
     def _rest_all(self) -> None:
         self._stepper = self._dynamics.stepper(self._initial)
+        self._limited_at: int | None = None
         self.frame: SteppedFrame = self._stepper.frame
         self.frame_number = 0
         self.broken: str | None = None
@@ -157,12 +158,15 @@ class Interaction:
             raise ConfigError(f"session: expected at most {MOST_STEPS} steps. Save it and begin another.")
         held = self.held if bool(self.held.any()) else None
         try:
+            before = self._stepper.limited
             frame = self._stepper.step(self._force(), held=held)
             self._check(frame)
         except DivergenceError as error:
             self.broken = str(error)
             raise
         self.tick, self.frame_number, self.frame = self.tick + 1, self.frame_number + 1, frame
+        if self._stepper.limited > before:
+            self._limited_at = self.frame_number
         self._frames.append(frame)
         self._impulses.clear()
         for name, push in list(self._forces.items()):
@@ -191,6 +195,16 @@ class Interaction:
     def fps(self) -> float:
         """Frames per second."""
         return self._stepper.fps
+
+    @property
+    def limited(self) -> int:
+        """Frames since the last reset in which forces acted in part only (:attr:`gausim.core.Stepper.limited`)."""
+        return self._stepper.limited
+
+    @property
+    def resisting(self) -> bool:
+        """Whether one of them was within the last second."""
+        return self._limited_at is not None and self.frame_number - self._limited_at < self.fps
 
     def trajectory(self) -> Trajectory:
         """The frames that were kept, the initial one first if no newer ones have displaced it."""

@@ -21,6 +21,8 @@ AXES = {
     "+x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "+y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
     "+z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0),
 }  # fmt: skip
+# Said while forces act in part only.
+_AT_LIMIT = "At the limit of what was learned: the forces act only in part. Pull less for what would really happen."
 # Files that one run of the viewer writes at most.
 _MOST_FILES = 200
 # The panel is brought up to date so often [times per second].
@@ -320,7 +322,8 @@ class Page:
         simulated = live.rate.per_second if shown.source == LIVE and live.playing else 0.0
         state = "playing" if live.playing else "paused"
         beside = live.companion.message if live.companion is not None else ""
-        problems = [text for text in (live.message, self._note, beside) if text]
+        limit = _AT_LIMIT if shown.source == LIVE and live.interaction.resisting else ""
+        problems = [text for text in (live.message, self._note, beside, limit) if text]
         acting = ", ".join(live.interaction.acting) if shown.source == LIVE else ""
         text = (
             f"<div style='padding:.3em .6em;font-size:.85em'>{state} | frame {shown.number} of {shown.last}<br>"

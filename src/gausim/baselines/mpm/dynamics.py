@@ -183,9 +183,11 @@ class MPMStepper:
         unit_of_kernel: the unit of each kernel.
         fps: frames per second.
         takes_forces: True; no kernels can be held beside those that the scene pins.
+        limited: 0; whatever forces do is simulated.
     """
 
     takes_forces: bool = True
+    limited: int = 0
 
     def __init__(self, dynamics: MPMDynamics, initial: SimState) -> None:
         """Begins at ``initial``."""
