@@ -30,7 +30,7 @@ FLAGS = (
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
     "--disable-features=Translate,OptimizationHints,MediaRouter", "--remote-allow-origins=*", "--mute-audio",
 )  # fmt: skip
-SHIFT = 8
+CTRL, SHIFT = 2, 8
 
 
 class Page:
@@ -124,6 +124,16 @@ class Page:
     def click(self, x: float, y: float) -> None:
         self.press(x, y)
         self.release(x, y)
+
+    def give_file(self, path: Path) -> None:
+        """Gives a file to the page's file input, as its dialog would."""
+        root = self.call("DOM.getDocument", depth=-1)["root"]["nodeId"]
+        node = self.wait(
+            lambda: self.call("DOM.querySelector", nodeId=root, selector="input[type=file]")["nodeId"],
+            10,
+            "a file input",
+        )
+        self.call("DOM.setFileInputFiles", nodeId=node, files=[str(path)])
 
     def press_button(self, label: str, elements: str = "button, [role=tab]") -> None:
         """Clicks the panel's button or tab of this label."""

@@ -26,7 +26,8 @@ from gausim.view.app import Subject, Viewer
 from gausim.view.guard import Door
 from gausim.view.interaction import Interaction, replay
 from gausim.view.recording import record
-from gausim.view.session import Force, load_session
+from gausim.view.selections import Kernels
+from gausim.view.session import Force, Impulse, load_session, save_session
 
 BROWSER = runpy.run_path(str(Path(__file__).parent / "chromium.py"))
 chromium, pytestmark = BROWSER["chromium"], BROWSER["needs_chromium"]
@@ -119,6 +120,44 @@ def test_page_is_dragged_reset_and_replayed(make_interaction: Callable[..., Inte
     subject = Subject("a column", interaction, sessions=tmp_path / "sessions")
     with served(subject) as viewer, chromium(tmp_path) as page:
         play(viewer, page, tmp_path, interaction)
+
+
+def test_page_brushes_flicks_and_takes_a_session(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
+    interaction = make_interaction(keep=None)
+    with served(Subject("a column", interaction, sessions=tmp_path)) as viewer, chromium(tmp_path) as page:
+        hands, live = viewer.hands, viewer.live
+        page.open(viewer.url)
+        page.wait(lambda: "simulated" in page.text() and live.steps > 3, 60, "the page")
+        centre = on_screen(viewer, viewer.placing.to_page(interaction.scene.means).mean(0))
+        start, end = (centre[0] - 250, centre[1] - 250), (centre[0] + 250, centre[1] + 250)
+        page.press(*start, modifiers=BROWSER["SHIFT"])
+        page.drag_to(start, end, modifiers=BROWSER["SHIFT"])
+        page.release(*end, modifiers=BROWSER["SHIFT"])
+        page.wait(lambda: isinstance(hands.selection, Kernels), 10, "a brushed region")
+        assert int(hands.mask.sum()) > 1
+        tip = hands._centres(interaction.scene.means)[0]
+        start = on_screen(viewer, tip)
+        end = (start[0] + 120, start[1])
+        page.press(*start, modifiers=BROWSER["CTRL"])
+        page.drag_to(start, end, modifiers=BROWSER["CTRL"])
+        assert not interaction.acting, "a flick pulls before it is released"
+        page.release(*end, modifiers=BROWSER["CTRL"])
+        page.wait(lambda: any(isinstance(e.event, Impulse) for e in interaction.session().entries), 10, "an impulse")
+        page.press_button("Pause")
+        page.wait(lambda: not live.playing, 10, "a pause")
+        recorded, session = interaction.trajectory(), interaction.session()
+        save_session(session, tmp_path / "flick.json")
+        page.press_button("Session")
+        page.give_file(tmp_path / "flick.json")
+        page.wait(lambda: live.message.startswith("The session is over"), 60, "the session's end")
+        again = interaction.trajectory()
+        assert again.frames == recorded.frames and torch.equal(again.positions, recorded.positions)
+        page.picture(tmp_path / "replayed.png")
+        broken = tmp_path / "broken.json"
+        broken.write_text("{")
+        page.give_file(broken)
+        page.wait(lambda: "the file" in live.message, 10, "what is wrong with the file")
+        assert live.is_alive() and viewer.server.traffic.junk == viewer.server.traffic.failed == 0
 
 
 @pytest.mark.slow

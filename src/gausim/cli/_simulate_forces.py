@@ -186,7 +186,7 @@ def _report(interaction: Interaction, trajectory: Trajectory) -> None:
     print(f"farthest     {float(away.max()):.3f} diagonals from rest, at frame {int(away.amax(1).argmax())}")
     if interaction.limited:
         print(
-            f"limited      in {interaction.limited} frames forces acted only in part: they would carry {scene.name} beyond "
-            "what was learned"
+            f"limited      in {interaction.limited} frames forces acted only in part: they would carry {scene.name} "
+            "beyond what was learned"
         )
     print(f"pinned       moved {float(away[:, held].max()) if bool(held.any()) else 0.0:g} diagonals")
