@@ -66,7 +66,7 @@ def killed(target: str, count: int, match: str = "", when: str = "before") -> di
 def learned(run: Path) -> dict[str, str]:
     """Digests of all that a checkpoint holds, seconds aside."""
     loaded = read_checkpoint(run / "last.ckpt")
-    kept = {k: v for k, v in loaded.items() if k not in ("callbacks", "digest")}
+    kept = {k: v for k, v in loaded.items() if k not in ("callbacks", "cost", "digest")}
     return {f"{k}.{name}": digest(v) for k, entry in kept.items() for name, v in _parts(entry)}
 
 

@@ -79,6 +79,8 @@ def make_curves(
         "sources": {"root": "/data/toy", "scene": {"file": "scene.ply", "sha256": "5ce7e" * 12},
                     "manifest": {"file": "dataset.json", "sha256": "da7a" * 16}},
         "absent": {"lpips": "no weights"},
+        "footnotes": {"gausim": {"extrapolates": True, "notes": [], "fit": {
+            "seconds": 90.0 * error, "cpu_seconds": 60.0 * error, "peak_bytes": 1.5e9}}},
     }  # fmt: skip
     return ObjectCurves(facts, values, record, make_pictures(name, shift=round(2 * error)))
 

@@ -121,7 +121,7 @@ def test_a_metric_that_old_evaluations_lack_is_not_called_no_weights(sweep):
     for path in sweep.rglob("metrics.json"):
         summary = json.loads(path.read_text())
         for entry in summary["objects"].values():
-            for key in ("absent", "efficiency", "sources"):
+            for key in ("absent", "efficiency", "footnotes", "sources"):
                 del entry[key]
         path.write_text(json.dumps(summary))
     found = sheets(sweep)
@@ -150,9 +150,10 @@ def test_the_change_against_full_is_measured_in_spreads(tmp_path):
 def test_the_efficiency_table(sweep):
     rows = texts(sheets(sweep)["efficiency"])
     assert rows["gausim"] == [
-        "200 → 20 → 4", "0.100", "0.0110 ± 0.0010", "2.00", "+ 3.6 MB", "cpu, 1 threads",
+        "200 → 20 → 4", "0.100", "0.0110 ± 0.0010", "2.00", "+ 3.6 MB", "1.1 min", "1.50 GB", "cpu, 1 threads",
     ]  # fmt: skip
-    memory = sheets(sweep)["efficiency"].lines[0].entries[4]
+    memory, trained = (sheets(sweep)["efficiency"].lines[0].entries[i] for i in (4, 5))
+    assert trained.extra == "± 0.1, 2 seeds; 1.6 min of wall time"
     assert memory.extra == "first + 20 MB; process 2.10 GB"
     assert rows["gausim w/o hierarchy"][0] == "failed"
     assert rows["GausSim w/o hierarchy (paper)"][2] == "0.36"

@@ -130,7 +130,6 @@ def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mappin
     module, datamodule = build(config)
     check_scenes(loaded, module.simulator.scenes, str(directory.path / checkpoint))
     load_weights(module, loaded)
-    if isinstance(module, FittedModule):
-        module.take_plan(loaded)
+    module.take_notes(loaded)
     module.eval()
     return LoadedRun(config, module, datamodule.objects, datamodule, module.renderer, directory.path)

@@ -1,11 +1,11 @@
-"""What a prediction costs: seconds and peak memory, measured while it is made."""
+"""What training and a prediction cost: seconds and peak memory, measured meanwhile."""
 
 from __future__ import annotations
 
 import gc
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -79,6 +79,51 @@ class CostMeter:
         first, *others = self._added
         added = {"added_bytes": max(others or [first]), "first_added_bytes": first}
         return {"kind": self._kind, "peak_bytes": self._peak, **added}
+
+
+class TrainingCost:
+    """What training has cost so far, over interruptions.
+
+    Attributes:
+        seconds: wall time.
+        cpu_seconds: processor time of this process.
+        peak_bytes: the most that CUDA had allocated or this process had resident; 0 where unknown.
+    """
+
+    def __init__(self) -> None:
+        self.seconds = self.cpu_seconds = self.peak_bytes = 0.0
+        self.begin()
+
+    def begin(self) -> None:
+        """Counts from here."""
+        self._mark = time.perf_counter(), time.process_time()
+
+    def state_dict(self) -> dict[str, float]:
+        """Counts up to now; plain numbers."""
+        wall, processor = self._mark
+        self.begin()
+        self.seconds += self._mark[0] - wall
+        self.cpu_seconds += self._mark[1] - processor
+        self.peak_bytes = max(self.peak_bytes, float(peak_bytes() or 0))
+        return self.summary()
+
+    def load_state_dict(self, state: Mapping[str, float]) -> None:
+        """Goes on from what :meth:`state_dict` gave."""
+        self.seconds, self.cpu_seconds = state["seconds"], state["cpu_seconds"]
+        self.peak_bytes = state["peak_bytes"]
+
+    def summary(self) -> dict[str, float]:
+        """What was counted."""
+        return {"seconds": self.seconds, "cpu_seconds": self.cpu_seconds, "peak_bytes": self.peak_bytes}
+
+    def notes(self) -> list[str]:
+        """The same in a sentence, if anything was counted."""
+        if not self.seconds:
+            return []
+        return [
+            f"Trained in {self.seconds / 60:.1f} minutes, {self.cpu_seconds / 60:.1f} of processor time; it held "
+            f"{self.peak_bytes / 1e9:.1f} GB at most."
+        ]
 
 
 def peak_bytes() -> int | None:

@@ -8,7 +8,6 @@ minimised changes from stage to stage.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
@@ -29,7 +28,6 @@ from gausim.core import (
     Trajectory,
 )
 from gausim.data.dataset import SampleFacts, SequenceSample
-from gausim.engine.cost import peak_bytes
 from gausim.engine.module import GausSimModule
 from gausim.engine.optim import OptimizerSettings
 from gausim.engine.reference import Yardsticks
@@ -183,8 +181,7 @@ class FittedModule(GausSimModule):
         self.plan, self.made = plan, dict.fromkeys((name for name, _ in plan.order), 0.0)
         self.stage = ""
         self._warned = True  # a first stage begins at rest, and the warning's advice is about other settings
-        self.cost = {"cpu_seconds": 0.0, "peak_bytes": 0.0}
-        self._explosion, self._mark = explosion, time.process_time()
+        self._explosion = explosion
 
     @property
     def method(self) -> FittedMethod:
@@ -197,9 +194,9 @@ class FittedModule(GausSimModule):
         return self.method.name
 
     @property
-    def footnotes(self) -> dict[str, Any] | None:
+    def footnotes(self) -> dict[str, Any]:
         """What the method says of itself, and what the fit cost."""
-        return {"extrapolates": self.method.extrapolates, "notes": self.notes(), "fit": dict(self.cost)}
+        return {**super().footnotes, "extrapolates": self.method.extrapolates}
 
     def foresee(self, sequence_id: int, steps: int) -> Trajectory:
         """Frames 0..``steps`` of a sequence."""
@@ -220,12 +217,7 @@ class FittedModule(GausSimModule):
                 notes.append(
                     f"Stage {name} had {self.made[name]:.0f} of its {stage.iterations} iterations per sequence."
                 )
-        if self.plan.order:
-            minutes, memory = self.cost["cpu_seconds"] / 60, self.cost["peak_bytes"] / 1e9
-            notes.append(
-                f"Fitted in {minutes:.1f} minutes of processor time; the process held {memory:.1f} GB at most."
-            )
-        return notes
+        return notes + super().notes() if self.plan.order else notes
 
     # ------------------------------------------------------------------------------------------------ one step
 
@@ -302,10 +294,6 @@ class FittedModule(GausSimModule):
         assert isinstance(curriculum, StagedCurriculum)
         return curriculum
 
-    def on_train_start(self) -> None:
-        """Counts the cost from here."""
-        self._mark = time.process_time()
-
     def on_train_epoch_end(self) -> None:
         """Forms the epoch's means and fixes what the next epoch learns: the next iterations, or what the clock says."""
         super().on_train_epoch_end()
@@ -316,24 +304,19 @@ class FittedModule(GausSimModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Adds where in the plan the fit is."""
         super().on_save_checkpoint(checkpoint)
-        now = time.process_time()
-        self.cost["cpu_seconds"] += now - self._mark
-        self.cost["peak_bytes"] = max(self.cost["peak_bytes"], float(peak_bytes() or 0))
-        self._mark = now
         place = self._staged().state_dict() if self.plan.order else {}
-        own = {"place": place, "stage": self.stage, "made": dict(self.made), "cost": dict(self.cost)}
+        own = {"place": place, "stage": self.stage, "made": dict(self.made)}
         checkpoint["gausim"]["plan"] = own
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Restores it."""
         super().on_load_checkpoint(checkpoint)
-        self.take_plan(checkpoint)
         if self.plan.order:
             self._staged().load_state_dict(checkpoint["gausim"]["plan"]["place"])
 
-    def take_plan(self, checkpoint: Mapping[str, Any]) -> None:
-        """What a checkpoint says of the stages that were made."""
+    def take_notes(self, checkpoint: Mapping[str, Any]) -> None:
+        """What a checkpoint says of the stages that were made, too."""
+        super().take_notes(checkpoint)
         own = checkpoint["gausim"]["plan"]
         self.stage = own["stage"]
         self.made.update(own["made"])
-        self.cost.update(own["cost"])

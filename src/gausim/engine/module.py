@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
 import torch
@@ -17,6 +17,7 @@ from gausim.data.dataset import SampleFacts, SequenceSample
 from gausim.data.sampler import hash_seed
 from gausim.engine.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes, fingerprints
 from gausim.engine.contracts import Foreseeing, InitialVelocities, SceneBatch, Simulator
+from gausim.engine.cost import TrainingCost
 from gausim.engine.curriculum import LossGatedCurriculum
 from gausim.engine.exchange import Exchange
 from gausim.engine.optim import OptimizerSettings
@@ -96,7 +97,7 @@ class GausSimModule(LightningModule):
         self.time_fraction = 0.0
         self._sums: dict[str, list[float]] = {}
         self._warned, self._barren = False, 0
-        self.ranks, self._shown = Ranks(), 0
+        self.ranks, self._shown, self.cost = Ranks(), 0, TrainingCost()
         self._exchange = Exchange(self.ranks, model)
 
     @property
@@ -105,9 +106,13 @@ class GausSimModule(LightningModule):
         return "gausim"
 
     @property
-    def footnotes(self) -> dict[str, Any] | None:
-        """Whether the method extrapolates and what readers of its figures must know; None: the config says all."""
-        return None
+    def footnotes(self) -> dict[str, Any]:
+        """Whether the method extrapolates, what readers of its figures must know, and what training cost."""
+        return {"extrapolates": True, "notes": self.notes(), "fit": self.cost.summary()}
+
+    def notes(self) -> list[str]:
+        """What a reader of the figures must know, in sentences."""
+        return self.cost.notes()
 
     @property
     def renderer(self) -> Renderer:
@@ -347,6 +352,10 @@ class GausSimModule(LightningModule):
         """Means over the sequences of the epoch so far."""
         return {name: total / weight for name, (total, weight) in self._sums.items() if weight}
 
+    def on_train_start(self) -> None:
+        """Counts the cost from here."""
+        self.cost.begin()
+
     def on_train_epoch_start(self) -> None:
         """Starts the epoch's sums anew."""
         self._sums.clear()
@@ -386,7 +395,7 @@ class GausSimModule(LightningModule):
         curriculum = self._curriculum()
         if curriculum is not None:
             own["curriculum"] = curriculum.state_dict()
-        checkpoint["gausim"] = own
+        checkpoint["gausim"], checkpoint["cost"] = own, self.cost.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuses a checkpoint of other scenes; restores what :meth:`on_save_checkpoint` added.
@@ -395,6 +404,7 @@ class GausSimModule(LightningModule):
             RunError: naming both scenes.
         """
         check_scenes(checkpoint, self.simulator.scenes, "the checkpoint")
+        self.take_notes(checkpoint)
         own = checkpoint["gausim"]
         self.average.load_state_dict(own["average"])
         epoch = own["epoch"]
@@ -404,6 +414,11 @@ class GausSimModule(LightningModule):
         curriculum = self._curriculum()
         if curriculum is not None and "curriculum" in own:
             curriculum.load_state_dict(own["curriculum"])
+
+    def take_notes(self, checkpoint: Mapping[str, Any]) -> None:
+        """What a checkpoint says of its training, for :attr:`footnotes`."""
+        if "cost" in checkpoint:  # not in those of earlier versions
+            self.cost.load_state_dict(checkpoint["cost"])
 
 
 def _pull(loss: Tensor, network: Sequence[nn.Parameter]) -> Float[Tensor, " P"]:

@@ -117,7 +117,7 @@ def _paper_ablation(name: str, groups: Sequence[Group], splits: Sequence[str], s
 
 
 def efficiency_sheet(study: Study) -> Sheet:
-    """Units per level, share that is predicted, seconds and memory per predicted frame."""
+    """Units per level, share that is predicted, seconds and memory per predicted frame and of training."""
     lines = []
     for group in study.groups:
         for name in group.objects:
@@ -126,31 +126,38 @@ def efficiency_sheet(study: Study) -> Sheet:
                 (r, e[group.method]) for r, e in found if isinstance(e, dict) and isinstance(e.get(group.method), dict)
             ]
             label = group.label if len(study.objects) == 1 else f"{group.label}, {name}"
-            lines.append(Line(label, METHOD, _costs(costs, group.of(name))))
+            fits = [_fit(entry, group.method) for _, entry in group.entries(name)]
+            lines.append(Line(label, METHOD, _costs(costs, [fit for fit in fits if fit], group.of(name))))
     for method, (seconds, memory) in paper.EFFICIENCY.items():
         whole = method == "GausSim (paper)"
         levels = " → ".join(str(n) for n in paper.LEVELS) if whole else NOTHING
-        texts = (levels, "0.05" if whole else NOTHING, f"{seconds:.2f}", NOTHING, f"{memory:.1f} GB", "A100")
+        texts = (
+            levels, "0.05" if whole else NOTHING, f"{seconds:.2f}", NOTHING, f"{memory:.1f} GB", NOTHING, NOTHING,
+            "A100",
+        )  # fmt: skip
         lines.append(Line(method, PAPER, tuple(Entry(t, missing=t == NOTHING) for t in texts)))
-    heads = ("units per level", "N_F / N_K", "s per frame", "ms per image", "peak memory", "on")
+    heads = ("units per level", "N_F / N_K", "s per frame", "ms per image", "peak memory", "trained in", "held", "on")
     caption = (
         "N_F / N_K: predicted deformation gradients over kernels. Seconds per predicted frame without drawing (mean ± "
         "standard deviation over sequences, the first warms up), milliseconds to draw one image. Memory: on a GPU the "
         "most that CUDA had allocated; on a CPU what the prediction of a sequence adds at most to the memory of the "
         "process, small: of the first sequence, which also builds the graph and loads compiled code, and the whole "
-        "process, libraries and videos included. Compare rows of one machine only. Grey: the paper's, on Mothorchids, "
-        "whose seconds are those of a whole forward pass."
+        "process, libraries and videos included. Trained in: processor time (wall time) of all sequences and objects "
+        "together; held: the most memory of the training process, or of CUDA. Compare rows of one machine only. Grey: "
+        "the paper's, on Mothorchids, whose seconds are those of a whole forward pass."
     )
     if any(e.text == NOT_MEASURED for line in lines for e in line.entries):
         caption += f" {OLD_EVALUATION}"
     return Sheet("efficiency", "Efficiency", caption, (("", heads),), tuple(lines), "method")
 
 
-def _costs(costs: Sequence[tuple[RunRecord, dict[str, Any]]], runs: tuple[RunRecord, ...]) -> tuple[Entry, ...]:
+def _costs(
+    costs: Sequence[tuple[RunRecord, dict[str, Any]]], fits: Sequence[dict[str, Any]], runs: tuple[RunRecord, ...]
+) -> tuple[Entry, ...]:
     if not costs:
         states = {r.status for r in runs if r.summary is None}
         text = next(iter(sorted(states)), NOT_MEASURED)
-        return (Entry(text, missing=True, runs=runs), *(Entry(NOTHING, missing=True) for _ in range(5)))
+        return (Entry(text, missing=True, runs=runs), *(Entry(NOTHING, missing=True) for _ in range(7)))
     used = tuple(r for r, _ in costs)
     first = costs[0][1]
     levels = first.get("levels") if isinstance(first.get("levels"), dict) else {}
@@ -168,6 +175,8 @@ def _costs(costs: Sequence[tuple[RunRecord, dict[str, Any]]], runs: tuple[RunRec
         (mean, extra),
         (f"{1e3 * _mean(drawing):.2f}" if drawing else NOTHING, ""),
         _memory([c for _, c in costs]),
+        _minutes(fits),
+        _held(fits),
         (device, ""),
     )
     return tuple(Entry(text, small, missing=text == NOTHING, runs=used) for text, small in texts)
@@ -187,6 +196,29 @@ def _memory(costs: Sequence[dict[str, Any]]) -> tuple[str, str]:
     if first is None:  # earlier versions: freed memory hid what was added
         return f"{peak / _GIGA:.2f} GB", "whole process"
     return f"+ {added / _MEGA:.1f} MB", f"first + {first / _MEGA:.0f} MB; process {peak / _GIGA:.2f} GB"
+
+
+def _fit(entry: dict[str, Any], method: str) -> dict[str, Any] | None:
+    """What training cost, where the run says so."""
+    own = entry.get("footnotes")
+    own = own.get(method) if isinstance(own, dict) else None
+    fit = own.get("fit") if isinstance(own, dict) else None
+    return fit if isinstance(fit, dict) and number(fit.get("cpu_seconds")) else None
+
+
+def _minutes(fits: Sequence[dict[str, Any]]) -> tuple[str, str]:
+    """Minutes of processor time, small: of the clock, and their spread."""
+    processor, wall = ([x / 60 for fit in fits if (x := number(fit.get(key)))] for key in ("cpu_seconds", "seconds"))
+    if not processor:
+        return NOTHING, ""
+    small = [f"± {spread:.1f}, {len(processor)} seeds"] if (spread := deviation(processor)) is not None else []
+    small += [f"{_mean(wall):.1f} min of wall time"] if wall else []
+    return f"{_mean(processor):.1f} min", "; ".join(small)
+
+
+def _held(fits: Sequence[dict[str, Any]]) -> tuple[str, str]:
+    most = [x for fit in fits if (x := number(fit.get("peak_bytes")))]
+    return (f"{max(most) / _GIGA:.2f} GB", "") if most else (NOTHING, "")
 
 
 def _ratio(levels: Any) -> float | None:

@@ -17,7 +17,8 @@
             "predicted", "predictions", "kernels"}}}, memory and levels null where unknown
         "sources": {"root", "scene": {"file", "sha256"}, "masks": {...}, "manifest": {...}},
         "absent": {KEY: why},                         metrics that could not be computed
-        "footnotes": {METHOD: {"extrapolates": bool, "notes": [text, ...], "fit": {"cpu_seconds", "peak_bytes"}}},
+        "footnotes": {METHOD: {"extrapolates": bool, "notes": [text, ...], "fit": {"seconds", "cpu_seconds",
+            "peak_bytes"}}},
         "diagnosis": {"share": [...], "frequency": [Hz, ...], "rows": {ROW: {"spectrum", "frequencies": [Hz, ...],
             "dampings": [...], "phase_error": [degrees, ...], "velocity_cosine": x,
             "level_errors": [x, ...]}}}                where the true motion is known
@@ -27,12 +28,12 @@ A CELL is ``{"mean", "std", "ratio"}``: mean and standard deviation over sequenc
 of a sequence) and the mean divided by the static row's (null for the floor and for what is better when higher). Ends
 of splits are exclusive. The cell of ``motion_energy`` has besides ``"pooled"``: predicted over true energy summed over
 all sequences, which no single sequence at rest can spoil; its mean and std are over the sequences' own ratios and its
-ratio is null. Undefined numbers are null. ``footnotes`` are what a fitted method says of itself; one that does not
-extrapolate repeats beyond the trained frames what it was fitted to. ``diagnosis`` looks at the motion in the principal
-motions of the truth: ``share`` of the squared displacement, ``frequencies`` and ``dampings`` (of critical) of each;
-power per ``frequency`` over all of them; ``phase_error`` per frame; ``level_errors`` over static's, of the units'
-centres at each level of a hierarchy, the small ones first; the truth is a row. ``provenance``, ``efficiency``,
-``sources``, ``absent``, ``footnotes`` and ``diagnosis`` are not in files of earlier versions.
+ratio is null. Undefined numbers are null. ``footnotes`` are what a method says of itself, and what its training cost;
+one that does not extrapolate repeats beyond the trained frames what it was fitted to. ``diagnosis`` looks at the motion
+in the principal motions of the truth: ``share`` of the squared displacement, ``frequencies`` and ``dampings`` (of
+critical) of each; power per ``frequency`` over all of them; ``phase_error`` per frame; ``level_errors`` over static's,
+of the units' centres at each level of a hierarchy, the small ones first; the truth is a row. ``provenance``,
+``efficiency``, ``sources``, ``absent``, ``footnotes`` and ``diagnosis`` are not in files of earlier versions.
 """
 
 from __future__ import annotations
