@@ -108,7 +108,7 @@ class GausSimModule(LightningModule):
     @property
     def footnotes(self) -> dict[str, Any]:
         """Whether the method extrapolates, what readers of its figures must know, and what training cost."""
-        return {"extrapolates": True, "notes": self.notes(), "fit": self.cost.summary()}
+        return {"extrapolates": True, "notes": self.notes(), "fit": self.cost.summary() if self.cost.seconds else None}
 
     def notes(self) -> list[str]:
         """What a reader of the figures must know, in sentences."""

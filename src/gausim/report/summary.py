@@ -18,7 +18,7 @@
         "sources": {"root", "scene": {"file", "sha256"}, "masks": {...}, "manifest": {...}},
         "absent": {KEY: why},                         metrics that could not be computed
         "footnotes": {METHOD: {"extrapolates": bool, "notes": [text, ...], "fit": {"seconds", "cpu_seconds",
-            "peak_bytes"}}},
+            "peak_bytes"}}},                              fit null where it was not counted
         "diagnosis": {"share": [...], "frequency": [Hz, ...], "rows": {ROW: {"spectrum", "frequencies": [Hz, ...],
             "dampings": [...], "phase_error": [degrees, ...], "velocity_cosine": x,
             "level_errors": [x, ...]}}}                where the true motion is known
