@@ -11,6 +11,7 @@ from gausim.benchmark.harness import Options
 from gausim.models.hierarchy import build_hierarchy
 
 
+@pytest.mark.slow
 def test_every_figure_of_the_step_is_reported() -> None:
     torch.manual_seed(0)
     rows = step.run(Options(torch.device("cpu"), quick=True, rounds=1))

@@ -47,6 +47,7 @@ def tried(do: Do, name: str) -> list[tuple[str, dict[str, Any], float]]:
     return [(t["state"], t["params"], t["value"]) for t in results(do, name)["trials"]]
 
 
+@pytest.mark.slow
 def test_a_killed_search_goes_on_with_what_it_would_have_tried(do: Do) -> None:
     few = (*RATES, "hydra.sweeper.n_trials=4", "hydra.sweeper.sampler.n_startup_trials=1")
     status, output = do("whole", *few)
@@ -97,6 +98,7 @@ def test_a_trial_that_fails_stops_no_other_and_is_tried_again_on_demand(do: Do, 
     assert all(params == {"data.root": str(late)} for _, params, _ in later)
 
 
+@pytest.mark.slow
 def test_poor_trials_are_ended_early(do: Do) -> None:
     pruner = "hydra.sweeper.pruner={_target_:optuna.pruners.ThresholdPruner,upper:0.0,n_warmup_steps:2}"
     search = (*RATES, "hydra.sweeper.n_trials=2", pruner, "trainer.max_epochs=4", "evaluate=true")

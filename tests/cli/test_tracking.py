@@ -40,6 +40,7 @@ def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> lis
     return [f"data.root={toy}", *TINY]
 
 
+@pytest.mark.slow
 def test_a_sweep_names_its_jobs_and_ends_each_once(arguments: list[str]) -> None:
     swept = ["logger=wandb", "ablation=none,no_momentum", "loss.static_weight=1,2", "seed=3"]
     assert command.main(["-m", *arguments, *swept]) == 0
