@@ -136,14 +136,35 @@ class Page:
         self.call("DOM.setFileInputFiles", nodeId=node, files=[str(path)])
 
     def press_button(self, label: str, elements: str = "button, [role=tab]") -> None:
-        """Clicks the panel's button or tab of this label."""
+        """Clicks the panel's button or tab of this label, or the innermost of other elements."""
+        self._press(
+            f"[...document.querySelectorAll({json.dumps(elements)})].filter(b => b.innerText.trim() === "
+            f"{json.dumps(label)} && b.offsetParent).pop()",
+            label,
+        )
+
+    def press_input(self, label: str) -> None:
+        """Clicks the panel's input that stands beside this label."""
+        self._press(
+            "(() => { let e = [...document.querySelectorAll('label, div, span')].filter(e => e.innerText.trim() === "
+            f"{json.dumps(label)} && e.offsetParent).pop(); "
+            "while (e && !e.querySelector('input')) e = e.parentElement; return e && e.querySelector('input'); })()",
+            label,
+        )
+
+    def _press(self, element: str, label: str) -> None:
+        """Clicks the middle of an element once it stands still: folders open slowly."""
         script = (
-            f"(() => {{ const b = [...document.querySelectorAll({json.dumps(elements)})].find(b => b.innerText.trim() "
-            f"=== {json.dumps(label)} && b.offsetParent); if (!b) return null; b.scrollIntoView({{block: 'nearest'}}); "
+            f"(() => {{ const b = {element}; if (!b) return null; b.scrollIntoView({{block: 'nearest'}}); "
             "const r = b.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; })()"
         )
-        x, y = self.wait(lambda: self.run(script), 20, f"button {label!r}")
-        self.click(x, y)
+
+        def place() -> Any:
+            before = self.run(script)
+            time.sleep(0.2)
+            return before if before and before == self.run(script) else None
+
+        self.click(*self.wait(place, 20, f"{label!r}"))
         time.sleep(0.3)
 
 

@@ -21,6 +21,7 @@ pytest.importorskip("viser", reason="the extra 'view' is not installed")
 from gausim.cli._subject import playable_run, playable_scene, subject_of
 from gausim.core import Trajectory
 from gausim.io.ply import load_scene
+from gausim.ops.orbit import orbit_cameras
 from gausim.ops.selection import apply_masks, parse_half_space
 from gausim.view.app import Subject, Viewer
 from gausim.view.guard import Door
@@ -158,6 +159,27 @@ def test_page_brushes_flicks_and_takes_a_session(make_interaction: Callable[...,
         page.give_file(broken)
         page.wait(lambda: "the file" in live.message, 10, "what is wrong with the file")
         assert live.is_alive() and viewer.server.traffic.junk == viewer.server.traffic.failed == 0
+
+
+@pytest.mark.slow
+def test_page_looks_from_a_camera_of_the_data_set(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
+    interaction = make_interaction()
+    cameras = orbit_cameras(interaction.scene.means, azimuths=[0.0, 90.0], size=(64, 48))
+    subject = Subject("a column", interaction, cameras=cameras, sessions=tmp_path)
+    with served(subject) as viewer, chromium(tmp_path) as page:
+        page.open(viewer.url)
+        page.wait(lambda: "simulated" in page.text() and viewer.live.steps > 3, 60, "the page")
+        client = next(iter(viewer.server.get_clients().values()))
+        page.press_button("Cameras of the data set", "div, legend, span, p")
+        page.press_input("Show them")
+        page.wait(lambda: all(frustum.visible for frustum in viewer.sights._frustums), 10, "frustums")
+        expected = viewer.sights._pose(cameras, 1)[0]
+        assert np.linalg.norm(client.camera.position - expected) > 0.5
+        page.press_input("Look from")
+        page.press_button(cameras.names[1], "[role=option]")
+        page.wait(lambda: np.linalg.norm(client.camera.position - expected) < 1e-3, 10, "the camera's place")
+        page.picture(tmp_path / "from_camera.png")
+        assert viewer.server.traffic.junk == viewer.server.traffic.failed == 0
 
 
 @pytest.mark.slow
