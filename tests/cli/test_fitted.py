@@ -129,6 +129,8 @@ def test_a_resumed_fit_equals_an_uninterrupted_one(
     notes = [load_run(Path(f"outputs/{run}/seed_0")).module.notes() for run in ("whole", "cut")]  # type: ignore[operator]
     assert (
         notes[0][:-1] == notes[1][:-1]
+        and notes[0][-1].startswith("Trained in ")
+        and " minutes, " in notes[0][-1]
         and "of processor time" in notes[0][-1]
         and not any(" had " in note for note in notes[0])
     )

@@ -27,6 +27,7 @@ from gausim.report.sheets import (
 )
 from gausim.report.study import FULL, NOT_MEASURED, Cell, Group, Study, cell, deviation, number
 from gausim.report.summary import MOTION_ENERGY
+from gausim.report.tables import said
 
 # What ablations are compared by: (metric, views).
 _ABLATED = (
@@ -200,9 +201,7 @@ def _memory(costs: Sequence[dict[str, Any]]) -> tuple[str, str]:
 
 def _fit(entry: dict[str, Any], method: str) -> dict[str, Any] | None:
     """What training cost, where the run says so."""
-    own = entry.get("footnotes")
-    own = own.get(method) if isinstance(own, dict) else None
-    fit = own.get("fit") if isinstance(own, dict) else None
+    fit = said(entry, method).get("fit")
     return fit if isinstance(fit, dict) and number(fit.get("cpu_seconds")) else None
 
 

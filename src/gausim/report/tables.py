@@ -86,15 +86,19 @@ def _number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
+def said(entry: dict[str, Any], method: str) -> dict[str, Any]:
+    """The ``footnotes`` of a method in an object's entry; empty where there are none."""
+    every = entry.get("footnotes")
+    own = every.get(method) if isinstance(every, dict) else None
+    return own if isinstance(own, dict) else {}
+
+
 def footnotes(entry: dict[str, Any], method: str) -> list[str]:
     """What a method says of itself in an object's entry: sentences, the first that it does not foresee."""
-    own = entry.get("footnotes")
-    own = own.get(method) if isinstance(own, dict) else None
-    if not isinstance(own, dict):
-        return []
+    own = said(entry, method)
     notes = own.get("notes")
-    said = [str(note) for note in notes] if isinstance(notes, list) else []
-    return [NO_FORESIGHT, *said] if own.get("extrapolates") is False else said
+    sentences = [str(note) for note in notes] if isinstance(notes, list) else []
+    return [NO_FORESIGHT, *sentences] if own.get("extrapolates") is False else sentences
 
 
 def markdown_table(table: Table) -> str:
