@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,13 +12,15 @@ import pytest
 import torch
 from torch import Tensor
 
-from gausim.core import DataError, Trajectory
+from gausim.core import DataError, GaussianScene, Trajectory
 from gausim.data.records import GroundTruth
 from gausim.engine.module import GausSimModule
 from gausim.engine.points import PointSupervision, attach_points
 from gausim.engine.rollout import States
-from gausim.losses import Objective
+from gausim.engine.supervision import Sources
+from gausim.losses import ImageLoss, Objective
 from gausim.metrics import point_error
+from gausim.render.reference import ReferenceRenderer
 
 SWAY = runpy.run_path(str(Path(__file__).parent / "sway.py"))
 TOY, sample = SWAY["TOY"], SWAY["sample"]
@@ -30,6 +33,10 @@ def truth(frames: int = 6) -> GroundTruth:
     moved = rest + 0.05 * torch.randn(frames, *rest.shape, generator=generator).cumsum(0)
     moved[0] = rest
     return GroundTruth(rest, moved)
+
+
+def sources(truth: Callable[[int], GroundTruth | None], scenes: Sequence[GaussianScene] = (SCENE,)) -> Sources:
+    return Sources(scenes, truth, lambda scene_id: None, ReferenceRenderer(), ImageLoss())
 
 
 def batch(members: int) -> SimpleNamespace:
@@ -65,7 +72,7 @@ def plain(known: GroundTruth, made: States, member: int) -> Tensor:
 
 def test_losses_are_squared_distances_in_percent_and_reach_positions_and_gradients() -> None:
     known, made = truth(), states(4, 2)
-    work = PointSupervision([SCENE], lambda number: known).comparison([sample(0, 5), sample(1, 5)], batch(2))
+    work = PointSupervision(sources(lambda number: known)).comparison([sample(0, 5), sample(1, 5)], batch(2))
     losses, motion = work(made, 0)
     assert losses.shape == (4, 2) and not motion.requires_grad
     expected, moved = [], 0.0
@@ -87,7 +94,7 @@ def test_losses_are_squared_distances_in_percent_and_reach_positions_and_gradien
 
 def test_stretches_continue_where_the_last_one_ended() -> None:
     known, made = truth(), states(5, 1)
-    supervision = PointSupervision([SCENE], lambda number: known)
+    supervision = PointSupervision(sources(lambda number: known))
     whole, motion = supervision.comparison([sample(0, 5)], batch(1))(made, 0)
     work = supervision.comparison([sample(0, 5)], batch(1))
     parts = [work(States(*(x[s] for x in made.tensors())), s.start) for s in (slice(0, 2), slice(2, 5))]
@@ -99,7 +106,7 @@ def test_the_rest_state_scores_the_true_displacement_and_only_of_the_samples_fra
     known = truth(frames=9)
     poisoned = GroundTruth(known.rest, known.positions.clone())
     poisoned.positions[4:] = torch.nan  # frames that the sample does not hold
-    supervision = PointSupervision([SCENE], lambda number: poisoned)
+    supervision = PointSupervision(sources(lambda number: poisoned))
     losses, motion = supervision.static(sample(0, 3), SCENE.means, 0)
     assert losses[0] == 0 and len(losses) == 4 and len(motion) == 3
     percent = 100 * (known.positions[:4] - known.rest).norm(dim=-1) / SCENE.diagonal
@@ -113,7 +120,7 @@ def test_the_rest_state_scores_the_true_displacement_and_only_of_the_samples_fra
 
 
 def test_unknown_motion_is_refused_by_name() -> None:
-    supervision = PointSupervision([SCENE], lambda number: None)
+    supervision = PointSupervision(sources(lambda number: None))
     with pytest.raises(DataError, match=r"toy/seq_0: its true motion is not known.*supervision=images"):
         supervision.static(sample(0), SCENE.means, 0)
 
@@ -145,7 +152,7 @@ def test_a_module_learns_from_points_and_draws_nothing() -> None:
         renderer=refuse,  # type: ignore[arg-type]
         objective=Objective(static_weight=0.0, momentum_weight=0.0, backprop_steps=0),
         optimizer=replace(SWAY["OptimizerSettings"](), network_lr=1e-3, scene_lr=1e-3, initial_lr=1e-4),
-        supervision=PointSupervision(model.scenes, lambda number: known[number]),
+        supervision=PointSupervision(sources(lambda number: known[number], model.scenes)),
     )
     optimizer, draws = module.configure_optimizers(), torch.Generator().manual_seed(0)
     found = [module.optimise([sample(0), sample(1)], optimizer, draws) for _ in range(60)]
@@ -157,19 +164,50 @@ def test_a_module_learns_from_points_and_draws_nothing() -> None:
 def test_velocities_count_as_much_as_they_are_weighted() -> None:
     known, made = truth(), states(4, 1)
     plain_loss, weighted = (
-        PointSupervision([SCENE], lambda number: known, velocity_weight=w).comparison([sample(0, 5)], batch(1))
+        PointSupervision(sources(lambda number: known), velocity_weight=w).comparison([sample(0, 5)], batch(1))
         for w in (0.0, 3.0)
     )
     points = torch.cat((known.rest[None], plain(known, made, 0)))
     off = 100 * (points.diff(dim=0) - known.positions[:5].diff(dim=0)).norm(dim=-1) / SCENE.diagonal
     expected = plain_loss(made, 0)[0][:, 0] + 3 * off.square().mean(1)
     torch.testing.assert_close(weighted(made, 0)[0][:, 0], expected)
-    work = PointSupervision([SCENE], lambda number: known, velocity_weight=3.0).comparison([sample(0, 5)], batch(1))
+    work = PointSupervision(sources(lambda number: known), velocity_weight=3.0).comparison([sample(0, 5)], batch(1))
     parts = [work(States(*(x[s] for x in made.tensors())), s.start)[0] for s in (slice(0, 2), slice(2, 4))]
     torch.testing.assert_close(torch.cat(parts)[:, 0], expected)  # across the border of two stretches
-    still = PointSupervision([SCENE], lambda number: known, velocity_weight=3.0)
+    still = PointSupervision(sources(lambda number: known), velocity_weight=3.0)
     percent = (100 / SCENE.diagonal) ** 2
     true = percent * (known.positions - known.rest).square().sum(-1).mean(1)
     steps = percent * known.positions.diff(dim=0).square().sum(-1).mean(1)
     assert still.static(sample(0, 4), SCENE.means, 0).losses[1:] == pytest.approx((true[1:5] + 3 * steps[:4]).tolist())
     assert still.static(sample(0, 4), SCENE.means, 3).losses == pytest.approx((true[3:5] + 3 * steps[2:4]).tolist())
+
+
+def test_energy_of_each_half_counts_by_its_logarithm_in_units_of_the_rest_state() -> None:
+    known, made = truth(), states(5, 1)
+    plain_loss, weighted = (
+        PointSupervision(sources(lambda number: known), energy_weight=w).comparison([sample(0, 5)], batch(1))(made, 0)[
+            0
+        ]
+        for w in (0.0, 2.0)
+    )
+    percent = (100 / SCENE.diagonal) ** 2
+    points = torch.cat((known.rest[None], plain(known, made, 0)))
+    energy, true = (x.diff(dim=0).square().sum(-1).mean(1) for x in (points, known.positions[:6]))
+    mismatch = []
+    for half in (slice(0, 3), slice(3, 5)):
+        least = 0.05 * true[half].mean()
+        mismatch.append(((energy[half].mean() + least) / (true[half].mean() + least)).log().square())
+    still = percent * (known.positions[1:6] - known.rest).square().sum(-1).mean(1)
+    torch.testing.assert_close(weighted - plain_loss, (2 * still * sum(mismatch) / 2)[:, None])
+
+
+def test_energy_of_a_motion_that_has_not_begun_has_a_gradient() -> None:
+    known = truth()
+    still = SCENE.means.repeat(3, 1, 1).requires_grad_()
+    identity = torch.eye(3).expand(3, 2, 3, 3)
+    supervision = PointSupervision(sources(lambda number: known), energy_weight=1.0)
+    losses = supervision.comparison([sample(0, 3)], batch(1))(States(still, identity, identity), 0)[0]
+    losses.sum().backward()
+    assert bool(torch.isfinite(still.grad).all())
+    expected = torch.tensor(supervision.static(sample(0, 3), SCENE.means, 0).losses[1:])
+    torch.testing.assert_close(losses[:, 0].detach(), expected, rtol=1e-3, atol=0)  # points lie off their kernels

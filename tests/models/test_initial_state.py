@@ -57,7 +57,8 @@ def test_modal_velocity_moves_units_as_the_basis_says(model) -> None:
     scene, hierarchy = model.scenes[0], model.hierarchies[0]
     moved = (scene.means - initial.previous(0).detach())[hierarchy.kernels]
     level, unit = hierarchy.levels[1], hierarchy.ancestor(0, 1)
-    modes, gradients = model.template.basis(0)
+    modes, gradients, sizes = model.template.basis(0)
+    modes, gradients = modes / sizes, gradients / sizes
     for c in (~level.pinned).nonzero()[:, 0].tolist():
         weight = hierarchy.levels[0].volume[unit == c, None]
         centre = (weight * moved[unit == c]).sum(0) / weight.sum()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,8 @@ from gausim.engine.fitting import FittedModule
 from gausim.engine.module import GausSimModule
 from gausim.engine.run import RunDirectory
 from gausim.engine.stages import StagedCurriculum
-from gausim.engine.supervision import Supervision
+from gausim.engine.supervision import Sources, Supervision
+from gausim.models.smooth import SmoothMotions
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,7 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
     scenes = [item.scene() for item in objects]
     model = instantiate(config.model.simulator, scenes=scenes, fps=[item.fps for item in objects])()
     scene_of_sequence = [scene_id for scene_id, _ in datamodule.index.entries]
-    supervision = _supervision(config, scenes, datamodule)
+    supervision = _supervision(config, scenes, datamodule, model.smooth_motions)
     states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
     module = GausSimModule(
         model=model,
@@ -79,10 +80,18 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
     return module, datamodule
 
 
-def _supervision(config: DictConfig, scenes: list[GaussianScene], datamodule: ReadyDataModule) -> Supervision | None:
+def _supervision(
+    config: DictConfig,
+    scenes: list[GaussianScene],
+    datamodule: ReadyDataModule,
+    motions: Callable[[int], SmoothMotions | None],
+) -> Supervision | None:
     if not config.get("supervision"):
         return None
-    made: Supervision = instantiate(config.supervision, scenes=scenes, truth=datamodule.index.ground_truth)()
+    sources = Sources(
+        scenes, datamodule.index.ground_truth, motions, instantiate(config.render), instantiate(config.loss).image
+    )
+    made: Supervision | None = instantiate(config.supervision)(sources)
     return made
 
 
@@ -106,7 +115,7 @@ def _build_fit(config: DictConfig) -> tuple[FittedModule, ReadyDataModule]:
         plan=plan,
         renderer=instantiate(config.render),
         explosion=float(config.loss.explosion),
-        supervision=_supervision(config, scenes, datamodule),
+        supervision=_supervision(config, scenes, datamodule, lambda scene_id: None),
         seed=int(config.seed),
     )
     return module, datamodule

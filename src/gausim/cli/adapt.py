@@ -19,6 +19,12 @@ Only frames 0 .. FRAMES - 1 of the training views are looked at.
   gausim adapt outputs/bunny/seed_0 --data NEW_STORE --frames 3
   gausim adapt outputs/bunny/seed_0 --data NEW_STORE --set trainer.threads=1 optimizer.initial_lr=0.02"""
 EPOCHS, REPEATS = 60, 4
+# What `--supervision` stands for (the defaults of these are those of conf/supervision).
+SUPERVISIONS = {
+    "images": None,
+    "points": "gausim.engine.points.PointSupervision",
+    "tracks": "gausim.engine.tracks.TrackSupervision",
+}
 
 
 def main(argv: list[str]) -> int:
@@ -72,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         help="settings other than the run's, e.g. trainer.threads=1",
     )
-    add("--supervision", choices=("images", "points"), help="what is compared (default: as in the run)")
+    add("--supervision", choices=tuple(SUPERVISIONS), help="what is compared (default: as in the run)")
     return parser
 
 
@@ -107,8 +113,8 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
         "trainer": {**config["trainer"], "max_epochs": arguments.epochs, "max_minutes": None, "overwrite": False},
     }
     if arguments.supervision is not None:
-        target = {"_target_": "gausim.engine.points.PointSupervision", "_partial_": True}
-        adapted["supervision"] = target if arguments.supervision == "points" else {}
+        target = SUPERVISIONS[arguments.supervision]
+        adapted["supervision"] = {"_target_": target, "_partial_": True} if target else {}
     node = OmegaConf.create(adapted)
     OmegaConf.set_struct(node, True)
     try:

@@ -27,6 +27,7 @@ from gausim.engine.reference import Yardsticks
 from gausim.engine.rollout import Explosions, States, UnitNoise, after, describe, windows
 from gausim.engine.supervision import ImageSupervision, Supervision
 from gausim.engine.tally import Found, Tally
+from gausim.engine.tracks import TrackSupervision
 from gausim.losses.objective import Objective
 from gausim.losses.static import static_loss
 from gausim.render.draw import draw
@@ -392,6 +393,8 @@ class GausSimModule(LightningModule):
         own["average"] = self.average.state_dict()
         own["epoch"] = {"sums": self._sums, "summary": self.summary, "warned": self._warned, "barren": self._barren}
         own["yardsticks"] = self.yardsticks.state_dict()
+        if isinstance(self.supervision, TrackSupervision):
+            own["tracks"] = self.supervision.state_dict()
         curriculum = self._curriculum()
         if curriculum is not None:
             own["curriculum"] = curriculum.state_dict()
@@ -411,6 +414,8 @@ class GausSimModule(LightningModule):
         self._sums, self.summary = epoch["sums"], epoch["summary"]
         self._warned, self._barren = epoch["warned"], epoch["barren"]
         self.yardsticks.load_state_dict(own["yardsticks"])
+        if isinstance(self.supervision, TrackSupervision):
+            self.supervision.load_state_dict(own.get("tracks", {}))
         curriculum = self._curriculum()
         if curriculum is not None and "curriculum" in own:
             curriculum.load_state_dict(own["curriculum"])

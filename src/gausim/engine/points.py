@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float, Int
@@ -13,7 +14,10 @@ from gausim.data.dataset import SequenceSample
 from gausim.data.records import GroundTruth
 from gausim.engine.contracts import SceneBatch
 from gausim.engine.rollout import States
-from gausim.engine.supervision import StaticFigures
+from gausim.engine.supervision import Sources, StaticFigures
+
+# Motion energy below this share of the true one counts as this share: initial states begin at rest.
+STILL_SHARE = 0.05
 
 
 def attach_points(scene: GaussianScene, points: Float[Tensor, "P 3"]) -> Int[Tensor, " P"]:
@@ -32,40 +36,41 @@ class PointSupervision:
 
     def __init__(
         self,
-        scenes: Sequence[GaussianScene],
-        truth: Callable[[int], GroundTruth | None],
+        sources: Sources,
         *,
         velocity_weight: float = 0.0,
+        energy_weight: float = 0.0,
     ) -> None:
         """Keeps its parts.
 
         Args:
-            scenes: the rest scenes.
-            truth: true motion of a sequence by its number.
+            sources: the rest scenes and the true motion.
             velocity_weight: of the same loss of the steps x_t - x_{t-1}, which counts fast motion more.
+            energy_weight: of the squared logarithm of predicted over true motion energy, its mean over the halves of a
+                stretch, times what the rest state scores: a motion that is out of step would else rather stop.
         """
-        self._scenes, self._read, self._velocity_weight = scenes, truth, velocity_weight
+        self._scenes, self._read = sources.scenes, sources.truth
+        self._velocity_weight, self._energy_weight = velocity_weight, energy_weight
         self._known: dict[int, GroundTruth] = {}
         self._attached: dict[int, Int[Tensor, " P"]] = {}
 
     def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> _PointComparison:
         """What compares the predictions of a batch."""
-        truths = [self._truth(sample) for sample in samples]
+        truths = [self.motion(sample) for sample in samples]
         for sample, truth in zip(samples, truths, strict=True):
             if sample.scene_id not in self._attached:
                 self._attached[sample.scene_id] = attach_points(self._scenes[sample.scene_id], truth.rest)
         attached = [self._attached[sample.scene_id].to(batch.rest.device) for sample in samples]
         scales = [self._scale(sample) for sample in samples]
-        return _PointComparison(
-            batch, [_on(truth, batch.rest) for truth in truths], attached, scales, self._velocity_weight
-        )
+        weights = self._velocity_weight, self._energy_weight
+        return _PointComparison(batch, [_on(truth, batch.rest) for truth in truths], attached, scales, *weights)
 
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
         """Scores the rest state on frames ``first`` .. T of a sample."""
-        truth = self._truth(sample)
+        truth = self.motion(sample)
         positions = truth.positions[first : sample.steps + 1]
         motion = _squared(positions.diff(dim=0))
-        losses = _squared(positions - truth.rest)
+        losses = _squared(positions - truth.rest) * (1 + self._energy_weight * math.log(1 + 1 / STILL_SHARE) ** 2)
         if self._velocity_weight:
             before = truth.positions[max(first - 1, 0) : sample.steps]
             losses = losses + self._velocity_weight * _squared(
@@ -76,7 +81,12 @@ class PointSupervision:
     def _scale(self, sample: SequenceSample) -> float:
         return (100 / self._scenes[sample.scene_id].diagonal) ** 2
 
-    def _truth(self, sample: SequenceSample) -> GroundTruth:
+    def motion(self, sample: SequenceSample) -> GroundTruth:
+        """The motion that a sample is compared with, in all of its frames at least.
+
+        Raises:
+            DataError: the data set does not know it.
+        """
         if sample.sequence_id not in self._known:
             truth = self._read(sample.sequence_id)
             if truth is None:
@@ -95,11 +105,13 @@ class _PointComparison:
         self,
         batch: SceneBatch,
         truths: Sequence[GroundTruth],
-        attached: Sequence[Int[Tensor, " P"]],
+        attached: Sequence[Int[Tensor, " _"]],
         scales: Sequence[float],
         velocity_weight: float,
+        energy_weight: float,
     ) -> None:
-        self._batch, self._truths, self._scales, self._weight = batch, truths, scales, velocity_weight
+        self._batch, self._truths, self._scales = batch, truths, scales
+        self._velocity_weight, self._energy_weight = velocity_weight, energy_weight
         self._kernels, self._units, self._offsets = [], [], []
         for member, truth, kernel in zip(batch.members, truths, attached, strict=True):
             unit = member.unit_of_kernel.to(kernel.device)
@@ -116,13 +128,24 @@ class _PointComparison:
             points = states.positions[:, self._kernels[i]] + turned[..., 0]
             span = slice(start + 1, start + 1 + len(points))
             steps = torch.cat((self._last[i][None], points)).diff(dim=0)
-            loss = _squared(points - truth.positions[span])
-            if self._weight:
-                loss = loss + self._weight * _squared(steps - truth.positions[start : span.stop].diff(dim=0))
+            loss, true_steps = _squared(points - truth.positions[span]), truth.positions[start : span.stop].diff(dim=0)
+            if self._velocity_weight:
+                loss = loss + self._velocity_weight * _squared(steps - true_steps)
+            if self._energy_weight:
+                still, energies = _squared(truth.positions[span] - truth.rest), (_squared(steps), _squared(true_steps))
+                loss = loss + self._energy_weight * still * _energy_mismatch(*energies)
             losses.append(scale * loss)
             motion += scale * _squared(steps.detach()).sum()
             self._last[i] = points[-1].detach()
         return torch.stack(losses, 1), motion
+
+
+def _energy_mismatch(made: Float[Tensor, " T"], true: Float[Tensor, " T"]) -> Float[Tensor, ""]:
+    """Squared logarithm of predicted over true motion energy, the mean over the two halves of T frames."""
+    halves = [half for half in zip(made.tensor_split(2), true.tensor_split(2), strict=True) if len(half[0])]
+    energies = torch.stack([torch.stack((a.mean(), b.mean())) for a, b in halves])
+    least = STILL_SHARE * energies[:, 1].clamp_min(torch.finfo(true.dtype).tiny)
+    return ((energies[:, 0] + least) / (energies[:, 1] + least)).log().square().mean()
 
 
 def _squared(vectors: Float[Tensor, "T P 3"]) -> Float[Tensor, " T"]:

@@ -1,8 +1,9 @@
-"""What a rollout is compared with: the videos, or (engine.points) true motion where it is known."""
+"""What a rollout is compared with: videos, motion tracked in them (engine.tracks) or true motion (engine.points)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
@@ -12,10 +13,12 @@ from torch import Tensor
 from gausim.core import GaussianScene, Rendered, Renderer
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
+from gausim.data.records import GroundTruth
 from gausim.engine.comparison import Comparison, channels
 from gausim.engine.contracts import SceneBatch
 from gausim.engine.rollout import Looks, States, Views, draw_rest
 from gausim.losses.image import ImageLoss
+from gausim.models.smooth import SmoothMotions
 
 # Losses (T, S) of T predicted frames of S sequences, and the squared change of what is compared, summed. ``start``
 # frames were predicted before them. Differentiable in the states through the losses alone.
@@ -32,6 +35,25 @@ class StaticFigures(NamedTuple):
 
     losses: list[float]
     motion: list[float]
+
+
+@dataclass(frozen=True, eq=False)
+class Sources:
+    """What a run has at hand for the making of its supervision.
+
+    Attributes:
+        scenes: the rest scenes.
+        truth: true motion of a sequence by its number, None where it is not known.
+        motions: smooth motions that the model can carry, of a scene by its number; None where it has no such basis.
+        renderer: draws.
+        loss: compares images.
+    """
+
+    scenes: Sequence[GaussianScene]
+    truth: Callable[[int], GroundTruth | None]
+    motions: Callable[[int], SmoothMotions | None]
+    renderer: Renderer
+    loss: ImageLoss
 
 
 @runtime_checkable

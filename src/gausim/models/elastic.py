@@ -318,7 +318,8 @@ class ElasticTemplate(Template):
         """Keeps the determinant above its bound (towards the identity) and, with mass on, scales it to one."""
         return bounded_deformation(gradient, MIN_DETERMINANT, unit=self.conserve_volume)
 
-    def basis(self, scene_id: int) -> tuple[Tensor, Tensor]:
-        """Modes (N, 3, M) and their gradients (N, 3, 3, M): a basis of smooth motions of one scene."""
+    def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Modes (N, 3, M), their gradients (N, 3, 3, M) and sizes (M,): motions of equal energy at the start."""
         scene = self.scene(scene_id)
-        return scene.modes * scene.scale, scene.gradients * scene.scale
+        sizes = scene.values.rsqrt()
+        return scene.modes * (scene.scale * sizes), scene.gradients * (scene.scale * sizes), sizes

@@ -42,7 +42,7 @@ class ModalInitialStates(nn.Module):
         super().__init__()
         self.scene_of_sequence = tuple(scene_of_sequence)
         self._rest = [s.means for s in model.scenes]
-        self._basis = [_kernel_basis(model, i) for i in range(len(model.scenes))]
+        self._basis = [_basis(model, i) for i in range(len(model.scenes))]
         self.velocity = nn.ParameterList(torch.zeros(self._basis[i].shape[-1]) for i in self.scene_of_sequence)
 
     def previous(self, sequence_id: int) -> Float[Tensor, "K 3"]:
@@ -51,20 +51,12 @@ class ModalInitialStates(nn.Module):
         return self._rest[scene].to(velocity) - self._basis[scene].to(velocity) @ velocity
 
 
-def _kernel_basis(model: GausSim, scene_id: int) -> Float[Tensor, "K 3 M"]:
-    """The template's modes at every kernel: unit displacement plus its gradient times the offset in the unit."""
-    scene, hierarchy, finest = model.scenes[scene_id], model.hierarchies[scene_id], model.predicted_levels[-1]
-    motions = model.template.basis(scene_id)
+def _basis(model: GausSim, scene_id: int) -> Float[Tensor, "K 3 M"]:
+    """The template's own motions at every kernel."""
+    motions = model.smooth_motions(scene_id)
     if motions is None:
         raise ConfigError(
             f"model.initial_states: {type(model.template).__name__} carries no basis of motions. "
             "Use gausim.models.initial_state.FreeInitialStates with it."
         )
-    modes, gradients = motions
-    unit = hierarchy.ancestor(0, finest)
-    offset = scene.means[hierarchy.kernels] - hierarchy.levels[finest].rest[unit]
-    moved = modes[unit] + torch.einsum("kabm,kb->kam", gradients[unit], offset)
-    moved = moved * ~hierarchy.levels[0].pinned[:, None, None]
-    basis = moved.new_zeros(scene.count, 3, modes.shape[-1])
-    basis[hierarchy.kernels] = moved
-    return basis
+    return motions.kernels / motions.sizes

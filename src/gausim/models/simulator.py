@@ -17,6 +17,7 @@ from gausim.models.graph import EdgeSet, fill, fill_edges
 from gausim.models.hierarchy import build_hierarchy
 from gausim.models.prepared import Prepared, fixed_units
 from gausim.models.recursion import Solved, Units, advance, inherit
+from gausim.models.smooth import SmoothMotions
 from gausim.models.template import Motion, RestTemplate, Template
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.mlp import zero_output as initialise_zero
@@ -202,6 +203,13 @@ class GausSim(nn.Module):
         none = torch.full((count,), -1)
         levels = range(1, len(hierarchy.levels))
         return tuple(none.index_copy(0, hierarchy.kernels, hierarchy.ancestor(0, level)) for level in levels)
+
+    def smooth_motions(self, scene_id: int) -> SmoothMotions | None:
+        """The motions of a scene that the template can carry; None where it carries none."""
+        motions = self.template.basis(scene_id)
+        if motions is None:
+            return None
+        return SmoothMotions.of(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], motions)
 
     def masses(self, batch: SceneBatch) -> tuple[Float[Tensor, " M"], Float[Tensor, " M"]]:
         """Masses m = exp(r) V of the simulated kernels, and r."""

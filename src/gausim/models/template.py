@@ -70,8 +70,11 @@ class Template(nn.Module, ABC):
         """Weights of neural networks in the template; they learn at the pace of a network."""
         return []
 
-    def basis(self, scene_id: int) -> tuple[Tensor, Tensor] | None:
-        """Smooth motions of one scene that the template can carry: (N, 3, M) and their gradients (N, 3, 3, M)."""
+    def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Smooth motions of one scene that the template can carry: (N, 3, M), their gradients (N, 3, 3, M), sizes (M,).
+
+        See :class:`gausim.models.smooth.SmoothMotions`.
+        """
         return None
 
 
