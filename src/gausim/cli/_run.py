@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from gausim.cli._config import instantiate
-from gausim.core import ConfigError, GaussianScene, Renderer
+from gausim.core import ConfigError, GaussianScene, Renderer, SmoothMotions
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData
 from gausim.engine.checkpoint import check_scenes, load_weights, read_checkpoint
@@ -19,7 +19,6 @@ from gausim.engine.module import GausSimModule
 from gausim.engine.run import RunDirectory
 from gausim.engine.stages import StagedCurriculum
 from gausim.engine.supervision import Sources, Supervision
-from gausim.models.smooth import SmoothMotions
 
 
 @dataclass(frozen=True, eq=False)

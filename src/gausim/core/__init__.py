@@ -15,6 +15,7 @@ from gausim.core.protocols import (
     trajectory_of,
 )
 from gausim.core.scene import GaussianScene
+from gausim.core.smooth import SmoothMotions
 from gausim.core.state import SimState, Trajectory
 
 __all__ = [
@@ -35,6 +36,7 @@ __all__ = [
     "RunError",
     "SceneError",
     "SimState",
+    "SmoothMotions",
     "Steppable",
     "SteppedFrame",
     "Stepper",

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import GaussianScene, Rendered, Renderer
+from gausim.core import GaussianScene, Rendered, Renderer, SmoothMotions
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.data.records import GroundTruth
@@ -18,7 +18,6 @@ from gausim.engine.comparison import Comparison, channels
 from gausim.engine.contracts import SceneBatch
 from gausim.engine.rollout import Looks, States, Views, draw_rest
 from gausim.losses.image import ImageLoss
-from gausim.models.smooth import SmoothMotions
 
 # Losses (T, S) of T predicted frames of S sequences, and the squared change of what is compared, summed. ``start``
 # frames were predicted before them. Differentiable in the states through the losses alone.

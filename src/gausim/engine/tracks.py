@@ -20,14 +20,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import ConfigError
+from gausim.core import ConfigError, SmoothMotions
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.data.records import GroundTruth
 from gausim.engine.comparison import channels
 from gausim.engine.points import PointSupervision
 from gausim.engine.supervision import Sources
-from gausim.models.smooth import SmoothMotions
 from gausim.ops.deformation import polar_rotation
 from gausim.render.draw import SceneAppearance, draw
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from gausim.core import ConfigError, GaussianScene, SimState
+from gausim.core import ConfigError, GaussianScene, SimState, SmoothMotions
 from gausim.models.batch import BatchBuilder, GraphOptions, LevelBatch, SceneBatch
 from gausim.models.dynamics import SceneDynamics
 from gausim.models.features import FeatureOptions, network_inputs
@@ -17,7 +17,7 @@ from gausim.models.graph import EdgeSet, fill, fill_edges
 from gausim.models.hierarchy import build_hierarchy
 from gausim.models.prepared import Prepared, fixed_units
 from gausim.models.recursion import Solved, Units, advance, inherit
-from gausim.models.smooth import SmoothMotions
+from gausim.models.smooth import smooth_motions
 from gausim.models.template import Motion, RestTemplate, Template
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.mlp import zero_output as initialise_zero
@@ -209,7 +209,7 @@ class GausSim(nn.Module):
         motions = self.template.basis(scene_id)
         if motions is None:
             return None
-        return SmoothMotions.of(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], motions)
+        return smooth_motions(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], motions)
 
     def masses(self, batch: SceneBatch) -> tuple[Float[Tensor, " M"], Float[Tensor, " M"]]:
         """Masses m = exp(r) V of the simulated kernels, and r."""

@@ -73,7 +73,7 @@ class Template(nn.Module, ABC):
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor] | None:
         """Smooth motions of one scene that the template can carry: (N, 3, M), their gradients (N, 3, 3, M), sizes (M,).
 
-        See :class:`gausim.models.smooth.SmoothMotions`.
+        See :class:`gausim.core.SmoothMotions`.
         """
         return None
 
