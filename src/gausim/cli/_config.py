@@ -49,7 +49,7 @@ class RootConfig:
     Attributes:
         data: the data module: which set, views, frames and batches.
         model: the dynamics.
-        supervision: what predictions are compared with; the videos unless it names something else.
+        supervision: what predictions are compared with; the images unless it names something else.
         loss: the terms and their weights.
         optimizer: the optimiser (partial, it awaits the parameters) and its schedule.
         render: the renderer.

@@ -41,6 +41,12 @@ A run goes to OUTPUT_ROOT/NAME/seed_SEED (paths.output_root, name, seed). Starte
 checkpoint; once finished it is refused, unless trainer.overwrite=true. A sweep (-m) that is started again leaves out
 what is finished, resumes what is not, and tries again what failed if sweep.retry_failed=true."""
 
+COMPARED = {
+    "ImageSupervision": "the images (supervision=images)",
+    "TrackSupervision": "motion tracked in the images (supervision=tracks), each frame when it is first shown",
+    "PointSupervision": "true points (supervision=points)",
+}
+
 
 def main(argv: Sequence[str]) -> int:
     """Runs the command.
@@ -300,6 +306,8 @@ def _introduce(
         lines += [f"  note: {note}" for note in module.method.notes()]
         print("\n".join(lines), file=sys.stdout, flush=True)
         return
+    kind = type(module.supervision).__name__
+    lines.append(f"  compared with {COMPARED.get(kind, kind)}")
     frames = sum(datamodule.steps(epoch) * batches for epoch in range(epochs))
     lines.append(
         f"  {epochs} epochs x {batches} steps; T {datamodule.steps(0)} to {datamodule.curriculum.t_max}, "
