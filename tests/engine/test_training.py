@@ -225,6 +225,32 @@ def test_absent_sequences_and_scenes_do_not_move_in_the_real_model(tmp_path: Pat
     assert not torch.equal(seen[-1]["initial_states.velocity.0"], seen[1]["initial_states.velocity.0"])
 
 
+def test_damping_counts_in_units_of_the_rest_states_loss() -> None:
+    """Two steps from the same weights differ in the template's damping alone, by the derivative of the term."""
+    found = []
+    for weight in (0.0, 0.5):
+        torch.manual_seed(0)
+        template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=0)
+        model = GausSim([TOY["toy_scene"]()], [24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
+        module = GausSimModule(
+            model=model, initial_states=ModalInitialStates(model, [0]), scene_of_sequence=[0],
+            renderer=CpuRenderer(threads=1), optimizer=OptimizerSettings(clip_norm=0.0),
+            objective=Objective(damping_weight=weight, backprop_steps=0, static_weight=0.0),
+        )  # fmt: skip
+        module.optimise([sample(0)], module.configure_optimizers(), torch.Generator().manual_seed(0), lambda: None)
+        found.append((module, {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}))
+    (_, without), (module, with_it) = found
+    damping = module.model.damping(0)
+    scored = module.yardsticks.of(sample(0), module.simulator.scenes[0].means).static
+    names = [n for n in with_it if "damping" in n]
+    expected = torch.autograd.grad(0.5 * sum(scored) / len(scored) * damping, [module.get_parameter(n) for n in names])
+    assert len(names) == 2 and float(expected[0].min()) > 0
+    for name, gradient in zip(names, expected, strict=True):
+        torch.testing.assert_close(with_it[name] - without.get(name, 0), gradient, rtol=1e-3, atol=1e-4)
+    others = [n for n in without if n not in names]
+    assert others and all(torch.equal(without[n], with_it[n]) for n in others)
+
+
 @pytest.mark.slow
 def test_overfitting_one_sequence_drives_its_loss_down_tenfold(tmp_path: Path) -> None:
     scene = TOY["toy_scene"]()

@@ -352,6 +352,7 @@ def test_dampings_are_what_they_are_called(make_scene) -> None:
         stiffness = 2 * (2 * identity - torch.linalg.solve(inverse, a))
         found[name] = damping, stiffness.diagonal(), (-4 + 2 * scene.damping).exp()
         assert torch.allclose(damping, torch.diag(damping.diagonal()), atol=1e-9)  # without mixing
+        torch.testing.assert_close(scene.dissipation(), damping, rtol=1e-6, atol=1e-9)
     for name, (damping, stiffness, rates) in found.items():
         if name == "modal":
             expected = rates

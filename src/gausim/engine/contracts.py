@@ -137,6 +137,15 @@ class Energetic(Protocol):
 
 
 @runtime_checkable
+class Damped(Protocol):
+    """A simulator that may tell how much it damps motion."""
+
+    def damping(self, scene_id: int) -> Tensor | None:
+        """A number per scene, differentiable; None where nothing is damped."""
+        ...
+
+
+@runtime_checkable
 class InitialVelocities(Protocol):
     """The frame before the first of every training sequence; a torch module with one parameter per sequence."""
 

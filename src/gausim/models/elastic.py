@@ -119,23 +119,28 @@ class ElasticScene(nn.Module):
             energy = energy + size * self.springs.potential(middle)
         return energy
 
+    def dissipation(self) -> Tensor:
+        """D (M, M)."""
+        identity = torch.eye(len(self.values), dtype=self.values.dtype, device=self.values.device)
+        root, mixing = self.roots()
+        log_damping = INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping
+        if self.damping_mixing is not None:
+            factor = (0.5 * log_damping).exp()[:, None] * (identity + MIXING_GAIN * self.damping_mixing)
+            return factor @ factor.mT
+        if self._damping == "modal":
+            return torch.diag(log_damping.exp())
+        if self._damping == "rayleigh":
+            factor = root[:, None] * mixing
+            return log_damping[0].exp() * identity + log_damping[1].exp() * (factor @ factor.mT)
+        factor = root.sqrt()[:, None] * mixing
+        return 2 * log_damping.exp() * factor @ factor.mT
+
     def matrices(self) -> tuple[Tensor, Tensor, Tensor]:
         """A, B and H of z_{t+1} = A z_t - B z_{t-1} + H f."""
         identity = torch.eye(len(self.values), dtype=self.values.dtype, device=self.values.device)
         root, mixing = self.roots()
         factor = root[:, None] * mixing
-        stiffness = factor @ factor.mT
-        log_damping = INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping
-        if self.damping_mixing is not None:
-            factor = (0.5 * log_damping).exp()[:, None] * (identity + MIXING_GAIN * self.damping_mixing)
-            damping = factor @ factor.mT
-        elif self._damping == "modal":
-            damping = torch.diag(log_damping.exp())
-        elif self._damping == "rayleigh":
-            damping = log_damping[0].exp() * identity + log_damping[1].exp() * stiffness
-        else:
-            factor = root.sqrt()[:, None] * mixing
-            damping = 2 * log_damping.exp() * factor @ factor.mT
+        stiffness, damping = factor @ factor.mT, self.dissipation()
         inverse = torch.linalg.inv(identity + stiffness / 4 + damping / 2)
         return inverse @ (2 * identity - stiffness / 2), inverse @ (identity + stiffness / 4 - damping / 2), inverse
 
@@ -284,6 +289,10 @@ class ElasticTemplate(Template):
         scene = self.scenes[scene_id]
         assert isinstance(scene, ElasticScene)
         return scene
+
+    def damping(self, scene_id: int) -> Float[Tensor, ""]:
+        """The mean of D's diagonal: the rate at which a mode loses velocity, per frame."""
+        return self.scene(scene_id).dissipation().diagonal().mean()
 
     def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
         """Everything of the scene's template."""

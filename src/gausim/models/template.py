@@ -62,6 +62,10 @@ class Template(nn.Module, ABC):
         """Energy of every member of a batch in the template's own terms, up to a factor; see ``has_energy``."""
         raise NotImplementedError(f"{type(self).__name__} has no energy")
 
+    def damping(self, scene_id: int) -> Float[Tensor, ""] | None:
+        """How much the template damps motion of a scene, differentiable; None where it has no damping."""
+        return None
+
     def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
         """What a scene has of its own in the template: names in its state dict, each behind ``prefix``."""
         return ()
