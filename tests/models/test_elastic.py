@@ -218,8 +218,8 @@ def test_template_gradients_conserve_volume(make_scene, make_model, amount) -> N
         model = _template(make_model, scene, conserve_mass=conserve)
         batch = model.batch((0,))
         rest = model.hierarchies[0].levels[1].rest
-        modes, _ = model.template.basis(0)
-        now = rest + modes @ torch.linspace(amount, -amount, 9, dtype=torch.float64)
+        modes, _, sizes = model.template.basis(0)
+        now = rest + modes @ (torch.linspace(amount, -amount, 9, dtype=torch.float64) / sizes)
         state = model.template(batch, Motion(rest, now, now))
         det = torch.linalg.det(state.gradients)
         assert bool(torch.isfinite(state.gradients).all()) and float(det.min()) > 0
