@@ -21,9 +21,7 @@ from gausim.losses import ImageLoss
 from gausim.losses.fused import FAST, blur_moments, gather_row, spread_along_width, ssim_slopes
 from gausim.ops.compiled import torch_only
 
-# Sums, products and both at once of several floats: which of them LLVM takes depends on the model of the processor.
-ARM = r"f(?:ml[as]|mul|add|sub)\s+v\d+\.4s"
-PACKED = {"x86_64": r"v(?:fn?m(?:add|sub)\d+|mul|add|sub)ps", "aarch64": ARM, "arm64": ARM}
+PACKED = {"x86_64": r"vfn?m(?:add|sub)\d+ps", "aarch64": r"fml[as]\s+v\d+\.4s", "arm64": r"fml[as]\s+v\d+\.4s"}
 
 
 def pair(states: int, views: int, height: int, width: int) -> tuple[torch.Tensor, torch.Tensor]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from gausim.cli._config import instantiate
-from gausim.core import ConfigError, GaussianScene, Renderer, SmoothMotions
+from gausim.core import ConfigError, Renderer
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData
 from gausim.engine.checkpoint import check_scenes, load_weights, read_checkpoint
@@ -64,32 +64,25 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
     scenes = [item.scene() for item in objects]
     model = instantiate(config.model.simulator, scenes=scenes, fps=[item.fps for item in objects])()
     scene_of_sequence = [scene_id for scene_id, _ in datamodule.index.entries]
-    supervision = _supervision(config, scenes, datamodule, model.smooth_motions)
+    renderer, objective = instantiate(config.render), instantiate(config.loss)
+    sources = Sources(scenes, datamodule.index.ground_truth, model.smooth_motions, renderer, objective.image)
     states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
     module = GausSimModule(
         model=model,
         initial_states=states,
         scene_of_sequence=scene_of_sequence,
-        renderer=instantiate(config.render),
-        objective=instantiate(config.loss),
+        renderer=renderer,
+        objective=objective,
         optimizer=instantiate(config.optimizer),
-        supervision=supervision,
+        supervision=_supervision(config, sources),
         seed=int(config.seed),
     )
     return module, datamodule
 
 
-def _supervision(
-    config: DictConfig,
-    scenes: list[GaussianScene],
-    datamodule: ReadyDataModule,
-    motions: Callable[[int], SmoothMotions | None],
-) -> Supervision | None:
+def _supervision(config: DictConfig, sources: Sources) -> Supervision | None:
     if not config.get("supervision"):
         return None
-    sources = Sources(
-        scenes, datamodule.index.ground_truth, motions, instantiate(config.render), instantiate(config.loss).image
-    )
     made: Supervision | None = instantiate(config.supervision)(sources)
     return made
 
@@ -109,12 +102,14 @@ def _build_fit(config: DictConfig) -> tuple[FittedModule, ReadyDataModule]:
         scene_of_sequence=[scene_id for scene_id, _ in datamodule.index.entries],
         seen=seen,
     )()
+    renderer, image_loss = instantiate(config.render), instantiate(config.loss).image
+    sources = Sources(scenes, datamodule.index.ground_truth, lambda scene_id: None, renderer, image_loss)
     module = FittedModule(
         method=method,
         plan=plan,
-        renderer=instantiate(config.render),
+        renderer=renderer,
         explosion=float(config.loss.explosion),
-        supervision=_supervision(config, scenes, datamodule, lambda scene_id: None),
+        supervision=_supervision(config, sources),
         seed=int(config.seed),
     )
     return module, datamodule

@@ -136,20 +136,17 @@ class TrackSupervision(PointSupervision):
         self,
         sources: Sources,
         *,
-        iterations: int = 40,
-        rate: float = 1.0,
-        momentum: float = 0.7,
-        prior: float = 1.0,
         velocity_weight: float = 0.0,
         energy_weight: float = 0.3,
+        **tracking: Any,
     ) -> None:
-        """Prepares the tracker (``iterations``, ``rate``, ``momentum``, ``prior``); the weights are of the loss.
+        """Prepares the tracker with the settings of :class:`MotionTracker`; the weights are of the loss.
 
         Raises:
             ConfigError: the model has no smooth motions, or a setting is out of range.
         """
         super().__init__(sources, velocity_weight=velocity_weight, energy_weight=energy_weight)
-        self.tracker = MotionTracker(sources, iterations=iterations, rate=rate, momentum=momentum, prior=prior)
+        self.tracker = MotionTracker(sources, **tracking)
         for scene_id in range(len(sources.scenes)):
             self.tracker.motions(scene_id)
         self._sources = sources

@@ -122,13 +122,13 @@ class ElasticScene(nn.Module):
     def dissipation(self) -> Tensor:
         """D (M, M)."""
         identity = torch.eye(len(self.values), dtype=self.values.dtype, device=self.values.device)
-        root, mixing = self.roots()
         log_damping = INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping
         if self.damping_mixing is not None:
             factor = (0.5 * log_damping).exp()[:, None] * (identity + MIXING_GAIN * self.damping_mixing)
             return factor @ factor.mT
         if self._damping == "modal":
             return torch.diag(log_damping.exp())
+        root, mixing = self.roots()
         if self._damping == "rayleigh":
             factor = root[:, None] * mixing
             return log_damping[0].exp() * identity + log_damping[1].exp() * (factor @ factor.mT)
