@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 from gausim.engine.checkpoint import read_checkpoint
@@ -13,6 +14,7 @@ from gausim.engine.checkpoint import read_checkpoint
 write_toy_object = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["write_toy_object"]
 
 
+@pytest.mark.slow  # compiles everything from nothing
 def test_the_process_that_compiles_trains_to_the_same_bits_as_one_that_loads_from_the_cache(tmp_path: Path) -> None:
     toy = write_toy_object(tmp_path / "toy", frames=8).root
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "compiled"), "OMP_NUM_THREADS": "1"}

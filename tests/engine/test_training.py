@@ -225,26 +225,30 @@ def test_absent_sequences_and_scenes_do_not_move_in_the_real_model(tmp_path: Pat
     assert not torch.equal(seen[-1]["initial_states.velocity.0"], seen[1]["initial_states.velocity.0"])
 
 
-def test_damping_counts_in_units_of_the_rest_states_loss() -> None:
-    """Two steps from the same weights differ in the template's damping alone, by the derivative of the term."""
+def test_mixing_counts_in_units_of_the_rest_states_loss() -> None:
+    """Two steps from the same weights differ in the template's mixing alone, by the derivative of the term."""
     found = []
     for weight in (0.0, 0.5):
         torch.manual_seed(0)
-        template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=0)
+        template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=0, inertia="trained")
         model = GausSim([TOY["toy_scene"]()], [24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
+        with torch.no_grad():
+            for name, p in model.template.named_parameters():
+                if "mixing" in name:
+                    p.normal_(std=0.1)
         module = GausSimModule(
             model=model, initial_states=ModalInitialStates(model, [0]), scene_of_sequence=[0],
             renderer=CpuRenderer(threads=1), optimizer=OptimizerSettings(clip_norm=0.0),
-            objective=Objective(damping_weight=weight, backprop_steps=0, static_weight=0.0),
+            objective=Objective(mixing_weight=weight, backprop_steps=0, static_weight=0.0),
         )  # fmt: skip
         module.optimise([sample(0)], module.configure_optimizers(), torch.Generator().manual_seed(0), lambda: None)
         found.append((module, {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}))
     (_, without), (module, with_it) = found
-    damping = module.model.damping(0)
+    mixing = module.model.mixing(0)
     scored = module.yardsticks.of(sample(0), module.simulator.scenes[0].means).static
-    names = [n for n in with_it if "damping" in n]
-    expected = torch.autograd.grad(0.5 * sum(scored) / len(scored) * damping, [module.get_parameter(n) for n in names])
-    assert len(names) == 2 and float(expected[0].min()) > 0
+    names = [n for n in with_it if "mixing" in n]
+    expected = torch.autograd.grad(0.5 * sum(scored) / len(scored) * mixing, [module.get_parameter(n) for n in names])
+    assert len(names) == 3 and all(float(e.abs().max()) > 0 for e in expected)
     for name, gradient in zip(names, expected, strict=True):
         torch.testing.assert_close(with_it[name] - without.get(name, 0), gradient, rtol=1e-3, atol=1e-4)
     others = [n for n in without if n not in names]

@@ -80,7 +80,10 @@ def test_mode_gradients_of_an_affine_motion_are_its_matrix() -> None:
     assert error.max() < 0.1 and np.median(error) < 0.01
 
 
-@pytest.fixture(params=["full", "modal", "rayleigh", "structural"])
+MATRICES = [(damping, "volume") for damping in ("full", "modal", "rayleigh", "structural")] + [("full", "trained")]
+
+
+@pytest.fixture(params=MATRICES, ids="-".join)
 def elastic(make_scene, request) -> ElasticScene:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
     own = {
@@ -89,7 +92,8 @@ def elastic(make_scene, request) -> ElasticScene:
         "period": 12.0,
         "hidden": 0,
         "amplitude": 0.02,
-        "damping": request.param,
+        "damping": request.param[0],
+        "inertia": request.param[1],
         "geometric": None,
         "solid": None,
     }
@@ -125,7 +129,12 @@ def test_first_mode_starts_with_the_given_period(elastic: ElasticScene) -> None:
 
 def _stiffness(scene: ElasticScene) -> torch.Tensor:
     a, _, inverse = scene.matrices()
-    return 2 * (2 * torch.eye(len(a)) - torch.linalg.solve(inverse, a))
+    return 2 * (2 * _inertia(scene) - torch.linalg.solve(inverse, a))
+
+
+def _inertia(scene: ElasticScene) -> torch.Tensor:
+    root = scene.inertia_root()
+    return torch.eye(len(scene.values), dtype=torch.float64) if root is None else root.mT @ root
 
 
 def _shake(scene: ElasticScene, generator: torch.Generator) -> None:
@@ -140,14 +149,14 @@ def test_discrete_energy_never_grows_for_random_mixing(elastic: ElasticScene, se
     _shake(elastic, generator)
     if not damped:
         _undamped(elastic)
-    stiffness = _stiffness(elastic)
+    stiffness, inertia = _stiffness(elastic), _inertia(elastic)
     assert float((stiffness - torch.diag(stiffness.diagonal())).abs().max()) > 0.1  # the modes do mix
     a, b, _ = elastic.matrices()
     before, now = torch.randn(2, 9, generator=generator, dtype=torch.float64)
     energies = []
     for _ in range(2000):
         velocity, middle = now - before, (now + before) / 2
-        energies.append(float(velocity @ velocity + middle @ stiffness @ middle) / 2)
+        energies.append(float(velocity @ inertia @ velocity + middle @ stiffness @ middle) / 2)
         before, now = now, a @ now - b @ before
     energy = torch.tensor(energies, dtype=torch.float64)
     assert bool((energy.diff() <= 1e-9 * energy[0]).all())
@@ -188,6 +197,7 @@ def test_single_precision_rollout_stays_bounded_for_2000_steps(make_scene) -> No
         hidden=0,
         amplitude=0.02,
         damping="full",
+        inertia="trained",
         geometric=None,
         solid=None,
     ).requires_grad_(False)
@@ -267,6 +277,7 @@ def test_parameters_are_grouped_by_role(make_scene, make_model) -> None:
 def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_order(make_scene) -> None:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
     own = {"modes": 9, "neighbours": 8, "period": 6.0, "hidden": 0, "amplitude": 0.02, "damping": "full", "solid": None}
+    own["inertia"] = "volume"
     scene = ElasticScene(hierarchy, 1, **own, geometric=1.0).double().requires_grad_(False)
     springs, level = scene.springs, hierarchy.levels[1]
     assert springs is not None
@@ -315,6 +326,7 @@ def test_springs_never_add_more_than_half_of_what_the_stiffness_pulls(make_scene
         "hidden": 0,
         "amplitude": 0.02,
         "damping": "modal",
+        "inertia": "trained",
         "solid": None,
     }
     scene = ElasticScene(hierarchy, 1, **own, geometric=1.0).double().requires_grad_(False)
@@ -331,6 +343,34 @@ def test_springs_never_add_more_than_half_of_what_the_stiffness_pulls(make_scene
     torch.testing.assert_close(shares[2], torch.full((5,), 0.5, dtype=torch.float64), rtol=1e-3, atol=0)
 
 
+def test_trained_inertia_is_the_equation_of_motion_with_another_mass(make_scene) -> None:
+    """Against M (z'' + ...) solved as it is written, with the forces of springs and the energy that goes with them."""
+    hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
+    own = {"modes": 9, "neighbours": 8, "period": 12.0, "hidden": 0, "amplitude": 0.02, "damping": "full"}
+    own |= {"geometric": 1.0, "solid": None, "inertia": "trained"}
+    scene = ElasticScene(hierarchy, 1, **own).double().requires_grad_(False)
+    generator = torch.Generator().manual_seed(3)
+    begun = scene.mixing_size()
+    for p in (scene.mixing, scene.damping_mixing, scene.inertia_mixing):
+        p.copy_(0.3 * torch.randn(p.shape, generator=generator, dtype=torch.float64))
+    total = sum(float((0.3 * p).square().sum()) for p in (scene.mixing, scene.damping_mixing, scene.inertia_mixing))
+    assert float(begun) == 0 and float(scene.mixing_size()) == pytest.approx(total)
+    root, mixing = scene.roots()
+    heavy = torch.eye(9, dtype=torch.float64) + 0.3 * scene.inertia_mixing
+    mass, inner = heavy.mT @ heavy, root[:, None] * mixing
+    stiffness, damping = heavy.mT @ inner @ inner.mT @ heavy, heavy.mT @ scene.dissipation() @ heavy
+    z, before = 0.01 * torch.randn(2, 1, 9, generator=generator, dtype=torch.float64)
+    size = torch.tensor(scene.initial_log_stiffness).exp() * scene.gain
+    force = size * scene.springs(z)
+    right = z @ (2 * mass - stiffness / 2) - before @ (mass + stiffness / 4 - damping / 2) + force
+    expected = torch.linalg.solve(mass + stiffness / 4 + damping / 2, right[0])
+    place = [torch.einsum("sm,ndm->snd", x, scene.modes) for x in (z, before)]
+    torch.testing.assert_close(scene(*place)[0], expected, rtol=1e-4, atol=1e-9)
+    step, middle = (z - before)[0], (z + before)[0] / 2
+    energy = (step @ mass @ step + middle @ stiffness @ middle) / 2 + size * scene.springs.potential(middle[None])[0]
+    assert float(scene.energy(*place)) == pytest.approx(float(energy), rel=1e-4)
+
+
 def test_dampings_are_what_they_are_called(make_scene) -> None:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
     own = {
@@ -339,6 +379,7 @@ def test_dampings_are_what_they_are_called(make_scene) -> None:
         "period": 12.0,
         "hidden": 0,
         "amplitude": 0.02,
+        "inertia": "volume",
         "geometric": None,
         "solid": None,
     }

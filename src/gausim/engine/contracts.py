@@ -137,11 +137,11 @@ class Energetic(Protocol):
 
 
 @runtime_checkable
-class Damped(Protocol):
-    """A simulator that may tell how much it damps motion."""
+class Mixing(Protocol):
+    """A simulator that may tell how far its template has left the body it began with."""
 
-    def damping(self, scene_id: int) -> Tensor | None:
-        """A number per scene, differentiable; None where nothing is damped."""
+    def mixing(self, scene_id: int) -> Tensor | None:
+        """A number per scene, differentiable, 0 at the start; None where no body is learned."""
         ...
 
 

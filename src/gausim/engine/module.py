@@ -16,7 +16,7 @@ from gausim.core import ConfigError, DivergenceError, Renderer, SimState, Trajec
 from gausim.data.dataset import SampleFacts, SequenceSample
 from gausim.data.sampler import hash_seed
 from gausim.engine.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes, fingerprints
-from gausim.engine.contracts import Damped, Foreseeing, InitialVelocities, SceneBatch, Simulator
+from gausim.engine.contracts import Foreseeing, InitialVelocities, Mixing, SceneBatch, Simulator
 from gausim.engine.cost import TrainingCost
 from gausim.engine.curriculum import LossGatedCurriculum
 from gausim.engine.exchange import Exchange
@@ -175,7 +175,7 @@ class GausSimModule(LightningModule):
         self._prime(samples)
         tally = self._rollout(samples, whole, draws)
         self._static(whole, draws, tally)
-        self._damp(samples, len(whole))
+        self._unmix(samples, len(whole))
         weights = [p for p in self.parameters() if p.requires_grad]
         self._exchange.step(weights, self._network(), tally)
         stats = self._read(samples, whole, tally.fetch(self.settings.clip(optimizer)))
@@ -284,18 +284,18 @@ class GausSimModule(LightningModule):
             self._backward(self.objective.static_weight * loss)
         tally.static = loss.detach()
 
-    def _damp(self, samples: list[SequenceSample], count: int) -> None:
-        """Backward of the template's damping, for each sequence in units of its rest state's loss."""
-        weight = self.objective.damping_weight
-        if not weight or not isinstance(self.model, Damped):
+    def _unmix(self, samples: list[SequenceSample], count: int) -> None:
+        """Backward of the template's mixing of modes, for each sequence in units of its rest state's loss."""
+        weight = self.objective.mixing_weight
+        if not weight or not isinstance(self.model, Mixing):
             return
         for sample in samples:
-            damping = self.model.damping(sample.scene_id)
-            if damping is None or not damping.requires_grad:
+            mixing = self.model.mixing(sample.scene_id)
+            if mixing is None or not mixing.requires_grad:
                 continue
-            yard = self.yardsticks.of(sample, self.simulator.scenes[sample.scene_id].means.to(damping))
+            yard = self.yardsticks.of(sample, self.simulator.scenes[sample.scene_id].means.to(mixing))
             losses = yard.static[: sample.steps]
-            self._backward(weight / count * sum(losses) / len(losses) * damping)
+            self._backward(weight / count * sum(losses) / len(losses) * mixing)
 
     # ------------------------------------------------------------------------------------------------ states, images
 

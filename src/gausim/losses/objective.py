@@ -29,8 +29,8 @@ class Objective:
         energy_frames: how far that motion goes.
         energy_stretch: frames over which its energy is averaged, about a period; gradients stop at its ends.
         energy_probability: how often a batch carries it.
-        damping_weight: of the damping that the model's template has learned, times what the rest state scores: motion
-            that is out of step would else be explained by friction.
+        mixing_weight: of the squares by which the template's matrices mix the modes of the body it began with, times
+            what the rest state scores: what the frames do not tell stays as it was.
         explosion: a rollout that moves a kernel further than this from its rest position ends there and the rest of
             it is not learned from [diagonals of the scene's bounding box]; each such end is counted in the log.
     """
@@ -48,13 +48,13 @@ class Objective:
     energy_frames: int = 36
     energy_stretch: int = 12
     energy_probability: float = 0.5
-    damping_weight: float = 0.0
+    mixing_weight: float = 0.0
     explosion: float = 3.0
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
         names = ("image_weight", "static_weight", "momentum_weight", "backprop_steps", "input_noise", "energy_weight",
-                 "damping_weight")  # fmt: skip
+                 "mixing_weight")  # fmt: skip
         negative = [name for name in names if (getattr(self, name) or 0) < 0]
         if negative or self.explosion <= 0:
             raise ConfigError(f"loss: expected {', '.join(negative) or 'explosion'} not to be negative, got {self}.")

@@ -7,7 +7,8 @@ z = Phi^T M u obeys z'' + D z' + K z = f(z, z'). One frame is one step of the tr
 
 which for every positive semi-definite K and D is stable and creates no energy; with D = 0 it keeps it. K and D are
 trained as S L L^T S products around the network's own spectrum, so that the modes may mix, and f is a small network
-that is zero at rest and starts at zero.
+that is zero at rest and starts at zero. The mass may differ from the units' volume, too: with trained inertia z above
+is G z, G a trained matrix, which makes the inertia G^T G and leaves every property as it is.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ INITIAL_LOG_DAMPING = -4.0
 # step): it is taken at the beginning of the step, and thin parts that turn far would make it explode.
 LARGEST_GEOMETRIC = 0.5
 DAMPINGS = ("full", "modal", "rayleigh", "structural")
+INERTIAS = ("volume", "trained")
 
 
 class ElasticScene(nn.Module):
@@ -60,6 +62,7 @@ class ElasticScene(nn.Module):
         hidden: int,
         amplitude: float,
         damping: str,
+        inertia: str,
         geometric: float | None,
         solid: float | None,
     ) -> None:
@@ -92,6 +95,7 @@ class ElasticScene(nn.Module):
         numbers = {"full": count, "modal": count, "rayleigh": 2, "structural": 1}
         self.damping, self._damping = nn.Parameter(torch.zeros(numbers[damping])), damping
         self.damping_mixing = nn.Parameter(torch.zeros(count, count)) if damping == "full" else None
+        self.inertia_mixing = nn.Parameter(torch.zeros(count, count)) if inertia == "trained" else None
         self.springs = None if geometric is None else Springs(rest, phi, neighbours)
         self.gain = None if geometric is None else nn.Parameter(torch.tensor(float(geometric)))
         self.force = mlp((2 * count, hidden, hidden, count)) if hidden else None
@@ -100,20 +104,35 @@ class ElasticScene(nn.Module):
 
     def roots(self) -> tuple[Tensor, Tensor]:
         """S (M,) and L (M, M) of K = S L L^T S."""
-        identity = torch.eye(len(self.values), dtype=self.values.dtype, device=self.values.device)
         log_stiffness = self.initial_log_stiffness + SPECTRUM_GAIN * (self.stiffness + self.spectrum)
-        return (0.5 * log_stiffness).exp() * self.values.sqrt(), identity + MIXING_GAIN * self.mixing
+        return (0.5 * log_stiffness).exp() * self.values.sqrt(), self._identity() + MIXING_GAIN * self.mixing
+
+    def inertia_root(self) -> Tensor | None:
+        """G (M, M) of the inertia G^T G; None where it is the identity."""
+        return None if self.inertia_mixing is None else self._identity() + MIXING_GAIN * self.inertia_mixing
+
+    def mixing_size(self) -> Float[Tensor, ""]:
+        """Sum of the squares by which the mixings of modes in stiffness, damping and inertia differ from none."""
+        mixings = (self.mixing, self.damping_mixing, self.inertia_mixing)
+        return torch.stack([(MIXING_GAIN * m).square().sum() for m in mixings if m is not None]).sum()
+
+    def _identity(self) -> Tensor:
+        return torch.eye(len(self.values), dtype=self.values.dtype, device=self.values.device)
 
     def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:
-        """|v|^2 / 2 + m^T K m / 2 and the springs' beyond it, of the modes of displacements; constants but for these.
+        """|G v|^2 / 2 + (G m)^T K G m / 2 and the springs' beyond it, constants but for the displacements.
 
         v is the step and m the middle of both, as the trapezoidal rule has it: without damping and springs the
-        template keeps this number exactly.
+        template keeps this number exactly. G is the root of the inertia, the identity where it is not trained.
         """
         z, previous = (torch.cat((now, before)).flatten(1) @ self.projection.flatten(0, 1)).chunk(2)
         root, mixing = (x.detach() for x in self.roots())
-        middle = (z + previous) / 2
-        energy = 0.5 * ((z - previous).square().sum(-1) + ((middle * root) @ mixing).square().sum(-1))
+        step, middle = z - previous, (z + previous) / 2
+        heavy = torch.cat((step, middle))
+        if (inertia := self.inertia_root()) is not None:
+            heavy = heavy @ inertia.detach().mT
+        heavy_step, heavy_middle = heavy.chunk(2)
+        energy = 0.5 * (heavy_step.square().sum(-1) + ((heavy_middle * root) @ mixing).square().sum(-1))
         if self.springs is not None and self.gain is not None:
             size = self.gain.detach() * (self.initial_log_stiffness + SPECTRUM_GAIN * self.stiffness.detach()).exp()
             energy = energy + size * self.springs.potential(middle)
@@ -121,7 +140,7 @@ class ElasticScene(nn.Module):
 
     def dissipation(self) -> Tensor:
         """D (M, M)."""
-        identity = torch.eye(len(self.values), dtype=self.values.dtype, device=self.values.device)
+        identity = self._identity()
         log_damping = INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping
         if self.damping_mixing is not None:
             factor = (0.5 * log_damping).exp()[:, None] * (identity + MIXING_GAIN * self.damping_mixing)
@@ -137,12 +156,16 @@ class ElasticScene(nn.Module):
 
     def matrices(self) -> tuple[Tensor, Tensor, Tensor]:
         """A, B and H of z_{t+1} = A z_t - B z_{t-1} + H f."""
-        identity = torch.eye(len(self.values), dtype=self.values.dtype, device=self.values.device)
+        identity = self._identity()
         root, mixing = self.roots()
         factor = root[:, None] * mixing
         stiffness, damping = factor @ factor.mT, self.dissipation()
         inverse = torch.linalg.inv(identity + stiffness / 4 + damping / 2)
-        return inverse @ (2 * identity - stiffness / 2), inverse @ (identity + stiffness / 4 - damping / 2), inverse
+        now, before = inverse @ (2 * identity - stiffness / 2), inverse @ (identity + stiffness / 4 - damping / 2)
+        if (inertia := self.inertia_root()) is None:
+            return now, before, inverse
+        back = torch.linalg.inv(inertia)
+        return back @ now @ inertia, back @ before @ inertia, back @ inverse @ back.mT
 
     def forward(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S M"]:
         """Modal coordinates at t + 1 from the displacements at t and t - 1 of S sequences."""
@@ -243,6 +266,7 @@ class ElasticTemplate(Template):
         hidden: int = 64,
         amplitude: float = 0.02,
         damping: str = "full",
+        inertia: str = "volume",
         geometric: float | None = None,
         solid: float | None = None,
         conserve_volume: bool = True,
@@ -259,6 +283,7 @@ class ElasticTemplate(Template):
             amplitude: typical displacement [diagonals], scales that network's inputs.
             damping: ``full``, a trained matrix; ``modal``, a number per mode; ``rayleigh``, a uniform and a part in
                 proportion to K, two numbers; ``structural``, the same share of critical for all modes, one number.
+            inertia: ``volume``, mass in proportion to the units' volume; ``trained``, a matrix that starts there.
             geometric: how much of the springs' nonlinear force there is at the start, trained; None leaves it out.
             solid: take the modes of the solid body around the kernels on a grid of this spacing [diagonals]; None takes
                 those of the springs between units.
@@ -267,6 +292,8 @@ class ElasticTemplate(Template):
         super().__init__()
         if damping not in DAMPINGS:
             raise ConfigError(f"model.template.damping is '{damping}'; expected one of {', '.join(DAMPINGS)}.")
+        if inertia not in INERTIAS:
+            raise ConfigError(f"model.template.inertia is '{inertia}'; expected one of {', '.join(INERTIAS)}.")
         self.conserve_volume = conserve_volume
         self.scenes = nn.ModuleList(
             ElasticScene(
@@ -278,6 +305,7 @@ class ElasticTemplate(Template):
                 hidden=hidden,
                 amplitude=amplitude,
                 damping=damping,
+                inertia=inertia,
                 geometric=geometric,
                 solid=solid,
             )
@@ -290,9 +318,9 @@ class ElasticTemplate(Template):
         assert isinstance(scene, ElasticScene)
         return scene
 
-    def damping(self, scene_id: int) -> Float[Tensor, ""]:
-        """The mean of D's diagonal: the rate at which a mode loses velocity, per frame."""
-        return self.scene(scene_id).dissipation().diagonal().mean()
+    def mixing(self, scene_id: int) -> Float[Tensor, ""]:
+        """How much the trained matrices mix the modes of the scene's body, a sum of squares."""
+        return self.scene(scene_id).mixing_size()
 
     def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
         """Everything of the scene's template."""

@@ -211,9 +211,9 @@ class GausSim(nn.Module):
             return None
         return smooth_motions(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], motions)
 
-    def damping(self, scene_id: int) -> Float[Tensor, ""] | None:
-        """How much the template damps motion of a scene; None where it has no damping."""
-        return self.template.damping(scene_id)
+    def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
+        """How far the template has left the body of a scene; None where it learns no body."""
+        return self.template.mixing(scene_id)
 
     def masses(self, batch: SceneBatch) -> tuple[Float[Tensor, " M"], Float[Tensor, " M"]]:
         """Masses m = exp(r) V of the simulated kernels, and r."""

@@ -62,8 +62,8 @@ class Template(nn.Module, ABC):
         """Energy of every member of a batch in the template's own terms, up to a factor; see ``has_energy``."""
         raise NotImplementedError(f"{type(self).__name__} has no energy")
 
-    def damping(self, scene_id: int) -> Float[Tensor, ""] | None:
-        """How much the template damps motion of a scene, differentiable; None where it has no damping."""
+    def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
+        """How far the template has left the body it began with, differentiable; None where it learns no body."""
         return None
 
     def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
