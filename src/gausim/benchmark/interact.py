@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gausim.benchmark.harness import Options, Row, medians, torch_threads
-from gausim.benchmark.step import Bound, cloud
+from gausim.benchmark.step import CLUSTERING, DEFAULT, TEMPLATE, Bound, cloud
 from gausim.core import GaussianScene, SimState
 from gausim.models.elastic import ElasticTemplate
 from gausim.models.simulator import GausSim
@@ -47,13 +47,8 @@ def build(count: int) -> tuple[GaussianScene, GausSim]:
         means=scene.means, log_scales=scene.log_scales, quats=scene.quats, opacity_logits=scene.opacity_logits,
         sh=colors, pinned=scene.pinned, name=scene.name,
     )  # fmt: skip
-    template = partial(
-        ElasticTemplate, modes=48, solid=0.12, geometric=1.0, neighbours=24, damping="full", period=8.0, hidden=0
-    )
-    model = GausSim(
-        [scene], [FPS], radii=(0.13, 0.4), graph_radii=(2.0, 0.4), max_neighbours=8, edges="rest", rest_inputs=True,
-        hidden=32, layers=2, output_scale=0.01, zero_output=True, passive_frames=12, template=template,
-    )  # fmt: skip
+    settings = {**DEFAULT, "template": partial(ElasticTemplate, **TEMPLATE), "passive_frames": 12}
+    model = GausSim([scene], [FPS], radii=(0.13, 0.4), clustering=CLUSTERING, **settings)
     return scene, model.eval()
 
 

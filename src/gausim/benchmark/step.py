@@ -39,8 +39,8 @@ DEFAULT: dict[str, Any] = {
     "hidden": 32, "layers": 2, "output_scale": 0.01, "zero_output": True,
 }  # fmt: skip
 TEMPLATE: dict[str, Any] = {
-    "modes": 48, "solid": 0.12, "geometric": 1.0, "neighbours": 24, "damping": "full", "period": 8.0, "hidden": 0,
-    "amplitude": 0.02,
+    "modes": 48, "solid": 0.12, "geometric": 1.0, "neighbours": 24, "damping": "full", "inertia": "trained",
+    "period": 8.0, "hidden": 0, "amplitude": 0.02,
 }  # fmt: skip
 # Calls of what takes long; its first call is not timed either.
 LONG_ROUNDS = 2
