@@ -24,7 +24,7 @@ from gausim.core import DataError, GausSimError
 
 MANIFEST = "synthetic.json"
 # Raise when the same settings give another set than before.
-GENERATOR = 1
+GENERATOR = 2
 REPLACED = ".replaced"
 
 
@@ -63,8 +63,12 @@ def main(argv: list[str] | None = None) -> int:
         return 2
     from data_prep.synthetic.writer import QUICK, Plan  # after --help: these take seconds to import
 
-    chosen = {name: getattr(arguments, name) for name in ("resolution", "sequences", "frames", "kernels", "objects")}
+    chosen = {
+        name: getattr(arguments, name) for name in ("resolution", "sequences", "frames", "kernels", "objects", "swing")
+    }
     given = {name: value for name, value in chosen.items() if value is not None}
+    if "swing" in given:
+        given["swing"] = tuple(given["swing"])
     try:
         plan = replace(QUICK if arguments.quick else Plan(), seed=arguments.seed, **given)
         settings = json.loads(json.dumps(asdict(plan)))
@@ -88,6 +92,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--frames", type=_positive, help="frames per sequence, at least 16")
     parser.add_argument("--resolution", type=_positive, help="of the videos [pixels]")
     parser.add_argument("--kernels", type=_positive, help="Gaussians per object")
+    parser.add_argument(
+        "--swing",
+        type=float,
+        nargs=2,
+        metavar=("LOW", "HIGH"),
+        help="amplitude of all pushes [fractions of the object's diagonal]; each object's own unless given",
+    )
     return parser
 
 
@@ -164,7 +175,8 @@ def _subject(settings: str, name: str):  # type: ignore[no-untyped-def]  # its c
     from data_prep.synthetic.writer import Plan, SyntheticObject
 
     fields = json.loads(settings)
-    return SyntheticObject(name, Plan(**{**fields, "objects": tuple(fields["objects"])}))
+    listed = {key: tuple(fields[key]) for key in ("objects", "swing") if fields[key] is not None}
+    return SyntheticObject(name, Plan(**{**fields, **listed}))
 
 
 if __name__ == "__main__":

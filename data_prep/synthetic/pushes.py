@@ -8,10 +8,15 @@ import numpy as np
 
 from data_prep.synthetic.bodies import Array, Body
 from data_prep.synthetic.elastic import ElasticBody
+from gausim.core import DivergenceError
 
 # Frames within which a push reaches its full amplitude: half a period of the slowest object.
 FIRST_SWING = 12
 TRIAL_SPEED = 1.0  # [diagonals / s], of about the size that the amplitudes ask for
+# Amplitudes of a push that stays nearly linear [diagonals]; beyond LINEAR one trial does not hit the amplitude.
+SMALL_SWING = (0.05, 0.08)
+LINEAR = 0.1
+TRIALS, TOLERANCE = 6, 0.05
 
 
 @dataclass(frozen=True)
@@ -31,14 +36,14 @@ class Push:
     amplitude: float
 
 
-def random_push(body: Body, kind: str, rng: np.random.Generator) -> Push:
-    """A push of the upper half of a body, mostly sideways, of 5 to 8 % of its diagonal."""
+def random_push(body: Body, kind: str, rng: np.random.Generator, swing: tuple[float, float] = SMALL_SWING) -> Push:
+    """A push of the upper half of a body, mostly sideways, its amplitude within ``swing`` [diagonals]."""
     height = np.ptp(body.nodes[:, 2])
     upper = np.flatnonzero(body.nodes[:, 2] > body.nodes[:, 2].min() + 0.5 * height)
     point = body.nodes[rng.choice(upper)]
     angle, lift = rng.uniform(0, 2 * np.pi), rng.uniform(-0.5, 0.5) if kind == "poke" else 0.0
     direction = np.array([np.cos(angle), np.sin(angle), lift]) / np.hypot(1.0, lift)
-    return Push(kind, tuple(point.tolist()), tuple(direction.tolist()), float(rng.uniform(0.05, 0.08)))
+    return Push(kind, tuple(point.tolist()), tuple(direction.tolist()), float(rng.uniform(*swing)))
 
 
 def push_field(body: Body, push: Push) -> Array:
@@ -56,10 +61,27 @@ def push_field(body: Body, push: Push) -> Array:
 
 
 def pushed_motion(body: Body, elastic: ElasticBody, push: Push, frames: int) -> Array:
-    """Motion (frames, N, 3) of a body after a push, scaled to the push's amplitude by a trial swing."""
+    """Motion (frames, N, 3) of a body after a push, scaled to the push's amplitude by trial swings.
+
+    Raises:
+        DivergenceError: the body reaches the amplitude at no speed that was tried.
+    """
     velocity = push_field(body, push)
     velocity *= TRIAL_SPEED * body.diagonal / np.abs(velocity).max()
+    if push.amplitude <= LINEAR:
+        return elastic.simulate(velocity * (push.amplitude / _peak(body, elastic, velocity)), frames)
+    for _ in range(TRIALS):
+        peak = _peak(body, elastic, velocity)
+        if abs(peak / push.amplitude - 1) < TOLERANCE:
+            return elastic.simulate(velocity, frames)
+        velocity *= push.amplitude / peak
+    raise DivergenceError(
+        f"a {push.kind} of {push.amplitude:.3f} diagonals is not reached within {TRIALS} trials; the last gave "
+        f"{peak:.3f}. Choose a smaller --swing."
+    )
+
+
+def _peak(body: Body, elastic: ElasticBody, velocity: Array) -> float:
+    """Largest displacement within the first swing [diagonals]."""
     swing = elastic.simulate(velocity, FIRST_SWING)
-    peak = np.linalg.norm(swing - body.nodes, axis=-1).max() / body.diagonal
-    # The bodies are soft enough for their response to be nearly linear: one trial hits the amplitude within a tenth.
-    return elastic.simulate(velocity * (push.amplitude / peak), frames)
+    return float(np.linalg.norm(swing - body.nodes, axis=-1).max() / body.diagonal)

@@ -13,7 +13,7 @@ from data_prep.synthetic.bodies import BODIES, Array, Body
 from data_prep.synthetic.elastic import ElasticBody, Material
 from data_prep.synthetic.embedding import Embedding, cover_surface, embedded_scene
 from data_prep.synthetic.paint import PAINTERS
-from data_prep.synthetic.pushes import pushed_motion, random_push
+from data_prep.synthetic.pushes import SMALL_SWING, pushed_motion, random_push
 from data_prep.synthetic.rig import VIDEO_ANGLES, photograph, still_cameras, video_cameras
 from gausim.core import Cameras, ConfigError, GaussianScene
 from gausim.data.images import write_rgba
@@ -23,23 +23,38 @@ from gausim.io.transforms import write_transforms
 
 TRAIN_FRAMES = 16  # frames 0..15 are seen, as the paper trains
 MIN_KERNELS = 50
+LARGEST_SWING = 0.5  # [diagonals]; further the finite elements turn inside out
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """What an object is: a shape of :data:`BODIES` and a material, with the step its stiffness allows [s]."""
+    """What an object is.
+
+    Attributes:
+        body: a shape of :data:`BODIES`.
+        material: what it is made of.
+        time_step: that its stiffness allows [s].
+        swing: least and largest amplitude of its pushes [diagonals].
+    """
 
     body: str
     material: Material
     time_step: float
+    swing: tuple[float, float] = SMALL_SWING
 
 
 # Periods of the slowest mode are about 14 frames (soft) and 9 frames (firm) at 24 frames per second.
+SOFT_PUDDING = Recipe("pudding", Material(young_modulus=170.0, poisson_ratio=0.35, drag=0.5), 2e-3)
+SOFT_FLOWER = Recipe("flower", Material(young_modulus=8e4, poisson_ratio=0.35, drag=0.5), 2e-4)
+# Pushes that bend a body far beyond where its motion is linear.
+LARGE_SWING = (0.18, 0.28)
 RECIPES = {
-    "pudding_soft": Recipe("pudding", Material(young_modulus=170.0, poisson_ratio=0.35, drag=0.5), 2e-3),
+    "pudding_soft": SOFT_PUDDING,
     "pudding_firm": Recipe("pudding", Material(young_modulus=400.0, poisson_ratio=0.35, drag=0.5), 2e-3),
-    "flower_soft": Recipe("flower", Material(young_modulus=8e4, poisson_ratio=0.35, drag=0.5), 2e-4),
+    "flower_soft": SOFT_FLOWER,
     "flower_firm": Recipe("flower", Material(young_modulus=1.7e5, poisson_ratio=0.35, drag=0.5), 1.5e-4),
+    "pudding_swing": replace(SOFT_PUDDING, swing=LARGE_SWING),
+    "flower_swing": replace(SOFT_FLOWER, swing=LARGE_SWING),
 }
 
 
@@ -57,10 +72,11 @@ class Plan:
         resolution: of the videos [pixels].
         still_resolution: of the stills [pixels].
         kernels: Gaussians per object.
+        swing: least and largest amplitude of all pushes [diagonals]; None: each object's own.
         seed: of everything random.
     """
 
-    objects: tuple[str, ...] = ("pudding_soft", "pudding_firm", "flower_soft")
+    objects: tuple[str, ...] = ("pudding_soft", "pudding_firm", "flower_soft", "flower_swing", "pudding_swing")
     sequences: int = 8
     frames: int = 50
     fps: int = 24
@@ -69,6 +85,7 @@ class Plan:
     resolution: int = 96
     still_resolution: int = 192
     kernels: int = 800
+    swing: tuple[float, float] | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -82,6 +99,9 @@ class Plan:
             raise ConfigError(f"train_views: expected 1..{len(VIDEO_ANGLES) - 1}, got {self.train_views}.")
         if self.kernels < MIN_KERNELS:
             raise ConfigError(f"kernels: expected at least {MIN_KERNELS} to cover a body, got {self.kernels}.")
+
+        if self.swing is not None and not 0 < self.swing[0] <= self.swing[1] <= LARGEST_SWING:
+            raise ConfigError(f"swing: expected 0 < LOW <= HIGH <= {LARGEST_SWING} diagonals, got {self.swing}.")
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -117,6 +137,10 @@ class SyntheticObject:
         low, high = self.body.nodes.min(0), self.body.nodes.max(0)
         self.center, self.radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
 
+    @property
+    def _swing(self) -> tuple[float, float]:
+        return self.recipe.swing if self.plan.swing is None else self.plan.swing
+
     @cached_property
     def elastic(self) -> ElasticBody:
         """The body's finite elements."""
@@ -143,7 +167,7 @@ class SyntheticObject:
     def write_sequence(self, root: Path, number: int) -> None:
         """Simulates, photographs and writes sequence ``number``."""
         plan, folder = self.plan, root / "sequences" / f"seq_{number:03d}"
-        push = random_push(self.body, ("poke", "drag")[number % 2], self._rng("push", number))
+        push = random_push(self.body, ("poke", "drag")[number % 2], self._rng("push", number), self._swing)
         motion = pushed_motion(self.body, self.elastic, push, plan.frames)
         displacement = motion - motion[0]
         cameras = video_cameras(self.center, self.radius, plan.resolution, plan.views)

@@ -46,7 +46,12 @@ def test_radii_are_found_that_give_the_units_wanted() -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "settings"), [("gausim_paper", step.PAPER), ("gausim", {**step.DEFAULT, "template": step.TEMPLATE})]
+    ("file", "settings"),
+    [
+        ("gausim_paper", step.PAPER),
+        ("gausim", {**step.DEFAULT, "template": step.TEMPLATE}),
+        ("gausim_elastic", {**step.ELASTIC, "template": step.ELASTIC_TEMPLATE}),
+    ],
 )
 def test_settings_are_those_of_the_configuration(file, settings) -> None:
     text = (Path(__file__).parents[2] / f"conf/model/{file}.yaml").read_text()

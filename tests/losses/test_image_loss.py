@@ -67,7 +67,7 @@ def test_equal_images_cost_nothing_and_black_ones_do_not_fail() -> None:
 
 def test_static_loss_sums_squared_distances() -> None:
     rest = torch.zeros(4, 3)
-    assert float(static_loss(rest + 2.0, rest)) == pytest.approx(48.0)
+    assert float(static_loss(rest + 2.0, rest, torch.full((len(rest), 1), 4.0))) == pytest.approx(3.0)
 
 
 def test_objective_windows_and_chances() -> None:

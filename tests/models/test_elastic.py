@@ -10,7 +10,7 @@ import torch
 
 from gausim.core import SimState
 from gausim.models.elastic import ElasticScene, ElasticTemplate
-from gausim.models.hierarchy import build_hierarchy
+from gausim.models.hierarchy import Hierarchy, build_hierarchy
 from gausim.models.initial_state import ModalInitialStates
 from gausim.models.springs import mode_gradients, spring_network, vibration_modes
 from gausim.models.template import Motion
@@ -80,25 +80,30 @@ def test_mode_gradients_of_an_affine_motion_are_its_matrix() -> None:
     assert error.max() < 0.1 and np.median(error) < 0.01
 
 
-MATRICES = [(damping, "volume") for damping in ("full", "modal", "rayleigh", "structural")] + [("full", "trained")]
-
-
-@pytest.fixture(params=MATRICES, ids="-".join)
-def elastic(make_scene, request) -> ElasticScene:
-    hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
+def _scene(hierarchy: Hierarchy, **settings) -> ElasticScene:
+    """Nine modes in double precision, linear and with mass by volume unless told otherwise."""
     own = {
         "modes": 9,
         "neighbours": 8,
         "period": 12.0,
         "hidden": 0,
         "amplitude": 0.02,
-        "damping": request.param[0],
-        "inertia": request.param[1],
+        "damping": "full",
+        "inertia": "volume",
         "geometric": None,
         "solid": None,
     }
-    scene = ElasticScene(hierarchy, 1, **own)
-    return scene.double().requires_grad_(False)
+    return ElasticScene(hierarchy, 1, **own | settings).double().requires_grad_(False)
+
+
+MATRICES = [(damping, "volume") for damping in ("full", "modal", "rayleigh", "structural")] + [("full", "trained")]
+
+
+@pytest.fixture(params=MATRICES, ids="-".join)
+def elastic(make_scene, request) -> ElasticScene:
+    hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
+    damping, inertia = request.param
+    return _scene(hierarchy, damping=damping, inertia=inertia)
 
 
 def _undamped(scene: ElasticScene) -> None:
@@ -188,21 +193,9 @@ def test_the_energy_of_a_state_is_kept_without_damping_and_lost_with_it(elastic:
 
 def test_single_precision_rollout_stays_bounded_for_2000_steps(make_scene) -> None:
     hierarchy = build_hierarchy(make_scene(90), radii=(0.2, 0.5))
-    scene = ElasticScene(
-        hierarchy,
-        1,
-        modes=9,
-        neighbours=8,
-        period=6.0,
-        hidden=0,
-        amplitude=0.02,
-        damping="full",
-        inertia="trained",
-        geometric=None,
-        solid=None,
-    ).requires_grad_(False)
+    scene = _scene(hierarchy, period=6.0, inertia="trained")
     generator = torch.Generator().manual_seed(7)
-    _shake(scene.double(), generator)
+    _shake(scene, generator)
     scene.float()
     start = torch.randn(2, 9, generator=generator)
     before, now = (torch.einsum("m,ndm->nd", z, scene.modes)[None] for z in start)
@@ -230,7 +223,7 @@ def test_template_gradients_conserve_volume(make_scene, make_model, amount) -> N
         rest = model.hierarchies[0].levels[1].rest
         modes, _, sizes = model.template.basis(0)
         now = rest + modes @ (torch.linspace(amount, -amount, 9, dtype=torch.float64) / sizes)
-        state = model.template(batch, Motion(rest, now, now))
+        state = model.prepare(batch).template(Motion(rest, now, now))
         det = torch.linalg.det(state.gradients)
         assert bool(torch.isfinite(state.gradients).all()) and float(det.min()) > 0
         spread[conserve] = float((det - 1).abs().max())
@@ -276,9 +269,7 @@ def test_parameters_are_grouped_by_role(make_scene, make_model) -> None:
 
 def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_order(make_scene) -> None:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
-    own = {"modes": 9, "neighbours": 8, "period": 6.0, "hidden": 0, "amplitude": 0.02, "damping": "full", "solid": None}
-    own["inertia"] = "volume"
-    scene = ElasticScene(hierarchy, 1, **own, geometric=1.0).double().requires_grad_(False)
+    scene = _scene(hierarchy, period=6.0, geometric=1.0)
     springs, level = scene.springs, hierarchy.levels[1]
     assert springs is not None
     pairs, blocks = spring_network(level.rest.double().numpy(), 8)
@@ -319,18 +310,8 @@ def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_or
 
 def test_springs_never_add_more_than_half_of_what_the_stiffness_pulls(make_scene) -> None:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
-    own = {
-        "modes": 9,
-        "neighbours": 8,
-        "period": 6.0,
-        "hidden": 0,
-        "amplitude": 0.02,
-        "damping": "modal",
-        "inertia": "trained",
-        "solid": None,
-    }
-    scene = ElasticScene(hierarchy, 1, **own, geometric=1.0).double().requires_grad_(False)
-    plain = ElasticScene(hierarchy, 1, **own, geometric=None).double().requires_grad_(False)
+    own = {"period": 6.0, "damping": "modal", "inertia": "trained"}
+    scene, plain = _scene(hierarchy, **own, geometric=1.0), _scene(hierarchy, **own)
     a, b, _ = scene.matrices()
     z = torch.randn(5, 9, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     shares = []
@@ -346,9 +327,7 @@ def test_springs_never_add_more_than_half_of_what_the_stiffness_pulls(make_scene
 def test_trained_inertia_is_the_equation_of_motion_with_another_mass(make_scene) -> None:
     """Against M (z'' + ...) solved as it is written, with the forces of springs and the energy that goes with them."""
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
-    own = {"modes": 9, "neighbours": 8, "period": 12.0, "hidden": 0, "amplitude": 0.02, "damping": "full"}
-    own |= {"geometric": 1.0, "solid": None, "inertia": "trained"}
-    scene = ElasticScene(hierarchy, 1, **own).double().requires_grad_(False)
+    scene = _scene(hierarchy, inertia="trained", geometric=1.0)
     generator = torch.Generator().manual_seed(3)
     begun = scene.mixing_size()
     for p in (scene.mixing, scene.damping_mixing, scene.inertia_mixing):
@@ -373,19 +352,9 @@ def test_trained_inertia_is_the_equation_of_motion_with_another_mass(make_scene)
 
 def test_dampings_are_what_they_are_called(make_scene) -> None:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
-    own = {
-        "modes": 9,
-        "neighbours": 8,
-        "period": 12.0,
-        "hidden": 0,
-        "amplitude": 0.02,
-        "inertia": "volume",
-        "geometric": None,
-        "solid": None,
-    }
     found = {}
     for name in ("modal", "rayleigh", "structural"):
-        scene = ElasticScene(hierarchy, 1, **own, damping=name).double().requires_grad_(False)
+        scene = _scene(hierarchy, damping=name)
         scene.damping.copy_(torch.arange(len(scene.damping)) / 10)
         a, b, inverse = scene.matrices()
         identity = torch.eye(9, dtype=torch.float64)

@@ -6,21 +6,20 @@ import pytest
 import torch
 
 from gausim.models.template import Template, TemplateState
-from gausim.ops.deformation import gradient_from_output
 
 
 class _Given(Template):
     """A fixed random configuration of the finest units."""
 
-    def __init__(self, hierarchies, finest, *, conserve_volume) -> None:
+    def __init__(self, hierarchies, finest, *, conserve_volume, attributes, frames) -> None:
         super().__init__()
         level = hierarchies[0].levels[finest]
         generator = torch.Generator().manual_seed(0)
         noise = torch.randn(level.count, 3, 4, generator=generator, dtype=torch.float64) * ~level.pinned[:, None, None]
         self.state = TemplateState(level.rest + 0.1 * noise[..., 3], torch.eye(3) + 0.2 * noise[..., :3])
 
-    def forward(self, batch, motion) -> TemplateState:
-        return self.state
+    def prepare(self, batch, units):
+        return lambda motion: self.state
 
 
 @torch.no_grad()
@@ -55,11 +54,11 @@ def test_coarse_template_positions_are_the_centres_of_mass_of_their_children(
     model = make_model(scene, template=_Given)
     seen = []
 
-    def identity(level, unit, above, target, *, position, share):
+    def nothing(level, unit, above, target, position):
         seen.append((unit, target))
-        return gradient_from_output(torch.zeros(level.count, 11, dtype=torch.float64), conserve_mass=True)
+        return torch.zeros(level.count, 11, dtype=torch.float64)
 
-    model._predict = identity
+    model._output = nothing
     model.step(model.batch((0,)), make_state(scene))
     (coarse, target), (fine, finest) = seen
     assert torch.equal(finest, model.template.state.positions)

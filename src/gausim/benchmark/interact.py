@@ -11,7 +11,7 @@ from torch import Tensor
 from gausim.benchmark.harness import Options, Row, medians, torch_threads
 from gausim.benchmark.step import CLUSTERING, DEFAULT, TEMPLATE, Bound, cloud
 from gausim.core import GaussianScene, SimState
-from gausim.models.elastic import ElasticTemplate
+from gausim.models.material import MaterialTemplate
 from gausim.models.simulator import GausSim
 from gausim.view.coloring import VIEW, Painter
 from gausim.view.interaction import Interaction
@@ -47,7 +47,7 @@ def build(count: int) -> tuple[GaussianScene, GausSim]:
         means=scene.means, log_scales=scene.log_scales, quats=scene.quats, opacity_logits=scene.opacity_logits,
         sh=colors, pinned=scene.pinned, name=scene.name,
     )  # fmt: skip
-    settings = {**DEFAULT, "template": partial(ElasticTemplate, **TEMPLATE), "passive_frames": 12}
+    settings = {**DEFAULT, "template": partial(MaterialTemplate, **TEMPLATE), "passive_frames": 36}
     model = GausSim([scene], [FPS], radii=(0.13, 0.4), clustering=CLUSTERING, **settings)
     return scene, model.eval()
 

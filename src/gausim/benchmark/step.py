@@ -20,25 +20,35 @@ from gausim.models.cuda_graph import GraphedStep
 from gausim.models.elastic import ElasticTemplate
 from gausim.models.features import network_inputs
 from gausim.models.hierarchy import build_hierarchy
+from gausim.models.material import MaterialTemplate
 from gausim.models.prepared import Prepared
 from gausim.models.recursion import Solved, Units, advance, inherit
 from gausim.models.simulator import GausSim
-from gausim.models.template import Motion
+from gausim.models.template import Motion, Template
 from gausim.ops.compiled import torch_only
 from gausim.ops.deformation import gradient_from_output
 
 CLUSTERING = "agglomerative"
-# The simulators of conf/model/gausim_paper.yaml, of conf/ablation/no_hierarchy.yaml with it, and of gausim.yaml.
+# The simulators of conf/model/gausim_paper.yaml, of conf/ablation/no_hierarchy.yaml with it, of gausim.yaml and of
+# gausim_elastic.yaml.
 PAPER: dict[str, Any] = {
     "predicted_levels": (2, 1), "graph_radii": (2.0, 0.4), "max_neighbours": 16, "edges": "union", "hidden": 128,
-    "layers": 16,
+    "layers": 16, "norm": "joint",
 }  # fmt: skip
 NO_HIERARCHY: dict[str, Any] = {**PAPER, "predicted_levels": (0,), "graph_radii": (0.1,)}
 DEFAULT: dict[str, Any] = {
     "predicted_levels": (2, 1), "graph_radii": (2.0, 0.4), "max_neighbours": 8, "edges": "rest", "rest_inputs": True,
-    "hidden": 32, "layers": 2, "output_scale": 0.01, "zero_output": True,
+    "attributes": 8, "hidden": 48, "layers": 3, "output_scale": 0.1, "zero_output": True, "velocity_inputs": False,
+    "lever_head": 0.02, "anchor": True, "body_frame": True,
 }  # fmt: skip
 TEMPLATE: dict[str, Any] = {
+    "modes": 48, "spacing": 0.12, "links": 12, "hidden": 48, "period": 8.0, "damping": 0.02,
+}  # fmt: skip
+ELASTIC: dict[str, Any] = {
+    "predicted_levels": (2, 1), "graph_radii": (2.0, 0.4), "max_neighbours": 8, "edges": "rest", "rest_inputs": True,
+    "hidden": 32, "layers": 2, "output_scale": 0.01, "zero_output": True,
+}  # fmt: skip
+ELASTIC_TEMPLATE: dict[str, Any] = {
     "modes": 48, "solid": 0.12, "geometric": 1.0, "neighbours": 24, "damping": "full", "inertia": "trained",
     "period": 8.0, "hidden": 0, "amplitude": 0.02,
 }  # fmt: skip
@@ -159,23 +169,31 @@ def _without(
 
 
 def _training(size: Size, options: Options) -> list[Row]:
-    """All steps of a training batch, compiled and by torch alone."""
+    """All steps of a training batch, compiled and by torch alone, and against those of the elastic model."""
     scene = cloud(size.bunny, "bunny")
-    template = functools.partial(ElasticTemplate, **TEMPLATE)
-    settings = {**DEFAULT, **dict(size.network), "template": template}
-    model = GausSim([scene], [24.0], radii=find_radii(scene, size.bunny_units), clustering=CLUSTERING, **settings)
-    bound = Bound(model, size.batch, options, steps=size.steps)
+    radii = find_radii(scene, size.bunny_units)
+
+    def bind(settings: dict[str, Any], template: Callable[..., Template]) -> Bound:
+        own = {**settings, **dict(size.network), "template": template}
+        model = GausSim([scene], [24.0], radii=radii, clustering=CLUSTERING, **own)
+        return Bound(model, size.batch, options, steps=size.steps)
+
+    bound = bind(DEFAULT, functools.partial(MaterialTemplate, **TEMPLATE))
+    elastic = bind(ELASTIC, functools.partial(ElasticTemplate, **ELASTIC_TEMPLATE))
     counts = " + ".join(str(level.count) for level in reversed(bound.batch.levels))
     case = f"{size.steps} steps, {size.batch} x {size.bunny} kernels, {counts} units"
     rows = [Row(case, "edges", float(bound.edges()), "1")]
-    for metric, call, alone in (
-        ("forward", bound.forward, bound.network_forward),
-        ("forward + backward", bound.both, bound.network_both),
+    for metric, call, alone, other in (
+        ("forward", bound.forward, bound.network_forward, elastic.forward),
+        ("forward + backward", bound.both, bound.network_both, elastic.both),
     ):
-        times = medians({"step": call, "network": alone, "torch": functools.partial(_by_torch, call)}, options)
+        by_torch = functools.partial(_by_torch, call)
+        times = medians({"step": call, "network": alone, "torch": by_torch, "elastic": other}, options)
         rows += _shares(case, metric, {**times, "network": size.steps * times["network"]})
         reference = "the torch forms of the same operations, same run"
         rows.append(Row(case, f"{metric} / torch forms", times["step"] / times["torch"], "x", reference))
+        reference = "model=gausim_elastic, same run"
+        rows.append(Row(case, f"{metric} / elastic", times["step"] / times["elastic"], "x", reference))
     rows.append(Row(case, "kept for the backward pass", saved_bytes(bound.differentiable) / 2**20, "MiB"))
     return rows
 
@@ -227,7 +245,7 @@ class Bound:
         with torch.no_grad():
             self.model.eval().step(self.batch, self.state)
         handle.remove()
-        return seen
+        return seen[-len(self.batch.levels) :]  # behind those of the anchor, where there is one
 
     def edges(self) -> int:
         """Edges of all predicted levels."""
@@ -317,7 +335,7 @@ class Bound:
 
 def _finest(prepared: Prepared, state: SimState) -> tuple[Units, Solved]:
     """Units of the finest level, and the level above (or the roots) as if it had not moved."""
-    now, before = prepared.aggregate(state.positions), prepared.aggregate(state.previous)
+    now, before = prepared.units(state.positions), prepared.units(state.previous)
     fixed, level = prepared.levels[-1], prepared.batch.levels[-1]
     unit = Units(fixed.rest, now[-1], before[-1], fixed.mass, fixed.log_density, fixed.attributes)
     if len(now) == 1:

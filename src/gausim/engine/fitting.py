@@ -269,7 +269,9 @@ class FittedModule(GausSimModule):
         if loss.requires_grad:
             super()._backward(loss)
 
-    def _static(self, whole: list[SampleFacts], draws: torch.Generator, tally: Tally) -> None:
+    def _static(
+        self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator, tally: Tally
+    ) -> None:
         """The stage's penalties of the sequences of this rank; the mean over all sequences of the step."""
         weights = dict(self.plan.order)[self.stage].penalties
         if not weights:

@@ -174,7 +174,7 @@ class GausSimModule(LightningModule):
         whole = interleave(self.ranks.gather([sample.facts for sample in samples]))
         self._prime(samples)
         tally = self._rollout(samples, whole, draws)
-        self._static(whole, draws, tally)
+        self._static(samples, whole, draws, tally)
         self._unmix(samples, len(whole))
         weights = [p for p in self.parameters() if p.requires_grad]
         self._exchange.step(weights, self._network(), tally)
@@ -269,17 +269,27 @@ class GausSimModule(LightningModule):
     def _network(self) -> list[nn.Parameter]:
         return [p for p in self.simulator.parameter_groups()["network"] if p.requires_grad]
 
-    def _static(self, whole: list[SampleFacts], draws: torch.Generator, tally: Tally) -> None:
+    def _static(
+        self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator, tally: Tally
+    ) -> None:
         chance = self.objective.static_chance(whole[0].steps)
         if float(torch.rand((), generator=draws)) >= chance:
             return
+        if self.objective.rest_image_weight and samples:
+            batch = self.simulator.batch([s.scene_id for s in samples])
+            step = self.simulator.step(batch, SimState(batch.rest, batch.rest))
+            losses, _ = self.images.at_rest(samples, batch)(States.of([step]), 0)
+            if losses.requires_grad:
+                self._backward(self.objective.rest_image_weight / len(whole) * losses.sum())
         scene_ids = sorted({s.scene_id for s in whole})
         own = scene_ids[self.ranks.rank :: self.ranks.size]
         if not own:
             return
         batch = self.simulator.batch(own)
         step = self.simulator.step(batch, SimState(batch.rest, batch.rest))
-        loss = static_loss(step.positions, batch.rest) / len(scene_ids)
+        diagonal = torch.cat([batch.rest.new_full((len(batch.rest[m.kernels]), 1), self.diagonals[m.scene_id])
+                              for m in batch.members])  # fmt: skip
+        loss = static_loss(step.positions, batch.rest, diagonal) / len(scene_ids)
         if loss.requires_grad:
             self._backward(self.objective.static_weight * loss)
         tally.static = loss.detach()

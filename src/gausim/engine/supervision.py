@@ -86,6 +86,13 @@ class ImageSupervision:
 
     def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Comparison:
         """What draws and compares the predictions of a batch."""
+        return self._comparison(samples, batch, slice(1, None))
+
+    def at_rest(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Comparison:
+        """What compares one step from the rest state with frame 0 of the samples."""
+        return self._comparison(samples, batch, slice(0, 1))
+
+    def _comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch, frames: slice) -> Comparison:
         groups = self.views.groups(samples)
         return Comparison(
             self.renderer,
@@ -93,7 +100,7 @@ class ImageSupervision:
             batch,
             groups,
             [self.looks.of(group.scene_id, batch.rest) for group in groups],
-            [sample.frames[1:] for sample in samples],
+            [sample.frames[frames] for sample in samples],
             [
                 self.rest_image(sample, batch.rest[member.kernels]).rgb[0]
                 for sample, member in zip(samples, batch.members, strict=True)

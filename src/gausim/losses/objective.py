@@ -15,9 +15,11 @@ class Objective:
     Attributes:
         image: loss between a predicted and a true image.
         image_weight: of the image loss (mean over views).
-        static_weight: of the static loss.
+        static_weight: of the static loss [diagonals^2].
+        rest_image_weight: of the image loss of one step from the rest state against frame 0, in batches that carry the
+            static loss.
         static_probability: how often a batch carries it; None is 1 / T.
-        momentum_weight: of the momentum loss.
+        momentum_weight: of the momentum loss [(total mass x diagonals)^2].
         over_steps: ``mean`` or ``sum`` of image and momentum losses over the steps of a rollout.
         backprop_steps: gradients stop every so many steps; 0 lets them through the whole rollout.
         checkpoint_steps: keep of each step of a rollout its input only and compute it once more in the backward pass;
@@ -38,6 +40,7 @@ class Objective:
     image: ImageLoss = field(default_factory=ImageLoss)
     image_weight: float = 1.0
     static_weight: float = 1.0
+    rest_image_weight: float = 0.0
     static_probability: float | None = None
     momentum_weight: float = 1.0
     over_steps: str = "mean"
@@ -53,8 +56,16 @@ class Objective:
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
-        names = ("image_weight", "static_weight", "momentum_weight", "backprop_steps", "input_noise", "energy_weight",
-                 "mixing_weight")  # fmt: skip
+        names = (
+            "image_weight",
+            "static_weight",
+            "rest_image_weight",
+            "momentum_weight",
+            "backprop_steps",
+            "input_noise",
+            "energy_weight",
+            "mixing_weight",
+        )
         negative = [name for name in names if (getattr(self, name) or 0) < 0]
         if negative or self.explosion <= 0:
             raise ConfigError(f"loss: expected {', '.join(negative) or 'explosion'} not to be negative, got {self}.")
@@ -74,7 +85,7 @@ class Objective:
 
     def static_chance(self, steps: int) -> float:
         """Probability that a batch of ``steps`` predicted steps also carries the static loss."""
-        if self.static_weight == 0:
+        if self.static_weight == 0 and self.rest_image_weight == 0:
             return 0.0
         return 1 / steps if self.static_probability is None else self.static_probability
 

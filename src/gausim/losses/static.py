@@ -6,9 +6,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def static_loss(positions: Float[Tensor, "K 3"], rest: Float[Tensor, "K 3"]) -> Float[Tensor, ""]:
+def static_loss(
+    positions: Float[Tensor, "K 3"], rest: Float[Tensor, "K 3"], diagonal: Float[Tensor, "K 1"]
+) -> Float[Tensor, ""]:
     """Sum over kernels of the squared distance between one step from the rest state and the rest state itself.
 
-    In scene units squared; a plain sum, as METHOD section 4 has it.
+    Lengths are divided by the diagonal of each kernel's scene, so that the unit of the scene does not matter.
     """
-    return (positions - rest).square().sum()
+    return ((positions - rest) / diagonal).square().sum()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -129,6 +129,15 @@ class SceneBatch:
     def scene_ids(self) -> tuple[int, ...]:
         """Scene of each member."""
         return tuple(m.scene_id for m in self.members)
+
+
+def rows_by_scene(batch: SceneBatch) -> Iterator[tuple[int, Int[Tensor, " R"], list[int]]]:
+    """Each scene of a batch, the rows of its members' finest units and the members."""
+    spans = batch.levels[-1].spans
+    for scene_id in sorted(set(batch.scene_ids)):
+        members = [i for i, s in enumerate(batch.scene_ids) if s == scene_id]
+        rows = torch.cat([torch.arange(spans[i].start, spans[i].stop) for i in members])
+        yield scene_id, rows.to(batch.rest.device), members
 
 
 @dataclass(frozen=True)

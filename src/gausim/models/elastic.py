@@ -14,18 +14,21 @@ is G z, G a trained matrix, which makes the inertia G^T G and leaves every prope
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.core import ConfigError
-from gausim.models.batch import SceneBatch
+from gausim.models.batch import SceneBatch, rows_by_scene
 from gausim.models.hierarchy import Hierarchy
 from gausim.models.solid import solid_modes
 from gausim.models.springs import Springs, mode_gradients, vibration_modes
 from gausim.models.template import Motion, Template, TemplateState
+from gausim.models.units import FixedUnits
 from gausim.nn.mlp import mlp, zero_output
 from gausim.ops.deformation import bounded_deformation
 
@@ -128,11 +131,10 @@ class ElasticScene(nn.Module):
         z, previous = (torch.cat((now, before)).flatten(1) @ self.projection.flatten(0, 1)).chunk(2)
         root, mixing = (x.detach() for x in self.roots())
         step, middle = z - previous, (z + previous) / 2
-        heavy = torch.cat((step, middle))
+        heavy = torch.stack((step, middle))
         if (inertia := self.inertia_root()) is not None:
             heavy = heavy @ inertia.detach().mT
-        heavy_step, heavy_middle = heavy.chunk(2)
-        energy = 0.5 * (heavy_step.square().sum(-1) + ((heavy_middle * root) @ mixing).square().sum(-1))
+        energy = 0.5 * (heavy[0].square().sum(-1) + ((heavy[1] * root) @ mixing).square().sum(-1))
         if self.springs is not None and self.gain is not None:
             size = self.gain.detach() * (self.initial_log_stiffness + SPECTRUM_GAIN * self.stiffness.detach()).exp()
             energy = energy + size * self.springs.potential(middle)
@@ -215,22 +217,14 @@ class PreparedScene:
         return (z @ self.motions.mT).view(*now.shape[:2], 12)
 
 
-def _rows(batch: SceneBatch) -> Iterator[tuple[int, Tensor, list[int]]]:
-    """Each scene of a batch, the rows of its members' finest units and the members."""
-    spans = batch.levels[-1].spans
-    for scene_id in sorted(set(batch.scene_ids)):
-        members = [i for i, s in enumerate(batch.scene_ids) if s == scene_id]
-        rows = torch.cat([torch.arange(spans[i].start, spans[i].stop) for i in members])
-        yield scene_id, rows.to(batch.rest.device), members
-
-
 class _PreparedTemplate:
     """The elastic template of one batch while its parameters do not change."""
 
     def __init__(self, template: ElasticTemplate, batch: SceneBatch) -> None:
         self.template = template
         self.parts = [
-            (PreparedScene(template.scene(scene_id)), rows, len(members)) for scene_id, rows, members in _rows(batch)
+            (PreparedScene(template.scene(scene_id)), rows, len(members))
+            for scene_id, rows, members in rows_by_scene(batch)
         ]
         order = torch.cat([rows for _, rows, _ in self.parts])
         self.places = torch.empty_like(order).index_copy(0, order, torch.arange(len(order), device=order.device))
@@ -269,6 +263,8 @@ class ElasticTemplate(Template):
         inertia: str = "volume",
         geometric: float | None = None,
         solid: float | None = None,
+        attributes: int = 0,
+        frames: Sequence[np.ndarray] = (),
         conserve_volume: bool = True,
     ) -> None:
         """See the module's text.
@@ -287,6 +283,8 @@ class ElasticTemplate(Template):
             geometric: how much of the springs' nonlinear force there is at the start, trained; None leaves it out.
             solid: take the modes of the solid body around the kernels on a grid of this spacing [diagonals]; None takes
                 those of the springs between units.
+            attributes: of the units, not read here: what a scene is made of is in its matrices.
+            frames: axes of the scenes, not read here.
             conserve_volume: scale the template's gradients to determinant 1 (METHOD's mass conservation).
         """
         super().__init__()
@@ -331,18 +329,14 @@ class ElasticTemplate(Template):
         forces = (self.scene(i).force for i in range(len(self.scenes)))
         return [p for force in forces if force is not None for p in force.parameters()]
 
-    def forward(self, batch: SceneBatch, motion: Motion) -> TemplateState:
-        """Positions X + Phi z and gradients I + grad(Phi) z of the next frame."""
-        return self.prepare(batch)(motion)
-
-    def prepare(self, batch: SceneBatch) -> Callable[[Motion], TemplateState]:
-        """The template with its matrices computed."""
+    def prepare(self, batch: SceneBatch, units: FixedUnits) -> Callable[[Motion], TemplateState]:
+        """The template with its matrices computed: positions X + Phi z and gradients I + grad(Phi) z."""
         return _PreparedTemplate(self, batch)
 
-    def energy(self, batch: SceneBatch, motion: Motion) -> Float[Tensor, " S"]:
+    def energy(self, batch: SceneBatch, motion: Motion, prepared: Any = None) -> Float[Tensor, " S"]:
         """Energy of every member of the batch, see :meth:`ElasticScene.energy`."""
         found = motion.rest.new_zeros(len(batch.scene_ids))
-        for scene_id, rows, members in _rows(batch):
+        for scene_id, rows, members in rows_by_scene(batch):
             now, before = (
                 (x.index_select(0, rows) - motion.rest.index_select(0, rows)).view(len(members), -1, 3)
                 for x in (motion.now, motion.before)

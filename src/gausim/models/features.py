@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gausim.core import ConfigError
 from gausim.models.features_compiled import NetworkInputs
 from gausim.models.recursion import Solved, Units
 from gausim.ops.compiled import fits
@@ -41,21 +42,33 @@ class FeatureOptions:
         angle: ``cos_sin`` of the difference of the two angles (scale-free), or ``inner``, the difference of products.
         rest_inputs: also give displacements, rest-space edge vectors and the template's prediction.
         coarse_inputs: below the top level read positions from the coarse prediction instead of the current state.
+        velocities: give velocities and accelerations; without them levers X_i - X_p, displacements and what the parent
+            did to the template take their place.
     """
 
     angle: str = "cos_sin"
     rest_inputs: bool = False
     coarse_inputs: bool = False
+    velocities: bool = True
+
+    def __post_init__(self) -> None:
+        """Checks that something is left to see."""
+        if not (self.velocities or self.rest_inputs):
+            raise ConfigError(
+                "model.simulator.velocity_inputs=false needs rest_inputs=true: the network would see nothing."
+            )
 
     @property
     def node_normalised(self) -> int:
         """How many leading node features are normalised."""
+        if not self.velocities:
+            return 9
         return 12 if self.rest_inputs else 6
 
     @property
     def edge_normalised(self) -> int:
         """How many leading edge features are normalised."""
-        return 13 if self.rest_inputs else 7
+        return (13 if self.rest_inputs else 7) - (0 if self.velocities else 3)
 
     @property
     def edge_size(self) -> int:
@@ -98,13 +111,25 @@ def network_inputs(
     if fits(*moving, *parents, unit.log_density, unit.attributes, size, dt, gravity):
         choices = options.rest_inputs, coarse, options.angle == "cos_sin"
         constants = above.index, edge_index, size.view(-1), dt.view(-1), gravity
-        return NetworkInputs.apply(*moving, unit.log_density, unit.attributes, *parents, *constants, choices)
+        made = NetworkInputs.apply(*moving, unit.log_density, unit.attributes, *parents, *constants, choices)
+        return made if options.velocities else _positions_only(made[0], made[1], unit, target, above, size)
     own = UnitState(unit.rest / size, unit.now / size, unit.before / size, above.carry(target) / size)
     parent = UnitState(*(x.index_select(0, above.index) / size for x in parents[:4]))
     nodes = node_features(
         own, parent, dt, gravity / size, unit.log_density, unit.attributes, options, coarse=coarse
     )  # fmt: skip
-    return nodes, edge_features(own, parent, edge_index, dt, options, coarse=coarse)
+    edges = edge_features(own, parent, edge_index, dt, options, coarse=coarse)
+    return (nodes, edges) if options.velocities else _positions_only(nodes, edges, unit, target, above, size)
+
+
+def _positions_only(
+    nodes: Tensor, edges: Tensor, unit: Units, target: Tensor, above: Solved, size: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Inputs without any velocity: lever, displacement and what the parent did to the template [diagonals]."""
+    lever = (unit.rest - above.rest.index_select(0, above.index)) / size
+    done = (above.carry(target) - target) / size
+    nodes = torch.cat((lever, nodes[:, 6:9], done, nodes[:, 12:]), -1)
+    return nodes, torch.cat((edges[:, :4], edges[:, 7:]), -1)
 
 
 def node_features(

@@ -48,7 +48,7 @@ class Hierarchy:
     Attributes:
         levels: the levels, kernels first.
         kernels: scene index of each level-0 unit.
-        diagonal: bounding-box diagonal of the simulated kernels [scene units].
+        diagonal: bounding-box diagonal of the simulated kernels [scene units]; see :func:`build_hierarchy`.
     """
 
     levels: tuple[Level, ...]
@@ -67,7 +67,13 @@ class Hierarchy:
         return sum(int((~self.levels[level].pinned).sum()) for level in predicted)
 
 
-def build_hierarchy(scene: GaussianScene, *, radii: Sequence[float], clustering: str = "agglomerative") -> Hierarchy:
+def build_hierarchy(
+    scene: GaussianScene,
+    *,
+    radii: Sequence[float],
+    clustering: str = "agglomerative",
+    axes: np.ndarray | None = None,
+) -> Hierarchy:
     """Clusters the simulated kernels level by level.
 
     Args:
@@ -75,6 +81,8 @@ def build_hierarchy(scene: GaussianScene, *, radii: Sequence[float], clustering:
         radii: largest cluster diameter per level 1..L, as fractions of the bounding-box diagonal.
         clustering: ``agglomerative`` (complete linkage in near-linear memory), ``ball`` (a greedy cover; more clusters)
             or ``complete_linkage`` (of all pairs; the reference).
+        axes: (3, 3) along whose rows the bounding box lies whose diagonal all lengths are stated in; the scene's when
+            None. With the body's own axes a turned scene has the same units.
 
     Raises:
         SceneError: no pinned kernel, or no simulated kernel that is free.
@@ -88,6 +96,7 @@ def build_hierarchy(scene: GaussianScene, *, radii: Sequence[float], clustering:
     volume = kernel_volumes(scene.log_scales.cpu()[index].double(), scene.volume_scale)
     pinned = scene.pinned.cpu()[index]
     pinned_kernels = pinned.nonzero()[:, 0].numpy()
+    diagonal = scene.diagonal if axes is None else float(np.linalg.norm(np.ptp(rest.numpy() @ axes.T, axis=0)))
     tree = cKDTree(rest[pinned].numpy())
     levels = []
     for number in range(len(radii) + 1):
@@ -95,11 +104,11 @@ def build_hierarchy(scene: GaussianScene, *, radii: Sequence[float], clustering:
         top = number == len(radii)
         parent = torch.zeros(0, dtype=torch.int64)
         if not top:
-            parent = _cluster_by_group(rest, pinned, radii[number] * scene.diagonal, clustering)
+            parent = _cluster_by_group(rest, pinned, radii[number] * diagonal, clustering)
         levels.append(Level(rest.to(scene.means.dtype), volume.to(scene.means.dtype), pinned, parent, root))
         if not top:
             rest, volume, pinned = _coarsen(rest, volume, pinned, parent)
-    return Hierarchy(tuple(levels), index, scene.diagonal)
+    return Hierarchy(tuple(levels), index, diagonal)
 
 
 def _cluster_by_group(rest: Tensor, pinned: Tensor, diameter: float, clustering: str) -> Tensor:

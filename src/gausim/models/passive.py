@@ -33,7 +33,7 @@ class EnergyGuard:
 
     of the network's output, E_0 and E_1 being the energies with none and all of it. E is convex in the state, so that
     of the share stays below the limit as far as the state is linear in s; where it does not, and where the template
-    alone passes the limit (its springs beyond the linear are taken explicitly), the template's own step is taken.
+    alone passes the limit (springs beyond the linear are taken explicitly), the template's own step is taken.
 
     Far beyond the motion that training shows those explicit springs are unstable: what forces have carried there would
     fly apart. A ``ceiling`` ends that. A force that would pass it acts with a share only; a step that passes it all the
@@ -67,7 +67,7 @@ class EnergyGuard:
             force: as of :meth:`gausim.models.simulator.GausSim.step`; the work it does raises the limit.
         """
         if not self._last:
-            self._last.append(self._energy(state))
+            self._last.append(self._model.template.headroom * self._energy(state))
         if force is not None:
             pushed = self._model.pushed(self._prepared, state, force)
             work = max(0.0, self._energy(pushed) - self._energy(state))

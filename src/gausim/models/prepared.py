@@ -2,36 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from gausim.models.batch import SceneBatch
+from gausim.models.frames import Frames
 from gausim.models.recursion import Solved
 from gausim.models.template import Motion, TemplateState
+from gausim.models.units import FixedUnits, per_level
 from gausim.ops.aggregation import weighted_sum
-
-
-@dataclass(frozen=True, eq=False)
-class FixedUnits:
-    """What of the units of one level stays between two updates of the parameters.
-
-    Attributes:
-        rest: centres of mass X [scene units].
-        mass: m_c = sum of m_i.
-        share: m_c over the mass of its parent among the predicted levels; at the top level over itself.
-        log_density: log of m_c / V_c.
-        attributes: plain mean over the kernels.
-    """
-
-    rest: Float[Tensor, "N 3"]
-    mass: Float[Tensor, " N"]
-    share: Float[Tensor, " N"]
-    log_density: Float[Tensor, " N"]
-    attributes: Float[Tensor, "N A"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +29,9 @@ class Prepared:
         levels: the predicted levels, coarse to fine.
         roots: what the top level hangs on.
         template: the template of the batch.
+        frames: the bodies' axes in which levels, roots and template are; None where these are the scene's.
+        rest: centres of mass of the finest predicted units in the scene's axes [scene units].
+        still: the network's outputs at rest per level, taken off others; None where they are not.
         with_gradients: whether it was made with gradients enabled.
     """
 
@@ -56,42 +41,20 @@ class Prepared:
     levels: tuple[FixedUnits, ...]
     roots: Solved
     template: Callable[[Motion], TemplateState]
+    frames: Frames | None
+    rest: Float[Tensor, "N 3"]
+    still: tuple[Tensor, ...] | None
     with_gradients: bool
 
     def aggregate(self, positions: Float[Tensor, "K 3"]) -> list[Tensor]:
         """Centres of mass of the units of every predicted level, coarse to fine."""
         return self.per_level(weighted_sum(positions, self.share, self.batch.finest, self.batch.levels[-1].count))
 
+    def units(self, positions: Float[Tensor, "K 3"]) -> list[Tensor]:
+        """The same in the bodies' own axes, where these are used."""
+        found = self.aggregate(positions)
+        return found if self.frames is None else [self.frames.into(i, x) for i, x in enumerate(found)]
+
     def per_level(self, finest: Float[Tensor, "N 3"]) -> list[Tensor]:
         """Positions of every predicted level, coarse to fine: coarser units are the centres of mass of the finer."""
-        return _per_level(self.batch, [level.share for level in self.levels], finest)
-
-
-def _per_level(batch: SceneBatch, shares: Sequence[Tensor], finest: Tensor) -> list[Tensor]:
-    found = [finest]
-    for position in range(len(batch.levels) - 1, 0, -1):
-        level, count = batch.levels[position], batch.levels[position - 1].count
-        found.insert(0, weighted_sum(found[0], shares[position], level.parent, count))
-    return found
-
-
-def fixed_units(
-    batch: SceneBatch, mass: Float[Tensor, " M"], attributes: Float[Tensor, "M A"]
-) -> tuple[Float[Tensor, " K"], tuple[FixedUnits, ...]]:
-    """Share of every kernel in its finest unit, and the constants of every predicted level (METHOD section 1)."""
-    levels = batch.levels
-    totals = [mass.new_zeros(level.count).index_add(0, level.unit_of_kernel, mass) for level in levels]
-    within = mass / totals[-1].index_select(0, levels[-1].unit_of_kernel)
-    share = mass.new_zeros(len(batch.rest)).index_copy(0, batch.simulated, within)
-    shares = [torch.ones_like(totals[0])]
-    for above, total, level in zip(totals, totals[1:], levels[1:], strict=False):
-        shares.append(total / above.index_select(0, level.parent))
-    rest = _per_level(batch, shares, weighted_sum(batch.rest, share, batch.finest, levels[-1].count))
-    units = []
-    for i, level in enumerate(levels):
-        ones = torch.ones_like(mass)
-        members = mass.new_zeros(level.count).index_add(0, level.unit_of_kernel, ones)[:, None]
-        mean = mass.new_zeros(level.count, attributes.shape[1]).index_add(0, level.unit_of_kernel, attributes) / members
-        log_density = torch.log(totals[i] / level.volume)
-        units.append(FixedUnits(rest[i], totals[i], shares[i], log_density, mean))
-    return share, tuple(units)
+        return per_level(self.batch, [level.share for level in self.levels], finest)

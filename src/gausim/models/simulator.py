@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
@@ -13,15 +14,18 @@ from gausim.core import ConfigError, GaussianScene, SimState, SmoothMotions
 from gausim.models.batch import BatchBuilder, GraphOptions, LevelBatch, SceneBatch
 from gausim.models.dynamics import SceneDynamics
 from gausim.models.features import FeatureOptions, network_inputs
+from gausim.models.frames import Frames, body_axes
 from gausim.models.graph import EdgeSet, fill, fill_edges
+from gausim.models.head import lever_gradient
 from gausim.models.hierarchy import build_hierarchy
-from gausim.models.prepared import Prepared, fixed_units
+from gausim.models.prepared import Prepared
 from gausim.models.recursion import Solved, Units, advance, inherit
 from gausim.models.smooth import smooth_motions
 from gausim.models.template import Motion, RestTemplate, Template
+from gausim.models.units import FixedUnits, fixed_units
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.mlp import zero_output as initialise_zero
-from gausim.nn.normaliser import RunningNormaliser
+from gausim.nn.normaliser import RunningNormaliser, gathering_nothing
 from gausim.ops.aggregation import weighted_sum
 from gausim.ops.announce import announced
 from gausim.ops.deformation import gradient_from_output
@@ -37,7 +41,8 @@ class Step:
         positions: x_{t+1} of all kernels of the batch [scene units].
         gradients: accumulated deformation gradients of the finest predicted units, per member plus its identity unit.
         rotations: their accumulated rotations.
-        momentum: sum over levels and parents of ||m_c x_c - sum m_i x_i||^2; zero where it is switched off.
+        momentum: sum over levels and parents of ||m_c x_c - sum m_i x_i||^2, masses over that of the scene and lengths
+            over its diagonal; zero where it is switched off.
         predicted: the network's own gradients F, per predicted level, coarse to fine.
     """
 
@@ -52,6 +57,8 @@ class GausSim(nn.Module):
     """The simulator of one or several scenes that share one network."""
 
     gravity: Tensor
+    axes: Tensor
+    origins: Tensor
 
     def __init__(
         self,
@@ -85,6 +92,10 @@ class GausSim(nn.Module):
         normaliser_floor: float = 1e-2,
         cuda_graph: bool = False,
         passive_frames: int = 0,
+        velocity_inputs: bool = True,
+        lever_head: float = 0.0,
+        anchor: bool = False,
+        body_frame: bool = False,
         template: Callable[..., Template] = RestTemplate,
     ) -> None:
         """Builds hierarchies, graph and network.
@@ -121,22 +132,47 @@ class GausSim(nn.Module):
             cuda_graph: rollouts on a CUDA device replay the step as one graph; of no effect elsewhere.
             passive_frames: in rollouts, the network may not raise the template's energy beyond the largest of so many
                 frames before (:class:`gausim.models.passive.EnergyGuard`); 0, or a template without energy: no limit.
-            template: what the gradients deform; called with (hierarchies, finest level, conserve_volume=conserve_mass).
+            velocity_inputs: give velocities and accelerations to the network. Without them it sees positions and, of
+                every unit, the lever X_i - X_p from its parent: the step is the same forwards and backwards in time.
+            lever_head: three more outputs per unit move its lever by so many diagonals each, see
+                :func:`gausim.models.head.lever_gradient`; 0 leaves them out.
+            anchor: take the network's outputs at rest off, so that rest is an equilibrium.
+            body_frame: work in the body's own axes, so that a scene that is turned or moved moves likewise.
+            template: what the gradients deform; called with (hierarchies, finest level, attributes=,
+                frames= (axes of the scenes), conserve_volume=conserve_mass).
         """
         super().__init__()
         _check(predicted_levels, radii, graph_radii, angle, scenes, fps)
+        if body_frame and any(gravity):
+            raise ConfigError(
+                "model.gravity is a direction of the scene: set model.simulator.body_frame=false with it."
+            )
         self.scenes, self.fps = tuple(scenes), tuple(fps)
         self.predicted_levels = tuple(predicted_levels)
         self.edges, self.output_scale = EdgeSet(edges, edge_bucket), output_scale
         self.conserve_mass, self.conserve_momentum = conserve_mass, conserve_momentum
         self.cuda_graph, self.passive_frames = cuda_graph, passive_frames
-        self.options = FeatureOptions(angle, rest_inputs, coarse_inputs)
-        self.hierarchies = tuple(build_hierarchy(s, radii=radii, clustering=clustering) for s in scenes)
+        self.options = FeatureOptions(angle, rest_inputs, coarse_inputs, velocities=velocity_inputs)
+        self.lever_head, self.anchor, self.body_frame = lever_head, anchor, body_frame
+        axes = [body_axes(s) if body_frame else np.eye(3) for s in scenes]
+        self.hierarchies = tuple(
+            build_hierarchy(s, radii=radii, clustering=clustering, axes=own if body_frame else None)
+            for s, own in zip(scenes, axes, strict=True)
+        )
         graph = GraphOptions(tuple(graph_radii), max_neighbours)
         self._builder = BatchBuilder(self.scenes, self.hierarchies, self.fps, self.predicted_levels, graph)
         self._batches: dict[tuple[tuple[int, ...], torch.device], SceneBatch] = {}
         self.register_buffer("gravity", torch.tensor([float(g) for g in gravity]), persistent=False)
-        self.template: Template = template(self.hierarchies, self.predicted_levels[-1], conserve_volume=conserve_mass)
+        origins = [s.means.mean(0) if body_frame else torch.zeros(3) for s in scenes]
+        self.register_buffer("axes", torch.from_numpy(np.stack(axes)).to(scenes[0].means), persistent=False)
+        self.register_buffer("origins", torch.stack(origins).to(scenes[0].means), persistent=False)
+        self.template: Template = template(
+            self.hierarchies,
+            self.predicted_levels[-1],
+            attributes=attributes,
+            frames=axes,
+            conserve_volume=conserve_mass,
+        )
         counts = [h.levels[0].count for h in self.hierarchies]
         self.log_density = nn.ParameterList(torch.zeros(n) for n in counts)
         self.attributes = nn.ParameterList(torch.zeros(n, attributes) for n in counts)
@@ -146,7 +182,7 @@ class GausSim(nn.Module):
             MeshGraphNet(
                 node_features=self.options.node_normalised + 1 + attributes,
                 edge_features=self.options.edge_size,
-                outputs=11,
+                outputs=14 if lever_head else 11,
                 hidden=hidden,
                 layers=layers,
                 norm=norm,
@@ -172,8 +208,8 @@ class GausSim(nn.Module):
         }
 
     def shared(self) -> dict[str, nn.Module]:
-        """What all scenes have in common, by name: the network and the normalisers of its inputs."""
-        names = ("network", "node_normaliser", "edge_normaliser")
+        """What all scenes have in common, by name: the network, the normalisers of its inputs, a shared template."""
+        names = ["network", "node_normaliser", "edge_normaliser", *(["template"] if self.template.is_shared else [])]
         return {name: self.get_submodule(name) for name in names}
 
     def own(self, scene_id: int) -> tuple[str, ...]:
@@ -186,7 +222,8 @@ class GausSim(nn.Module):
         Args:
             scenes: keep what the scenes have of their own, too.
         """
-        (self if scenes else self.network).requires_grad_(False)
+        for module in (self,) if scenes else self.shared().values():
+            module.requires_grad_(False)
         self.node_normaliser.frozen = self.edge_normaliser.frozen = True
 
     def batch(self, scene_ids: Sequence[int]) -> SceneBatch:
@@ -209,7 +246,12 @@ class GausSim(nn.Module):
         motions = self.template.basis(scene_id)
         if motions is None:
             return None
-        return smooth_motions(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], motions)
+        modes, gradients, sizes = motions
+        axes = self.axes[scene_id].to(modes)
+        modes = torch.einsum("ba,nbm->nam", axes, modes)
+        gradients = torch.einsum("ca,ncdm,db->nabm", axes, gradients, axes)
+        own = modes, gradients, sizes
+        return smooth_motions(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], own)
 
     def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
         """How far the template has left the body of a scene; None where it learns no body."""
@@ -228,8 +270,8 @@ class GausSim(nn.Module):
     def energy(self, batch: SceneBatch, state: SimState, prepared: Prepared | None = None) -> Float[Tensor, " S"]:
         """Energy of every member of the batch in the template's terms, up to a factor per scene."""
         prepared = self.prepare(batch) if prepared is None else prepared
-        now, before = (prepared.aggregate(x)[-1] for x in (state.positions, state.previous))
-        return self.template.energy(batch, Motion(prepared.levels[-1].rest, now, before))
+        now, before = (prepared.units(x)[-1] for x in (state.positions, state.previous))
+        return self.template.energy(batch, Motion(prepared.levels[-1].rest, now, before), prepared.template)
 
     def prepare(self, batch: SceneBatch) -> Prepared:
         """What steps of this batch have in common as long as no parameter changes.
@@ -239,10 +281,23 @@ class GausSim(nn.Module):
         mass, _ = self.masses(batch)
         attributes = torch.cat([self.attributes[i] for i in batch.scene_ids])
         share, levels = fixed_units(batch, mass, attributes)
-        top = batch.levels[0]
+        top, rest = batch.levels[0], levels[-1].rest
         roots = batch.rest.index_select(0, batch.simulated.index_select(0, top.parent))
-        template, grad = self.template.prepare(batch), torch.is_grad_enabled()
-        return Prepared(batch, mass, share, levels, Solved.roots(roots), template, grad)
+        frames = Frames.of(batch, self.axes, self.origins) if self.body_frame else None
+        if frames is not None:
+            levels = tuple(replace(level, rest=frames.into(i, level.rest)) for i, level in enumerate(levels))
+            roots = frames.into(0, roots)
+        template, grad = self.template.prepare(batch, levels[-1]), torch.is_grad_enabled()
+        prepared = Prepared(batch, mass, share, levels, Solved.roots(roots), template, frames, rest, None, grad)
+        return replace(prepared, still=self._outputs_at_rest(prepared)) if self.anchor else prepared
+
+    def _outputs_at_rest(self, prepared: Prepared) -> tuple[Tensor, ...]:
+        """The network's output for every unit of every predicted level where nothing moves."""
+        units = [level.rest for level in prepared.levels]
+        outputs: list[Tensor] = []
+        with gathering_nothing([self.node_normaliser, self.edge_normaliser]):
+            self._descend(prepared, units, units, 0.0, outputs)
+        return tuple(outputs)
 
     def step(
         self,
@@ -285,8 +340,23 @@ class GausSim(nn.Module):
 
     def _solve(self, prepared: Prepared, state: SimState, share: float) -> Step:
         """All predicted levels, coarse to fine, then the kernels."""
+        now, before = prepared.units(state.positions), prepared.units(state.previous)
+        finest, gradients, momentum, predicted = self._descend(prepared, now, before, share, [])
+        frames, last = prepared.frames, len(prepared.levels) - 1
+        if frames is not None:
+            finest = frames.back(finest, prepared.rest)
+            gradients = None if gradients is None else frames.turned_back(last, gradients)
+            predicted = [frames.turned_back(i, f) for i, f in enumerate(predicted)]
+        return Step(*inherit(finest, gradients, prepared.batch.kernels), momentum, tuple(predicted))
+
+    def _descend(
+        self, prepared: Prepared, now: list[Tensor], before: list[Tensor], share: float, outputs: list[Tensor]
+    ) -> tuple[Solved, Tensor | None, Tensor, list[Tensor]]:
+        """The predicted levels, coarse to fine: the finest one solved, the template's gradients, momentum and all F.
+
+        The network's outputs, before anything is taken off, are appended to ``outputs``.
+        """
         batch = prepared.batch
-        now, before = prepared.aggregate(state.positions), prepared.aggregate(state.previous)
         units = [
             Units(fixed.rest, x, y, fixed.mass, fixed.log_density, fixed.attributes)
             for fixed, x, y in zip(prepared.levels, now, before, strict=True)
@@ -297,22 +367,40 @@ class GausSim(nn.Module):
         for position, (level, unit, target) in enumerate(zip(batch.levels, units, targets, strict=True)):
             if position:
                 above = replace(above, index=level.parent)
-            gradient, rotation = self._predict(level, unit, above, target, position=position, share=share)
+            still = None if prepared.still is None else prepared.still[position]
+            output, gradient, rotation = self._predict(
+                level, unit, above, target, position=position, share=share, still=still
+            )
+            outputs.append(output)
             predicted.append(gradient)
             accumulated, turned, after = advance(gradient, rotation, target, above)
             if position and self.conserve_momentum:
-                momentum = momentum + _momentum(level, unit, after, above.after, prepared.levels[position - 1].mass)
+                momentum = momentum + _momentum(level, unit, after, above.after, prepared.levels[position - 1])
             above = Solved(unit.rest, unit.now, unit.before, after, target, accumulated, turned, above.index)
-        return Step(*inherit(above, template.gradients, batch.kernels), momentum, tuple(predicted))
+        return above, template.gradients, momentum, predicted
 
     def _fixes_shapes(self, positions: Tensor) -> bool:
         """Whether the number of edges must not depend on the state: where steps may be captured in a CUDA graph."""
         return self.edges.rule != "rest" and positions.device.type == "cuda" and not self.training
 
     def _predict(
-        self, level: LevelBatch, unit: Units, above: Solved, target: Tensor, *, position: int, share: float
-    ) -> tuple[Tensor, Tensor]:
-        """The network's gradient and rotation of each unit of a level; the identity for pinned units."""
+        self,
+        level: LevelBatch,
+        unit: Units,
+        above: Solved,
+        target: Tensor,
+        *,
+        position: int,
+        share: float,
+        still: Tensor | None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The network's output, gradient and rotation of each unit of a level; identities for pinned units."""
+        output = self._output(level, unit, above, target, position)
+        moved = output if still is None else output - still
+        return output, *self._head(moved * (share * level.free), level, above, target)
+
+    def _output(self, level: LevelBatch, unit: Units, above: Solved, target: Tensor, position: int) -> Tensor:
+        """The network's raw output for each unit of a level."""
         network = self.network[position] if isinstance(self.network, nn.ModuleList) else self.network
         coarse = self.options.coarse_inputs and position > 0
         fixed = self._fixes_shapes(unit.now)
@@ -327,18 +415,28 @@ class GausSim(nn.Module):
         if fixed or self.edges.bucket:
             nodes, edges = fill(nodes, 1), fill(edges, extra)
             edge_index = fill_edges(edge_index, level.count, extra)
-        output = network(nodes, edges, edge_index)[: level.count]
-        return gradient_from_output(output * (share * self.output_scale * level.free), conserve_mass=self.conserve_mass)
+        output: Tensor = network(nodes, edges, edge_index)[: level.count]
+        return output
+
+    def _head(self, output: Tensor, level: LevelBatch, above: Solved, target: Tensor) -> tuple[Tensor, Tensor]:
+        """F and its rotation of each unit; the identity where the output is zero."""
+        numbers = output[:, :11] * self.output_scale
+        gradient, rotation = gradient_from_output(numbers, conserve_mass=self.conserve_mass)
+        if not self.lever_head:
+            return gradient, rotation
+        lever = above.carry(target) - above.after.index_select(0, above.index)
+        shift = output[:, 11:] * (self.lever_head * level.length)
+        return lever_gradient(shift, lever, level.length, conserve_mass=self.conserve_mass) @ gradient, rotation
 
     def dynamics(self, scene_id: int = 0) -> SceneDynamics:
         """The simulator bound to one scene, as the protocol :class:`gausim.core.Dynamics`."""
         return SceneDynamics(self, scene_id)
 
 
-def _momentum(level: LevelBatch, unit: Units, after: Tensor, parents: Tensor, mass: Tensor) -> Tensor:
-    """sum_c ||m_c x_c - sum_{i in c} m_i x_i||^2 over the parents c, of masses ``mass``, of a level's units."""
+def _momentum(level: LevelBatch, unit: Units, after: Tensor, parents: Tensor, above: FixedUnits) -> Tensor:
+    """sum_c ||m_c x_c - sum_{i in c} m_i x_i||^2 over the parents c; masses over the scene's, lengths over its size."""
     weighted = weighted_sum(after, unit.mass, level.parent, len(parents))
-    return (mass[:, None] * parents - weighted).square().sum()
+    return ((above.mass[:, None] * parents - weighted) / above.scale).square().sum()
 
 
 def _check(

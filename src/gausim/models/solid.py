@@ -124,6 +124,63 @@ def stiffness(grid: Grid, centres: np.ndarray, weights: np.ndarray) -> list[list
     ]
 
 
+@dataclass(frozen=True, eq=False)
+class SolidBody:
+    """The lowest modes of a body, anywhere in it.
+
+    Attributes:
+        grid: of the splines.
+        values: eigenvalues (M,), ascending.
+        field: coefficients (3, nodes, M) of the modes, orthonormal under the units' mass.
+        centres: of the integration cells (Q, 3) [scene units].
+        weights: their volumes (Q,), those outside the body at :data:`OUTSIDE` of it [scene units^3].
+    """
+
+    grid: Grid
+    values: np.ndarray
+    field: np.ndarray
+    centres: np.ndarray
+    weights: np.ndarray
+
+    def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Modes (P, 3, M) and their gradients (P, 3, 3, M) [1 / scene units] at points (P, 3)."""
+        nodes, values, gradients = self.grid.splines(points)
+        at = self.field[:, nodes]  # (3, P, 27, M)
+        modes = np.einsum("nk,ankm->nam", values, at, optimize=True)
+        return modes, np.einsum("nkb,ankm->nabm", gradients, at, optimize=True)
+
+
+def solid_body(
+    kernels: np.ndarray,
+    held: np.ndarray,
+    rest: np.ndarray,
+    mass: np.ndarray,
+    pinned: np.ndarray,
+    *,
+    modes: int,
+    spacing: float,
+) -> SolidBody:
+    """Lowest modes of the body around the kernels; arguments as in :func:`solid_modes`."""
+    grid, centres, weights = cells(kernels, spacing)
+    blocks = stiffness(grid, centres, weights)
+    if held.any():
+        nodes, values, _ = grid.splines(kernels[held])
+        hold = matrix(nodes, values, grid.size)
+        strength = PIN_STIFFNESS * weights.sum() / (held.sum() * spacing**2)
+        for a in range(3):
+            blocks[a][a] = blocks[a][a] + strength * (hold.T @ hold)
+    whole = sp.bmat(blocks).tocsr()
+    used = whole.diagonal() > NO_SUPPORT * whole.diagonal().max()
+    whole = (whole + FOUNDATION * np.median(whole.diagonal()[used]) * sp.identity(whole.shape[0])).tocsr()
+    nodes, values, _ = grid.splines(rest[~pinned])
+    carry = sp.block_diag([matrix(nodes, values, grid.size)] * 3).tocsr()[:, used]
+    root = np.tile(np.sqrt(mass[~pinned]), 3)
+    eigenvalues, vectors = lowest(whole[used][:, used], sp.diags(root) @ carry, modes)
+    full = np.zeros((3 * grid.size, vectors.shape[1]))
+    full[used] = vectors
+    return SolidBody(grid, eigenvalues, full.reshape(3, grid.size, -1), centres, weights)
+
+
 def solid_modes(
     kernels: np.ndarray,
     held: np.ndarray,
@@ -149,33 +206,13 @@ def solid_modes(
         Eigenvalues (M,) relative to the first, modes (N, 3, M) orthonormal under the units' mass and zero at pinned
         units, and their gradients (N, 3, 3, M) [1 / scene units].
     """
-    grid, centres, weights = cells(kernels, spacing)
-    blocks = stiffness(grid, centres, weights)
-    if held.any():
-        nodes, values, _ = grid.splines(kernels[held])
-        hold = matrix(nodes, values, grid.size)
-        strength = PIN_STIFFNESS * weights.sum() / (held.sum() * spacing**2)
-        for a in range(3):
-            blocks[a][a] = blocks[a][a] + strength * (hold.T @ hold)
-    whole = sp.bmat(blocks).tocsr()
-    used = whole.diagonal() > NO_SUPPORT * whole.diagonal().max()
-    whole = (whole + FOUNDATION * np.median(whole.diagonal()[used]) * sp.identity(whole.shape[0])).tocsr()
-    nodes, values, _ = grid.splines(rest[~pinned])
-    carry = sp.block_diag([matrix(nodes, values, grid.size)] * 3).tocsr()[:, used]
-    root = np.tile(np.sqrt(mass[~pinned]), 3)
-    eigenvalues, vectors = lowest(whole[used][:, used], sp.diags(root) @ carry, modes)
-    full = np.zeros((3 * grid.size, vectors.shape[1]))
-    full[used] = vectors
-    field = full.reshape(3, grid.size, -1)
-    nodes, values, gradients = grid.splines(rest)
-    at = field[:, nodes]  # (3, N, 27, M)
-    phi = np.einsum("nk,ankm->nam", values, at)
-    slope = np.einsum("nkb,ankm->nabm", gradients, at)
+    body = solid_body(kernels, held, rest, mass, pinned, modes=modes, spacing=spacing)
+    phi, slope = body.at(rest)
     phi[pinned] = 0
     slope[pinned] = 0
     flat = phi.reshape(-1, phi.shape[-1])
     scale = np.sign(flat[np.abs(flat).argmax(0), np.arange(phi.shape[-1])])
-    eigenvalues = np.maximum(eigenvalues, 1e-4 * eigenvalues[-1])
+    eigenvalues = np.maximum(body.values, 1e-4 * body.values[-1])
     return eigenvalues / eigenvalues[0], phi * scale, slope * scale
 
 

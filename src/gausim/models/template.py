@@ -10,13 +10,15 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from typing import Any
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.models.batch import SceneBatch
 from gausim.models.hierarchy import Hierarchy
+from gausim.models.units import FixedUnits
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,20 +48,30 @@ class Template(nn.Module, ABC):
 
     Attributes:
         has_energy: whether :meth:`energy` is there.
+        headroom: so many times the energy that a rollout begins with is allowed in its first frames.
+        is_shared: whether its parameters serve all scenes, as the network's do, or are each a scene's own.
     """
 
-    has_energy = False
+    has_energy, is_shared = False, False
+    headroom = 1.0
 
     @abstractmethod
-    def forward(self, batch: SceneBatch, motion: Motion) -> TemplateState:
-        """The template state at t + 1."""
+    def prepare(self, batch: SceneBatch, units: FixedUnits) -> Callable[[Motion], TemplateState]:
+        """The template of one batch while parameters do not change: it takes the motion to the template state at t + 1.
 
-    def prepare(self, batch: SceneBatch) -> Callable[[Motion], TemplateState]:
-        """The template of one batch while parameters do not change; what only depends on them is computed here."""
-        return partial(self, batch)
+        Args:
+            batch: the disjoint graph.
+            units: constants of the finest predicted level, densities and attributes among them.
+        """
 
-    def energy(self, batch: SceneBatch, motion: Motion) -> Float[Tensor, " S"]:
-        """Energy of every member of a batch in the template's own terms, up to a factor; see ``has_energy``."""
+    def energy(self, batch: SceneBatch, motion: Motion, prepared: Any) -> Float[Tensor, " S"]:
+        """Energy of every member of a batch in the template's own terms, up to a factor; see ``has_energy``.
+
+        Args:
+            batch: the disjoint graph.
+            motion: of the units.
+            prepared: from :meth:`prepare`.
+        """
         raise NotImplementedError(f"{type(self).__name__} has no energy")
 
     def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
@@ -85,10 +97,18 @@ class Template(nn.Module, ABC):
 class RestTemplate(Template):
     """The paper's template: the rest state, whatever the motion."""
 
-    def __init__(self, hierarchies: Sequence[Hierarchy], finest: int, *, conserve_volume: bool = True) -> None:
+    def __init__(
+        self,
+        hierarchies: Sequence[Hierarchy],
+        finest: int,
+        *,
+        attributes: int = 0,
+        frames: Sequence[np.ndarray] = (),
+        conserve_volume: bool = True,
+    ) -> None:
         """Takes what every template takes; the rest state needs none of it."""
         super().__init__()
 
-    def forward(self, batch: SceneBatch, motion: Motion) -> TemplateState:
+    def prepare(self, batch: SceneBatch, units: FixedUnits) -> Callable[[Motion], TemplateState]:
         """Rest positions, identity gradients."""
-        return TemplateState(motion.rest, None)
+        return lambda motion: TemplateState(motion.rest, None)

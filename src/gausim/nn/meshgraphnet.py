@@ -19,7 +19,7 @@ from gausim.nn.linear import Linear
 from gausim.nn.mlp import ACTIVATIONS, mlp
 
 PRECISIONS = ("fp32", "bf16")
-NORMS = ("pre", "post")
+NORMS = ("pre", "post", "joint")
 
 
 class _Message(nn.Module):
@@ -71,6 +71,26 @@ class _PlainMessage(nn.Module):
         return nodes + (self.node_norm(update) if self.post else update), edges
 
 
+class _JointMessage(nn.Module):
+    """The layer of the authors' code: MLPs of three linear layers, one LayerNorm over all that each of them reads.
+
+    The summed messages are normalised with the node, so that the node stream does not grow from layer to layer.
+    """
+
+    def __init__(self, hidden: int, *, activation: str) -> None:
+        super().__init__()
+        self.edge_norm, self.node_norm = nn.LayerNorm(3 * hidden), nn.LayerNorm(2 * hidden)
+        self.edge = mlp((3 * hidden, hidden, hidden, hidden), activation)
+        self.node = mlp((2 * hidden, hidden, hidden, hidden), activation)
+
+    def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor, bf16: bool) -> tuple[Tensor, Tensor]:
+        source, destination = edge_index
+        joined = torch.cat((edges, nodes.index_select(0, destination), nodes.index_select(0, source)), -1)
+        edges = edges + self.edge(self.edge_norm(joined))
+        received = torch.zeros_like(nodes).index_add(0, destination, edges)
+        return nodes + self.node(self.node_norm(torch.cat((nodes, received), -1))), edges
+
+
 class MeshGraphNet(nn.Module):
     """Encoder, ``layers`` message-passing layers, decoder hidden -> hidden/2 -> hidden/4 -> outputs.
 
@@ -103,7 +123,9 @@ class MeshGraphNet(nn.Module):
             outputs: number of outputs per node.
             hidden: width of all hidden layers.
             layers: message-passing layers.
-            norm: LayerNorm ``pre`` (of what a residual update reads) or ``post`` (of the update).
+            norm: LayerNorm ``pre`` (of what a residual update reads), ``post`` (of the update), or ``joint``: the
+                authors' layers, with three linear layers per MLP, one LayerNorm over all that each reads, none before
+                the decoder, and ReLU in encoders and decoder.
             activation: ``silu`` or ``relu``; anything but pre-norm and SiLU runs without the blocked kernels.
             precision: ``fp32``, or ``bf16``: the products of the message-passing layers in bfloat16, all streams, sums,
                 encoders and the decoder in float32. An autocast around the network means ``bf16`` too.
@@ -125,11 +147,12 @@ class MeshGraphNet(nn.Module):
             if given not in known:
                 raise ConfigError(f"model.simulator.{name} is '{given}'; expected one of {', '.join(known)}.")
         self.precision, self.checkpointed, self.compiled = precision, checkpoint, compile
-        self.node_encoder = mlp((node_features, hidden, hidden), activation)
-        self.edge_encoder = mlp((edge_features, hidden, hidden), activation)
+        ends = "relu" if norm == "joint" else activation
+        self.node_encoder = mlp((node_features, hidden, hidden), ends)
+        self.edge_encoder = mlp((edge_features, hidden, hidden), ends)
         self.processor = nn.ModuleList(_layer(hidden, norm, activation) for _ in range(layers))
         self.norm = nn.LayerNorm(hidden) if norm == "pre" else nn.Identity()
-        self.decoder = mlp((hidden, hidden // 2, hidden // 4, outputs), activation)
+        self.decoder = mlp((hidden, hidden // 2, hidden // 4, outputs), ends)
 
     def forward(
         self, node_features: Float[Tensor, "N Cn"], edge_features: Float[Tensor, "E Ce"], edge_index: Int[Tensor, "2 E"]
@@ -172,6 +195,8 @@ class MeshGraphNet(nn.Module):
 def _layer(hidden: int, norm: str, activation: str) -> nn.Module:
     if (norm, activation) == ("pre", "silu"):
         return _Message(hidden)
+    if norm == "joint":
+        return _JointMessage(hidden, activation=activation)
     return _PlainMessage(hidden, norm=norm, activation=activation)
 
 

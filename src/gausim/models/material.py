@@ -1,0 +1,351 @@
+"""The template of the neural simulator: a solid body whose material a shared network reads from its units' attributes.
+
+What the geometry tells is computed once per scene: the lowest modes Phi of the solid body around the kernels
+(:mod:`gausim.models.solid`) and, between these modes, how much of the elastic energy and of the mass sits at each unit
+i and in each link (i, j) of neighbouring units. What the geometry does not tell is material. One decoder, shared by all
+scenes, reads it from each unit's density rho_i and attributes a_i,
+
+    s_i, d_i = decode(a_i)     p_ij, q_ij = decode(a_i, a_j, distance)
+
+and with them, in the modes' coordinates z,
+
+    K = k (sum_i e^{s_i} K_i + sum_ij e^{p_ij} S_ij)     stiffness, S_ij: a link resists being stretched
+    M = sum_i rho_i M_i + sum_ij e^{q_ij} T_ij           inertia, T_ij: matter between units moves with them
+    D = c_0 sum_i e^{d_i} rho_i M_i + c_1 K              damping
+
+k, c_0 and c_1 are one trained number each for all scenes. One frame is one step of the trapezoidal rule,
+
+    (M + K/4 + D/2) (z_{t+1} - 2 z_t + z_{t-1}) = -K z_t - D (z_t - z_{t-1})     [frame units]
+
+K, M and D are positive semi-definite whatever is decoded, so the template never creates energy, and without damping
+keeps it. Distances are the only geometry that the decoder reads: it means the same on every body, however it lies.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from gausim.models.batch import SceneBatch, rows_by_scene
+from gausim.models.hierarchy import Hierarchy
+from gausim.models.solid import POISSON, SolidBody, solid_body
+from gausim.models.template import Motion, Template, TemplateState
+from gausim.models.units import FixedUnits
+from gausim.nn.mlp import mlp
+from gausim.ops.deformation import bounded_deformation
+
+# A modal gradient with a smaller determinant is no deformation any more (matter turned inside out).
+MIN_DETERMINANT = 0.2
+# Decoded logarithms saturate here: a factor of twelve either way.
+LARGEST_LOG = 2.5
+# Stiffness and inertia of all links together, as shares of the body's own (by trace), before anything is learned.
+LINK_SHARE = 0.3
+# Units among which a cell's energy and mass are divided, by inverse squared distance.
+CELL_UNITS = 4
+# Step of the units per frame that one unit of an initial velocity's coordinate means, at the lowest mode [diagonals].
+AMPLITUDE = 0.05
+# The three numbers of all scenes may move so much faster than the decoders' weights; one learning rate serves both.
+GAIN = 10.0
+# Frames per second at which k and the dampings are stated.
+REFERENCE_FPS = 24.0
+
+
+class BodyModes(nn.Module):
+    """What the geometry of one scene tells, in modal coordinates; nothing in here is trained.
+
+    Attributes:
+        modes: Phi (N, 3, M), orthonormal under the units' volumes.
+        gradients: of the modes (N, 3, 3, M) [1 / scene units].
+        projection: (N, 3, M), z = sum_n projection_n u_n.
+        values: eigenvalues of the homogeneous body (M,), the first is 1.
+        stiffness: K_i (N, M, M), their sum is the homogeneous body's.
+        inertia: root of M_i, (N, 3, M).
+        links: pairs of units (2, E).
+        stretch: root of S_ij, (E, M).
+        between: root of T_ij, (E, 3, M).
+        distance: logarithm of the links' lengths over their mean (E,).
+    """
+
+    modes: Tensor
+    gradients: Tensor
+    projection: Tensor
+    values: Tensor
+    stiffness: Tensor
+    inertia: Tensor
+    links: Tensor
+    stretch: Tensor
+    between: Tensor
+    distance: Tensor
+
+    def __init__(self, hierarchy: Hierarchy, finest: int, frame: np.ndarray, *, modes: int, spacing: float, links: int):
+        """Computes everything in the body's own axes ``frame`` (3, 3); see :class:`MaterialTemplate`."""
+        super().__init__()
+        level, kernels = hierarchy.levels[finest], hierarchy.levels[0]
+        rest, pinned = level.rest.double().numpy() @ frame.T, level.pinned.numpy()
+        mass = level.volume.double().numpy()
+        mass = mass / mass[~pinned].mean()
+        own = kernels.rest.double().numpy() @ frame.T
+        size = spacing * hierarchy.diagonal
+        body = solid_body(own, kernels.pinned.numpy(), rest, mass, pinned, modes=modes, spacing=size)
+        phi, slope = body.at(rest)
+        phi[pinned], slope[pinned] = 0, 0
+        lowest = body.values[0]
+        pairs = _links(rest, pinned, links)
+        change = phi[pairs[1]] - phi[pairs[0]]
+        offset = rest[pairs[1]] - rest[pairs[0]]
+        length = np.linalg.norm(offset, axis=1)
+        stretch = np.einsum("eam,ea->em", change, offset) / (length**2)[:, None]
+        stretch *= math.sqrt(body.values.sum() / lowest / max(float((stretch**2).sum()), 1e-30))
+        between = change * math.sqrt(len(body.values) / max(float((change**2).sum()), 1e-30))
+        arrays = {
+            "modes": phi,
+            "gradients": slope,
+            "projection": phi * mass[:, None, None],
+            "values": np.maximum(body.values, 1e-6 * body.values[-1]) / lowest,
+            "stiffness": _cell_stiffness(body, rest, pinned) / lowest,
+            "inertia": phi * np.sqrt(mass)[:, None, None],
+            "stretch": stretch,
+            "between": between,
+            "distance": np.log(length / length.mean()),
+        }
+        for name, array in arrays.items():
+            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)).float(), persistent=False)
+        self.register_buffer("links", torch.from_numpy(pairs), persistent=False)
+        self.scale = AMPLITUDE * hierarchy.diagonal * math.sqrt(float((~pinned).sum()))
+
+
+def _links(rest: np.ndarray, pinned: np.ndarray, count: int) -> np.ndarray:
+    """Pairs (2, E) of neighbouring units, each once, not between pinned ones."""
+    k = min(count + 1, len(rest))
+    near = cKDTree(rest).query(rest, k=k)[1].reshape(len(rest), k)[:, 1:]
+    pairs = np.stack((np.repeat(np.arange(len(rest)), k - 1), near.ravel()), 1)
+    pairs = np.unique(np.sort(pairs, 1), axis=0)
+    distinct = np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1) > 1e-9 * np.abs(rest).max()
+    return np.ascontiguousarray(pairs[distinct & ~(pinned[pairs[:, 0]] & pinned[pairs[:, 1]])].T)
+
+
+def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np.ndarray:
+    """K_i (N, M, M): elastic energy of the cells near each unit, between modes, pins included."""
+    _, slope = body.at(body.centres)
+    strain = (slope + slope.transpose(0, 2, 1, 3)) / 2
+    trace = np.trace(strain, axis1=1, axis2=2)
+    first, second = POISSON / ((1 + POISSON) * (1 - 2 * POISSON)), 1 / (2 * (1 + POISSON))
+    count = slope.shape[-1]
+    # Ten numbers per cell and mode whose squares are twice the energy: nine strains and their trace.
+    roots = np.concatenate((math.sqrt(2 * second) * strain.reshape(-1, 9, count), math.sqrt(first) * trace[:, None]), 1)
+    roots *= np.sqrt(body.weights)[:, None, None]
+    near, units = cKDTree(rest).query(body.centres, k=min(CELL_UNITS, len(rest)))
+    near, units = near.reshape(len(body.centres), -1), units.reshape(len(body.centres), -1)
+    share = 1 / (near**2 + 1e-12)
+    share /= share.sum(1, keepdims=True)
+    found = np.zeros((len(rest), count, count))
+    for unit in range(len(rest)):
+        cells, place = np.nonzero(units == unit)
+        part = (roots[cells] * np.sqrt(share[cells, place])[:, None, None]).reshape(-1, count)
+        found[unit] = part.T @ part
+    missing = np.diag(body.values) - found.sum(0)  # the springs that hold the pins, and rounding
+    free = ~pinned
+    found[free] += missing / free.sum()
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Matrices:
+    """Stiffness, inertia and damping of one scene (M, M) [frame units]."""
+
+    stiffness: Tensor
+    inertia: Tensor
+    damping: Tensor
+
+    def transition(self) -> tuple[Tensor, Tensor]:
+        """B and C of z_{t+1} = 2 z_t - z_{t-1} - B z_t - C (z_t - z_{t-1})."""
+        solve = torch.linalg.inv(self.inertia + self.stiffness / 4 + self.damping / 2)
+        return solve @ self.stiffness, solve @ self.damping
+
+
+class MaterialTemplate(Template):
+    """Proposes the next state by the dynamics of a solid body, its material decoded from densities and attributes."""
+
+    has_energy, is_shared = True, True
+    # The network carries part of the motion: how lively it is is known, in the template's terms, from its first swing.
+    headroom = 2.0
+
+    def __init__(
+        self,
+        hierarchies: Sequence[Hierarchy],
+        finest: int,
+        *,
+        attributes: int,
+        frames: Sequence[np.ndarray],
+        modes: int = 48,
+        spacing: float = 0.12,
+        links: int = 12,
+        hidden: int = 48,
+        period: float = 8.0,
+        damping: float = 0.02,
+        conserve_volume: bool = True,
+    ) -> None:
+        """See the module's text.
+
+        Args:
+            hierarchies: one per scene.
+            finest: level whose units carry the modes.
+            attributes: per unit.
+            frames: axes (3, 3) of each scene in which the template works.
+            modes: number of modes kept.
+            spacing: of the solid body's grid [diagonals].
+            links: neighbours per unit.
+            hidden: width of the decoders.
+            period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
+            damping: initial c_0 and c_1 [1 / frame, frames].
+            conserve_volume: scale the template's gradients to determinant 1 (METHOD's mass conservation).
+        """
+        super().__init__()
+        self.conserve_volume = conserve_volume
+        self.bodies = nn.ModuleList(
+            BodyModes(h, finest, f, modes=modes, spacing=spacing, links=links)
+            for h, f in zip(hierarchies, frames, strict=True)
+        )
+        self.start = 2 * math.log(2 * math.pi / period), math.log(damping)
+        self.stiffness, self.damping = nn.Parameter(torch.zeros(())), nn.Parameter(torch.zeros(2))
+        self.unit_decoder = mlp((attributes, hidden, 2))
+        self.link_decoder = mlp((3 * attributes + 1, hidden, 2))
+
+    def body(self, scene_id: int) -> BodyModes:
+        """Modes of one scene."""
+        body = self.bodies[scene_id]
+        assert isinstance(body, BodyModes)
+        return body
+
+    def decode(
+        self, body: BodyModes, attributes: Float[Tensor, "N A"]
+    ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "E 2"]]:
+        """Logarithms of stiffness and drag of every unit, and of stiffness and inertia of every link.
+
+        Without attributes every unit is the same: what the decoder says of zero attributes is taken off.
+        """
+        units = self.unit_decoder(attributes) - self.unit_decoder(torch.zeros_like(attributes[:1]))
+        a, b = (attributes.index_select(0, end) for end in body.links)
+        links = self.link_decoder(torch.cat((a + b, (a - b).square(), a * b, body.distance[:, None]), -1))
+        return _saturated(units), _saturated(links)
+
+    def matrices(
+        self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"], dt: float
+    ) -> Matrices:
+        """K, M and D of one scene from the material of its units.
+
+        Args:
+            scene_id: of the scene.
+            log_density: of the units.
+            attributes: of the units.
+            dt: frame interval [s].
+        """
+        body, frame = self.body(scene_id), dt * REFERENCE_FPS
+        units, links = self.decode(body, attributes)
+        k = (self.start[0] + GAIN * self.stiffness).exp() * frame**2
+        drag, viscosity = (self.start[1] + GAIN * self.damping).exp()
+        stretch = LINK_SHARE * links[:, :1].exp() * body.stretch
+        stiffness = torch.einsum("n,nlm->lm", units[:, 0].exp(), body.stiffness) + body.stretch.mT @ stretch
+        density = _saturated(log_density).exp()[:, None, None]
+        root, heavy = body.inertia.flatten(0, 1), (density * body.inertia).flatten(0, 1)
+        between = LINK_SHARE * links[:, 1, None, None].exp() * body.between
+        inertia = root.mT @ heavy + body.between.flatten(0, 1).mT @ between.flatten(0, 1)
+        dragged = root.mT @ (units[:, 1, None, None].exp() * density * body.inertia).flatten(0, 1)
+        return Matrices(k * stiffness, inertia, drag * frame * dragged + viscosity / frame * k * stiffness)
+
+    def _all_matrices(self, batch: SceneBatch, units: FixedUnits) -> dict[int, Matrices]:
+        found = {}
+        for scene_id, rows, members in rows_by_scene(batch):
+            own = rows[: len(rows) // len(members)]
+            dt = float(batch.levels[-1].dt[own[0]])
+            found[scene_id] = self.matrices(
+                scene_id, units.log_density.index_select(0, own), units.attributes.index_select(0, own), dt
+            )
+        return found
+
+    def prepare(self, batch: SceneBatch, units: FixedUnits) -> Callable[[Motion], TemplateState]:
+        """The template with its matrices computed."""
+        return _PreparedMaterial(self, batch, self._all_matrices(batch, units))
+
+    def energy(self, batch: SceneBatch, motion: Motion, prepared: Any) -> Float[Tensor, " S"]:
+        """v^T M v / 2 + m^T K m / 2 of every member: v the step and m the middle of both states, M and K constants.
+
+        Without damping the template keeps this number exactly, as the trapezoidal rule does.
+        """
+        assert isinstance(prepared, _PreparedMaterial)
+        found = motion.rest.new_zeros(len(batch.scene_ids))
+        for part in prepared.parts:
+            z, previous = part.coordinates(motion)
+            step, middle = z - previous, (z + previous) / 2
+            inertia, stiffness = part.matrices.inertia.detach(), part.matrices.stiffness.detach()
+            energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
+            found = found.index_copy(0, part.members, energy)
+        return found
+
+    def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Modes (N, 3, M), their gradients (N, 3, 3, M) and sizes (M,): what initial velocities are made of."""
+        body = self.body(scene_id)
+        sizes = body.values**-0.25
+        return body.modes * (body.scale * sizes), body.gradients * (body.scale * sizes), sizes
+
+
+def _saturated(logarithms: Tensor) -> Tensor:
+    return LARGEST_LOG * torch.tanh(logarithms / LARGEST_LOG)
+
+
+class _Part:
+    """The members of one scene in a batch."""
+
+    def __init__(self, body: BodyModes, matrices: Matrices, rows: Tensor, members: list[int]) -> None:
+        self.matrices, self.rows, self.count = matrices, rows, len(members)
+        self.members = torch.tensor(members, device=rows.device)
+        self.projection = body.projection.flatten(0, 1)
+        # Positions and gradients of a unit side by side: one product gives both.
+        self.motions = torch.cat((body.modes, body.gradients.flatten(1, 2)), 1).flatten(0, 1)
+        pull, drag = matrices.transition()
+        identity = torch.eye(len(pull), dtype=pull.dtype, device=pull.device)
+        self.transition = torch.cat(((2 * identity - pull - drag).mT, (drag - identity).mT))
+
+    def coordinates(self, motion: Motion) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M"]]:
+        """z_t and z_{t-1}."""
+        now, before = (
+            (x.index_select(0, self.rows) - motion.rest.index_select(0, self.rows)).view(self.count, -1)
+            for x in (motion.now, motion.before)
+        )
+        z, previous = (torch.cat((now, before)) @ self.projection).chunk(2)
+        return z, previous
+
+    def __call__(self, motion: Motion) -> Float[Tensor, "R 12"]:
+        """Displacement and its gradient, row by row, of every unit at t + 1."""
+        after = torch.cat(self.coordinates(motion), -1) @ self.transition
+        return (after @ self.motions.mT).view(-1, 12)
+
+
+class _PreparedMaterial:
+    """The template of one batch while its parameters do not change."""
+
+    def __init__(self, template: MaterialTemplate, batch: SceneBatch, matrices: dict[int, Matrices]) -> None:
+        self._template = template
+        self.parts = [
+            _Part(template.body(scene_id), matrices[scene_id], rows, members)
+            for scene_id, rows, members in rows_by_scene(batch)
+        ]
+        order = torch.cat([part.rows for part in self.parts])
+        self._places = torch.empty_like(order).index_copy(0, order, torch.arange(len(order), device=order.device))
+
+    def __call__(self, motion: Motion) -> TemplateState:
+        made = [part(motion) for part in self.parts]
+        moved = made[0] if len(made) == 1 else torch.cat(made).index_select(0, self._places)
+        identity = torch.eye(3, dtype=moved.dtype, device=moved.device)
+        gradients = bounded_deformation(
+            moved[:, 3:].reshape(-1, 3, 3) + identity, MIN_DETERMINANT, unit=self._template.conserve_volume
+        )
+        return TemplateState(motion.rest + moved[:, :3], gradients)

@@ -1,0 +1,204 @@
+"""The solid body whose material a shared network decodes from densities and attributes."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+from gausim.core import SimState
+from gausim.models.frames import body_axes
+from gausim.models.hierarchy import build_hierarchy
+from gausim.models.material import MaterialTemplate
+from gausim.models.solid import solid_modes
+
+SETTINGS = {"modes": 9, "spacing": 0.2, "links": 4, "hidden": 8}
+TEMPLATE = partial(MaterialTemplate, **SETTINGS)
+NEURAL = {
+    "template": TEMPLATE, "rest_inputs": True, "velocity_inputs": False, "lever_head": 0.02, "anchor": True,
+    "body_frame": True, "edges": "rest", "attributes": 3,
+}  # fmt: skip
+
+
+def _template(hierarchy, *, seed: int = 0, **settings) -> MaterialTemplate:
+    """In double precision, its decoders and attributes random."""
+    torch.manual_seed(seed)
+    made = TEMPLATE([hierarchy], 1, attributes=3, frames=[np.eye(3)], **settings)
+    return made.double().requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def hierarchy(make_scene):
+    return build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
+
+
+def _material(hierarchy, *, seed: int = 1):
+    generator = torch.Generator().manual_seed(seed)
+    count = hierarchy.levels[1].count
+    draw = partial(torch.randn, generator=generator, dtype=torch.float64)
+    return 0.5 * draw(count), draw(count, 3)
+
+
+def test_parts_of_the_units_sum_up_to_the_homogeneous_body(hierarchy) -> None:
+    template, level = _template(hierarchy), hierarchy.levels[1]
+    body = template.body(0)
+    arguments = [x.double().numpy() for x in (hierarchy.levels[0].rest, level.rest)]
+    mass = (level.volume / level.volume[~level.pinned].mean()).double().numpy()
+    values, _, _ = solid_modes(
+        arguments[0], hierarchy.levels[0].pinned.numpy(), arguments[1], mass, level.pinned.numpy(),
+        modes=9, spacing=0.2 * hierarchy.diagonal,
+    )  # fmt: skip
+    torch.testing.assert_close(body.stiffness.sum(0), torch.diag(torch.from_numpy(values)), atol=1e-4, rtol=1e-4)
+    root = body.inertia.flatten(0, 1)
+    torch.testing.assert_close(root.mT @ root, torch.eye(9, dtype=torch.float64), atol=1e-5, rtol=0)
+    assert not body.modes[level.pinned].any()
+
+
+def test_matrices_are_sums_over_units_and_links(hierarchy) -> None:
+    """Against the equations of the module's text, written out unit by unit."""
+    template, (density, attributes) = _template(hierarchy), _material(hierarchy)
+    body = template.body(0)
+    units, links = template.decode(body, attributes)
+    found = template.matrices(0, density, attributes, 1 / 24)
+    k, c0, c1 = (2 * np.pi / 8) ** 2, 0.02, 0.02
+    rho = (2.5 * torch.tanh(density / 2.5)).exp()
+    stiffness, inertia, drag = (torch.zeros(9, 9, dtype=torch.float64) for _ in range(3))
+    for i in range(len(density)):
+        own = sum(torch.outer(body.inertia[i, a], body.inertia[i, a]) for a in range(3))
+        stiffness += units[i, 0].exp() * body.stiffness[i]
+        inertia += rho[i] * own
+        drag += rho[i] * units[i, 1].exp() * own
+    for e in range(body.links.shape[1]):
+        stiffness += 0.3 * links[e, 0].exp() * torch.outer(body.stretch[e], body.stretch[e])
+        inertia += 0.3 * links[e, 1].exp() * body.between[e].mT @ body.between[e]
+    torch.testing.assert_close(found.stiffness, k * stiffness)
+    torch.testing.assert_close(found.inertia, inertia)
+    torch.testing.assert_close(found.damping, c0 * drag + c1 * k * stiffness)
+    for matrix in (found.stiffness, found.inertia, found.damping):
+        assert float(torch.linalg.eigvalsh(matrix)[0]) > -1e-9
+
+
+def test_half_the_frame_rate_is_the_same_body(hierarchy) -> None:
+    template, (density, attributes) = _template(hierarchy), _material(hierarchy)
+    fast, slow = (template.matrices(0, density, attributes, dt) for dt in (1 / 48, 1 / 24))
+    torch.testing.assert_close(slow.stiffness, 4 * fast.stiffness)
+    torch.testing.assert_close(slow.damping, 2 * fast.damping)
+    torch.testing.assert_close(slow.inertia, fast.inertia)
+
+
+def test_no_attributes_are_a_body_of_one_material(hierarchy) -> None:
+    template = _template(hierarchy)
+    units, links = template.decode(template.body(0), torch.zeros(hierarchy.levels[1].count, 3, dtype=torch.float64))
+    assert not units.any() and links.std(0).max() < 0.5  # links still differ by their length
+
+
+@pytest.fixture
+def neural(make_scene, make_model):
+    return lambda **options: make_model(make_scene(90, dtype=torch.float64), **(NEURAL | options))
+
+
+@torch.no_grad()
+def test_the_template_keeps_its_energy_without_damping_and_loses_it_with_it(neural) -> None:
+    model = neural(lever_head=0.0, output_scale=0.0)
+    batch, scene = model.batch((0,)), model.scenes[0]
+    body = model.template.body(0)
+    start = model.smooth_motions(0).kernels @ torch.linspace(1, 0.2, 9, dtype=torch.float64)
+    for damping, low, high in ((-40.0, 1 - 1e-4, 1 + 1e-4), (0.0, 0.0, 0.5)):
+        model.template.damping.fill_(damping / 10)
+        prepared = model.prepare(batch)
+        state = SimState(scene.means, scene.means - start)
+        first = float(model.energy(batch, state, prepared))
+        for _ in range(60):
+            step = model.step(batch, state, prepared=prepared)
+            state = SimState(step.positions, state.positions)
+        assert low <= float(model.energy(batch, state, prepared)) / first <= high
+    assert body.scale > 0
+
+
+@torch.no_grad()
+def test_rest_is_an_equilibrium_whatever_the_weights(neural) -> None:
+    model = neural(output_scale=1.0)
+    batch = model.batch((0,))
+    step = model.step(batch, SimState(batch.rest, batch.rest))
+    torch.testing.assert_close(step.positions, batch.rest, atol=1e-9, rtol=0)
+    loose = neural(output_scale=1.0, anchor=False)
+    step = loose.step(loose.batch((0,)), SimState(batch.rest, batch.rest))
+    assert float((step.positions - batch.rest).abs().max()) > 1e-4
+
+
+def _moved(scene, turn, shift):
+    from dataclasses import replace
+
+    return replace(scene, means=scene.means @ turn.mT + shift)
+
+
+@pytest.mark.parametrize("framed", [True, False])
+@torch.no_grad()
+def test_a_turned_and_moved_scene_moves_likewise(neural, make_scene, make_model, make_state, framed: bool) -> None:
+    scene = make_scene(90, dtype=torch.float64)
+    quaternion = torch.tensor([0.5, -0.3, 0.7, 0.4], dtype=torch.float64)
+    w, x, y, z = quaternion / quaternion.norm()
+    turn = torch.stack((
+        torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w))),
+        torch.stack((2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w))),
+        torch.stack((2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))),
+    ))  # fmt: skip
+    shift = torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64)
+    model = make_model(scene, **(NEURAL | {"body_frame": framed, "output_scale": 1.0}))
+    other = make_model(_moved(scene, turn, shift), **(NEURAL | {"body_frame": framed, "output_scale": 1.0}))
+    other.load_state_dict(model.state_dict())
+    state = make_state(scene)
+    turned = SimState(*(p @ turn.mT + shift for p in (state.positions, state.previous)))
+    made, there = model.step(model.batch((0,)), state), other.step(other.batch((0,)), turned)
+    violation = (there.positions - (made.positions @ turn.mT + shift)).abs().max() / scene.diagonal
+    assert (float(violation) < 1e-6) == framed
+    if framed:
+        units = [m.batch((0,)).members[0].unit_of_kernel for m in (model, other)]  # their order may differ
+        there_own, own = there.gradients[units[1]], turn @ made.gradients[units[0]] @ turn.mT
+        torch.testing.assert_close(there_own, own, atol=1e-6, rtol=0)
+
+
+def test_the_body_s_axes_turn_with_it(make_scene) -> None:
+    axes = body_axes(make_scene(90, dtype=torch.float64))
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    assert axes[0, 2] > 0.9  # from the pinned foot upwards
+
+
+def test_everything_of_the_model_learns(neural, make_state) -> None:
+    model = neural()
+    batch, state = model.batch((0,)), make_state(model.scenes[0])
+    prepared = model.prepare(batch)
+    step = model.step(batch, state, prepared=prepared)
+    step = model.step(batch, SimState(step.positions, state.positions), prepared=prepared)
+    (step.positions.square().sum() + step.momentum).backward()
+    still = [n for n, p in model.named_parameters() if p.grad is None or not p.grad.any()]
+    assert not [n for n in still if "unit_decoder.2.bias" not in n], still  # what is taken off again at rest
+
+
+def test_scenes_of_a_batch_do_not_disturb_each_other(make_scene, make_model, make_state) -> None:
+    scenes = [make_scene(90, dtype=torch.float64), make_scene(80, seed=3, dtype=torch.float64)]
+    model = make_model(scenes, **NEURAL)
+    states = [make_state(s) for s in scenes]
+    joint = SimState(*(torch.cat([getattr(s, n) for s in states]) for n in ("positions", "previous")))
+    with torch.no_grad():
+        made = model.step(model.batch((0, 1)), joint).positions
+        alone = [model.step(model.batch((i,)), states[i]).positions for i in range(2)]
+    torch.testing.assert_close(made, torch.cat(alone), atol=1e-9, rtol=0)
+
+
+@torch.no_grad()
+def test_millimetres_move_like_metres(make_scene, make_model, make_state) -> None:
+    from dataclasses import replace
+
+    scene = make_scene(90, dtype=torch.float64)
+    large = replace(scene, means=1000 * scene.means, log_scales=scene.log_scales + np.log(1000.0))
+    model, other = make_model(scene, **NEURAL), make_model(large, **NEURAL)
+    other.load_state_dict(model.state_dict())
+    state = make_state(scene)
+    step = model.step(model.batch((0,)), state)
+    there = other.step(other.batch((0,)), SimState(1000 * state.positions, 1000 * state.previous))
+    torch.testing.assert_close(there.positions / 1000, step.positions, atol=1e-7, rtol=0)
+    torch.testing.assert_close(there.momentum, step.momentum, rtol=1e-4, atol=1e-12)
