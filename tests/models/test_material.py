@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -99,6 +100,32 @@ def neural(make_scene, make_model):
     return lambda **options: make_model(make_scene(90, dtype=torch.float64), **(NEURAL | options))
 
 
+def test_links_pull_by_the_gradient_of_their_potential_and_not_at_all_to_first_order(neural) -> None:
+    model = neural()
+    part = model.prepare(model.batch((0,))).template.parts[0]
+    body, springs = model.template.body(0), part.matrices.links.detach()
+    z = 0.05 * torch.randn(2, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+
+    def energy(z):
+        total = torch.zeros(len(z), dtype=torch.float64)
+        for e in range(body.links.shape[1]):
+            change = z @ body.change[e].mT
+            length, now = body.offset[e].norm(), (body.offset[e] + change).norm(dim=-1)
+            total = total + 0.5 * springs[e] * ((now - length) ** 2 - (change @ body.offset[e] / length) ** 2)
+        return total
+
+    z.requires_grad_()
+    expected = energy(z)
+    torch.testing.assert_close(part.potential(z), expected)
+    (slope,) = torch.autograd.grad(expected.sum(), z)
+    added = -slope @ part.solve
+    bound = 0.5 * (z @ part.pull).norm(dim=-1, keepdim=True)
+    added = added * (bound / added.norm(dim=-1, keepdim=True)).clamp_max(1)
+    torch.testing.assert_close(part._beyond(z), added)
+    ratio = part._beyond(1e-4 * z).norm() / part._beyond(1e-3 * z).norm()
+    assert float(ratio) == pytest.approx(0.01, rel=0.1)
+
+
 @torch.no_grad()
 def test_the_template_keeps_its_energy_without_damping_and_loses_it_with_it(neural) -> None:
     model = neural(lever_head=0.0, output_scale=0.0)
@@ -108,6 +135,8 @@ def test_the_template_keeps_its_energy_without_damping_and_loses_it_with_it(neur
     for damping, low, high in ((-40.0, 1 - 1e-4, 1 + 1e-4), (0.0, 0.0, 0.5)):
         model.template.damping.fill_(damping / 10)
         prepared = model.prepare(batch)
+        part = prepared.template.parts[0]  # without links beyond the linear, which are taken explicitly
+        part.matrices = replace(part.matrices, links=torch.zeros_like(part.matrices.links))
         state = SimState(scene.means, scene.means - start)
         first = float(model.energy(batch, state, prepared))
         for _ in range(60):
@@ -129,8 +158,6 @@ def test_rest_is_an_equilibrium_whatever_the_weights(neural) -> None:
 
 
 def _moved(scene, turn, shift):
-    from dataclasses import replace
-
     return replace(scene, means=scene.means @ turn.mT + shift)
 
 
@@ -191,8 +218,6 @@ def test_scenes_of_a_batch_do_not_disturb_each_other(make_scene, make_model, mak
 
 @torch.no_grad()
 def test_millimetres_move_like_metres(make_scene, make_model, make_state) -> None:
-    from dataclasses import replace
-
     scene = make_scene(90, dtype=torch.float64)
     large = replace(scene, means=1000 * scene.means, log_scales=scene.log_scales + np.log(1000.0))
     model, other = make_model(scene, **NEURAL), make_model(large, **NEURAL)

@@ -217,7 +217,7 @@ class GausSimModule(LightningModule):
         device = next(self.parameters()).device
         explosions = Explosions(batch, self.diagonals, whole, self.objective.explosion, ranks=self.ranks,
                                 deferred=device if self._defers(device) else None)  # fmt: skip
-        free = self.free_motion.chosen(draws)
+        free, unit = self.free_motion.chosen(draws), self._momentum_unit(samples)
         if batch is None:  # hears where the others' rollout ends
             any(explosions.end(None, start, tally.reach) for start in range(0, steps, length))
             return tally
@@ -233,7 +233,7 @@ class GausSimModule(LightningModule):
             losses, motion = comparison(explosions.spared(states), start)
             tally.motion.append(motion)
             momentum = explosions.counted(torch.stack([step.momentum for step in made]))
-            self._descend(explosions.counted(losses), momentum, per, tally, measure=start == 0)
+            self._descend(explosions.counted(losses), unit * momentum, per, tally, measure=start == 0)
             own = own + per * explosions.counted(losses).detach().sum(0)
             last = after(made, last)
         else:
@@ -303,9 +303,21 @@ class GausSimModule(LightningModule):
             mixing = self.model.mixing(sample.scene_id)
             if mixing is None or not mixing.requires_grad:
                 continue
-            yard = self.yardsticks.of(sample, self.simulator.scenes[sample.scene_id].means.to(mixing))
-            losses = yard.static[: sample.steps]
-            self._backward(weight / count * sum(losses) / len(losses) * mixing)
+            self._backward(weight / count * self._rest_loss(sample) * mixing)
+
+    def _momentum_unit(self, samples: list[SequenceSample]) -> float:
+        """What the rest state scores on the frames of the batch, over all ranks: the unit of the momentum loss."""
+        if self.objective.momentum_weight == 0:
+            return 0.0
+        scores = interleave(self.ranks.gather([self._rest_loss(sample) for sample in samples]))
+        return sum(scores) / len(scores)
+
+    def _rest_loss(self, sample: SequenceSample) -> float:
+        """What the rest state scores on the frames of a sample, their mean: the unit of penalties."""
+        rest = self.simulator.scenes[sample.scene_id].means.to(next(self.parameters()).device)
+        yard = self.yardsticks.of(sample, rest)
+        losses = yard.static[: sample.steps]
+        return sum(losses) / len(losses)
 
     # ------------------------------------------------------------------------------------------------ states, images
 

@@ -19,7 +19,7 @@ class Objective:
         rest_image_weight: of the image loss of one step from the rest state against frame 0, in batches that carry the
             static loss.
         static_probability: how often a batch carries it; None is 1 / T.
-        momentum_weight: of the momentum loss [(total mass x diagonals)^2].
+        momentum_weight: of the momentum loss [(total mass x diagonals)^2], times what the rest state scores.
         over_steps: ``mean`` or ``sum`` of image and momentum losses over the steps of a rollout.
         backprop_steps: gradients stop every so many steps; 0 lets them through the whole rollout.
         checkpoint_steps: keep of each step of a rollout its input only and compute it once more in the backward pass;

@@ -5,7 +5,7 @@ What the geometry tells is computed once per scene: the lowest modes Phi of the 
 i and in each link (i, j) of neighbouring units. What the geometry does not tell is material. One decoder, shared by all
 scenes, reads it from each unit's density rho_i and attributes a_i,
 
-    s_i, d_i = decode(a_i)     p_ij, q_ij = decode(a_i, a_j, distance)
+    s_i, d_i = decode(a_i)     p_ij, q_ij, g_ij = decode(a_i, a_j, distance)
 
 and with them, in the modes' coordinates z,
 
@@ -17,8 +17,10 @@ k, c_0 and c_1 are one trained number each for all scenes. One frame is one step
 
     (M + K/4 + D/2) (z_{t+1} - 2 z_t + z_{t-1}) = -K z_t - D (z_t - z_{t-1})     [frame units]
 
-K, M and D are positive semi-definite whatever is decoded, so the template never creates energy, and without damping
-keeps it. Distances are the only geometry that the decoder reads: it means the same on every body, however it lies.
+K, M and D are positive semi-definite whatever is decoded, so this never creates energy, and without damping keeps it.
+Links that turn or stretch by more than a little pull otherwise than S_ij says: the share sigmoid(g_ij) of the
+difference is added to the force, taken at z_t and held below half of what K pulls. It has a potential, too. Distances
+are the only geometry that the decoder reads: it means the same on every body, however it lies.
 """
 
 from __future__ import annotations
@@ -48,6 +50,9 @@ MIN_DETERMINANT = 0.2
 LARGEST_LOG = 2.5
 # Stiffness and inertia of all links together, as shares of the body's own (by trace), before anything is learned.
 LINK_SHARE = 0.3
+# The links' force beyond the linear one stays below this share of the stiffness's own (both as they act in a step): it
+# is taken at the beginning of the step, and thin parts that turn far would make it explode.
+LARGEST_BEYOND = 0.5
 # Units among which a cell's energy and mass are divided, by inverse squared distance.
 CELL_UNITS = 4
 # Step of the units per frame that one unit of an initial velocity's coordinate means, at the lowest mode [diagonals].
@@ -70,6 +75,9 @@ class BodyModes(nn.Module):
         inertia: root of M_i, (N, 3, M).
         links: pairs of units (2, E).
         stretch: root of S_ij, (E, M).
+        offset: from the first unit of a link to the second, X_j - X_i (E, 3) [scene units].
+        change: Phi_j - Phi_i, (E, 3, M).
+        hardness: of the link as a spring, per unit of S_ij (E,).
         between: root of T_ij, (E, 3, M).
         distance: logarithm of the links' lengths over their mean (E,).
     """
@@ -82,6 +90,9 @@ class BodyModes(nn.Module):
     inertia: Tensor
     links: Tensor
     stretch: Tensor
+    offset: Tensor
+    change: Tensor
+    hardness: Tensor
     between: Tensor
     distance: Tensor
 
@@ -103,7 +114,7 @@ class BodyModes(nn.Module):
         offset = rest[pairs[1]] - rest[pairs[0]]
         length = np.linalg.norm(offset, axis=1)
         stretch = np.einsum("eam,ea->em", change, offset) / (length**2)[:, None]
-        stretch *= math.sqrt(body.values.sum() / lowest / max(float((stretch**2).sum()), 1e-30))
+        even = math.sqrt(body.values.sum() / lowest / max(float((stretch**2).sum()), 1e-30))
         between = change * math.sqrt(len(body.values) / max(float((change**2).sum()), 1e-30))
         arrays = {
             "modes": phi,
@@ -112,7 +123,10 @@ class BodyModes(nn.Module):
             "values": np.maximum(body.values, 1e-6 * body.values[-1]) / lowest,
             "stiffness": _cell_stiffness(body, rest, pinned) / lowest,
             "inertia": phi * np.sqrt(mass)[:, None, None],
-            "stretch": stretch,
+            "stretch": even * stretch,
+            "offset": offset,
+            "change": change,
+            "hardness": (even / length) ** 2,
             "between": between,
             "distance": np.log(length / length.mean()),
         }
@@ -159,16 +173,19 @@ def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np
 
 @dataclass(frozen=True, eq=False)
 class Matrices:
-    """Stiffness, inertia and damping of one scene (M, M) [frame units]."""
+    """What moves one scene [frame units].
 
-    stiffness: Tensor
-    inertia: Tensor
-    damping: Tensor
+    Attributes:
+        stiffness: K (M, M).
+        inertia: M (M, M).
+        damping: D (M, M).
+        links: stiffness of every link as a spring, times the share of it that acts beyond the linear (E,).
+    """
 
-    def transition(self) -> tuple[Tensor, Tensor]:
-        """B and C of z_{t+1} = 2 z_t - z_{t-1} - B z_t - C (z_t - z_{t-1})."""
-        solve = torch.linalg.inv(self.inertia + self.stiffness / 4 + self.damping / 2)
-        return solve @ self.stiffness, solve @ self.damping
+    stiffness: Float[Tensor, "M M"]
+    inertia: Float[Tensor, "M M"]
+    damping: Float[Tensor, "M M"]
+    links: Float[Tensor, " E"]
 
 
 class MaterialTemplate(Template):
@@ -217,7 +234,7 @@ class MaterialTemplate(Template):
         self.start = 2 * math.log(2 * math.pi / period), math.log(damping)
         self.stiffness, self.damping = nn.Parameter(torch.zeros(())), nn.Parameter(torch.zeros(2))
         self.unit_decoder = mlp((attributes, hidden, 2))
-        self.link_decoder = mlp((3 * attributes + 1, hidden, 2))
+        self.link_decoder = mlp((3 * attributes + 1, hidden, 3))
 
     def body(self, scene_id: int) -> BodyModes:
         """Modes of one scene."""
@@ -227,8 +244,8 @@ class MaterialTemplate(Template):
 
     def decode(
         self, body: BodyModes, attributes: Float[Tensor, "N A"]
-    ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "E 2"]]:
-        """Logarithms of stiffness and drag of every unit, and of stiffness and inertia of every link.
+    ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "E 3"]]:
+        """Logarithms of stiffness and drag of every unit; s, q and g of every link (see the module's text).
 
         Without attributes every unit is the same: what the decoder says of zero attributes is taken off.
         """
@@ -259,7 +276,8 @@ class MaterialTemplate(Template):
         between = LINK_SHARE * links[:, 1, None, None].exp() * body.between
         inertia = root.mT @ heavy + body.between.flatten(0, 1).mT @ between.flatten(0, 1)
         dragged = root.mT @ (units[:, 1, None, None].exp() * density * body.inertia).flatten(0, 1)
-        return Matrices(k * stiffness, inertia, drag * frame * dragged + viscosity / frame * k * stiffness)
+        springs = k * LINK_SHARE * body.hardness * links[:, 0].exp() * links[:, 2].sigmoid()
+        return Matrices(k * stiffness, inertia, drag * frame * dragged + viscosity / frame * k * stiffness, springs)
 
     def _all_matrices(self, batch: SceneBatch, units: FixedUnits) -> dict[int, Matrices]:
         found = {}
@@ -276,9 +294,9 @@ class MaterialTemplate(Template):
         return _PreparedMaterial(self, batch, self._all_matrices(batch, units))
 
     def energy(self, batch: SceneBatch, motion: Motion, prepared: Any) -> Float[Tensor, " S"]:
-        """v^T M v / 2 + m^T K m / 2 of every member: v the step and m the middle of both states, M and K constants.
+        """v^T M v / 2 + m^T K m / 2 and the links' beyond it: v the step, m the middle of both states, constants all.
 
-        Without damping the template keeps this number exactly, as the trapezoidal rule does.
+        Without damping and links beyond the linear the template keeps this number exactly.
         """
         assert isinstance(prepared, _PreparedMaterial)
         found = motion.rest.new_zeros(len(batch.scene_ids))
@@ -287,7 +305,7 @@ class MaterialTemplate(Template):
             step, middle = z - previous, (z + previous) / 2
             inertia, stiffness = part.matrices.inertia.detach(), part.matrices.stiffness.detach()
             energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
-            found = found.index_copy(0, part.members, energy)
+            found = found.index_copy(0, part.members, energy + part.potential(middle))
         return found
 
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -310,9 +328,13 @@ class _Part:
         self.projection = body.projection.flatten(0, 1)
         # Positions and gradients of a unit side by side: one product gives both.
         self.motions = torch.cat((body.modes, body.gradients.flatten(1, 2)), 1).flatten(0, 1)
-        pull, drag = matrices.transition()
-        identity = torch.eye(len(pull), dtype=pull.dtype, device=pull.device)
-        self.transition = torch.cat(((2 * identity - pull - drag).mT, (drag - identity).mT))
+        solve = torch.linalg.inv(matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2)
+        self.solve, self.pull = solve.mT, (solve @ matrices.stiffness).mT
+        drag = (solve @ matrices.damping).mT
+        identity = torch.eye(len(solve), dtype=solve.dtype, device=solve.device)
+        self.transition = torch.cat((2 * identity - self.pull - drag, drag - identity))
+        self.change, self.offset = body.change.flatten(0, 1), body.offset
+        self.length = torch.linalg.vector_norm(body.offset, dim=-1, keepdim=True)
 
     def coordinates(self, motion: Motion) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M"]]:
         """z_t and z_{t-1}."""
@@ -323,9 +345,32 @@ class _Part:
         z, previous = (torch.cat((now, before)) @ self.projection).chunk(2)
         return z, previous
 
+    def _stretched(self, z: Float[Tensor, "S M"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Every link's vector at z, its length, and the linear part of its change of length."""
+        change = (z @ self.change.mT).unflatten(-1, (-1, 3))
+        link = self.offset + change
+        now = link.square().sum(-1, keepdim=True).clamp_min(1e-6 * self.length.square()).sqrt()
+        return link, now, (self.offset * change).sum(-1, keepdim=True) / self.length
+
+    def _beyond(self, z: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+        """What links add to the next coordinates beyond the linear, held below its bound."""
+        link, now, linear = self._stretched(z)
+        pull = (1 - self.length / now) * link - linear / self.length * self.offset
+        added = -(self.matrices.links[:, None] * pull).flatten(1) @ self.change @ self.solve
+        bound = LARGEST_BEYOND * torch.linalg.vector_norm(z @ self.pull, dim=-1, keepdim=True).detach()
+        size = torch.linalg.vector_norm(added, dim=-1, keepdim=True).detach()
+        return added * (bound / size.clamp_min(1e-30)).clamp_max(1.0)
+
+    def potential(self, z: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
+        """Energy of which the links' force beyond the linear is minus the gradient; stiffness is a constant."""
+        _, now, linear = self._stretched(z)
+        stretch = (now - self.length).square() - linear.square()
+        return 0.5 * (self.matrices.links.detach() * stretch[..., 0]).sum(-1)
+
     def __call__(self, motion: Motion) -> Float[Tensor, "R 12"]:
         """Displacement and its gradient, row by row, of every unit at t + 1."""
-        after = torch.cat(self.coordinates(motion), -1) @ self.transition
+        z, previous = self.coordinates(motion)
+        after = torch.cat((z, previous), -1) @ self.transition + self._beyond(z)
         return (after @ self.motions.mT).view(-1, 12)
 
 
