@@ -50,7 +50,7 @@ def random_step(module: GausSimModule):
     with torch.no_grad():
         for p in simulator.parameter_groups()["network"]:
             p.add_(0.5 * torch.randn(p.shape, generator=generator))
-    simulator.output_scale, simulator.lever_head = 1.0, 10 * simulator.lever_head
+    simulator.output_scale, simulator.lever_head = 1.0, 40 * simulator.lever_head
     batch = simulator.batch([0])
     shift = 0.05 * torch.randn(2, *batch.rest.shape, generator=generator)
     return simulator.step(batch, SimState(batch.rest + shift[0], batch.rest + shift[1]))
