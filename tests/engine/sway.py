@@ -64,7 +64,7 @@ class Sway(nn.Module):
         if self.poison is not None:
             positions = positions * self.poison
         identity = torch.eye(3).expand(len(batch.members), 3, 3)
-        momentum = (self.keep * drift.sum()).square()
+        momentum = (self.keep * drift.mean()).square()
         return SimpleNamespace(positions=positions, gradients=identity, rotations=identity, momentum=momentum)
 
 
