@@ -14,8 +14,7 @@ is G z, G a trained matrix, which makes the inertia G^T G and leaves every prope
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -23,25 +22,19 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.core import ConfigError
-from gausim.models.batch import SceneBatch, rows_by_scene
+from gausim.models.batch import SceneBatch
 from gausim.models.hierarchy import Hierarchy
-from gausim.models.solid import solid_modes
-from gausim.models.springs import Springs, mode_gradients, vibration_modes
-from gausim.models.template import Motion, Template, TemplateState
+from gausim.models.solid import solid_body
+from gausim.models.springs import Springs, held_below, mode_gradients, unit_springs, vibration_modes
+from gausim.models.template import PreparedScenes, Template
 from gausim.models.units import FixedUnits
 from gausim.nn.mlp import mlp, zero_output
-from gausim.ops.deformation import bounded_deformation
 
-# Below this the modal gradient is no longer a deformation (matter turned inside out); it is pulled back to it.
-MIN_DETERMINANT = 0.2
 # Logarithms of stiffness and damping may move ten times faster than the mixing of modes; written as gains on the
 # parameters so that one learning rate serves both.
 SPECTRUM_GAIN, MIXING_GAIN = 2.0, 0.3
 # Nearly undamped at the start: exp(-4) per frame of the velocity.
 INITIAL_LOG_DAMPING = -4.0
-# The springs' force beyond the linear one stays below this share of the trained stiffness's own (both as they act in a
-# step): it is taken at the beginning of the step, and thin parts that turn far would make it explode.
-LARGEST_GEOMETRIC = 0.5
 DAMPINGS = ("full", "modal", "rayleigh", "structural")
 INERTIAS = ("volume", "trained")
 
@@ -82,9 +75,8 @@ class ElasticScene(nn.Module):
         else:
             finer = hierarchy.levels[0]
             kernels, spacing = finer.rest.double().numpy(), solid * hierarchy.diagonal
-            values, phi, slopes = solid_modes(
-                kernels, finer.pinned.numpy(), rest, mass, pinned, modes=modes, spacing=spacing
-            )
+            body = solid_body(kernels, finer.pinned.numpy(), rest, mass, pinned, modes=modes, spacing=spacing)
+            values, phi, slopes = body.of_units(rest, pinned)
         count = phi.shape[-1]
         self.register_buffer("values", torch.from_numpy(values).float())
         self.register_buffer("modes", torch.from_numpy(phi).float())
@@ -99,7 +91,7 @@ class ElasticScene(nn.Module):
         self.damping, self._damping = nn.Parameter(torch.zeros(numbers[damping])), damping
         self.damping_mixing = nn.Parameter(torch.zeros(count, count)) if damping == "full" else None
         self.inertia_mixing = nn.Parameter(torch.zeros(count, count)) if inertia == "trained" else None
-        self.springs = None if geometric is None else Springs(rest, phi, neighbours)
+        self.springs = None if geometric is None else unit_springs(rest, phi, neighbours)
         self.gain = None if geometric is None else nn.Parameter(torch.tensor(float(geometric)))
         self.force = mlp((2 * count, hidden, hidden, count)) if hidden else None
         if self.force is not None:
@@ -171,10 +163,10 @@ class ElasticScene(nn.Module):
 
     def forward(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S M"]:
         """Modal coordinates at t + 1 from the displacements at t and t - 1 of S sequences."""
-        return PreparedScene(self).coordinates(now, before)
+        return PreparedElastic(self).coordinates(now, before)
 
 
-class PreparedScene:
+class PreparedElastic:
     """An elastic scene while its parameters do not change: its matrices and what the force is at rest."""
 
     def __init__(self, scene: ElasticScene) -> None:
@@ -205,43 +197,17 @@ class PreparedScene:
         return after if self.scene.springs is None else after + self._springs(self.scene.springs, z)
 
     def _springs(self, springs: Springs, z: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-        """What the springs add to the next coordinates, held below its bound."""
-        added = springs(z) @ self.turned
-        bound = LARGEST_GEOMETRIC * torch.linalg.vector_norm(z @ self.pull, dim=-1, keepdim=True).detach()
-        size = torch.linalg.vector_norm(added, dim=-1, keepdim=True).detach()
-        return added * (bound / size.clamp_min(1e-30)).clamp_max(1.0)
+        """What the springs add to the next coordinates."""
+        return held_below(springs(z) @ self.turned, z @ self.pull)
 
     def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
         """Displacement and its gradient, row by row, of every unit at t + 1."""
         z = self.coordinates(now, before)
         return (z @ self.motions.mT).view(*now.shape[:2], 12)
 
-
-class _PreparedTemplate:
-    """The elastic template of one batch while its parameters do not change."""
-
-    def __init__(self, template: ElasticTemplate, batch: SceneBatch) -> None:
-        self.template = template
-        self.parts = [
-            (PreparedScene(template.scene(scene_id)), rows, len(members))
-            for scene_id, rows, members in rows_by_scene(batch)
-        ]
-        order = torch.cat([rows for _, rows, _ in self.parts])
-        self.places = torch.empty_like(order).index_copy(0, order, torch.arange(len(order), device=order.device))
-
-    def __call__(self, motion: Motion) -> TemplateState:
-        now, before = motion.now - motion.rest, motion.before - motion.rest
-        if len(self.parts) == 1:
-            scene, _, count = self.parts[0]
-            moved = scene(now.view(count, -1, 3), before.view(count, -1, 3)).flatten(0, 1)
-        else:
-            made = []
-            for scene, rows, count in self.parts:
-                a, b = (x.index_select(0, rows).view(count, -1, 3) for x in (now, before))
-                made.append(scene(a, b).flatten(0, 1))
-            moved = torch.cat(made).index_select(0, self.places)
-        identity = torch.eye(3, dtype=moved.dtype, device=moved.device)
-        return TemplateState(motion.rest + moved[:, :3], self.template.valid(moved[:, 3:].view(-1, 3, 3) + identity))
+    def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:
+        """Energy, see :meth:`ElasticScene.energy`."""
+        return self.scene.energy(now, before)
 
 
 class ElasticTemplate(Template):
@@ -329,25 +295,11 @@ class ElasticTemplate(Template):
         forces = (self.scene(i).force for i in range(len(self.scenes)))
         return [p for force in forces if force is not None for p in force.parameters()]
 
-    def prepare(self, batch: SceneBatch, units: FixedUnits) -> Callable[[Motion], TemplateState]:
+    def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
         """The template with its matrices computed: positions X + Phi z and gradients I + grad(Phi) z."""
-        return _PreparedTemplate(self, batch)
-
-    def energy(self, batch: SceneBatch, motion: Motion, prepared: Any = None) -> Float[Tensor, " S"]:
-        """Energy of every member of the batch, see :meth:`ElasticScene.energy`."""
-        found = motion.rest.new_zeros(len(batch.scene_ids))
-        for scene_id, rows, members in rows_by_scene(batch):
-            now, before = (
-                (x.index_select(0, rows) - motion.rest.index_select(0, rows)).view(len(members), -1, 3)
-                for x in (motion.now, motion.before)
-            )
-            index = torch.tensor(members, device=found.device)
-            found = found.index_copy(0, index, self.scene(scene_id).energy(now, before))
-        return found
-
-    def valid(self, gradient: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 3 3"]:
-        """Keeps the determinant above its bound (towards the identity) and, with mass on, scales it to one."""
-        return bounded_deformation(gradient, MIN_DETERMINANT, unit=self.conserve_volume)
+        return PreparedScenes(
+            batch, lambda scene_id, _: PreparedElastic(self.scene(scene_id)), conserve_volume=self.conserve_volume
+        )
 
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
         """Modes (N, 3, M), their gradients (N, 3, 3, M) and sizes (M,): motions of equal energy at the start."""

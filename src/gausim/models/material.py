@@ -26,9 +26,8 @@ are the only geometry that the decoder reads: it means the same on every body, h
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -36,23 +35,18 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from gausim.models.batch import SceneBatch, rows_by_scene
+from gausim.models.batch import SceneBatch
 from gausim.models.hierarchy import Hierarchy
 from gausim.models.solid import POISSON, SolidBody, solid_body
-from gausim.models.template import Motion, Template, TemplateState
+from gausim.models.springs import Springs, held_below, neighbour_pairs
+from gausim.models.template import PreparedScenes, Template
 from gausim.models.units import FixedUnits
 from gausim.nn.mlp import mlp
-from gausim.ops.deformation import bounded_deformation
 
-# A modal gradient with a smaller determinant is no deformation any more (matter turned inside out).
-MIN_DETERMINANT = 0.2
 # Decoded logarithms saturate here: a factor of twelve either way.
 LARGEST_LOG = 2.5
 # Stiffness and inertia of all links together, as shares of the body's own (by trace), before anything is learned.
 LINK_SHARE = 0.3
-# The links' force beyond the linear one stays below this share of the stiffness's own (both as they act in a step): it
-# is taken at the beginning of the step, and thin parts that turn far would make it explode.
-LARGEST_BEYOND = 0.5
 # Units among which a cell's energy and mass are divided, by inverse squared distance.
 CELL_UNITS = 4
 # Step of the units per frame that one unit of an initial velocity's coordinate means, at the lowest mode [diagonals].
@@ -75,9 +69,7 @@ class BodyModes(nn.Module):
         inertia: root of M_i, (N, 3, M).
         links: pairs of units (2, E).
         stretch: root of S_ij, (E, M).
-        offset: from the first unit of a link to the second, X_j - X_i (E, 3) [scene units].
-        change: Phi_j - Phi_i, (E, 3, M).
-        hardness: of the link as a spring, per unit of S_ij (E,).
+        springs: the links as springs, their stiffness per unit of S_ij.
         between: root of T_ij, (E, 3, M).
         distance: logarithm of the links' lengths over their mean (E,).
     """
@@ -90,9 +82,6 @@ class BodyModes(nn.Module):
     inertia: Tensor
     links: Tensor
     stretch: Tensor
-    offset: Tensor
-    change: Tensor
-    hardness: Tensor
     between: Tensor
     distance: Tensor
 
@@ -124,26 +113,21 @@ class BodyModes(nn.Module):
             "stiffness": _cell_stiffness(body, rest, pinned) / lowest,
             "inertia": phi * np.sqrt(mass)[:, None, None],
             "stretch": even * stretch,
-            "offset": offset,
-            "change": change,
-            "hardness": (even / length) ** 2,
             "between": between,
             "distance": np.log(length / length.mean()),
         }
         for name, array in arrays.items():
             self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)).float(), persistent=False)
+        self.springs = Springs(offset, change, (even / length) ** 2)
         self.register_buffer("links", torch.from_numpy(pairs), persistent=False)
         self.scale = AMPLITUDE * hierarchy.diagonal * math.sqrt(float((~pinned).sum()))
 
 
 def _links(rest: np.ndarray, pinned: np.ndarray, count: int) -> np.ndarray:
-    """Pairs (2, E) of neighbouring units, each once, not between pinned ones."""
-    k = min(count + 1, len(rest))
-    near = cKDTree(rest).query(rest, k=k)[1].reshape(len(rest), k)[:, 1:]
-    pairs = np.stack((np.repeat(np.arange(len(rest)), k - 1), near.ravel()), 1)
-    pairs = np.unique(np.sort(pairs, 1), axis=0)
+    """Pairs (2, E) of neighbouring units that have a length, not between pinned ones."""
+    pairs = neighbour_pairs(rest, count)
     distinct = np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1) > 1e-9 * np.abs(rest).max()
-    return np.ascontiguousarray(pairs[distinct & ~(pinned[pairs[:, 0]] & pinned[pairs[:, 1]])].T)
+    return np.ascontiguousarray(pairs[distinct & ~pinned[pairs].all(1)].T)
 
 
 def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np.ndarray:
@@ -179,7 +163,7 @@ class Matrices:
         stiffness: K (M, M).
         inertia: M (M, M).
         damping: D (M, M).
-        links: stiffness of every link as a spring, times the share of it that acts beyond the linear (E,).
+        links: factor on every link's stiffness as a spring, times the share of it that acts beyond the linear (E,).
     """
 
     stiffness: Float[Tensor, "M M"]
@@ -276,37 +260,18 @@ class MaterialTemplate(Template):
         between = LINK_SHARE * links[:, 1, None, None].exp() * body.between
         inertia = root.mT @ heavy + body.between.flatten(0, 1).mT @ between.flatten(0, 1)
         dragged = root.mT @ (units[:, 1, None, None].exp() * density * body.inertia).flatten(0, 1)
-        springs = k * LINK_SHARE * body.hardness * links[:, 0].exp() * links[:, 2].sigmoid()
+        springs = k * LINK_SHARE * links[:, 0].exp() * links[:, 2].sigmoid()
         return Matrices(k * stiffness, inertia, drag * frame * dragged + viscosity / frame * k * stiffness, springs)
 
-    def _all_matrices(self, batch: SceneBatch, units: FixedUnits) -> dict[int, Matrices]:
-        found = {}
-        for scene_id, rows, members in rows_by_scene(batch):
-            own = rows[: len(rows) // len(members)]
-            dt = float(batch.levels[-1].dt[own[0]])
-            found[scene_id] = self.matrices(
-                scene_id, units.log_density.index_select(0, own), units.attributes.index_select(0, own), dt
-            )
-        return found
-
-    def prepare(self, batch: SceneBatch, units: FixedUnits) -> Callable[[Motion], TemplateState]:
+    def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
         """The template with its matrices computed."""
-        return _PreparedMaterial(self, batch, self._all_matrices(batch, units))
 
-    def energy(self, batch: SceneBatch, motion: Motion, prepared: Any) -> Float[Tensor, " S"]:
-        """v^T M v / 2 + m^T K m / 2 and the links' beyond it: v the step, m the middle of both states, constants all.
+        def made(scene_id: int, rows: Tensor) -> PreparedMaterial:
+            density, attributes = (x.index_select(0, rows) for x in (units.log_density, units.attributes))
+            matrices = self.matrices(scene_id, density, attributes, float(batch.levels[-1].dt[rows[0]]))
+            return PreparedMaterial(self.body(scene_id), matrices)
 
-        Without damping and links beyond the linear the template keeps this number exactly.
-        """
-        assert isinstance(prepared, _PreparedMaterial)
-        found = motion.rest.new_zeros(len(batch.scene_ids))
-        for part in prepared.parts:
-            z, previous = part.coordinates(motion)
-            step, middle = z - previous, (z + previous) / 2
-            inertia, stiffness = part.matrices.inertia.detach(), part.matrices.stiffness.detach()
-            energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
-            found = found.index_copy(0, part.members, energy + part.potential(middle))
-        return found
+        return PreparedScenes(batch, made, conserve_volume=self.conserve_volume)
 
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
         """Modes (N, 3, M), their gradients (N, 3, 3, M) and sizes (M,): what initial velocities are made of."""
@@ -319,12 +284,12 @@ def _saturated(logarithms: Tensor) -> Tensor:
     return LARGEST_LOG * torch.tanh(logarithms / LARGEST_LOG)
 
 
-class _Part:
-    """The members of one scene in a batch."""
+class PreparedMaterial:
+    """A scene's body while no parameter changes."""
 
-    def __init__(self, body: BodyModes, matrices: Matrices, rows: Tensor, members: list[int]) -> None:
-        self.matrices, self.rows, self.count = matrices, rows, len(members)
-        self.members = torch.tensor(members, device=rows.device)
+    def __init__(self, body: BodyModes, matrices: Matrices) -> None:
+        """Computes the constants; gradients flow through them."""
+        self.matrices, self.springs = matrices, body.springs
         self.projection = body.projection.flatten(0, 1)
         # Positions and gradients of a unit side by side: one product gives both.
         self.motions = torch.cat((body.modes, body.gradients.flatten(1, 2)), 1).flatten(0, 1)
@@ -333,64 +298,29 @@ class _Part:
         drag = (solve @ matrices.damping).mT
         identity = torch.eye(len(solve), dtype=solve.dtype, device=solve.device)
         self.transition = torch.cat((2 * identity - self.pull - drag, drag - identity))
-        self.change, self.offset = body.change.flatten(0, 1), body.offset
-        self.length = torch.linalg.vector_norm(body.offset, dim=-1, keepdim=True)
 
-    def coordinates(self, motion: Motion) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M"]]:
+    def _coordinates(self, now: Tensor, before: Tensor) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M"]]:
         """z_t and z_{t-1}."""
-        now, before = (
-            (x.index_select(0, self.rows) - motion.rest.index_select(0, self.rows)).view(self.count, -1)
-            for x in (motion.now, motion.before)
-        )
-        z, previous = (torch.cat((now, before)) @ self.projection).chunk(2)
+        z, previous = (torch.cat((now, before)).flatten(1) @ self.projection).chunk(2)
         return z, previous
 
-    def _stretched(self, z: Float[Tensor, "S M"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Every link's vector at z, its length, and the linear part of its change of length."""
-        change = (z @ self.change.mT).unflatten(-1, (-1, 3))
-        link = self.offset + change
-        now = link.square().sum(-1, keepdim=True).clamp_min(1e-6 * self.length.square()).sqrt()
-        return link, now, (self.offset * change).sum(-1, keepdim=True) / self.length
+    def beyond(self, z: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+        """What links add to the next coordinates beyond the linear."""
+        return held_below(self.springs(z, self.matrices.links) @ self.solve, z @ self.pull)
 
-    def _beyond(self, z: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-        """What links add to the next coordinates beyond the linear, held below its bound."""
-        link, now, linear = self._stretched(z)
-        pull = (1 - self.length / now) * link - linear / self.length * self.offset
-        added = -(self.matrices.links[:, None] * pull).flatten(1) @ self.change @ self.solve
-        bound = LARGEST_BEYOND * torch.linalg.vector_norm(z @ self.pull, dim=-1, keepdim=True).detach()
-        size = torch.linalg.vector_norm(added, dim=-1, keepdim=True).detach()
-        return added * (bound / size.clamp_min(1e-30)).clamp_max(1.0)
-
-    def potential(self, z: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """Energy of which the links' force beyond the linear is minus the gradient; stiffness is a constant."""
-        _, now, linear = self._stretched(z)
-        stretch = (now - self.length).square() - linear.square()
-        return 0.5 * (self.matrices.links.detach() * stretch[..., 0]).sum(-1)
-
-    def __call__(self, motion: Motion) -> Float[Tensor, "R 12"]:
+    def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
         """Displacement and its gradient, row by row, of every unit at t + 1."""
-        z, previous = self.coordinates(motion)
-        after = torch.cat((z, previous), -1) @ self.transition + self._beyond(z)
-        return (after @ self.motions.mT).view(-1, 12)
+        z, previous = self._coordinates(now, before)
+        after = torch.cat((z, previous), -1) @ self.transition + self.beyond(z)
+        return (after @ self.motions.mT).view(*now.shape[:2], 12)
 
+    def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:
+        """v^T M v / 2 + m^T K m / 2 and the links' beyond it: v the step, m the middle of both states, constants all.
 
-class _PreparedMaterial:
-    """The template of one batch while its parameters do not change."""
-
-    def __init__(self, template: MaterialTemplate, batch: SceneBatch, matrices: dict[int, Matrices]) -> None:
-        self._template = template
-        self.parts = [
-            _Part(template.body(scene_id), matrices[scene_id], rows, members)
-            for scene_id, rows, members in rows_by_scene(batch)
-        ]
-        order = torch.cat([part.rows for part in self.parts])
-        self._places = torch.empty_like(order).index_copy(0, order, torch.arange(len(order), device=order.device))
-
-    def __call__(self, motion: Motion) -> TemplateState:
-        made = [part(motion) for part in self.parts]
-        moved = made[0] if len(made) == 1 else torch.cat(made).index_select(0, self._places)
-        identity = torch.eye(3, dtype=moved.dtype, device=moved.device)
-        gradients = bounded_deformation(
-            moved[:, 3:].reshape(-1, 3, 3) + identity, MIN_DETERMINANT, unit=self._template.conserve_volume
-        )
-        return TemplateState(motion.rest + moved[:, :3], gradients)
+        Without damping and links beyond the linear the template keeps this number exactly.
+        """
+        z, previous = self._coordinates(now, before)
+        step, middle = z - previous, (z + previous) / 2
+        inertia, stiffness = self.matrices.inertia.detach(), self.matrices.stiffness.detach()
+        energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
+        return energy + self.springs.potential(middle, self.matrices.links.detach())

@@ -21,7 +21,7 @@ from gausim.models.hierarchy import build_hierarchy
 from gausim.models.prepared import Prepared
 from gausim.models.recursion import Solved, Units, advance, inherit
 from gausim.models.smooth import smooth_motions
-from gausim.models.template import Motion, RestTemplate, Template
+from gausim.models.template import Motion, PreparedScenes, RestTemplate, Template
 from gausim.models.units import FixedUnits, fixed_units
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.mlp import zero_output as initialise_zero
@@ -271,7 +271,9 @@ class GausSim(nn.Module):
         """Energy of every member of the batch in the template's terms, up to a factor per scene."""
         prepared = self.prepare(batch) if prepared is None else prepared
         now, before = (prepared.units(x)[-1] for x in (state.positions, state.previous))
-        return self.template.energy(batch, Motion(prepared.levels[-1].rest, now, before), prepared.template)
+        if not isinstance(prepared.template, PreparedScenes):
+            raise NotImplementedError(f"{type(self.template).__name__} has no energy")
+        return prepared.template.energy(Motion(prepared.levels[-1].rest, now, before))
 
     def prepare(self, batch: SceneBatch) -> Prepared:
         """What steps of this batch have in common as long as no parameter changes.

@@ -149,6 +149,20 @@ class SolidBody:
         modes = np.einsum("nk,ankm->nam", values, at, optimize=True)
         return modes, np.einsum("nkb,ankm->nabm", gradients, at, optimize=True)
 
+    def of_units(self, rest: np.ndarray, pinned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The modes of units at ``rest`` (N, 3), of which ``pinned`` (N,) stay where they are.
+
+        Returns:
+            Eigenvalues (M,) relative to the first, modes (N, 3, M), zero at pinned units and of a fixed sign, and their
+            gradients (N, 3, 3, M) [1 / scene units].
+        """
+        phi, slope = self.at(rest)
+        phi[pinned], slope[pinned] = 0, 0
+        flat = phi.reshape(-1, phi.shape[-1])
+        scale = np.sign(flat[np.abs(flat).argmax(0), np.arange(phi.shape[-1])])
+        values = np.maximum(self.values, 1e-4 * self.values[-1])
+        return values / values[0], phi * scale, slope * scale
+
 
 def solid_body(
     kernels: np.ndarray,
@@ -160,7 +174,17 @@ def solid_body(
     modes: int,
     spacing: float,
 ) -> SolidBody:
-    """Lowest modes of the body around the kernels; arguments as in :func:`solid_modes`."""
+    """Lowest modes of the body around the kernels.
+
+    Args:
+        kernels: rest positions (K, 3) [scene units].
+        held: which kernels are pinned (K,).
+        rest: rest positions of the units (N, 3) [scene units].
+        mass: of the units (N,); the modes are orthonormal under it.
+        pinned: which units are (N,).
+        modes: how many are wanted; at most three per free unit are given.
+        spacing: of the grid [scene units].
+    """
     grid, centres, weights = cells(kernels, spacing)
     blocks = stiffness(grid, centres, weights)
     if held.any():
@@ -179,41 +203,6 @@ def solid_body(
     full = np.zeros((3 * grid.size, vectors.shape[1]))
     full[used] = vectors
     return SolidBody(grid, eigenvalues, full.reshape(3, grid.size, -1), centres, weights)
-
-
-def solid_modes(
-    kernels: np.ndarray,
-    held: np.ndarray,
-    rest: np.ndarray,
-    mass: np.ndarray,
-    pinned: np.ndarray,
-    *,
-    modes: int,
-    spacing: float,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lowest modes of the body around the kernels, at its units.
-
-    Args:
-        kernels: rest positions (K, 3) [scene units].
-        held: which kernels are pinned (K,).
-        rest: rest positions of the units (N, 3) [scene units].
-        mass: of the units (N,).
-        pinned: which units are (N,).
-        modes: how many are wanted; at most three per free unit are given.
-        spacing: of the grid [scene units].
-
-    Returns:
-        Eigenvalues (M,) relative to the first, modes (N, 3, M) orthonormal under the units' mass and zero at pinned
-        units, and their gradients (N, 3, 3, M) [1 / scene units].
-    """
-    body = solid_body(kernels, held, rest, mass, pinned, modes=modes, spacing=spacing)
-    phi, slope = body.at(rest)
-    phi[pinned] = 0
-    slope[pinned] = 0
-    flat = phi.reshape(-1, phi.shape[-1])
-    scale = np.sign(flat[np.abs(flat).argmax(0), np.arange(phi.shape[-1])])
-    eigenvalues = np.maximum(body.values, 1e-4 * body.values[-1])
-    return eigenvalues / eigenvalues[0], phi * scale, slope * scale
 
 
 def lowest(k: sp.spmatrix, carry: sp.spmatrix, count: int) -> tuple[np.ndarray, np.ndarray]:

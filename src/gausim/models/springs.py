@@ -14,15 +14,23 @@ from torch import Tensor, nn
 TRANSVERSE_STIFFNESS = 0.3
 # Regularises the least-squares gradient of units whose neighbours lie in a plane (share of the trace).
 GRADIENT_RIDGE = 1e-3
+# The springs' force beyond the linear one stays below this share of the trained stiffness's own (both as they act in a
+# step): it is taken at the beginning of the step, and thin parts that turn far would make it explode.
+LARGEST_BEYOND = 0.5
 
 
-def spring_network(rest: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
-    """Undirected springs (E, 2) between nearest neighbours and their stiffness blocks (E, 3, 3), k = 1 / length^2."""
+def neighbour_pairs(rest: np.ndarray, neighbours: int) -> np.ndarray:
+    """Pairs (E, 2) of points (N, 3) of which one is among the other's nearest neighbours, each pair once."""
     k = min(neighbours + 1, len(rest))
     near = cKDTree(rest).query(rest, k=k)[1].reshape(len(rest), k)[:, 1:]
     pairs = np.stack((np.repeat(np.arange(len(rest)), k - 1), near.ravel()), 1)
     pairs = np.unique(np.sort(pairs, 1), axis=0)
-    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    return pairs[pairs[:, 0] != pairs[:, 1]]
+
+
+def spring_network(rest: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
+    """Undirected springs (E, 2) between nearest neighbours and their stiffness blocks (E, 3, 3), k = 1 / length^2."""
+    pairs = neighbour_pairs(rest, neighbours)
     offset = rest[pairs[:, 1]] - rest[pairs[:, 0]]
     length = np.maximum(np.linalg.norm(offset, axis=1), 1e-9 * np.abs(rest).max())[:, None, None]
     outer = offset[:, :, None] * offset[:, None, :] / length**2
@@ -74,11 +82,17 @@ def mode_gradients(rest: np.ndarray, modes: np.ndarray, neighbours: int) -> np.n
 
 
 class Springs(nn.Module):
-    """The network's springs as they turn and stretch by more than a little, in modal coordinates.
+    """Springs between units as they turn and stretch by more than a little, in modal coordinates.
 
     A spring from d_0 to d = d_0 + Psi z has the energy k (|d| - |d_0|)^2 / 2, linearised k (n . Psi z)^2 / 2 with
     n = d_0 / |d_0|. The force is minus the gradient of the difference, so it has a potential and vanishes at rest to
     second order: the linear part is left to the trained matrices.
+
+    Attributes:
+        modes: Psi, differences of the modes between the ends, (3 E, M).
+        offset: d_0 (E, 3) [scene units].
+        length: |d_0| (E,) [scene units].
+        stiffness: k (E,), up to the factor that the calls take.
     """
 
     modes: Tensor
@@ -86,33 +100,30 @@ class Springs(nn.Module):
     length: Tensor
     stiffness: Tensor
 
-    def __init__(self, rest: np.ndarray, phi: np.ndarray, neighbours: int) -> None:
-        """Springs of :func:`spring_network` between the units, stiffness such that the first mode has the value 1."""
+    def __init__(self, offset: np.ndarray, difference: np.ndarray, stiffness: np.ndarray) -> None:
+        """Springs along ``offset`` (E, 3), between whose ends the modes differ by ``difference`` (E, 3, M)."""
         super().__init__()
-        pairs, blocks = spring_network(rest, neighbours)
-        difference = phi[pairs[:, 1]] - phi[pairs[:, 0]]
-        first = difference[:, :, 0]
-        lowest = np.einsum("ea,eab,eb->", first, blocks, first)
-        offset = rest[pairs[:, 1]] - rest[pairs[:, 0]]
-        squared = (offset**2).sum(1)
-        self.register_buffer("modes", torch.from_numpy(difference.reshape(-1, phi.shape[-1])).float(), persistent=False)
-        self.register_buffer("offset", torch.from_numpy(offset).float(), persistent=False)
-        self.register_buffer("length", torch.from_numpy(np.sqrt(squared)).float(), persistent=False)
-        stiffness = (1 - TRANSVERSE_STIFFNESS) / (squared * lowest)
-        self.register_buffer("stiffness", torch.from_numpy(stiffness).float(), persistent=False)
+        arrays = {
+            "modes": difference.reshape(-1, difference.shape[-1]),
+            "offset": offset,
+            "length": np.sqrt((offset**2).sum(1)),
+            "stiffness": stiffness,
+        }
+        for name, array in arrays.items():
+            self.register_buffer(name, torch.from_numpy(array).float(), persistent=False)
 
-    def forward(self, z: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-        """Modal forces beyond the linear ones, in units of the first mode's value."""
+    def forward(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, "S M"]:
+        """Modal forces beyond the linear ones; ``factor`` on the stiffness, one of all springs or (E,)."""
         change, squared, along, now, stretch = self._stretched(z)
         shrink = stretch / now
         beyond = shrink[..., None] * change + (shrink - along / squared)[..., None] * self.offset
-        beyond = self.stiffness[:, None] * beyond
+        beyond = (factor * self.stiffness)[:, None] * beyond
         return -(beyond.flatten(-2) @ self.modes)
 
-    def potential(self, z: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """Energy of which :meth:`forward` is minus the gradient, in the same units."""
+    def potential(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, " S"]:
+        """Energy of which :meth:`forward` is minus the gradient."""
         _, squared, along, _, stretch = self._stretched(z)
-        return 0.5 * (self.stiffness * (stretch.square() - along.square() / squared)).sum(-1)
+        return 0.5 * (factor * self.stiffness * (stretch.square() - along.square() / squared)).sum(-1)
 
     def _stretched(self, z: Float[Tensor, "S M"]) -> tuple[Tensor, ...]:
         """Psi z, |d_0|^2, d_0 . Psi z, |d| and |d| - |d_0| of every spring."""
@@ -122,3 +133,20 @@ class Springs(nn.Module):
         grown = 2 * along + change.square().sum(-1)  # |d|^2 - |d_0|^2
         now = (squared + grown).clamp_min(1e-6 * squared).sqrt()
         return change, squared, along, now, grown / (now + self.length)  # no difference of nearly equal numbers
+
+
+def unit_springs(rest: np.ndarray, phi: np.ndarray, neighbours: int) -> Springs:
+    """Springs of :func:`spring_network` between units, stiffness such that the first mode has the value 1."""
+    pairs, blocks = spring_network(rest, neighbours)
+    difference = phi[pairs[:, 1]] - phi[pairs[:, 0]]
+    first = difference[:, :, 0]
+    lowest = np.einsum("ea,eab,eb->", first, blocks, first)
+    offset = rest[pairs[:, 1]] - rest[pairs[:, 0]]
+    return Springs(offset, difference, (1 - TRANSVERSE_STIFFNESS) / ((offset**2).sum(1) * lowest))
+
+
+def held_below(added: Float[Tensor, "S M"], pull: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+    """What springs add to a step, held below :data:`LARGEST_BEYOND` of how the stiffness pulls in it."""
+    bound = LARGEST_BEYOND * torch.linalg.vector_norm(pull, dim=-1, keepdim=True).detach()
+    size = torch.linalg.vector_norm(added, dim=-1, keepdim=True).detach()
+    return added * (bound / size.clamp_min(1e-30)).clamp_max(1.0)

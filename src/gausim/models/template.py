@@ -10,15 +10,20 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gausim.models.batch import SceneBatch
+from gausim.models.batch import SceneBatch, rows_by_scene
 from gausim.models.hierarchy import Hierarchy
 from gausim.models.units import FixedUnits
+from gausim.ops.deformation import bounded_deformation
+
+# Below this a gradient is no longer a deformation (matter turned inside out); it is pulled back to it.
+MIN_DETERMINANT = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +52,7 @@ class Template(nn.Module, ABC):
     """Proposes the next configuration of the finest predicted level from its two latest ones.
 
     Attributes:
-        has_energy: whether :meth:`energy` is there.
+        has_energy: whether what :meth:`prepare` makes has an energy, too, as :class:`PreparedScenes` has.
         headroom: so many times the energy that a rollout begins with is allowed in its first frames.
         is_shared: whether its parameters serve all scenes, as the network's do, or are each a scene's own.
     """
@@ -63,16 +68,6 @@ class Template(nn.Module, ABC):
             batch: the disjoint graph.
             units: constants of the finest predicted level, densities and attributes among them.
         """
-
-    def energy(self, batch: SceneBatch, motion: Motion, prepared: Any) -> Float[Tensor, " S"]:
-        """Energy of every member of a batch in the template's own terms, up to a factor; see ``has_energy``.
-
-        Args:
-            batch: the disjoint graph.
-            motion: of the units.
-            prepared: from :meth:`prepare`.
-        """
-        raise NotImplementedError(f"{type(self).__name__} has no energy")
 
     def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
         """How far the template has left the body it began with, differentiable; None where it learns no body."""
@@ -92,6 +87,60 @@ class Template(nn.Module, ABC):
         See :class:`gausim.core.SmoothMotions`.
         """
         return None
+
+
+class PreparedScene(Protocol):
+    """The template of one scene while its parameters do not change, from the displacements of S sequences."""
+
+    def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
+        """Displacement and its gradient, row by row, of every unit at t + 1."""
+
+    def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:
+        """Energy; what is trained counts as constant."""
+
+
+class PreparedScenes:
+    """The template of a batch, scene by scene."""
+
+    def __init__(
+        self, batch: SceneBatch, made: Callable[[int, Tensor], PreparedScene], *, conserve_volume: bool
+    ) -> None:
+        """Prepares every scene.
+
+        Args:
+            batch: the disjoint graph.
+            made: makes the template of a scene, given its number and the rows of one member's units.
+            conserve_volume: scale gradients to determinant 1.
+        """
+        self._conserve_volume = conserve_volume
+        self.parts = [
+            (made(scene_id, rows[: len(rows) // len(members)]), rows, members)
+            for scene_id, rows, members in rows_by_scene(batch)
+        ]
+        order = torch.cat([rows for _, rows, _ in self.parts])
+        self._places = torch.empty_like(order).index_copy(0, order, torch.arange(len(order), device=order.device))
+
+    def _displacements(self, motion: Motion, rows: Tensor, members: list[int]) -> tuple[Tensor, Tensor]:
+        alone = len(self.parts) == 1
+        now, before = (
+            (x - motion.rest if alone else x.index_select(0, rows) - motion.rest.index_select(0, rows))
+            for x in (motion.now, motion.before)
+        )
+        return now.view(len(members), -1, 3), before.view(len(members), -1, 3)
+
+    def __call__(self, motion: Motion) -> TemplateState:
+        """Positions X + u and gradients I + grad u, their determinants bounded."""
+        made = [part(*self._displacements(motion, rows, members)).flatten(0, 1) for part, rows, members in self.parts]
+        moved = made[0] if len(made) == 1 else torch.cat(made).index_select(0, self._places)
+        gradients = moved[:, 3:].reshape(-1, 3, 3) + torch.eye(3, dtype=moved.dtype, device=moved.device)
+        gradients = bounded_deformation(gradients, MIN_DETERMINANT, unit=self._conserve_volume)
+        return TemplateState(motion.rest + moved[:, :3], gradients)
+
+    def energy(self, motion: Motion) -> Float[Tensor, " S"]:
+        """Energy of every member of the batch."""
+        found = [part.energy(*self._displacements(motion, rows, members)) for part, rows, members in self.parts]
+        order = torch.tensor([m for _, _, members in self.parts for m in members], device=motion.rest.device)
+        return torch.cat(found).index_select(0, order.argsort())
 
 
 class RestTemplate(Template):
