@@ -52,9 +52,7 @@ def test_parts_of_the_units_sum_up_to_the_homogeneous_body(hierarchy) -> None:
         modes=9, spacing=0.2 * hierarchy.diagonal,
     )  # fmt: skip
     values = torch.from_numpy(expected.values / expected.values[0])
-    torch.testing.assert_close(
-        body.stiffness.sum(0), torch.diag(values), atol=1e-4, rtol=1e-4
-    )
+    torch.testing.assert_close(body.stiffness.sum(0), torch.diag(values), atol=1e-4, rtol=1e-4)
     root = body.inertia.flatten(0, 1)
     torch.testing.assert_close(root.mT @ root, torch.eye(9, dtype=torch.float64), atol=1e-5, rtol=0)
     assert not body.modes[level.pinned].any()
