@@ -114,8 +114,16 @@ class TrainedPrediction:
 
     @property
     def footnotes(self) -> dict[str, Any] | None:
-        """What the method says of itself (see :attr:`GausSimModule.footnotes`)."""
-        return self._run.module.footnotes
+        """What the method says of itself (see :attr:`GausSimModule.footnotes`), and whether small motions grow."""
+        from gausim.engine.stability import largest_eigenvalue
+        from gausim.models.simulator import GausSim
+
+        said, model = self._run.module.footnotes, self._run.module.model
+        if not isinstance(model, GausSim):
+            return said
+        largest = largest_eigenvalue(model, self._item.scene_id)
+        note = f"Largest eigenvalue of the step, linearised at rest: {largest:.4f}; small motions grow above 1."
+        return {**said, "largest_eigenvalue": largest, "notes": [*said["notes"], note]}
 
     def full(self, record: SequenceRecord) -> Trajectory:
         """All predicted frames of a sequence, the recorded ones and those asked for beyond."""

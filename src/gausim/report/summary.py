@@ -18,7 +18,8 @@
         "sources": {"root", "scene": {"file", "sha256"}, "masks": {...}, "manifest": {...}},
         "absent": {KEY: why},                         metrics that could not be computed
         "footnotes": {METHOD: {"extrapolates": bool, "notes": [text, ...], "fit": {"seconds", "cpu_seconds",
-            "peak_bytes"}}},                              fit null where it was not counted
+            "peak_bytes"}, "largest_eigenvalue": x}}          fit null where it was not counted; the eigenvalue is of
+                                                      the step linearised at rest, only of simulators with a network
         "diagnosis": {"share": [...], "frequency": [Hz, ...], "rows": {ROW: {"spectrum", "frequencies": [Hz, ...],
             "dampings": [...], "phase_error": [degrees, ...], "velocity_cosine": x,
             "level_errors": [x, ...]}}}                where the true motion is known
