@@ -52,7 +52,7 @@ def test_parts_of_the_units_sum_up_to_the_homogeneous_body(hierarchy) -> None:
         modes=9, spacing=0.2 * hierarchy.diagonal,
     )  # fmt: skip
     values = torch.from_numpy(expected.values / expected.values[0])
-    torch.testing.assert_close(body.stiffness.sum(0), torch.diag(values), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(body.stiffness.sum((0, 1)), torch.diag(values), atol=1e-4, rtol=1e-4)
     root = body.inertia.flatten(0, 1)
     torch.testing.assert_close(root.mT @ root, torch.eye(9, dtype=torch.float64), atol=1e-5, rtol=0)
     assert not body.modes[level.pinned].any()
@@ -69,15 +69,16 @@ def test_matrices_are_sums_over_units_and_links(hierarchy) -> None:
     stiffness, inertia, drag = (torch.zeros(9, 9, dtype=torch.float64) for _ in range(3))
     for i in range(len(density)):
         own = sum(torch.outer(body.inertia[i, a], body.inertia[i, a]) for a in range(3))
-        stiffness += units[i, 0].exp() * body.stiffness[i]
+        stiffness += units[i, 0].exp() * body.stiffness[0, i] + units[i, 1].exp() * body.stiffness[1, i]
         inertia += rho[i] * own
-        drag += rho[i] * units[i, 1].exp() * own
+        drag += rho[i] * units[i, 2].exp() * own
     for e in range(body.links.shape[1]):
         stiffness += 0.3 * links[e, 0].exp() * torch.outer(body.stretch[e], body.stretch[e])
         inertia += 0.3 * links[e, 1].exp() * body.between[e].mT @ body.between[e]
     torch.testing.assert_close(found.stiffness, k * stiffness)
     torch.testing.assert_close(found.inertia, inertia)
     torch.testing.assert_close(found.damping, c0 * drag + c1 * k * stiffness)
+    torch.testing.assert_close(found.links, 0.15 * k * links[:, 2].exp())
     for matrix in (found.stiffness, found.inertia, found.damping):
         assert float(torch.linalg.eigvalsh(matrix)[0]) > -1e-9
 

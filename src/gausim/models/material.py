@@ -5,21 +5,21 @@ What the geometry tells is computed once per scene: the lowest modes Phi of the 
 i and in each link (i, j) of neighbouring units. What the geometry does not tell is material. One decoder, shared by all
 scenes, reads it from each unit's density rho_i and attributes a_i,
 
-    s_i, d_i = decode(a_i)     p_ij, q_ij, g_ij = decode(a_i, a_j, distance)
+    s_i, b_i, d_i = decode(a_i)     p_ij, q_ij, g_ij = decode(a_i, a_j, distance)
 
 and with them, in the modes' coordinates z,
 
-    K = k (sum_i e^{s_i} K_i + sum_ij e^{p_ij} S_ij)     stiffness, S_ij: a link resists being stretched
-    M = sum_i rho_i M_i + sum_ij e^{q_ij} T_ij           inertia, T_ij: matter between units moves with them
-    D = c_0 sum_i e^{d_i} rho_i M_i + c_1 K              damping
+    K = k (sum_i (e^{s_i} K_i + e^{b_i} B_i) + sum_ij e^{p_ij} S_ij)   stiffness: shear, volume, stretch of links
+    M = sum_i rho_i M_i + sum_ij e^{q_ij} T_ij                         inertia: of the units, and of matter between them
+    D = c_0 sum_i e^{d_i} rho_i M_i + c_1 K                            damping
 
 k, c_0 and c_1 are one trained number each for all scenes. One frame is one step of the trapezoidal rule,
 
     (M + K/4 + D/2) (z_{t+1} - 2 z_t + z_{t-1}) = -K z_t - D (z_t - z_{t-1})     [frame units]
 
 K, M and D are positive semi-definite whatever is decoded, so this never creates energy, and without damping keeps it.
-Links that turn or stretch by more than a little pull otherwise than S_ij says: the share sigmoid(g_ij) of the
-difference is added to the force, taken at z_t and held below half of what K pulls. It has a potential, too. Distances
+Links that turn or stretch by more than a little pull otherwise than S_ij says: the difference, for springs of stiffness
+e^{g_ij}, is added to the force, taken at z_t and held below half of what K pulls. It has a potential, too. Distances
 are the only geometry that the decoder reads: it means the same on every body, however it lies.
 """
 
@@ -47,6 +47,8 @@ from gausim.nn.mlp import mlp
 LARGEST_LOG = 2.5
 # Stiffness and inertia of all links together, as shares of the body's own (by trace), before anything is learned.
 LINK_SHARE = 0.3
+# Stiffness of the links beyond the linear, as the same share, before anything is learned.
+LINK_BEYOND = 0.15
 # Units among which a cell's energy and mass are divided, by inverse squared distance.
 CELL_UNITS = 4
 # Step of the units per frame that one unit of an initial velocity's coordinate means, at the lowest mode [diagonals].
@@ -65,7 +67,7 @@ class BodyModes(nn.Module):
         gradients: of the modes (N, 3, 3, M) [1 / scene units].
         projection: (N, 3, M), z = sum_n projection_n u_n.
         values: eigenvalues of the homogeneous body (M,), the first is 1.
-        stiffness: K_i (N, M, M), their sum is the homogeneous body's.
+        stiffness: K_i of shear and B_i of volume (2, N, M, M), their sum is the homogeneous body's.
         inertia: root of M_i, (N, 3, M).
         links: pairs of units (2, E).
         stretch: root of S_ij, (E, M).
@@ -131,27 +133,28 @@ def _links(rest: np.ndarray, pinned: np.ndarray, count: int) -> np.ndarray:
 
 
 def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np.ndarray:
-    """K_i (N, M, M): elastic energy of the cells near each unit, between modes, pins included."""
+    """K_i and B_i (2, N, M, M): energy of shear and of volume of the cells near each unit, pins included."""
     _, slope = body.at(body.centres)
     strain = (slope + slope.transpose(0, 2, 1, 3)) / 2
     trace = np.trace(strain, axis1=1, axis2=2)
     first, second = POISSON / ((1 + POISSON) * (1 - 2 * POISSON)), 1 / (2 * (1 + POISSON))
     count = slope.shape[-1]
-    # Ten numbers per cell and mode whose squares are twice the energy: nine strains and their trace.
-    roots = np.concatenate((math.sqrt(2 * second) * strain.reshape(-1, 9, count), math.sqrt(first) * trace[:, None]), 1)
-    roots *= np.sqrt(body.weights)[:, None, None]
+    # Numbers per cell and mode whose squares are twice the energy: nine of shear, one of volume.
+    parts = math.sqrt(2 * second) * strain.reshape(-1, 9, count), math.sqrt(first) * trace[:, None]
     near, units = cKDTree(rest).query(body.centres, k=min(CELL_UNITS, len(rest)))
     near, units = near.reshape(len(body.centres), -1), units.reshape(len(body.centres), -1)
     share = 1 / (near**2 + 1e-12)
     share /= share.sum(1, keepdims=True)
-    found = np.zeros((len(rest), count, count))
+    found = np.zeros((2, len(rest), count, count))
     for unit in range(len(rest)):
         cells, place = np.nonzero(units == unit)
-        part = (roots[cells] * np.sqrt(share[cells, place])[:, None, None]).reshape(-1, count)
-        found[unit] = part.T @ part
-    missing = np.diag(body.values) - found.sum(0)  # the springs that hold the pins, and rounding
+        size = np.sqrt(share[cells, place] * body.weights[cells])[:, None, None]
+        for total, roots in zip(found, parts, strict=True):
+            part = (roots[cells] * size).reshape(-1, count)
+            total[unit] = part.T @ part
+    missing = np.diag(body.values) - found.sum((0, 1))  # the springs that hold the pins, and rounding
     free = ~pinned
-    found[free] += missing / free.sum()
+    found[0, free] += missing / free.sum()
     return found
 
 
@@ -163,7 +166,7 @@ class Matrices:
         stiffness: K (M, M).
         inertia: M (M, M).
         damping: D (M, M).
-        links: factor on every link's stiffness as a spring, times the share of it that acts beyond the linear (E,).
+        links: factor on every link's stiffness as a spring beyond the linear (E,).
     """
 
     stiffness: Float[Tensor, "M M"]
@@ -217,7 +220,7 @@ class MaterialTemplate(Template):
         )
         self.start = 2 * math.log(2 * math.pi / period), math.log(damping)
         self.stiffness, self.damping = nn.Parameter(torch.zeros(())), nn.Parameter(torch.zeros(2))
-        self.unit_decoder = mlp((attributes, hidden, 2))
+        self.unit_decoder = mlp((attributes, hidden, 3))
         self.link_decoder = mlp((3 * attributes + 1, hidden, 3))
 
     def body(self, scene_id: int) -> BodyModes:
@@ -228,8 +231,8 @@ class MaterialTemplate(Template):
 
     def decode(
         self, body: BodyModes, attributes: Float[Tensor, "N A"]
-    ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "E 3"]]:
-        """Logarithms of stiffness and drag of every unit; s, q and g of every link (see the module's text).
+    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "E 3"]]:
+        """s, b and d of every unit; p, q and g of every link (see the module's text).
 
         Without attributes every unit is the same: what the decoder says of zero attributes is taken off.
         """
@@ -254,13 +257,13 @@ class MaterialTemplate(Template):
         k = (self.start[0] + GAIN * self.stiffness).exp() * frame**2
         drag, viscosity = (self.start[1] + GAIN * self.damping).exp()
         stretch = LINK_SHARE * links[:, :1].exp() * body.stretch
-        stiffness = torch.einsum("n,nlm->lm", units[:, 0].exp(), body.stiffness) + body.stretch.mT @ stretch
+        stiffness = torch.einsum("np,pnlm->lm", units[:, :2].exp(), body.stiffness) + body.stretch.mT @ stretch
         density = _saturated(log_density).exp()[:, None, None]
         root, heavy = body.inertia.flatten(0, 1), (density * body.inertia).flatten(0, 1)
         between = LINK_SHARE * links[:, 1, None, None].exp() * body.between
         inertia = root.mT @ heavy + body.between.flatten(0, 1).mT @ between.flatten(0, 1)
-        dragged = root.mT @ (units[:, 1, None, None].exp() * density * body.inertia).flatten(0, 1)
-        springs = k * LINK_SHARE * links[:, 0].exp() * links[:, 2].sigmoid()
+        dragged = root.mT @ (units[:, 2, None, None].exp() * density * body.inertia).flatten(0, 1)
+        springs = k * LINK_BEYOND * links[:, 2].exp()
         return Matrices(k * stiffness, inertia, drag * frame * dragged + viscosity / frame * k * stiffness, springs)
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
