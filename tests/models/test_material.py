@@ -230,3 +230,14 @@ def test_millimetres_move_like_metres(make_scene, make_model, make_state) -> Non
     there = other.step(other.batch((0,)), SimState(1000 * state.positions, 1000 * state.previous))
     torch.testing.assert_close(there.positions / 1000, step.positions, atol=1e-7, rtol=0)
     torch.testing.assert_close(there.momentum, step.momentum, rtol=1e-4, atol=1e-12)
+
+
+def test_scenes_share_everything_but_densities_and_attributes(make_scene, make_model) -> None:
+    model = make_model([make_scene(90), make_scene(80, seed=3)], **NEURAL)
+    names = [n for n, _ in model.named_parameters()]
+    shared = tuple(f"{name}." for name in model.shared())
+    own = [n for n in names if n.startswith(model.own(0) + model.own(1))]
+    assert sorted(own) == ["attributes.0", "attributes.1", "log_density.0", "log_density.1"]
+    assert all(n.startswith(shared) for n in names if n not in own)
+    model.freeze()
+    assert sorted(n for n, p in model.named_parameters() if p.requires_grad) == sorted(own)
