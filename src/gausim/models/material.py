@@ -19,8 +19,10 @@ k, c_0 and c_1 are one trained number each for all scenes. One frame is one step
 
 K, M and D are positive semi-definite whatever is decoded, so this never creates energy, and without damping keeps it.
 Links that turn or stretch by more than a little pull otherwise than S_ij says: the difference, for springs of stiffness
-e^{g_ij}, is added to the force, taken at z_t and held below half of what K pulls. It has a potential, too. Distances
-are the only geometry that the decoder reads: it means the same on every body, however it lies.
+e^{g_ij}, is added to the force, taken at z_t and held below half of what K pulls. It has a potential, too. A force that
+is taken at z_t makes vibrations grow that are too fast for the frames, so it is solved for once more, with S =
+(M + K/4 + D/2)^-1: by S M S instead of S, which is S for slow motion and fades out where K/4 is large against M.
+Distances are the only geometry that the decoder reads: it means the same on every body, however it lies.
 """
 
 from __future__ import annotations
@@ -297,7 +299,7 @@ class PreparedMaterial:
         # Positions and gradients of a unit side by side: one product gives both.
         self.motions = torch.cat((body.modes, body.gradients.flatten(1, 2)), 1).flatten(0, 1)
         solve = torch.linalg.inv(matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2)
-        self.solve, self.pull = solve.mT, (solve @ matrices.stiffness).mT
+        self.pull, self.explicit = (solve @ matrices.stiffness).mT, (solve @ matrices.inertia @ solve).mT
         drag = (solve @ matrices.damping).mT
         identity = torch.eye(len(solve), dtype=solve.dtype, device=solve.device)
         self.transition = torch.cat((2 * identity - self.pull - drag, drag - identity))
@@ -308,8 +310,8 @@ class PreparedMaterial:
         return z, previous
 
     def beyond(self, z: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-        """What links add to the next coordinates beyond the linear."""
-        return held_below(self.springs(z, self.matrices.links) @ self.solve, z @ self.pull)
+        """What links add to the next coordinates beyond the linear, through S M S (see the module's text)."""
+        return held_below(self.springs(z, self.matrices.links) @ self.explicit, z @ self.pull)
 
     def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
         """Displacement and its gradient, row by row, of every unit at t + 1."""
