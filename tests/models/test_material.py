@@ -243,3 +243,26 @@ def test_scenes_share_everything_but_densities_and_attributes(make_scene, make_m
     assert all(n.startswith(shared) for n in names if n not in own)
     model.freeze()
     assert sorted(n for n, p in model.named_parameters() if p.requires_grad) == sorted(own)
+
+
+@torch.no_grad()
+def test_stiff_bodies_do_not_tremble_ever_more_after_a_large_displacement(neural) -> None:
+    """Modes far too fast for the frames, and links that turn far: explicit forces at full size make them grow."""
+    model = neural(lever_head=0.0, output_scale=0.0)
+    model.template.stiffness.fill_(0.35)  # thirty times as stiff
+    batch, scene = model.batch((0,)), model.scenes[0]
+    prepared = model.prepare(batch)
+    ((part, _, _),) = prepared.template.parts
+    moved = model.smooth_motions(0).kernels @ torch.linspace(1, 0.5, 9, dtype=torch.float64)
+    matrices = part.matrices
+    solve = torch.linalg.inv(matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2)
+    sizes = {}
+    for name, explicit in (("fades", part.explicit), ("full", solve.mT)):
+        part.explicit = explicit
+        part.pull = matrices.stiffness @ explicit
+        state = SimState(scene.means + moved, scene.means + moved)
+        for _ in range(80):
+            step = model.step(batch, state, prepared=prepared)
+            state = SimState(step.positions, state.positions)
+        sizes[name] = float((state.positions - scene.means).norm() / moved.norm())
+    assert sizes["fades"] < 0.5 and sizes["full"] > 100, sizes

@@ -299,10 +299,11 @@ class PreparedMaterial:
         # Positions and gradients of a unit side by side: one product gives both.
         self.motions = torch.cat((body.modes, body.gradients.flatten(1, 2)), 1).flatten(0, 1)
         solve = torch.linalg.inv(matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2)
-        self.pull, self.explicit = (solve @ matrices.stiffness).mT, (solve @ matrices.inertia @ solve).mT
+        slow = solve @ matrices.inertia @ solve
+        self.explicit, self.pull = slow.mT, (slow @ matrices.stiffness).mT
         drag = (solve @ matrices.damping).mT
         identity = torch.eye(len(solve), dtype=solve.dtype, device=solve.device)
-        self.transition = torch.cat((2 * identity - self.pull - drag, drag - identity))
+        self.transition = torch.cat((2 * identity - (solve @ matrices.stiffness).mT - drag, drag - identity))
 
     def _coordinates(self, now: Tensor, before: Tensor) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M"]]:
         """z_t and z_{t-1}."""
