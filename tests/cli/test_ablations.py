@@ -51,7 +51,7 @@ def random_step(module: GausSimModule):
         for name, p in simulator.network.named_parameters():
             if "decoder" in name:  # it may start at zero, and layers of random weights hand little on
                 p.add_(torch.randn(p.shape, generator=generator))
-    simulator.output_scale, simulator.lever_head = 1.0, float(simulator.lever_head > 0)
+    simulator.output_scale, simulator.lever_head = 1.0, 0.3 * (simulator.lever_head > 0)
     batch = simulator.batch([0])
     shift = 0.05 * torch.randn(2, *batch.rest.shape, generator=generator)
     return simulator.step(batch, SimState(batch.rest + shift[0], batch.rest + shift[1]))

@@ -80,8 +80,8 @@ def test_objects_of_different_stores_share_the_network_and_nothing_else(joint: d
         ("toy", 24.0, 2, 2), ("other", 50.0, 3, 2),
     ]  # fmt: skip
     simulator, states = run.module.model, run.module.initial_states
-    assert [tuple(p.shape) for p in simulator.attributes] == [(36, 4), (63, 4)]
-    assert simulator.fps == (24.0, 50.0) and len(simulator.template.scenes) == 2
+    assert [tuple(p.shape) for p in simulator.attributes] == [(36, 8), (63, 8)]
+    assert simulator.fps == (24.0, 50.0) and len(simulator.template.bodies) == 2
     assert len(list(states.parameters())) == 5 and states.scene_of_sequence == (0, 0, 1, 1, 1)
     for own in (*simulator.log_density, *simulator.attributes, *states.parameters()):
         assert bool(own.detach().any())  # each has learned
