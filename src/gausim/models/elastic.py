@@ -26,7 +26,7 @@ from gausim.models.batch import SceneBatch
 from gausim.models.hierarchy import Hierarchy
 from gausim.models.solid import solid_body
 from gausim.models.springs import Springs, held_below, mode_gradients, unit_springs, vibration_modes
-from gausim.models.template import PreparedScenes, Template
+from gausim.models.template import PreparedScenes, Template, modal_coordinates
 from gausim.models.units import FixedUnits
 from gausim.nn.mlp import mlp, zero_output
 
@@ -120,7 +120,7 @@ class ElasticScene(nn.Module):
         v is the step and m the middle of both, as the trapezoidal rule has it: without damping and springs the
         template keeps this number exactly. G is the root of the inertia, the identity where it is not trained.
         """
-        z, previous = (torch.cat((now, before)).flatten(1) @ self.projection.flatten(0, 1)).chunk(2)
+        z, previous = modal_coordinates(now, before, self.projection.flatten(0, 1))
         root, mixing = (x.detach() for x in self.roots())
         step, middle = z - previous, (z + previous) / 2
         heavy = torch.stack((step, middle))
@@ -189,7 +189,7 @@ class PreparedElastic:
 
     def coordinates(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S M"]:
         """Modal coordinates at t + 1 from the displacements at t and t - 1 of S sequences."""
-        z, previous = (torch.cat((now, before)).flatten(1) @ self.projection).chunk(2)
+        z, previous = modal_coordinates(now, before, self.projection)
         parts = [z, previous]
         if self.force is not None:
             parts.append(self.force(torch.cat((z, z - previous), -1) / self.scene.scale) - self.still)

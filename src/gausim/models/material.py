@@ -41,7 +41,7 @@ from gausim.models.batch import SceneBatch
 from gausim.models.hierarchy import Hierarchy
 from gausim.models.solid import POISSON, SolidBody, solid_body
 from gausim.models.springs import Springs, held_below, neighbour_pairs
-from gausim.models.template import PreparedScenes, Template
+from gausim.models.template import PreparedScenes, Template, modal_coordinates
 from gausim.models.units import FixedUnits
 from gausim.nn.mlp import mlp
 
@@ -305,18 +305,13 @@ class PreparedMaterial:
         identity = torch.eye(len(solve), dtype=solve.dtype, device=solve.device)
         self.transition = torch.cat((2 * identity - (solve @ matrices.stiffness).mT - drag, drag - identity))
 
-    def _coordinates(self, now: Tensor, before: Tensor) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M"]]:
-        """z_t and z_{t-1}."""
-        z, previous = (torch.cat((now, before)).flatten(1) @ self.projection).chunk(2)
-        return z, previous
-
     def beyond(self, z: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
         """What links add to the next coordinates beyond the linear, through S M S (see the module's text)."""
         return held_below(self.springs(z, self.matrices.links) @ self.explicit, z @ self.pull)
 
     def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
         """Displacement and its gradient, row by row, of every unit at t + 1."""
-        z, previous = self._coordinates(now, before)
+        z, previous = modal_coordinates(now, before, self.projection)
         after = torch.cat((z, previous), -1) @ self.transition + self.beyond(z)
         return (after @ self.motions.mT).view(*now.shape[:2], 12)
 
@@ -325,7 +320,7 @@ class PreparedMaterial:
 
         Without damping and links beyond the linear the template keeps this number exactly.
         """
-        z, previous = self._coordinates(now, before)
+        z, previous = modal_coordinates(now, before, self.projection)
         step, middle = z - previous, (z + previous) / 2
         inertia, stiffness = self.matrices.inertia.detach(), self.matrices.stiffness.detach()
         energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)

@@ -89,6 +89,14 @@ class Template(nn.Module, ABC):
         return None
 
 
+def modal_coordinates(
+    now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"], projection: Float[Tensor, "D M"]
+) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M"]]:
+    """z_t and z_{t-1} of the displacements of S sequences; ``projection`` has a row per unit and axis."""
+    z, previous = (torch.cat((now, before)).flatten(1) @ projection).chunk(2)
+    return z, previous
+
+
 class PreparedScene(Protocol):
     """The template of one scene while its parameters do not change, from the displacements of S sequences."""
 
