@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -73,7 +74,8 @@ def test_matrices_are_sums_over_units_and_links(hierarchy) -> None:
         inertia += rho[i] * own
         drag += rho[i] * units[i, 2].exp() * own
     for e in range(body.links.shape[1]):
-        stiffness += 0.3 * links[e, 0].exp() * torch.outer(body.stretch[e], body.stretch[e])
+        stretch = 0.3 * links[e, 0].exp() + 0.15 * links[e, 2].exp()
+        stiffness += stretch * torch.outer(body.stretch[e], body.stretch[e])
         inertia += 0.3 * links[e, 1].exp() * body.between[e].mT @ body.between[e]
     torch.testing.assert_close(found.stiffness, k * stiffness)
     torch.testing.assert_close(found.inertia, inertia)
@@ -121,14 +123,27 @@ def test_links_pull_by_the_gradient_of_their_potential_and_not_at_all_to_first_o
     expected = energy(z)
     torch.testing.assert_close(links.potential(z, part.matrices.links), expected)
     (slope,) = torch.autograd.grad(expected.sum(), z)
-    matrices = part.matrices
-    solve = torch.linalg.inv(matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2).detach()
-    added = -slope @ solve @ matrices.inertia.detach() @ solve
-    bound = 0.5 * (z @ part.pull).norm(dim=-1, keepdim=True)
-    added = added * (bound / added.norm(dim=-1, keepdim=True)).clamp_max(1)
-    torch.testing.assert_close(part.beyond(z), added)
-    ratio = part.beyond(1e-4 * z).norm() / part.beyond(1e-3 * z).norm()
+    torch.testing.assert_close(links(z, part.matrices.links), -slope)
+    ratio = links(1e-4 * z).norm() / links(1e-3 * z).norm()
     assert float(ratio.detach()) == pytest.approx(0.01, rel=0.1)
+
+
+def test_the_step_is_implicit_in_the_slope_of_the_force(neural) -> None:
+    model = neural()
+    ((part, _, _),) = model.prepare(model.batch((0,))).template.parts
+    springs, matrices = model.template.body(0).springs, part.matrices
+    z, previous = 0.02 * torch.randn(2, 1, 9, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    slope = -torch.autograd.functional.jacobian(lambda q: springs(q[None], matrices.links)[0], z[0])
+    found = springs.stiffening(z, matrices.links)[0]
+    least = torch.linalg.eigvalsh(found - slope)  # compressed springs count as of their length
+    assert least.min() > -1e-9 * least.max() and least.max() > 0
+    taut = (z @ springs.modes.mT).unflatten(-1, (-1, 3)) + springs.offset
+    only = (taut.norm(dim=-1)[0] > springs.length).double() * matrices.links
+    slope = -torch.autograd.functional.jacobian(lambda q: springs(q[None], only)[0], z[0])
+    torch.testing.assert_close(springs.stiffening(z, only)[0], slope.detach())
+    force = springs(z, matrices.links) - z @ matrices.stiffness - (z - previous) @ matrices.damping
+    operator = matrices.inertia + (matrices.stiffness + found) / 4 + matrices.damping / 2
+    torch.testing.assert_close(part.change(z, previous)[0], torch.linalg.solve(operator, force[0]))
 
 
 @torch.no_grad()
@@ -254,15 +269,16 @@ def test_stiff_bodies_do_not_tremble_ever_more_after_a_large_displacement(neural
     prepared = model.prepare(batch)
     ((part, _, _),) = prepared.template.parts
     moved = model.smooth_motions(0).kernels @ torch.linspace(1, 0.5, 9, dtype=torch.float64)
-    matrices = part.matrices
-    solve = torch.linalg.inv(matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2)
-    sizes = {}
-    for name, explicit in (("fades", part.explicit), ("full", solve.mT)):
-        part.explicit = explicit
-        part.pull = matrices.stiffness @ explicit
+    sizes, implicit = {}, part.change
+
+    def explicit(z, previous):
+        with mock.patch.object(part.springs, "stiffening", return_value=torch.zeros_like(part.operator)):
+            return implicit(z, previous)
+
+    for name, part.change in (("implicit", implicit), ("explicit", explicit)):
         state = SimState(scene.means + moved, scene.means + moved)
         for _ in range(80):
             step = model.step(batch, state, prepared=prepared)
             state = SimState(step.positions, state.positions)
         sizes[name] = float((state.positions - scene.means).norm() / moved.norm())
-    assert sizes["fades"] < 0.5 and sizes["full"] > 100, sizes
+    assert sizes["implicit"] < 0.5 and not sizes["explicit"] < 100, sizes

@@ -9,20 +9,20 @@ scenes, reads it from each unit's density rho_i and attributes a_i,
 
 and with them, in the modes' coordinates z,
 
-    K = k (sum_i (e^{s_i} K_i + e^{b_i} B_i) + sum_ij e^{p_ij} S_ij)   stiffness: shear, volume, stretch of links
-    M = sum_i rho_i M_i + sum_ij e^{q_ij} T_ij                         inertia: of the units, and of matter between them
-    D = c_0 sum_i e^{d_i} rho_i M_i + c_1 K                            damping
+    K = k (sum_i (e^{s_i} K_i + e^{b_i} B_i) + sum_ij (e^{p_ij} + e^{g_ij}) S_ij)  stiffness: shear, volume, links
+    M = sum_i rho_i M_i + sum_ij e^{q_ij} T_ij             inertia: of the units, and of matter between them
+    D = c_0 sum_i e^{d_i} rho_i M_i + c_1 K                damping
 
-k, c_0 and c_1 are one trained number each for all scenes. One frame is one step of the trapezoidal rule,
+k, c_0 and c_1 are one trained number each for all scenes. The links of stiffness e^{g_ij} are springs that turn and
+stretch: f is what they pull beyond the linear, J how much stiffer they are at z_t than at rest. One frame is one step
+of the trapezoidal rule, the force linear within it,
 
-    (M + K/4 + D/2) (z_{t+1} - 2 z_t + z_{t-1}) = -K z_t - D (z_t - z_{t-1})     [frame units]
+    (M + (K + J(z_t))/4 + D/2) (z_{t+1} - 2 z_t + z_{t-1}) = -K z_t - D (z_t - z_{t-1}) + f(z_t)     [frame units]
 
-K, M and D are positive semi-definite whatever is decoded, so this never creates energy, and without damping keeps it.
-Links that turn or stretch by more than a little pull otherwise than S_ij says: the difference, for springs of stiffness
-e^{g_ij}, is added to the force, taken at z_t and held below half of what K pulls. It has a potential, too. A force that
-is taken at z_t makes vibrations grow that are too fast for the frames, so it is solved for once more, with S =
-(M + K/4 + D/2)^-1: by S M S instead of S, which is S for slow motion and fades out where K/4 is large against M.
-Distances are the only geometry that the decoder reads: it means the same on every body, however it lies.
+K, K + J, M and D are positive semi-definite whatever is decoded. Without f this never creates energy, and without
+damping keeps it; f has a potential, too, and a step that is implicit in its slope does not make vibrations grow that
+are too fast for the frames. Distances are the only geometry that the decoder reads: it means the same on every body,
+however it lies.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from torch import Tensor, nn
 from gausim.models.batch import SceneBatch
 from gausim.models.hierarchy import Hierarchy
 from gausim.models.solid import POISSON, SolidBody, solid_body
-from gausim.models.springs import Springs, held_below, neighbour_pairs
+from gausim.models.springs import Springs, neighbour_pairs
 from gausim.models.template import PreparedScenes, Template, modal_coordinates
 from gausim.models.units import FixedUnits
 from gausim.nn.mlp import mlp
@@ -258,15 +258,16 @@ class MaterialTemplate(Template):
         units, links = self.decode(body, attributes)
         k = (self.start[0] + GAIN * self.stiffness).exp() * frame**2
         drag, viscosity = (self.start[1] + GAIN * self.damping).exp()
-        stretch = LINK_SHARE * links[:, :1].exp() * body.stretch
+        beyond = LINK_BEYOND * links[:, 2].exp()
+        stretch = (LINK_SHARE * links[:, 0].exp() + beyond)[:, None] * body.stretch
         stiffness = torch.einsum("np,pnlm->lm", units[:, :2].exp(), body.stiffness) + body.stretch.mT @ stretch
         density = _saturated(log_density).exp()[:, None, None]
         root, heavy = body.inertia.flatten(0, 1), (density * body.inertia).flatten(0, 1)
         between = LINK_SHARE * links[:, 1, None, None].exp() * body.between
         inertia = root.mT @ heavy + body.between.flatten(0, 1).mT @ between.flatten(0, 1)
         dragged = root.mT @ (units[:, 2, None, None].exp() * density * body.inertia).flatten(0, 1)
-        springs = k * LINK_BEYOND * links[:, 2].exp()
-        return Matrices(k * stiffness, inertia, drag * frame * dragged + viscosity / frame * k * stiffness, springs)
+        damping = drag * frame * dragged + viscosity / frame * k * stiffness
+        return Matrices(k * stiffness, inertia, damping, k * beyond)
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
         """The template with its matrices computed."""
@@ -298,21 +299,19 @@ class PreparedMaterial:
         self.projection = body.projection.flatten(0, 1)
         # Positions and gradients of a unit side by side: one product gives both.
         self.motions = torch.cat((body.modes, body.gradients.flatten(1, 2)), 1).flatten(0, 1)
-        solve = torch.linalg.inv(matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2)
-        slow = solve @ matrices.inertia @ solve
-        self.explicit, self.pull = slow.mT, (slow @ matrices.stiffness).mT
-        drag = (solve @ matrices.damping).mT
-        identity = torch.eye(len(solve), dtype=solve.dtype, device=solve.device)
-        self.transition = torch.cat((2 * identity - (solve @ matrices.stiffness).mT - drag, drag - identity))
+        self.operator = matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2
 
-    def beyond(self, z: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-        """What links add to the next coordinates beyond the linear, through S M S (see the module's text)."""
-        return held_below(self.springs(z, self.matrices.links) @ self.explicit, z @ self.pull)
+    def change(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+        """z_{t+1} - 2 z_t + z_{t-1} (see the module's text)."""
+        links = self.matrices.links
+        force = self.springs(z, links) - z @ self.matrices.stiffness - (z - previous) @ self.matrices.damping
+        operator = self.operator + self.springs.stiffening(z, links) / 4
+        return torch.linalg.solve(operator, force[..., None])[..., 0]
 
     def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
         """Displacement and its gradient, row by row, of every unit at t + 1."""
         z, previous = modal_coordinates(now, before, self.projection)
-        after = torch.cat((z, previous), -1) @ self.transition + self.beyond(z)
+        after = 2 * z - previous + self.change(z, previous)
         return (after @ self.motions.mT).view(*now.shape[:2], 12)
 
     def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:

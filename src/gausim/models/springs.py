@@ -120,6 +120,22 @@ class Springs(nn.Module):
         beyond = (factor * self.stiffness)[:, None] * beyond
         return -(beyond.flatten(-2) @ self.modes)
 
+    def stiffening(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, "S M M"]:
+        """How much stiffer springs are at ``z`` than at rest: change of the second derivative of their energy.
+
+        A spring in direction n of length |d| has (1 - t) n n^T + t I for n n^T at rest, t = 1 - |d_0| / |d|. Compressed
+        springs (t < 0) buckle; they count as t = 0, so that with what they have at rest it is positive semi-definite.
+        Gradients go to ``factor`` alone.
+        """
+        change, _, _, now, stretch = self._stretched(z.detach())
+        towards, rest = (change + self.offset) / now[..., None], self.offset / self.length[:, None]
+        share = (stretch / now).clamp_min(0)[..., None, None]
+        blocks = (1 - share) * towards[..., :, None] * towards[..., None, :] - rest[:, :, None] * rest[:, None, :]
+        blocks = blocks + share * torch.eye(3, dtype=z.dtype, device=z.device)
+        modes = self.modes.unflatten(0, (-1, 3))
+        turned = ((factor * self.stiffness)[:, None, None] * blocks) @ modes
+        return self.modes.mT @ turned.flatten(-3, -2)
+
     def potential(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, " S"]:
         """Energy of which :meth:`forward` is minus the gradient."""
         _, squared, along, _, stretch = self._stretched(z)
