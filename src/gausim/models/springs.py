@@ -125,9 +125,8 @@ class Springs(nn.Module):
 
         A spring in direction n of length |d| has (1 - t) n n^T + t I for n n^T at rest, t = 1 - |d_0| / |d|. Compressed
         springs (t < 0) buckle; they count as t = 0, so that with what they have at rest it is positive semi-definite.
-        Gradients go to ``factor`` alone.
         """
-        change, _, _, now, stretch = self._stretched(z.detach())
+        change, _, _, now, stretch = self._stretched(z)
         towards, rest = (change + self.offset) / now[..., None], self.offset / self.length[:, None]
         share = (stretch / now).clamp_min(0)[..., None, None]
         blocks = (1 - share) * towards[..., :, None] * towards[..., None, :] - rest[:, :, None] * rest[:, None, :]
