@@ -13,7 +13,7 @@ import torch
 from gausim.core import SimState
 from gausim.models.frames import body_axes
 from gausim.models.hierarchy import build_hierarchy
-from gausim.models.material import MaterialTemplate
+from gausim.models.material import DAMPING_GAIN, MaterialTemplate
 from gausim.models.solid import solid_body
 
 SETTINGS = {"modes": 9, "spacing": 0.2, "links": 4, "hidden": 8}
@@ -153,7 +153,7 @@ def test_the_template_keeps_its_energy_without_damping_and_loses_it_with_it(neur
     body = model.template.body(0)
     start = model.smooth_motions(0).kernels @ torch.linspace(1, 0.2, 9, dtype=torch.float64)
     for damping, low, high in ((-40.0, 1 - 1e-4, 1 + 1e-4), (0.0, 0.0, 0.5)):
-        model.template.damping.fill_(damping / 10)
+        model.template.damping.fill_(damping / DAMPING_GAIN)
         prepared = model.prepare(batch)
         ((part, _, _),) = prepared.template.parts  # without links beyond the linear, which are taken explicitly
         part.matrices = replace(part.matrices, links=torch.zeros_like(part.matrices.links))

@@ -55,8 +55,9 @@ LINK_BEYOND = 0.15
 CELL_UNITS = 4
 # Step of the units per frame that one unit of an initial velocity's coordinate means, at the lowest mode [diagonals].
 AMPLITUDE = 0.05
-# The three numbers of all scenes may move so much faster than the decoders' weights; one learning rate serves both.
-GAIN = 10.0
+# The three numbers of all scenes move so much faster than the decoders' weights; one learning rate serves both. Damping
+# is slower: while a body's periods are not learned yet, motion that dies away fits best, and it is slow to come back.
+GAIN, DAMPING_GAIN = 10.0, 2.0
 # Frames per second at which k and the dampings are stated.
 REFERENCE_FPS = 24.0
 
@@ -257,7 +258,7 @@ class MaterialTemplate(Template):
         body, frame = self.body(scene_id), dt * REFERENCE_FPS
         units, links = self.decode(body, attributes)
         k = (self.start[0] + GAIN * self.stiffness).exp() * frame**2
-        drag, viscosity = (self.start[1] + GAIN * self.damping).exp()
+        drag, viscosity = (self.start[1] + DAMPING_GAIN * self.damping).exp()
         beyond = LINK_BEYOND * links[:, 2].exp()
         stretch = (LINK_SHARE * links[:, 0].exp() + beyond)[:, None] * body.stretch
         stiffness = torch.einsum("np,pnlm->lm", units[:, :2].exp(), body.stiffness) + body.stretch.mT @ stretch
