@@ -155,7 +155,7 @@ def test_the_template_keeps_its_energy_without_damping_and_loses_it_with_it(neur
     for damping, low, high in ((-40.0, 1 - 1e-4, 1 + 1e-4), (0.0, 0.0, 0.5)):
         model.template.damping.fill_(damping / DAMPING_GAIN)
         prepared = model.prepare(batch)
-        ((part, _, _),) = prepared.template.parts  # without links beyond the linear, which are taken explicitly
+        ((part, _, _),) = prepared.template.parts  # without links beyond the linear: only K is kept exactly
         part.matrices = replace(part.matrices, links=torch.zeros_like(part.matrices.links))
         state = SimState(scene.means, scene.means - start)
         first = float(model.energy(batch, state, prepared))

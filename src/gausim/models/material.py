@@ -49,7 +49,7 @@ from gausim.nn.mlp import mlp
 LARGEST_LOG = 2.5
 # Stiffness and inertia of all links together, as shares of the body's own (by trace), before anything is learned.
 LINK_SHARE = 0.3
-# Stiffness of the links beyond the linear, as the same share, before anything is learned.
+# Stiffness of the links that are springs, their linear part in K and the rest in f and J, as the same share.
 LINK_BEYOND = 0.15
 # Units among which a cell's energy and mass are divided, by inverse squared distance.
 CELL_UNITS = 4
