@@ -14,7 +14,6 @@ import pytest
 import torch
 import yaml
 
-from data_prep.lpips_weights import convert
 from gausim.cli.main import main
 from gausim.core import GausSimError
 from gausim.data.objects import ObjectData
@@ -25,6 +24,7 @@ from gausim.io.ply import load_masks, load_scene
 from gausim.io.trajectory import load_trajectory
 from gausim.io.transforms import read_json, read_transforms
 from gausim.metrics import LPIPS
+from gausim.metrics.lpips_weights import convert
 from gausim.report.curves import load_curves
 from gausim.report.pictures import load_pictures
 from gausim.report.summary import load_summary
@@ -47,6 +47,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "trajectory": ("trajectory.safetensors", load_trajectory),
     "lpips": ("lpips.safetensors", LPIPS),
     "lpips, jax": ("alexnet.ckpt", convert),
+    "lpips, npz": ("w.npz", convert),
     "lpips, torchvision": ("alexnet.pth", lambda path: convert(path, path)),
     "lpips, wheel": ("lpips.whl", lambda path: convert(path, path)),
 }

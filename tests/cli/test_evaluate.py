@@ -44,10 +44,12 @@ def run(tmp_path, monkeypatch):
     return loaded
 
 
-def test_whole_evaluation(run, capsys):
+def test_whole_evaluation(run, capsys, monkeypatch):
+    monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(run.run_dir / "none"))
     assert evaluate.main([str(run.run_dir)]) == 0
     captured = capsys.readouterr()
     assert "views never trained on" in captured.out and "not finished" not in captured.err
+    assert "`gausim prepare lpips` gets them" in captured.out
     folder = run.run_dir / "evaluation"
     names = {p.name for p in folder.iterdir()}
     assert names == {"metrics.json", "metrics.npz", "pictures.npz", "table.md", "errors_toy.png", "motion_toy.png"}

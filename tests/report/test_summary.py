@@ -148,3 +148,10 @@ def test_tables_hold_the_numbers(tmp_path):
     assert LEGEND in text and "name exp/seed_0, epoch 3" in text and "(0.30, 0.00, 0.40) | 0.50 | 0.90" in text
     for table in tables:
         assert len({len(row) for row in [table.head, *table.rows]}) == 1
+
+
+def test_tables_without_lpips_say_how_to_get_it(tmp_path):
+    lacking = write_summary(tmp_path / "metrics.json", [curves()], {})
+    assert "gausim prepare lpips" not in markdown(lacking)  # an old evaluation, which does not say why
+    lacking["objects"]["toy"]["absent"] = {"lpips": "no weights"}
+    assert "`gausim prepare lpips` gets them; then evaluate again." in markdown(lacking)

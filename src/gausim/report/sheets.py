@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from gausim.metrics.lpips import HOW_TO_GET_WEIGHTS, NO_WEIGHTS
+from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.report import paper
 from gausim.report.curves import ERROR_3D
 from gausim.report.runs import RunRecord
@@ -165,7 +165,7 @@ def _caption(metric: str, views: str, info: dict[str, Any], lines: Sequence[Line
     if any(line.kind == PAPER for line in lines):
         parts.append("Grey: the paper's own figures, of its own recordings, cameras and image sizes.")
     if metric == "lpips" and any(NO_WEIGHTS in e.text for line in lines for e in line.entries):
-        parts.append(f"No weights: `{HOW_TO_GET_WEIGHTS}` gets them; then evaluate again.")
+        parts.append(NO_LPIPS)
     if any(e.text == NOT_MEASURED for line in lines for e in line.entries):
         parts.append(OLD_EVALUATION)
     return " ".join(parts)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.report.summary import MOTION_ENERGY
 
 SPLIT_TITLES = {"seen": "seen", "unseen": "unseen", "unseen_near": "unseen, first", "unseen_all": "unseen, all"}
@@ -101,6 +102,13 @@ def footnotes(entry: dict[str, Any], method: str) -> list[str]:
     return [NO_FORESIGHT, *sentences] if own.get("extrapolates") is False else sentences
 
 
+def gaps(summary: dict[str, Any]) -> list[str]:
+    """What no table of an evaluation has, and how to get it: sentences."""
+    absent = [entry.get("absent") for entry in summary["objects"].values()]
+    lacks_lpips = any(isinstance(a, dict) and a.get("lpips") == NO_WEIGHTS for a in absent)
+    return [NO_LPIPS] if lacks_lpips else []
+
+
 def markdown_table(table: Table) -> str:
     """One table as GitHub Markdown, its title as a heading."""
     lines = [f"### {table.title}", "", _markdown_row(table.head)]
@@ -115,7 +123,7 @@ def _markdown_row(cells: list[str]) -> str:
 def markdown(summary: dict[str, Any]) -> str:
     """The whole ``table.md`` of an evaluation."""
     run = ", ".join(f"{key} {value}" for key, value in summary["run"].items())
-    parts = ["# Evaluation", "", run, "", LEGEND, ""]
+    parts = ["# Evaluation", "", run, "", " ".join([LEGEND, *gaps(summary)]), ""]
     for name, entry in summary["objects"].items():
         count, frames = len(entry["sequences"]), max(entry["frames"])
         parts += [f"## {name}", "", f"{count} sequences of {frames} frames at {entry['fps']:g} fps.", ""]

