@@ -50,14 +50,7 @@ def main(argv: list[str]) -> int:
         DataError: images, poses or masks are unusable.
         SceneError: the pins select no kernel.
     """
-    parser = argparse.ArgumentParser(prog="gausim reconstruct", description=HELP)
-    add = parser.add_argument
-    add("root", nargs="?", metavar="ROOT", help="directory of the object (dataset.json, static/, sequences/)")
-    add("--transforms", metavar="FILE", help="transforms.json of the stills, where there is no data set")
-    add("--out", metavar="SCENE.ply", help="scene to write; default ROOT/scene.ply")
-    add_fit_options(parser)
-    add_pin_options(parser)
-    arguments = parser.parse_args(argv)
+    arguments = _parser().parse_args(argv)
     if (arguments.root is None) == (arguments.transforms is None):
         raise ConfigError("expected either ROOT (a data set's directory) or --transforms FILE, got both or neither.")
     if arguments.root is not None:
@@ -66,6 +59,17 @@ def main(argv: list[str]) -> int:
         source, default = Path(arguments.transforms), Path(arguments.transforms).parent / "scene.ply"
     print(fit_scene(source, Path(arguments.out or default), arguments).text)
     return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="gausim reconstruct", description=HELP)
+    add = parser.add_argument
+    add("root", nargs="?", metavar="ROOT", help="directory of the object (dataset.json, static/, sequences/)")
+    add("--transforms", metavar="FILE", help="transforms.json of the stills, where there is no data set")
+    add("--out", metavar="SCENE.ply", help="scene to write; default ROOT/scene.ply")
+    add_fit_options(parser)
+    add_pin_options(parser)
+    return parser
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,7 @@ def main(argv: list[str]) -> int:
     Raises:
         DataError: there is no data set at a path.
     """
-    parser = argparse.ArgumentParser(prog="gausim verify", description=f"{HELP} Exits with 1 if there are some.")
-    parser.add_argument("root", metavar="ROOT", nargs="+", type=Path, help="object directories, or folders of them")
-    parser.add_argument("--quick", action="store_true", help="headers and sizes only: no image is read or hashed")
-    parser.add_argument("--json", action="store_true", help="print an object: {DIRECTORY: [[file, fault], ...]}")
-    arguments = parser.parse_args(argv)
+    arguments = _parser().parse_args(argv)
     from gausim.data.objects import find_objects
     from gausim.data.verify import verify
 
@@ -39,3 +35,11 @@ def main(argv: list[str]) -> int:
             for fault in found:
                 print(f"  {fault.where}: {fault.what}")
     return 1 if any(faults.values()) else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="gausim verify", description=f"{HELP} Exits with 1 if there are some.")
+    parser.add_argument("root", metavar="ROOT", nargs="+", type=Path, help="object directories, or folders of them")
+    parser.add_argument("--quick", action="store_true", help="headers and sizes only: no image is read or hashed")
+    parser.add_argument("--json", action="store_true", help="print an object: {DIRECTORY: [[file, fault], ...]}")
+    return parser

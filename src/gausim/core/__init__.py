@@ -1,22 +1,28 @@
 """Types, errors and contracts that every other room builds on."""
 
-from gausim.core.camera import Cameras
+import importlib
+from typing import TYPE_CHECKING, Any
+
 from gausim.core.errors import BusyError, ConfigError, DataError, DivergenceError, GausSimError, RunError, SceneError
-from gausim.core.fitted import FittedDynamics, FittedMethod, FittedState, TakesOver
-from gausim.core.protocols import (
-    Dynamics,
-    Forces,
-    Rendered,
-    Renderer,
-    Steppable,
-    SteppedFrame,
-    Stepper,
-    roll_out,
-    trajectory_of,
-)
-from gausim.core.scene import GaussianScene
-from gausim.core.smooth import SmoothMotions
-from gausim.core.state import SimState, Trajectory
+
+# The errors alone load at once: what a command line says before it works must not wait for torch.
+if TYPE_CHECKING:
+    from gausim.core.camera import Cameras
+    from gausim.core.fitted import FittedDynamics, FittedMethod, FittedState, TakesOver
+    from gausim.core.protocols import (
+        Dynamics,
+        Forces,
+        Rendered,
+        Renderer,
+        Steppable,
+        SteppedFrame,
+        Stepper,
+        roll_out,
+        trajectory_of,
+    )
+    from gausim.core.scene import GaussianScene
+    from gausim.core.smooth import SmoothMotions
+    from gausim.core.state import SimState, Trajectory
 
 __all__ = [
     "Cameras",
@@ -45,3 +51,14 @@ __all__ = [
     "roll_out",
     "trajectory_of",
 ]
+
+_LATE = ("camera", "fitted", "protocols", "scene", "smooth", "state")
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        for module in _LATE:
+            found = importlib.import_module(f"{__name__}.{module}")
+            if name in vars(found):
+                return vars(found)[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
