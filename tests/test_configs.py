@@ -16,8 +16,9 @@ import pytest
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from gausim.cli import _config
-from gausim.cli._config import check_targets, compose, conf_dir, instantiate, run_hydra
+from gausim.cli import _conf, _config
+from gausim.cli._conf import conf_dir
+from gausim.cli._config import check_targets, compose, instantiate, run_hydra
 from gausim.core.errors import ConfigError, SceneError
 from gausim.engine.launch import Crew
 from gausim.engine.layout import Layout, LocalRanks, RanksStrategy
@@ -171,9 +172,9 @@ def test_jobs_of_a_sweep_never_share_a_directory(
 
 
 def test_a_folder_name_is_one_short_component_and_tells_texts_apart() -> None:
-    assert _config.folder_name("") == "" and _config.folder_name("a.b=1,+c=x") == "a.b=1,+c=x"
+    assert _conf.folder_name("") == "" and _conf.folder_name("a.b=1,+c=x") == "a.b=1,+c=x"
     texts = ["a/b", "a_b", "a//b", "a b", "../b", "k=" + 200 * "x", "k=" + 201 * "x"]
-    names = [_config.folder_name(text) for text in texts]
+    names = [_conf.folder_name(text) for text in texts]
     assert len(set(names)) == len(names)
     assert all("/" not in name and len(name) <= 120 for name in names)
 

@@ -21,6 +21,8 @@ def imported_by(code: str) -> set[str]:
         "from gausim.cli.main import main; assert main(['--help']) == 0",
         "from gausim.cli.main import main; assert main(['--version']) == 0",
         "from gausim.cli.main import main; assert main(['no-such-command']) == 2",
+        "from gausim.core.errors import ConfigError; from gausim.core import RunError",
+        "from gausim.cli.main import main; assert main(['config', 'complete', 'evaluate', '--']) == 0",
     ],
 )
 def test_loads_nothing_heavy(code: str) -> None:
@@ -33,8 +35,13 @@ def test_the_list_of_modules_would_show_a_heavy_import() -> None:
     assert "numpy" in imported_by("import gausim, numpy")
 
 
+def test_completing_a_configuration_loads_hydra_and_no_torch() -> None:
+    modules = imported_by("from gausim.cli.main import main; main(['config', 'complete', 'train', 'model='])")
+    assert "hydra" in modules and not modules & {"torch", "lightning", "numpy"}
+
+
 def test_core_needs_no_gpu_dashboard_or_viewer() -> None:
-    assert not imported_by("import gausim.core") & {
+    assert not imported_by("from gausim.core import GaussianScene") & {
         "lightning",
         "pytorch_lightning",
         "wandb",

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from gausim.cli._config import compose, conf_dir
+from gausim.cli._conf import conf_dir
+from gausim.cli._config import compose
 from gausim.cli._run import build
 from gausim.core import SimState
 from gausim.data.dataset import SampleKey, SequenceSample, TrainingDataset

@@ -14,7 +14,7 @@ import hydra
 import pytest
 from hydra.core.hydra_config import HydraConfig
 
-from gausim.cli import _config
+from gausim.cli import _conf
 from gausim.cli import train as command
 from gausim.core import ConfigError
 from gausim.engine.checkpoint import digest, read_checkpoint
@@ -123,7 +123,7 @@ def test_what_cannot_be_swept_is_told_before_anything_runs(
 def test_threads_are_shared_among_the_jobs_of_a_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     def threads(cores: int, *overrides: str) -> int:
         monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
-        with hydra.initialize_config_dir(str(_config.conf_dir()), version_base="1.3"):
+        with hydra.initialize_config_dir(str(_conf.conf_dir()), version_base="1.3"):
             config = hydra.compose("train", ["hydra.mode=MULTIRUN", *overrides], return_hydra_config=True)
         monkeypatch.setattr(HydraConfig.instance(), "cfg", config)
         return config.trainer.threads

@@ -3,149 +3,28 @@
 from __future__ import annotations
 
 import difflib
-import hashlib
 import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
-from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException
 from hydra.types import RunMode
-from omegaconf import MISSING, DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-import gausim
+from gausim.cli._conf import HYDRA_VERSION_BASE, conf_dir
 from gausim.cli._targets import check_hydra, check_targets
 from gausim.core.errors import ConfigError, GausSimError
 
-HYDRA_VERSION_BASE = "1.3"
-LONGEST_FOLDER_NAME = 120
-
-
-@dataclass
-class SweepConfig:
-    """What the jobs of a sweep do about runs that are there already.
-
-    Attributes:
-        retry_failed: train those again that an error ended; otherwise they are left out.
-    """
-
-    retry_failed: bool = False
-
-
-@dataclass
-class RootConfig:
-    """Schema of the root keys of a training configuration: a misspelt root key fails instead of being ignored.
-
-    Attributes:
-        data: the data module: which set, views, frames and batches.
-        model: the dynamics.
-        supervision: what predictions are compared with; the images unless it names something else.
-        loss: the terms and their weights.
-        optimizer: the optimiser (partial, it awaits the parameters) and its schedule.
-        render: the renderer.
-        trainer: arguments of the Lightning trainer.
-        logger: loggers by name.
-        callbacks: callbacks by name.
-        paths: where data is read and runs are written.
-        ablation: what the chosen ablation records about itself.
-        experiment: what the chosen experiment records about itself.
-        sweep: what the jobs of a sweep do about runs that are there already.
-        seed: of every random generator.
-        init_from: run whose network, with the statistics of its inputs, this one starts from; null starts anew.
-        freeze: `network` keeps that network as it is, so that only what a scene has of its own is learned; `model`
-            takes all of the simulator from that run and keeps it, so that only initial states are learned.
-        evaluate: whether the run is evaluated once it is trained (`gausim evaluate`), for reports.
-        name: of the run; its directory is `${paths.output_root}/${name}/seed_${seed}`.
-        task_name: what is being done, for logs and dashboards.
-    """
-
-    data: Any = MISSING
-    model: Any = MISSING
-    supervision: Any = None
-    loss: Any = MISSING
-    optimizer: Any = MISSING
-    render: Any = MISSING
-    trainer: Any = MISSING
-    logger: Any = None
-    callbacks: Any = None
-    paths: Any = MISSING
-    ablation: Any = None
-    experiment: Any = None
-    sweep: SweepConfig = field(default_factory=SweepConfig)
-    seed: int = 0
-    init_from: str | None = None
-    freeze: str | None = None
-    evaluate: bool = False
-    name: str = MISSING
-    task_name: str = "train"
-
-
-def folder_name(text: str) -> str:
-    """Returns a text as the name of one directory: the same if it can be, else legible, short and with a hash."""
-    plain = re.sub(r"[^\w.,=+~:-]+", "_", text)
-    if plain == text and len(text) <= LONGEST_FOLDER_NAME:
-        return text
-    return f"{plain[: LONGEST_FOLDER_NAME - 9]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
-
-
-def job_threads(most: int) -> int:
-    """Returns the threads of one job: `most`, or its share of the cores where a sweep runs several at a time."""
-    if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
-        return most
-    launcher = HydraConfig.get().launcher
-    if "cpus_per_task" in launcher:  # submitit: what the scheduler grants
-        return min(most, int(launcher.cpus_per_task or 1))
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    jobs = int(launcher.get("n_jobs") or 1)  # joblib; negative: all cores but so many
-    return min(most, max(1, cores // (jobs if jobs > 0 else max(1, cores + 1 + jobs))))
-
-
-def job_group(name: str) -> str:
-    """Returns what dashboards list a run under: NAME/ABLATION/MODEL, of which seeds and settings are variants."""
-    if not HydraConfig.initialized():
-        return name  # composed without a job; nobody has chosen anything
-    choices = HydraConfig.get().runtime.choices
-    return "/".join([name, *(str(choices.get(group) or "none") for group in ("ablation", "model"))])
-
-
-def job_name(seed: int) -> str:
-    """Returns what dashboards call a run within its group: of a sweep, its overrides and its seed."""
-    hydra_config = HydraConfig.get() if HydraConfig.initialized() else None
-    sweeps = hydra_config is not None and hydra_config.mode == RunMode.MULTIRUN
-    overrides = folder_name(hydra_config.job.override_dirname) if hydra_config is not None and sweeps else ""
-    return "/".join([*([overrides] if overrides else []), f"seed_{seed}"])
-
-
-ConfigStore.instance().store(name="base_schema", node=RootConfig, provider="gausim")
-for resolver in (folder_name, job_threads, job_group, job_name):
-    OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
-
-
-def conf_dir() -> Path:
-    """Returns the directory of the configurations: the wheel's own copy, or conf/ of the checkout.
-
-    Raises:
-        ConfigError: neither is there.
-    """
-    package = Path(gausim.__file__).resolve().parent
-    candidates = (package / "conf", package.parents[1] / "conf")
-    for candidate in candidates:
-        if candidate.is_dir():
-            return candidate
-    raise ConfigError(
-        f"expected the configurations in {candidates[0]} or {candidates[1]}, found neither. Reinstall gausim, or run "
-        "from a complete checkout."
-    )
+_UNKNOWN_KEY = r"Could not override '([^']+)'|Key '([^']+)' (?:is )?not in"
 
 
 def compose(config_name: str, overrides: Sequence[str] = ()) -> DictConfig:
@@ -163,6 +42,45 @@ def compose(config_name: str, overrides: Sequence[str] = ()) -> DictConfig:
     """
     with _readable_errors(config_name):
         return _compose(config_name, overrides)
+
+
+def compose_leniently(config_name: str, overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
+    """Composes what can be composed of the overrides, and says of every other what is wrong with it.
+
+    Args:
+        config_name: file in conf/, without its suffix.
+        overrides: as on the command line.
+
+    Returns:
+        The configuration without the wrong overrides, and a sentence for each of these.
+
+    Raises:
+        ConfigError: the file in conf/ is broken by itself.
+    """
+    try:
+        return _compose(config_name, overrides), []
+    except (HydraException, OmegaConfBaseException):
+        pass  # now one by one, groups first: they decide which keys there are
+    taken: list[str] = []
+    faults: list[str] = []
+    for override in sorted(overrides, key=lambda text: not (conf_dir() / text.lstrip("+~").split("=")[0]).is_dir()):
+        try:
+            _compose(config_name, [*taken, override])
+            taken.append(override)
+        except (HydraException, OmegaConfBaseException) as error:
+            faults.append(_fault(config_name, taken, override, error))
+    return compose(config_name, taken), faults
+
+
+def _fault(config_name: str, taken: Sequence[str], override: str, error: Exception) -> str:
+    """What is wrong with one override beside those that are right."""
+    unknown = re.search(_UNKNOWN_KEY, str(error))
+    if unknown is None:
+        why = f"{error.__cause__ or error}".partition("Config search path")[0]
+        return f"{override}: {' '.join(why.split())}"
+    key = override.lstrip("+~").split("=")[0]
+    matches = difflib.get_close_matches(key, list(_keys(_compose(config_name, taken))), n=1, cutoff=0.6)
+    return f"{key}: unknown key." + (f" Did you mean '{matches[0]}'?" if matches else "")
 
 
 def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
@@ -261,7 +179,7 @@ def _readable_errors(config_name: str) -> Iterator[None]:
 
 
 def _close_keys(config_name: str, message: str) -> str:
-    found = re.search(r"Could not override '([^']+)'|Key '([^']+)' (?:is )?not in", message)
+    found = re.search(_UNKNOWN_KEY, message)
     if found is None:
         return ""
     key = str(found.group(1) or found.group(2)).split("@")[0]

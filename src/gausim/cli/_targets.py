@@ -61,10 +61,25 @@ def check_targets(node: DictConfig | ListConfig) -> None:
     Raises:
         ConfigError: naming the key and the target.
     """
-    root = str(node._get_full_key(None) or "")
-    for key, target in _targets(OmegaConf.to_container(node, resolve=True), root):
-        if target not in ALLOWED_TARGETS and not _is_allowed(target, ALLOWED_PACKAGES, REFUSED_MODULES):
-            raise ConfigError(
+    for fault in target_faults(OmegaConf.to_container(node, resolve=True), str(node._get_full_key(None) or "")):
+        raise ConfigError(fault)
+
+
+def target_faults(config: Any, root: str = "") -> Iterator[str]:
+    """Every `_target_` of a configuration that may not be built or does not exist, in words.
+
+    Args:
+        config: plain containers, interpolations resolved.
+        root: key of the node that they are.
+    """
+    for key, target in _targets(config, root):
+        try:
+            allowed = target in ALLOWED_TARGETS or _is_allowed(target, ALLOWED_PACKAGES, REFUSED_MODULES)
+        except ConfigError as error:  # it does not exist
+            yield f"{key}: {error}"
+            continue
+        if not allowed:
+            yield (
                 f"{key}._target_: expected a class or function of {', '.join(ALLOWED_PACKAGES)} or one of "
                 f"{', '.join(ALLOWED_TARGETS)}, got {target!r}. Only these may be built from a configuration."
             )

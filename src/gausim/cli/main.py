@@ -47,6 +47,9 @@ COMMANDS: dict[str, Command] = {
     "export": Command(
         "gausim.cli.export", "Write a motion as PLY, OpenUSD, safetensors, viser, HTML, MP4 or GIF, and read it back."
     ),
+    "config": Command(
+        "gausim.cli.config", "Check a training configuration, print its JSON schema, complete it in the shell."
+    ),
     "report": Command("gausim.cli.report", "Compare runs and sweeps: one HTML page, Markdown, LaTeX and CSV."),
 }
 

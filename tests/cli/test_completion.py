@@ -1,0 +1,106 @@
+"""Completion of the command line: what is offered where, and the scripts in real shells."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gausim.cli._completion import _hydra_parser, complete
+from gausim.cli.main import COMMANDS, main
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("ev", {"evaluate"}),
+        ("--v", {"--version"}),
+        ("evaluate --vi", {"--views"}),
+        ("evaluate RUN --views ", {"all", "train", "heldout"}),
+        ("evaluate RUN --out ", set()),  # files, which the shell knows better
+        ("evaluate RUN --views train --js", {"--json"}),
+        ("nonsense ", set()),
+        ("config ", {"validate", "schema", "completion"}),
+        ("config completion ", {"bash", "zsh", "fish"}),
+        ("prepare lpips --f", {"--from"}),
+        ("train --mu", {"--multirun"}),
+        ("train model=gausim_", {"model=gausim_elastic", "model=gausim_paper"}),
+        ("train mod", {"model=", "model."}),
+        ("train model=spring_mass model.", {"model.method.", "model.plan."}),
+        ("train model=gausim model.simulator.anc", {"model.simulator.anchor="}),
+        ("train model.simulator.anc", set()),  # the default model has none
+        ("train -m ablation=none,no_mass_no_h", {"ablation=none,no_mass_no_hierarchy"}),
+        ("train trainer.progress=", {"trainer.progress=true", "trainer.progress=false"}),
+        ("train hydra/swee", {"hydra/sweeper="}),
+        ("train sed=1 model=gausim_p", {"model=gausim_paper"}),
+        ("train sed=1 model.simu", set()),  # beside what is wrong nothing composes
+        ("config validate experiment=demo_", {"experiment=demo_tiny"}),
+        ("adapt RUN --set trainer.max_e", {"trainer.max_epochs="}),
+        ("benchmark train experiment=demo_", {"experiment=demo_tiny"}),
+    ],
+)  # fmt: skip
+def test_what_may_follow(line: str, expected: set[str]) -> None:
+    assert set(complete(line.split(" "))) == expected
+
+
+def test_directories_are_completed_behind_a_key(tmp_path: Path) -> None:
+    (tmp_path / "stores").mkdir()
+    assert complete(["train", f"data.root={tmp_path}/st"]) == [f"data.root={tmp_path}/stores/"]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_offers_its_options(name: str) -> None:
+    assert "--help" in complete([name, "-"])
+    parser = getattr(importlib.import_module(COMMANDS[name].module), "_parser", _hydra_parser)()
+    named = set(re.findall(r"--[\w-]+", parser.format_usage()))
+    assert named <= set(complete([name, "--"])) and (len(named) > 1 or name in ("config", "prepare"))
+
+
+ASK = """gausim() { "$PYTHON" -m gausim.cli.main "$@"; }
+source "$1"; complete -p gausim
+COMP_LINE=$2 COMP_POINT=${#2} COMP_WORDBREAKS=$3
+_gausim 2>/dev/null; printf '%s\\n' "${COMPREPLY[@]}"
+"""
+
+
+def in_bash(tmp_path: Path, line: str, *, breaks: str = " \t\n\"'><=;|&(:") -> list[str]:
+    """COMPREPLY of a real bash at the end of a line."""
+    done = subprocess.run([sys.executable, "-m", "gausim.cli.main", "config", "completion", "bash"],
+                          capture_output=True, text=True, check=True)  # fmt: skip
+    script = tmp_path / "gausim.bash"
+    script.write_text(done.stdout)
+    told = subprocess.run(
+        ["bash", "--norc", "-c", ASK, "bash", str(script), line, breaks],
+        capture_output=True, text=True, check=True, env={**os.environ, "PYTHON": sys.executable},
+    )  # fmt: skip
+    registered, *reply = told.stdout.splitlines()
+    assert registered == "complete -o default -F _gausim gausim"
+    return [choice for choice in reply if choice]
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+def test_the_script_in_bash(tmp_path: Path) -> None:
+    assert in_bash(tmp_path, "gausim eval") == ["evaluate"]
+    assert in_bash(tmp_path, "gausim evaluate RUN --views ") == ["all", "train", "heldout"]
+    # Readline has `model` and `=` behind it already, unless = breaks no words.
+    assert in_bash(tmp_path, "gausim train model=gausim_p") == ["gausim_paper"]
+    assert in_bash(tmp_path, "gausim train model=gausim_p", breaks=" \t\n") == ["model=gausim_paper"]
+    assert in_bash(tmp_path, "gausim train trainer.max_e") == ["trainer.max_epochs="]
+    assert in_bash(tmp_path, "gausim evaluate outp") == []
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_the_scripts_of_other_shells_are_well_formed(shell: str, tmp_path: Path, capsys) -> None:
+    assert main(["config", "completion", shell]) == 0
+    script = tmp_path / f"gausim.{shell}"
+    script.write_text(capsys.readouterr().out)
+    assert "config complete" in script.read_text()
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
+    assert subprocess.run([shell, "-n", str(script)]).returncode == 0

@@ -1,0 +1,208 @@
+"""`gausim config`: what it says of wrong configurations, and a schema that knows every file of conf/."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import pkgutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from jsonschema import Draft7Validator
+from omegaconf import OmegaConf
+
+from gausim.cli import _validate
+from gausim.cli._conf import conf_dir
+from gausim.cli._config import compose
+from gausim.cli._places import GLOBAL_PACKAGE, read_places
+from gausim.cli._schema import training_schema
+from gausim.cli.main import main
+from gausim.core import ConfigError
+
+FILES = sorted(
+    path.relative_to(conf_dir()) for path in conf_dir().rglob("*/*.yaml") if "hydra" not in path.parts[-3:]
+)  # fmt: skip
+MODELS = sorted(path.stem for path in (conf_dir() / "model").glob("*.yaml"))
+
+
+@pytest.fixture(scope="module")
+def schema() -> dict[str, Any]:
+    return training_schema()
+
+
+@pytest.fixture
+def once(schema, monkeypatch):
+    """The schema is the same every time, and takes a moment to make."""
+    monkeypatch.setattr(_validate, "training_schema", lambda: schema)
+
+
+def plain(*overrides: str) -> dict[str, Any]:
+    return OmegaConf.to_container(compose("train", overrides), resolve=True)
+
+
+def violations(schema: dict[str, Any], config: Any) -> list[str]:
+    return [f"{error.json_path}: {error.message}" for error in Draft7Validator(schema).iter_errors(config)]
+
+
+def test_it_is_a_schema(schema) -> None:
+    Draft7Validator.check_schema(schema)
+    assert json.loads(json.dumps(schema)) == schema
+
+
+@pytest.mark.parametrize("name", FILES, ids=str)
+def test_every_file_of_conf_fits_the_schema(name: Path, schema) -> None:
+    text = (conf_dir() / name).read_text()
+    config = yaml.safe_load(text)
+    assert violations(schema, config if GLOBAL_PACKAGE in text else {name.parts[0]: without_defaults(config)}) == []
+
+
+def without_defaults(config: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in config.items() if key != "defaults"}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_composed_configurations_fit_the_schema(model: str, schema) -> None:
+    assert violations(schema, plain(f"model={model}")) == []
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("model.simulator.layer", 3, "model.simulator"),
+        ("model.simulator.template.mode", 3, "model.simulator.template"),
+        ("trainer.max_epochs", "ten", "trainer.max_epochs"),
+        ("model.simulator.radii", [0.1, "wide"], "model.simulator.radii[1]"),
+        ("callbacks.progess", {"refresh_rate": 2}, "callbacks.progess"),
+        ("optimiser", {}, "$"),
+        ("sweep.retry", True, "sweep"),
+        ("data.curriculum.t_start", None, "data.curriculum.t_start"),
+    ],
+)
+def test_the_schema_refuses_what_is_wrong(key: str, value: Any, told: str, schema) -> None:
+    config = plain("model=gausim_elastic")
+    *parents, last = key.split(".")
+    node = config
+    for parent in parents:
+        node = node[parent]
+    node[last] = value
+    (found,) = violations(schema, config)
+    assert found.startswith(f"{told if told == '$' else f'$.{told}'}: ")
+
+
+def test_keys_without_a_target_are_those_of_any(schema) -> None:
+    def change(**keys: Any) -> list[str]:
+        return violations(schema, {"model": {"method": keys}})
+
+    assert change(anchors=3, courant=0.5) == []  # of the springs, and of PhysDreamer
+    assert len(change(ankers=3)) == 1
+
+
+def test_arguments_are_those_of_the_signatures(schema) -> None:
+    place = read_places().children["model"].children["simulator"]
+    (target,) = place.targets
+    offered = {*schema["definitions"]["model.simulator"]["else"]["properties"]}
+    arguments = {*inspect.signature(pkgutil.resolve_name(target)).parameters}
+    assert arguments - offered == {"scenes", "fps"}  # training gives it these
+    assert offered - arguments == {"_target_", "_partial_", "_recursive_", "_convert_", "_args_"}
+    radii = schema["definitions"]["model.simulator"]["else"]["properties"]["radii"]
+    assert "fractions of the object's diagonal" in radii["description"]
+    assert radii["else"] == {"type": "array", "items": radii["else"]["items"]}
+    assert "of every random generator" in schema["properties"]["seed"]["description"]
+
+
+def test_the_schema_is_printed(capsys, schema, monkeypatch) -> None:
+    monkeypatch.setattr("gausim.cli._schema.training_schema", lambda: schema)
+    assert main(["config", "schema"]) == 0
+    assert json.loads(capsys.readouterr().out) == schema
+
+
+@pytest.mark.parametrize("what", [[], ["bunny_points"], ["model=spring_mass", "seed=3"]])
+def test_what_is_in_order(what: list[str], once, capsys) -> None:
+    assert main(["config", "validate", *what]) == 0
+    assert "in order" in capsys.readouterr().out
+
+
+def test_a_file_of_conf_is_what_its_group_chooses(once, capsys) -> None:
+    assert main(["config", "validate", str(conf_dir() / "ablation" / "no_mass.yaml")]) == 0
+    assert main(["config", "validate", str(conf_dir() / "train.yaml")]) == 0
+
+
+def test_every_wrong_override_is_named_with_the_nearest_right_key(once, capsys) -> None:
+    wrong = ["sed=1", "model.simulator.achor=true", "trainer.max_epoch=3", "render=nope", "seed=x", "freeze=5"]
+    assert main(["config", "validate", *wrong, "model=gausim", "trainer.max_minutes=soon"]) == 1
+    told = capsys.readouterr()
+    for expected in (
+        "sed: unknown key. Did you mean 'seed'?",
+        "model.simulator.achor: unknown key. Did you mean 'model.simulator.anchor'?",  # which only this model has
+        "trainer.max_epoch: unknown key. Did you mean 'trainer.max_epochs'?",
+        "Available options in 'render': auto cpu gsplat reference",
+        "seed=x: Value 'x' of type 'str' could not be converted to Integer",
+        "trainer.max_minutes: expected a number or null, got 'soon'.",
+    ):
+        assert expected in told.out
+    assert told.err == "6 faults\n"
+
+
+def test_keys_that_hydra_merges_silently_are_named(once, capsys) -> None:
+    wrong = ["+model.simulator.layer=3", "+callbacks.progess.refresh_rate=3", "+model.plan=null", "+model.plans=null"]
+    assert main(["config", "validate", *wrong]) == 1
+    told = capsys.readouterr().out
+    assert "model.simulator.layer: unknown key of gausim.models.simulator.GausSim. Did you mean 'layers'?" in told
+    assert "callbacks.progess: expected a node with `_target_`" in told and "Did you mean 'progress'?" in told
+    assert "model.plans: unknown key. Did you mean 'plan'?" in told and told.count("\n") == 3
+
+
+def test_a_saved_configuration(once, tmp_path, capsys) -> None:
+    config = plain("model=gausim")
+    saved = tmp_path / "run" / "config.yaml"
+    saved.parent.mkdir()
+    saved.write_text(yaml.safe_dump(config))
+    assert main(["config", "validate", str(saved.parent)]) == 0
+    config["optimiser"] = config.pop("optimizer")
+    config["data"]["curriculum"]["tmax"] = 3
+    saved.write_text(yaml.safe_dump(config))
+    capsys.readouterr()
+    assert main(["config", "validate", str(saved)]) == 1
+    told = capsys.readouterr().out.splitlines()
+    assert told == [
+        "optimizer: missing. Every configuration that is trained has it.",
+        "data.curriculum.tmax: unknown key of gausim.data.curriculum.Curriculum. Did you mean 't_max'?",
+        "optimiser: unknown key. Did you mean 'optimizer'?",
+    ]
+
+
+def test_contradictions_are_the_constructors_own(once, capsys) -> None:
+    assert main(["config", "validate", "data.curriculum.t_start=20"]) == 1
+    assert "t_start" in capsys.readouterr().out
+
+
+def test_all_targets_that_may_not_be_built_are_named(once, tmp_path) -> None:
+    config = plain()
+    config["render"] = {"_target_": "os.system", "command": f"touch {tmp_path / 'canary'}"}
+    config["loss"]["image"]["_target_"] = "gausim.losses.image.ImageLos"
+    first, second = sorted(_validate.check(config), reverse=True)
+    assert first.startswith("render._target_: ") and "'os.system'" in first
+    assert second.startswith("loss.image: ") and "ImageLos" in second
+    assert not (tmp_path / "canary").exists()
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        (["bunyy"], "Did you mean 'bunny'?"),
+        (["nowhere.yaml"], "expected a YAML file or a run directory"),
+        (["part.yaml"], "is composed with others"),
+        (["list.yaml"], "expected a mapping, got list"),
+        (["torn.yaml"], "cannot be read as YAML"),
+        (["list.yaml", "seed=1"], "expected a saved configuration alone"),
+    ],
+)
+def test_what_is_no_configuration(what: list[str], message: str, tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("part.yaml").write_text("defaults:\n  - override /model: gausim\n")
+    Path("list.yaml").write_text("- 3\n")
+    Path("torn.yaml").write_text("a: [\n")
+    with pytest.raises(ConfigError, match=message.replace("?", r"\?")):
+        _validate.faults(what)
