@@ -129,6 +129,21 @@ def test_a_file_of_conf_is_what_its_group_chooses(once, capsys) -> None:
     assert main(["config", "validate", str(conf_dir() / "train.yaml")]) == 0
 
 
+def test_a_file_beside_conf_is_composed_as_with_config_dir(once, tmp_path, capsys) -> None:
+    own = tmp_path / "my conf" / "experiment" / "mine.yaml"
+    own.parent.mkdir(parents=True)
+    lines = ["# @package _global_", "defaults:", "- override /model: gausim", "model: {simulator: {anchor: false}}"]
+    own.write_text("\n".join(lines))
+    assert main(["config", "validate", str(own)]) == 0
+    own.write_text("\n".join(lines).replace("anchor", "achor"))
+    capsys.readouterr()
+    assert main(["config", "validate", str(own), "sed=1"]) == 1
+    assert capsys.readouterr().out.splitlines() == [
+        "sed: unknown key. Did you mean 'seed'?",
+        "model.simulator.achor: unknown key of gausim.models.simulator.GausSim. Did you mean 'anchor'?",
+    ]
+
+
 def test_every_wrong_override_is_named_with_the_nearest_right_key(once, capsys) -> None:
     wrong = ["sed=1", "model.simulator.achor=true", "trainer.max_epoch=3", "render=nope", "seed=x", "freeze=5"]
     assert main(["config", "validate", *wrong, "model=gausim", "trainer.max_minutes=soon"]) == 1

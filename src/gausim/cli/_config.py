@@ -63,13 +63,19 @@ def compose_leniently(config_name: str, overrides: Sequence[str]) -> tuple[DictC
         pass  # now one by one, groups first: they decide which keys there are
     taken: list[str] = []
     faults: list[str] = []
-    for override in sorted(overrides, key=lambda text: not (conf_dir() / text.lstrip("+~").split("=")[0]).is_dir()):
+    for override in sorted(overrides, key=_turn):
         try:
             _compose(config_name, [*taken, override])
             taken.append(override)
         except (HydraException, OmegaConfBaseException) as error:
             faults.append(_fault(config_name, taken, override, error))
     return compose(config_name, taken), faults
+
+
+def _turn(override: str) -> int:
+    """When an override is tried: where files are searched, then groups, then keys."""
+    key = override.lstrip("+~").split("=")[0]
+    return 0 if key == "hydra.searchpath" else 1 if (conf_dir() / key).is_dir() else 2
 
 
 def _fault(config_name: str, taken: Sequence[str], override: str, error: Exception) -> str:

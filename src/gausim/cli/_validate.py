@@ -29,7 +29,7 @@ def faults(arguments: Sequence[str]) -> list[str]:
 
     Args:
         arguments: one saved configuration (a YAML file, or a run directory); or what `gausim train` would be given:
-            overrides, names of experiments and files of conf/.
+            overrides, names of experiments, and files of conf/ or of a folder like it (`MINE/experiment/NAME.yaml`).
 
     Returns:
         A sentence for every fault; none if it can be trained, its data aside.
@@ -44,7 +44,7 @@ def faults(arguments: Sequence[str]) -> list[str]:
         whole = _read(saved[0])
         missing = [f"{key}: missing. Every configuration that is trained has it." for key in required_keys()]
         return [fault for fault in missing if fault.split(":")[0] not in whole] + check(whole)
-    overrides = [override for argument in arguments if (override := _override(argument))]
+    overrides = _search_path(arguments) + [said for argument in arguments if (said := _override(argument))]
     config, found = compose_leniently(ROOT_FILE, overrides)
     try:
         return found + check(OmegaConf.to_container(config, resolve=True))
@@ -63,11 +63,26 @@ def check(config: Any) -> list[str]:
 
 
 def _saved(argument: str) -> Path | None:
-    """The file of a saved configuration, if the argument names one: a run's directory or a file outside of conf/."""
+    """The file of a saved configuration, if the argument names one: a run's directory, or a file of no group."""
     path = Path(argument)
     path = path / RUN_CONFIG if (path / RUN_CONFIG).is_file() else path
     is_file = path.suffix in (".yaml", ".yml") and path.is_file()
-    return path if is_file and not path.resolve().is_relative_to(conf_dir()) else None
+    return path if is_file and _group(path) is None else None
+
+
+def _group(path: Path) -> str | None:
+    """The group whose choice a file is, by its folder in conf/ or its folder's name elsewhere; "" of conf/ itself."""
+    folder = path.resolve().parent
+    if folder.is_relative_to(conf_dir()):
+        return folder.relative_to(conf_dir()).as_posix().removeprefix(".")
+    return folder.name if folder.name in choices() else None
+
+
+def _search_path(arguments: Sequence[str]) -> list[str]:
+    """What `--config-dir` is to `gausim train`: where the groups of files outside of conf/ lie."""
+    files = [Path(argument).resolve() for argument in arguments if Path(argument).is_file()]
+    roots = sorted({f"'file://{file.parent.parent}'" for file in files if not file.is_relative_to(conf_dir())})
+    return [f"hydra.searchpath=[{','.join(roots)}]"] if roots else []
 
 
 def _override(argument: str) -> str:
@@ -77,10 +92,8 @@ def _override(argument: str) -> str:
         ConfigError: it is neither an override, an experiment nor a file.
     """
     path, experiments = Path(argument), choices()["experiment"]
-    if path.is_file() and path.resolve().is_relative_to(conf_dir()):
-        inside = path.resolve().relative_to(conf_dir())
-        group = inside.parent.as_posix()
-        return f"{group}={inside.stem}" if group != "." else ""
+    if path.is_file() and (group := _group(path)) is not None:
+        return f"{group}={path.stem}" if group else ""
     if "=" in argument or argument.startswith("~"):
         return argument
     if argument in experiments:
@@ -101,7 +114,7 @@ def _read(path: Path) -> dict[str, Any]:
     if not isinstance(loaded, dict):
         raise ConfigError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
     if "defaults" in loaded or GLOBAL_PACKAGE in text.splitlines():
-        raise ConfigError(f"{path}: is composed with others. Put it into {conf_dir()}/experiment, and name it there.")
+        raise ConfigError(f"{path}: is composed with others. Put it into a folder named experiment (or ablation, ...).")
     return loaded
 
 

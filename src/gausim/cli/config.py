@@ -14,6 +14,7 @@ of the wrong kind, targets that may not be built, what the constructors refuse. 
 
   gausim config validate experiment=bunny trainer.max_epochs=90    as `gausim train` would be given
   gausim config validate bunny                                     an experiment of conf/
+  gausim config validate MINE/experiment/a.yaml                    of `gausim train --config-dir MINE experiment=a`
   gausim config validate outputs/bunny/seed_0                      what a run was trained with
   gausim config validate FILE.yaml                                 a configuration that was saved"""
 
