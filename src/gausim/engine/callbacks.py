@@ -6,12 +6,13 @@ import math
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, RichProgressBar
 
 from gausim.core import ConfigError
+from gausim.data.datamodule import ReadyDataModule
 from gausim.engine.cadence import has_come
 from gausim.engine.checkpoint import LAST_CHECKPOINT, digest
 from gausim.engine.epoch_table import EpochTable, short
@@ -177,10 +178,27 @@ class EpochSummary(Callback):
         parts += [text.format(means[name]) for name, text in labels.items() if name in means]
         if means.get("exploded", 0) > 0:
             parts.append(f"exploded {means['exploded']:.0%}")
-        return "  ".join([*parts, f"{means['seconds']:.1f} s"])
+        parts.append(f"{means['seconds']:.1f} s")
+        fitted = hasattr(trainer.lightning_module, "plan")  # in stages, which have lengths of their own
+        left = None if fitted else _minutes_left(trainer, means["seconds"])
+        return "  ".join([*parts, *([] if left is None else [f"about {left:.0f} min left"])])
 
     def _table(self, trainer: Trainer) -> EpochTable:
         return EpochTable(Path(trainer.default_root_dir) / EPOCHS, self.COLUMNS)
+
+
+def _minutes_left(trainer: Trainer, seconds: float) -> float | None:
+    """What the epochs to come will take at the pace of the one that is over, each in proportion to its T [minutes].
+
+    None where there are none, or nothing says how many frames they predict.
+    """
+    data: Any = getattr(trainer, "datamodule", None)
+    done, epochs = trainer.current_epoch + 1, trainer.max_epochs or 0
+    if not isinstance(data, ReadyDataModule) or done >= epochs:
+        return None
+    left = sum(data.steps(epoch) for epoch in range(done, epochs)) / data.steps(done - 1) * seconds / 60.0
+    budgets = [c.minutes_left for c in cast(Any, trainer).callbacks if isinstance(c, TimeBudget)]
+    return float(min([left, *budgets]))
 
 
 class TimeBudget(Callback):
@@ -211,6 +229,11 @@ class TimeBudget(Callback):
     def spent(self) -> bool:
         """Whether the budget is used up."""
         return self._used >= self._budget
+
+    @property
+    def minutes_left(self) -> float:
+        """What is left of the budget, on its own clock [minutes]."""
+        return max(0.0, self._budget - self._used) / 60.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Starts the clock; a resumed run's first step has the learning rate of the time used so far."""
