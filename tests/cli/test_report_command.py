@@ -21,10 +21,21 @@ def test_the_whole_report(sweep, capsys):
     shown = capsys.readouterr()
     files = ["report.html", "report.md", "tables.tex", "numbers.csv"]
     assert sorted(p.name for p in (sweep / "report").iterdir()) == sorted(files)
-    assert all(f"wrote {sweep / 'report' / name}" in shown.out for name in files)
-    assert "5 runs: 3 evaluated, 1 failed, 1 unfinished" in shown.out and "pictures of toy_bunny" in shown.err
+    lines = shown.out.splitlines()
+    assert lines[-4] == f"page: {(sweep / 'report' / 'report.html').as_uri()}" and len(lines) == 6
+    assert [line.split("gausim ")[1].split()[0] for line in lines[-3:]] == ["view", "simulate", "train"]
+    assert lines[1].startswith(
+        "toy_bunny, predicted by gausim: On frames never seen (16–49; mean of 2 seeds), its points"
+    )
+    assert (
+        "wrote" not in shown.out
+        and "5 runs: 3 evaluated, 1 failed, 1 unfinished" in shown.out
+        and "pictures of toy_bunny" in shown.err
+    )
     page = (sweep / "report" / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 4 and page.count("data:video/mp4;base64,") == 1
+    # Four pictures, three videos of runs with a poster each, and one of both rows side by side.
+    kinds = [page.count(f"data:{kind};base64,") for kind in ("image/webp", "image/jpeg", "video/mp4")]
+    assert kinds == [4, 3, 4]
     # Made again, the report does not take itself for a run and comes out the same (but for the video's encoder).
     assert cli.main(["report", str(sweep)]) == 0
     again = (sweep / "report" / "report.html").read_text()

@@ -41,21 +41,21 @@ def drawn(tmp_path_factory) -> dict[str, Exhibit]:
 
 
 def image(figure: Exhibit) -> np.ndarray:
-    assert figure.uri.startswith("data:image/png;base64,")
+    assert figure.uri.startswith("data:image/webp;base64,")
     return cv2.imdecode(np.frombuffer(base64.b64decode(figure.uri.split(",")[1]), np.uint8), cv2.IMREAD_COLOR)
 
 
 def test_every_picture_is_there_and_says_what_was_done_to_it(drawn):
-    assert list(drawn) == ["Errors over time", "Space-time slices", "Frames", "Several cameras", "Video"]
+    assert list(drawn) == ["Errors over time", "Space-time slices", "Frames", "Several cameras", "Side by side"]
     for name, figure in drawn.items():
-        if name != "Video":
+        if name != "Side by side":
             assert len(np.unique(image(figure).reshape(-1, 3), axis=0)) > 20
         if name != "Errors over time":
             assert "over the original background, brightened 1.92×" in figure.caption and "no number" in figure.caption
 
 
 def test_the_video_shows_truth_and_predictions_over_the_background(drawn, tmp_path):
-    figure = drawn["Video"]
+    figure = drawn["Side by side"]
     assert figure.kind == "video"
     (tmp_path / "v.mp4").write_bytes(base64.b64decode(figure.uri.split(",")[1]))
     frames = list(read_video(tmp_path / "v.mp4"))
@@ -75,7 +75,8 @@ def test_runs_without_pictures_leave_the_others_theirs(tmp_path):
     (root / "b" / "evaluation" / "metrics.npz").write_bytes(b"PK\x03\x04 torn")
     write_report([root], root / "report")
     page = (root / "report" / "report.html").read_text()
-    assert page.count("data:image") == 4 and page.count("data:video") == 1
+    kinds = [page.count(f"data:{kind};base64,") for kind in ("image/webp", "image/jpeg", "video/mp4")]
+    assert kinds == [4, 1, 1] and "There is no video: its evaluation kept no pictures" in page
     notes = re.findall(r'<p class="note">(.*?)</p>', page, re.S)
     assert any("gausim:" in n and "kept no pictures" in n and "gausim evaluate" in n for n in notes)
     assert any("gausim w/o mass:" in n and "metrics.npz" in n for n in notes)
@@ -88,7 +89,7 @@ def test_nothing_measured_nothing_shown(tmp_path):
 
 def test_a_name_with_a_formula_is_drawn_as_it_is(tmp_path):
     evaluate(write_run(tmp_path / "a", config(name="x"), model="$\\frac{$"), make_curves(1.0))
-    assert len(figures(tmp_path)[0]) == 5
+    assert len(figures(tmp_path)[0]) == 4
 
 
 def test_pictures_round_trip(tmp_path):

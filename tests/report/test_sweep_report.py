@@ -72,7 +72,7 @@ def test_the_ablation_table_pools_seeds_and_shows_what_is_missing(sweep: Path) -
 
 
 def test_failures_are_told_and_every_number_links_to_its_runs(sweep: Path, tmp_path: Path) -> None:
-    study, _ = write_report([sweep], tmp_path / "out", pictures=False)
+    study = write_report([sweep], tmp_path / "out", pictures=False).study
     page = (tmp_path / "out" / "report.html").read_text()
     assert "step 3 is not finite" in page and "80 GB" in page
     assert any("w/o momentum: 1 of 3 runs have no numbers" in note for note in study.notes)

@@ -5,6 +5,10 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gausim.report.write import Report
 
 HELP = "Compare runs and sweeps: one HTML page, Markdown, LaTeX and CSV."
 
@@ -22,21 +26,36 @@ def main(argv: list[str]) -> int:
         RunError: a directory is not there, or there is no run in it.
     """
     arguments = _parser().parse_args(argv)
+    from gausim.cli._end import end
     from gausim.report.page import summary_line
     from gausim.report.write import write_report
 
     out = arguments.out or arguments.dirs[0] / "report"
-    study, files = write_report(
+    report = write_report(
         arguments.dirs,
         out,
         title=arguments.title,
         pictures=not arguments.no_pictures,
         say=lambda text: print(text, file=sys.stderr),
     )
-    print(summary_line(study))
-    for path in files:
-        print(f"wrote {path}")
+    if arguments.verbose:
+        print("\n".join(f"wrote {path}" for path in report.files))
+    result = [f"{best.title}: {best.sentences[0]}" for best in report.openings[:1]]
+    end([summary_line(report.study), *result], "page", report.files[0], *_next(report))
     return 0
+
+
+def _next(report: Report) -> list[list[object]]:
+    """What can be done with the best run; where nothing was evaluated, what makes a report of it."""
+    from gausim.cli._end import OWN_OBJECT, push
+    from gausim.report.runs import NOT_EVALUATED
+
+    if not report.openings:
+        trained = [run for run in report.study.runs if run.status == NOT_EVALUATED]
+        return [["evaluate", run.path] for run in trained[:3]]
+    best = report.openings[0]
+    objects = (best.run.summary or {}).get("objects", {})
+    return [["view", best.run.path], push(best.run.path, best.name if len(objects) > 1 else None), list(OWN_OBJECT)]
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -49,5 +68,6 @@ def _parser() -> argparse.ArgumentParser:
     add("dirs", metavar="DIR", type=Path, nargs="+", help="run directories, sweeps, or any folder of them")
     add("--out", metavar="DIR", type=Path, help="folder to write; default report in the first DIR")
     add("--title", default="GausSim report", help="heading (default: %(default)s)")
+    add("--verbose", action="store_true", help="list the files that are written")
     add("--no-pictures", action="store_true", help="leave figures and videos out (a small page, in a second)")
     return parser

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from gausim.report.curves import TRUTH
 from gausim.report.figures import METHOD_COLORS, SEEN_SHADE, save_figure
 from gausim.report.runs import RunRecord
-from gausim.report.sheets import METHOD, NOTHING, REFERENCE, Entry, Line, Sheet
+from gausim.report.sheets import METHOD, MOTION, NOTHING, REFERENCE, Entry, Line, Sheet
 from gausim.report.study import Study, deviation, number
 
 _DPI = 110
@@ -140,9 +141,8 @@ def diagnosis_sheets(study: Study) -> list[Sheet]:
             (run, first), methods = reference
             others = [row for row in first.rows if row != TRUTH and row not in methods]
             lines += [Line(row, REFERENCE, _entries([(run, first)], row)) for row in others]
-            sheets.append(
-                Sheet(f"motion_{name}", f"How {name} moves", _CAPTION, (("", _HEADS),), tuple(lines), "method")
-            )
+            title = f"How {name} moves"
+            sheets.append(Sheet(f"motion_{name}", MOTION, title, _CAPTION, (("", _HEADS),), tuple(lines), "method"))
     return sheets
 
 
@@ -201,6 +201,8 @@ def diagnosis_plot(named: Sequence[tuple[str, Diagnosis, str]], *, title: str) -
         power.semilogy(first.frequency, _positive(first.rows[row].spectrum), ":", color=color, linewidth=1.1, label=row)
         phase.plot(first.rows[row].phase_error, ":", color=color, linewidth=1.1)
     phase.axvspan(-0.5, first.first_unseen - 0.5, color=SEEN_SHADE, linewidth=0, zorder=0)
+    # The page turns formulas off, and so would print those of the default labels.
+    power.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0e}"))
     power.set(title="power of the motion", xlabel="frequency [Hz]", ylabel="squared displacement per Hz")
     phase.set(title="phase error [degrees]", xlabel="frame (shaded: seen)", ylim=(0, 130))
     phase.axhline(180 / np.sqrt(3), color="#999999", linewidth=0.8)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -28,52 +29,75 @@ def error_figure(curves: ObjectCurves, path: Path, *, sequence: str | None = Non
         sequence: one sequence; mean over all, with a band of one standard deviation for the methods, when None.
     """
     facts = curves.facts
-    panels = [("l2", group) for group in ("train", "heldout") if curves.view_indices(group)]
-    if any(ERROR_3D in metrics for metrics in curves.values.values()):
+    title = f"{facts.name}, {sequence or f'mean over {len(facts.sequences)} sequences'}"
+    save_figure(error_plot([(row, [(curves, row)]) for row in curves.rows], title=title, sequence=sequence), path)
+
+
+def error_plot(
+    rows: Sequence[tuple[str, Sequence[tuple[ObjectCurves, str]]]], *, title: str = "", sequence: str | None = None
+) -> Figure:
+    """The same of rows that may come from several evaluations.
+
+    Args:
+        rows: label, and the evaluations (seeds) with the name of their row; mean and band are over all of them.
+        title: heading.
+        sequence: one sequence; all when None.
+    """
+    first = rows[0][1][0][0]
+    panels = [("l2", views) for views in ("train", "heldout") if first.view_indices(views)]
+    every = [(curves, row) for _, members in rows for curves, row in members]
+    if any(ERROR_3D in curves.values.get(row, {}) for curves, row in every):
         panels.insert(0, (ERROR_3D, "points"))
-    figure = Figure(figsize=(5.2 * len(panels), 3.6), dpi=_DPI, layout="constrained")
-    for axes, (metric, group) in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
-        _error_panel(axes, curves, metric, group, sequence)
+    figure = Figure(figsize=(4.4 * len(panels), 3.4), dpi=_DPI, layout="constrained")
+    for axes, panel in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
+        _error_panel(axes, rows, panel, sequence)
+        axes.set(xlim=(0, max(first.facts.frames) - 1))
+        axes.axvspan(-0.5, first.facts.first_unseen - 0.5, color=SEEN_SHADE, zorder=0, label="seen in training")
     handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=7)
-    figure.suptitle(f"{facts.name}, {sequence or f'mean over {len(facts.sequences)} sequences'}", fontsize=10)
-    save_figure(figure, path)
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)), fontsize=7)
+    figure.suptitle(title, fontsize=10)
+    return figure
 
 
-def _error_panel(axes: Axes, curves: ObjectCurves, metric: str, group: str, sequence: str | None) -> None:
-    titles = {"points": "3D error [% of diagonal]", "train": "l2 x 1000, training views",
-              "heldout": "l2 x 1000, views never trained on"}  # fmt: skip
-    scale = 1.0 if metric == ERROR_3D else 1e3
-    references = [row for row in curves.rows if row not in curves.facts.methods]
-    for row in curves.rows:
-        if metric not in curves.values[row]:
+def _error_panel(
+    axes: Axes,
+    rows: Sequence[tuple[str, Sequence[tuple[ObjectCurves, str]]]],
+    panel: tuple[str, str],
+    sequence: str | None,
+) -> None:
+    metric, views = panel
+    methods, references = cycle(METHOD_COLORS), cycle(_REFERENCE_COLORS)
+    for label, members in rows:
+        is_method = any(row in curves.facts.methods for curves, row in members)
+        color = next(methods if is_method else references)
+        lines = [
+            _lines(curves, row, panel, sequence) for curves, row in members if metric in curves.values.get(row, {})
+        ]
+        if not lines:
             continue
-        lines = _lines(curves, row, metric, group, sequence) * scale
+        length = max(line.shape[1] for line in lines)
+        padded = [np.pad(n, ((0, 0), (0, length - n.shape[1])), constant_values=np.nan) for n in lines]
+        stacked = np.concatenate(padded) * (1.0 if metric == ERROR_3D else 1e3)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # frames that no sequence has
-            mean, std = np.nanmean(lines, 0), np.nanstd(lines, 0)
-        is_method = row in curves.facts.methods
-        palette, place = (METHOD_COLORS, curves.facts.methods) if is_method else (_REFERENCE_COLORS, references)
-        color = palette[list(place).index(row) % len(palette)]
-        style = "-" if is_method else "--" if row == STATIC else ":"
-        axes.plot(mean, style, color=color, label=row, linewidth=1.8 if is_method else 1.2)
-        if is_method and len(lines) > 1:
-            axes.fill_between(np.arange(len(mean)), mean - std, mean + std, color=color, alpha=0.15, linewidth=0)
-    _shade_seen(axes, curves.facts.first_unseen)
-    axes.set(title=titles[group], xlabel="frame", ylim=(0, None), xlim=(0, max(curves.facts.frames) - 1))
-    axes.title.set_fontsize(9)
+            mean, std = np.nanmean(stacked, 0), np.nanstd(stacked, 0)
+        style = "-" if is_method else "--" if label == STATIC else ":"
+        axes.plot(mean, style, color=color, label=label, linewidth=1.8 if is_method else 1.2)
+        if is_method and len(stacked) > 1:
+            axes.fill_between(np.arange(length), mean - std, mean + std, color=color, alpha=0.15, linewidth=0)
+    titles = {"points": "3D error [% of diagonal]", "train": "l2 ×10⁻³, training views",
+              "heldout": "l2 ×10⁻³, views never trained on"}  # fmt: skip
+    axes.set_title(titles[views], fontsize=9)
+    axes.set(xlabel="frame", ylim=(0, None))
 
 
-def _lines(curves: ObjectCurves, row: str, metric: str, group: str, sequence: str | None) -> np.ndarray:
-    """(S, F) values, averaged over the group's views."""
+def _lines(curves: ObjectCurves, row: str, panel: tuple[str, str], sequence: str | None) -> np.ndarray:
+    """(S, F) values, averaged over the panel's views."""
+    metric, views = panel
     values = curves.values[row][metric]
-    if group != "points":
-        values = values[:, :, curves.view_indices(group)].mean(-1)
+    if views != "points":
+        values = values[:, :, curves.view_indices(views)].mean(-1)
     return values if sequence is None else values[[curves.facts.sequences.index(sequence)]]
-
-
-def _shade_seen(axes: Axes, first_unseen: int) -> None:
-    axes.axvspan(-0.5, first_unseen - 0.5, color=SEEN_SHADE, zorder=0, label="seen in training")
 
 
 def slice_figure(

@@ -10,8 +10,11 @@ import numpy as np
 # Colour distance that the error panel shows as white-hot; the largest possible one is sqrt(3).
 ERROR_RANGE = 0.5
 PANEL_HEIGHT = 320
-_BAR = 24
-_SEEN, _FORESEEN, _INK, _PAPER = (120, 160, 200), (240, 150, 40), (235, 235, 235), (24, 24, 24)
+_BAR, _LINE = 24, 8
+SEEN, FORESEEN = (120, 160, 200), (240, 150, 40)
+_INK, _PAPER = (235, 235, 235), (24, 24, 24)
+# The brightest percentile of the true foreground becomes this light; never more than so much gain.
+_LIGHT, _MOST_GAIN = 230.0, 2.5
 
 
 @dataclass(frozen=True)
@@ -75,14 +78,19 @@ def timeline_bar(frame: int, timeline: Timeline, title: str, width: int) -> np.n
     foreseen = frame >= timeline.first_unseen
     state = "FORESEEN" if foreseen else "seen in training"
     bar = label_bar(f"{title}   frame {frame}/{timeline.frames - 1}   {state}", width)
-    line = np.full((8, width, 3), _PAPER, np.uint8)
-    begin, now = (round(width * f / timeline.frames) for f in (timeline.first_unseen, frame + 1))
-    line[:, : min(begin, now)] = _SEEN
-    line[:, begin:now] = _FORESEEN
-    line[:, min(begin, width - 1) :][:, :2] = _INK
     if foreseen:
-        bar[:, -_BAR:] = _FORESEEN
-    return np.concatenate((bar, line))
+        bar[:, -_BAR:] = FORESEEN
+    return np.concatenate((bar, time_line(frame, timeline, width)))
+
+
+def time_line(frame: int, timeline: Timeline, width: int) -> np.ndarray:
+    """The line of time alone, up to a frame; a mark stands where the foreseen frames begin."""
+    line = np.full((_LINE, width, 3), _PAPER, np.uint8)
+    begin, now = (round(width * f / timeline.frames) for f in (timeline.first_unseen, frame + 1))
+    line[:, : min(begin, now)] = SEEN
+    line[:, begin:now] = FORESEEN
+    line[:, min(begin, width - 1) :][:, :2] = _INK
+    return line
 
 
 def moving_line(frames: np.ndarray) -> tuple[str, int]:
@@ -109,3 +117,10 @@ def brighten(frames: np.ndarray, gain: float) -> np.ndarray:
         return frames
     table = np.clip(np.arange(256) * gain + 0.5, 0, 255).astype(np.uint8)
     return table[frames]
+
+
+def light_gain(truth: np.ndarray) -> float:
+    """The gain that makes the foreground of (..., 4) uint8 frames, RGB premultiplied with alpha, bright enough."""
+    opaque = truth[truth[..., 3] > 128][:, :3]
+    bright = float(np.percentile(opaque.max(-1), 95)) if len(opaque) else _LIGHT
+    return round(min(_MOST_GAIN, max(1.0, _LIGHT / max(bright, 1.0))), 2)

@@ -5,25 +5,30 @@ from __future__ import annotations
 import base64
 import io
 import tempfile
-import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from gausim.core import GausSimError
-from gausim.io.video import write_video
-from gausim.report.curves import ERROR_3D, POINT_ARRAYS, STATIC, ObjectCurves, load_curves
+from gausim.io.video import SMALL, write_video
+from gausim.report.curves import POINT_ARRAYS, STATIC, ObjectCurves, load_curves
 from gausim.report.diagnosis import diagnosis_plot, read_diagnosis
-from gausim.report.figures import METHOD_COLORS, SEEN_SHADE, contact_frames
-from gausim.report.frames import Timeline, brighten, label_bar, moving_line, space_time_slice, timeline_bar
-from gausim.report.pictures import Pictures, load_pictures
-from gausim.report.runs import RunRecord
+from gausim.report.figures import contact_frames, error_plot
+from gausim.report.frames import (
+    Timeline,
+    brighten,
+    label_bar,
+    light_gain,
+    moving_line,
+    space_time_slice,
+    timeline_bar,
+)
+from gausim.report.pictures import Pictures, kept_pictures
 from gausim.report.study import Group, Study
 
 _DPI = 100
@@ -31,8 +36,6 @@ _BORDER = "#f0962a"
 TRUTH = "ground truth"
 # More predictions than these side by side are too small to see; the tables have them all.
 MOST_METHODS, MOST_VIEWS = 5, 3
-# The brightest percentile of the true foreground becomes this light; never more than so much gain.
-_LIGHT, _MOST_GAIN = 230.0, 2.5
 # Height of a panel of a video [pixels].
 _PANEL = 168
 
@@ -71,7 +74,9 @@ def object_figures(study: Study, name: str) -> tuple[list[Exhibit], list[str]]:
         figures.append(_error_curves(name, curves))
     figures += _motions(study, name)
     for shown in _shown(study, name, problems):
-        figures += [_slices(shown), _grid(shown), _cameras(shown), _video(shown)]
+        figures += [_slices(shown), _grid(shown), _cameras(shown)]
+        # The page opens with a video of each; this one is for comparing them.
+        figures += [_video(shown)] if len(shown.columns) > 2 else []
     return figures, problems
 
 
@@ -87,7 +92,7 @@ def _motions(study: Study, name: str) -> list[Exhibit]:
         "First seed of each row. Left: power of the true and the predicted points over frequency. Right: how far the "
         "prediction is out of step, over the principal motions; unrelated motions have 104 degrees."
     )
-    return [Exhibit(f"Spectrum and phase: {name}", caption, "image", _png(diagnosis_plot(named, title=name)))]
+    return [Exhibit(f"Spectrum and phase: {name}", caption, "image", _drawn(diagnosis_plot(named, title=name)))]
 
 
 def _curves(study: Study, name: str, problems: list[str]) -> list[tuple[Group, list[ObjectCurves]]]:
@@ -96,16 +101,14 @@ def _curves(study: Study, name: str, problems: list[str]) -> list[tuple[Group, l
         seeds = []
         for run, _ in group.entries(name):
             try:
-                seeds += [_checked(c) for c in load_curves(_file(run, "metrics.npz")) if c.facts.name == name]
+                seeds += [
+                    _checked(c) for c in load_curves(run.path / "evaluation" / "metrics.npz") if c.facts.name == name
+                ]
             except (GausSimError, ValueError, TypeError, KeyError) as error:
                 problems.append(f"{group.label}: {error}")
         if seeds:
             found.append((group, seeds))
     return found
-
-
-def _file(run: RunRecord, name: str) -> Path:
-    return run.path / "evaluation" / name
 
 
 def _checked(curves: ObjectCurves) -> ObjectCurves:
@@ -121,50 +124,12 @@ def _checked(curves: ObjectCurves) -> ObjectCurves:
 
 def _error_curves(name: str, curves: Sequence[tuple[Group, list[ObjectCurves]]]) -> Exhibit:
     """Errors over time of all rows, mean over sequences and seeds; the seen frames are shaded."""
-    first = curves[0][1][0]
-    panels = [("l2", views) for views in ("train", "heldout") if first.view_indices(views)]
-    if any(ERROR_3D in m for _, seeds in curves for c in seeds for m in c.values.values()):
-        panels.insert(0, (ERROR_3D, "points"))
-    figure = Figure(figsize=(5.4 * len(panels), 3.9), dpi=_DPI, layout="constrained")
-    for axes, (metric, views) in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
-        for color, (group, seeds) in zip(METHOD_COLORS * len(curves), curves, strict=False):
-            _curve(axes, [(c, group.method) for c in seeds], metric, views, color, group.label)
-        _curve(axes, [(first, STATIC)], metric, views, "#555555", STATIC)
-        border = first.facts.first_unseen - 0.5
-        axes.axvspan(0, border, color=SEEN_SHADE, linewidth=0, zorder=0)
-        axes.axvline(border, color=_BORDER, linewidth=1.4)
-        title = {"points": "3D error [% of diagonal]", "train": "l2 ×10⁻³, training cameras"}
-        axes.set_title(title.get(views, "l2 ×10⁻³, cameras never trained on"), fontsize=9)
-        axes.set(xlabel="frame", ylim=(0, None), xlim=(0, max(first.facts.frames) - 1))
-    handles, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=min(4, len(labels)), fontsize=8)
+    rows = [(group.label, [(c, group.method) for c in seeds]) for group, seeds in curves]
+    figure = error_plot([*rows, (STATIC, [(curves[0][1][0], STATIC)])])
     caption = (
         "Mean over sequences and seeds, band: ± one standard deviation over both. Shaded: frames that training saw."
     )
-    return Exhibit(f"Errors over time: {name}", caption, "image", _png(figure))
-
-
-def _curve(
-    axes: Axes, members: Sequence[tuple[ObjectCurves, str]], metric: str, views: str, color: str, label: str
-) -> None:
-    lines = []
-    for curves, row in members:
-        values = curves.values.get(row, {}).get(metric)
-        if values is None:
-            continue
-        lines.append(values if views == "points" else values[:, :, curves.view_indices(views)].mean(-1))
-    if not lines:
-        return
-    length = max(line.shape[1] for line in lines)
-    padded = [np.pad(line, ((0, 0), (0, length - line.shape[1])), constant_values=np.nan) for line in lines]
-    stacked = np.concatenate(padded) * (1.0 if metric == ERROR_3D else 1e3)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # frames that no sequence has
-        mean, std = np.nanmean(stacked, 0), np.nanstd(stacked, 0)
-    static = label == STATIC
-    axes.plot(mean, "--" if static else "-", color=color, label=label, linewidth=1.2 if static else 1.8)
-    if not static:
-        axes.fill_between(np.arange(length), mean - std, mean + std, color=color, alpha=0.13, linewidth=0)
+    return Exhibit(f"Errors over time: {name}", caption, "image", _drawn(figure))
 
 
 def _shown(study: Study, name: str, problems: list[str]) -> Iterator[Shown]:
@@ -172,14 +137,8 @@ def _shown(study: Study, name: str, problems: list[str]) -> Iterator[Shown]:
     sets: dict[tuple[object, ...], list[tuple[str, Pictures, np.ndarray]]] = {}
     for group in study.groups:
         for run, _ in group.entries(name)[:1]:
-            if not _file(run, "pictures.npz").is_file():
-                problems.append(
-                    f"{group.label}: its evaluation kept no pictures (an earlier version did it). "
-                    f"Call `gausim evaluate {run.path}` again."
-                )
-                continue
             try:
-                kept = [p for p in load_pictures(_file(run, "pictures.npz")) if p.object == name]
+                kept = kept_pictures(run.path, name)
             except GausSimError as error:
                 problems.append(f"{group.label}: {error}")
                 continue
@@ -196,9 +155,7 @@ def _shown(study: Study, name: str, problems: list[str]) -> Iterator[Shown]:
 
 def _lit(members: Sequence[tuple[str, Pictures, np.ndarray]]) -> Shown:
     first = members[0][1]
-    opaque = first.truth[first.truth[..., 3] > 128][:, :3]
-    bright = float(np.percentile(opaque.max(-1), 95)) if len(opaque) else _LIGHT
-    gain = round(min(_MOST_GAIN, max(1.0, _LIGHT / max(bright, 1.0))), 2)
+    gain = light_gain(first.truth)
     columns = [(TRUTH, first.truth), *((label, frames) for label, _, frames in members)]
     shown = [(label, brighten(first.over_background(frames), gain)) for label, frames in columns]
     behind = "over plain grey (the recording keeps no background)" if first.background is None else (
@@ -226,7 +183,7 @@ def _slices(shown: Shown) -> Exhibit:
                 axes.set_ylabel(_short(label), fontsize=8)
         grid[0, column].set_title(f"{_view_name(pictures, view)}: {line[0]} {line[1]}", fontsize=9)
         grid[-1, column].set_xlabel("frame (foreseen right of the line)", fontsize=8)
-    return Exhibit(f"Space-time slices: {pictures.object}", shown.note, "image", _png(figure))
+    return Exhibit(f"Space-time slices: {pictures.object}", shown.note, "image", _drawn(figure))
 
 
 def _grid(shown: Shown) -> Exhibit:
@@ -262,18 +219,23 @@ def _panels(rows: Sequence[tuple[str, list[np.ndarray]]], heads: Sequence[tuple[
         line[0].set_ylabel(_short(label), fontsize=8)
     for axes, (head, color) in zip(grid[0], heads, strict=True):
         axes.set_title(head, fontsize=7, color=color)
-    return _png(figure)
+    return _drawn(figure)
 
 
 def _video(shown: Shown) -> Exhibit:
     """All methods side by side in several cameras."""
     pictures, views = shown.pictures, _some_views(shown.pictures)
+    uri = video_uri(_video_frames(shown, views), pictures.fps)
+    names = ", ".join(_view_name(pictures, v) for v in views)
+    return Exhibit(f"Side by side: {pictures.object}", f"Rows: {names}. {shown.note}", "video", uri)
+
+
+def video_uri(frames: Iterable[np.ndarray], fps: float) -> str:
+    """The MP4 of (H, W, 3) uint8 frames as a data URI."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "video.mp4"
-        write_video(path, _video_frames(shown, views), pictures.fps)
-        uri = "data:video/mp4;base64," + base64.b64encode(path.read_bytes()).decode()
-    names = ", ".join(_view_name(pictures, v) for v in views)
-    return Exhibit(f"Video: {pictures.object}", f"Rows: {names}. {shown.note}", "video", uri)
+        write_video(path, frames, fps, quality=SMALL)
+        return "data:video/mp4;base64," + base64.b64encode(path.read_bytes()).decode()
 
 
 def _video_frames(shown: Shown, views: Sequence[int]) -> Iterator[np.ndarray]:
@@ -306,11 +268,11 @@ def _short(label: str, most: int = 22) -> str:
     return label if len(label) <= most else label[: most - 2] + ".."
 
 
-def _png(figure: Figure) -> str:
+def _drawn(figure: Figure) -> str:
     # A dollar sign in a name would start a formula.
     for text in figure.findobj(Text):
         assert isinstance(text, Text)
         text.set_parse_math(False)
     stream = io.BytesIO()
-    figure.savefig(stream, format="png")
-    return "data:image/png;base64," + base64.b64encode(stream.getvalue()).decode()
+    figure.savefig(stream, format="webp", pil_kwargs={"quality": 85})
+    return "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode()

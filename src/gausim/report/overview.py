@@ -10,6 +10,9 @@ from gausim.report.curves import ERROR_3D
 from gausim.report.diagnosis import diagnosis_sheets
 from gausim.report.runs import RunRecord
 from gausim.report.sheets import (
+    ABLATIONS,
+    CONTRAST,
+    COST,
     METHOD,
     NOTHING,
     OLD_EVALUATION,
@@ -84,7 +87,9 @@ def _ablation(study: Study, name: str, family: str, groups: Sequence[Group]) -> 
         "of the difference over seeds, where both have several."
     )
     heads = ((f"{family}", tuple(g.variation for g in groups)),)
-    return Sheet(f"ablation_{name}_{family}", f"Ablations of {family} on {name}", caption, heads, tuple(lines))
+    return Sheet(
+        f"ablation_{name}_{family}", ABLATIONS, f"Ablations of {family} on {name}", caption, heads, tuple(lines)
+    )
 
 
 def _against_full(cells: Sequence[Cell], title: str) -> Line:
@@ -149,7 +154,7 @@ def efficiency_sheet(study: Study) -> Sheet:
     )
     if any(e.text == NOT_MEASURED for line in lines for e in line.entries):
         caption += f" {OLD_EVALUATION}"
-    return Sheet("efficiency", "Efficiency", caption, (("", heads),), tuple(lines), "method")
+    return Sheet("efficiency", COST, "Efficiency", caption, (("", heads),), tuple(lines), "method")
 
 
 def _costs(
@@ -258,7 +263,7 @@ def contrast_sheet(study: Study) -> Sheet:
         "Against the black background. Bright objects get larger absolute errors from the same displacement: compare "
         "errors between objects with this in mind. The largest l2 is that of the first run in this report."
     )
-    return Sheet("contrast", "Colour contrast", caption, (("", tuple(study.objects)),), tuple(lines))
+    return Sheet("contrast", CONTRAST, "Colour contrast", caption, (("", tuple(study.objects)),), tuple(lines))
 
 
 def _contrast(study: Study, name: str) -> tuple[list[str], tuple[RunRecord, ...]]:

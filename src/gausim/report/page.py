@@ -7,9 +7,12 @@ from importlib.resources import files
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
+from markupsafe import Markup, escape
 
+from gausim.report.frames import FORESEEN, SEEN
 from gausim.report.media import Exhibit
-from gausim.report.sheets import Line, Sheet
+from gausim.report.opening import Opening, unanswered
+from gausim.report.sheets import SECTIONS, Line, Sheet
 from gausim.report.sources import Sources
 from gausim.report.study import Study
 
@@ -19,8 +22,11 @@ def html_page(
     study: Study,
     sheets: Sequence[Sheet],
     sources: Sources,
-    exhibits: Sequence[tuple[str, list[Exhibit]]],
-    notes: Sequence[str],
+    *,
+    openings: Sequence[Opening],
+    left: int = 0,
+    exhibits: Sequence[tuple[str, list[Exhibit]]] = (),
+    notes: Sequence[str] = (),
 ) -> str:
     """The page; every text is escaped, and its policy forbids the browser to load anything.
 
@@ -29,21 +35,40 @@ def html_page(
         study: what the report is about.
         sheets: tables.
         sources: where their numbers link to.
+        openings: first screens, of which one is shown at a time.
+        left: number of first screens that were left out.
         exhibits: pictures and videos by object.
         notes: what a reader must know.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    environment.filters["commands"] = _with_commands
     template = environment.from_string(files("gausim.report").joinpath("page.html").read_text(encoding="utf-8"))
+    sections = [(name, [_sheet(sheet, sources) for sheet in sheets if sheet.section == name]) for name in SECTIONS]
     return template.render(
         title=title,
         summary=summary_line(study),
+        openings=list(openings),
+        left=left,
+        remedies=unanswered(study),
         notes=list(notes),
-        sheets=[_sheet(sheet, sources) for sheet in sheets],
-        exhibits=list(exhibits),
+        sections=[(name, own) for name, own in sections if own and openings],
+        exhibits=[(name, figures) for name, figures in exhibits if figures],
+        seen_color=_rgb(SEEN),
+        foreseen_color=_rgb(FORESEEN),
         sets=list(sources.sets.items()),
         names={anchor: source.name for anchor, source in sources.by_anchor().items()},
         runs=sources.runs,
     )
+
+
+def _with_commands(text: str) -> Markup:
+    """Escaped text with what stands between backquotes as code."""
+    parts = text.split("`")
+    return Markup("").join(Markup("<code>{}</code>").format(p) if i % 2 else escape(p) for i, p in enumerate(parts))
+
+
+def _rgb(color: tuple[int, int, int]) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*color)
 
 
 def summary_line(study: Study) -> str:
@@ -52,7 +77,12 @@ def summary_line(study: Study) -> str:
     for run in study.runs:
         states[run.status] = states.get(run.status, 0) + 1
     shown = ", ".join(f"{count} {state}" for state, count in states.items())
-    return f"{len(study.runs)} runs: {shown}; {len(study.groups)} rows; objects: {', '.join(study.objects) or 'none'}."
+    objects = ", ".join(study.objects) or "none"
+    return f"{_counted(len(study.runs), 'run')}: {shown}; {_counted(len(study.groups), 'row')}; objects: {objects}."
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _sheet(sheet: Sheet, sources: Sources) -> dict[str, Any]:

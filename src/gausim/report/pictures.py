@@ -82,6 +82,20 @@ def load_pictures(path: Path) -> list[Pictures]:
         raise RunError(f"{path}: cannot be read ({error}). Write it with `gausim evaluate RUN`.") from error
 
 
+def kept_pictures(run: Path, name: str) -> list[Pictures]:
+    """The pictures of an object that the evaluation of a run directory keeps.
+
+    Raises:
+        RunError: it keeps none, or they cannot be read.
+    """
+    path = run / "evaluation" / "pictures.npz"
+    if not path.is_file():
+        raise RunError(
+            f"its evaluation kept no pictures (an earlier version did it). Make them with `gausim evaluate {run}`."
+        )
+    return [item for item in load_pictures(path) if item.object == name]
+
+
 def _pictures(name: str, arrays: dict[str, np.ndarray]) -> Pictures:
     facts = json.loads(str(arrays[f"{name}/facts"]))
     prefix, truth = f"{name}/prediction/", arrays[f"{name}/truth"]

@@ -23,17 +23,22 @@ TABLES = (
     ("l2", "train"),
     ("ssim", "train"),
     ("lpips", "train"),
+    ("psnr", "train"),
     ("flip", "train"),
     (ERROR_3D, "points"),
     (MOTION_ENERGY, "points"),
     (MOTION_ENERGY, "train"),
-    ("l2_foreground", "train"),
-    ("psnr_foreground", "train"),
     ("l2", "heldout"),
     ("ssim", "heldout"),
     ("lpips", "heldout"),
+    ("psnr", "heldout"),
     ("flip", "heldout"),
 )
+# What tables belong to, in the order of a page.
+ABLATIONS, MOTION = "Ablations", "3D error and motion"
+TRAINING_VIEWS, NEW_VIEWS = "Images in the training views", "Images in views never trained on"
+COST, CONTRAST = "Time and memory", "Colour contrast"
+SECTIONS = (ABLATIONS, MOTION, TRAINING_VIEWS, NEW_VIEWS, COST, CONTRAST)
 # How metrics are named and printed that no run has.
 _LPIPS = {"label": "LPIPS", "scale": 100.0, "unit": "1e-2", "higher_is_better": False}
 NOTHING = "–"
@@ -75,6 +80,7 @@ class Sheet:
 
     Attributes:
         key: short name for files and anchors.
+        section: what it belongs to, of ``SECTIONS``.
         title: heading.
         caption: how to read it.
         columns: groups of columns: (heading, headings of its columns).
@@ -83,6 +89,7 @@ class Sheet:
     """
 
     key: str
+    section: str
     title: str
     caption: str
     columns: tuple[tuple[str, tuple[str, ...]], ...]
@@ -137,7 +144,8 @@ def metric_sheet(study: Study, metric: str, views: str) -> Sheet | None:
     )
     title = f"{info['label']}{_unit(info)}, {VIEWS[views]}"
     caption = " ".join([_caption(metric, views, info, lines), *_blind(study.groups)])
-    return Sheet(f"{metric}_{views}", title, caption, heads, tuple(lines), "method")
+    section = MOTION if metric in (ERROR_3D, MOTION_ENERGY) else NEW_VIEWS if views == "heldout" else TRAINING_VIEWS
+    return Sheet(f"{metric}_{views}", section, title, caption, heads, tuple(lines), "method")
 
 
 def _blind(groups: Sequence[Group]) -> list[str]:

@@ -8,6 +8,7 @@ import itertools
 import re
 from collections.abc import Sequence
 
+from gausim.report.opening import Opening
 from gausim.report.sheets import PAPER, Entry, Line, Sheet, metric_info
 from gausim.report.sources import Sources, commit_of, data_hashes
 from gausim.report.study import Group, Study, Value, cell
@@ -37,9 +38,16 @@ def markdown_escape(text: str) -> str:
     return re.sub(r"([\\*_\[\]|<>#~&])", r"\\\1", flat)
 
 
-def markdown_report(title: str, study: Study, sheets: Sequence[Sheet], sources: Sources) -> str:
+def markdown_report(
+    title: str, study: Study, sheets: Sequence[Sheet], sources: Sources, openings: Sequence[Opening]
+) -> str:
     """The whole report without its pictures."""
-    parts = [f"# {markdown_escape(title)}", "", "Numbers link to the runs that they come from.", ""]
+    parts = [f"# {markdown_escape(title)}", ""]
+    # Further seeds of a row have its sentences.
+    told = {opening.title: opening for opening in reversed(openings)}
+    for opening in reversed(told.values()):
+        parts += [f"**{markdown_escape(opening.title)}.** {markdown_escape(' '.join(opening.sentences))}", ""]
+    parts += ["Numbers link to the runs that they come from.", ""]
     parts += [f"> {markdown_escape(note)}\n" for note in study.notes]
     for sheet in sheets:
         parts += [

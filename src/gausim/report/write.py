@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from gausim.io.files import write_durably
 from gausim.report.media import Exhibit, object_figures
+from gausim.report.opening import Opening, make_openings
 from gausim.report.overview import make_sheets
 from gausim.report.page import html_page
 from gausim.report.runs import find_runs
@@ -17,6 +19,21 @@ from gausim.report.text import csv_numbers, latex_tables, markdown_report
 PAGE, MARKDOWN, LATEX, NUMBERS = "report.html", "report.md", "tables.tex", "numbers.csv"
 
 
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A report that was written.
+
+    Attributes:
+        study: what it is about.
+        openings: first screens, the best run's first; none where nothing was evaluated.
+        files: the page first.
+    """
+
+    study: Study
+    openings: list[Opening]
+    files: list[Path]
+
+
 def write_report(
     roots: Sequence[Path],
     out: Path,
@@ -24,7 +41,7 @@ def write_report(
     title: str = "Report",
     pictures: bool = True,
     say: Callable[[str], None] | None = None,
-) -> tuple[Study, list[Path]]:
+) -> Report:
     """Writes the report of all runs at or below ``roots`` into ``out``.
 
     Args:
@@ -35,7 +52,7 @@ def write_report(
         say: told what is being drawn.
 
     Returns:
-        What the report is about, and the files.
+        What the report is about, what it begins with, and the files.
 
     Raises:
         RunError: a root is no directory, or there is no run.
@@ -44,6 +61,9 @@ def write_report(
     study = make_study(runs)
     sheets = make_sheets(study)
     sources = Sources(runs, sheets, out)
+    if say is not None and pictures:
+        say("videos of the runs")
+    openings, left = make_openings(study, pictures=pictures)
     exhibits: list[tuple[str, list[Exhibit]]] = []
     notes = list(study.notes)
     for name in study.objects if pictures else ():
@@ -52,14 +72,16 @@ def write_report(
         figures, problems = object_figures(study, name)
         exhibits.append((name, figures))
         notes += [f"{name}: {problem}" for problem in dict.fromkeys(problems)]
+    page = html_page(title, study, sheets, sources, openings=openings, left=left, exhibits=exhibits, notes=notes)
     texts = {
-        PAGE: html_page(title, study, sheets, sources, exhibits, notes),
-        MARKDOWN: markdown_report(title, study, sheets, sources),
+        PAGE: page,
+        MARKDOWN: markdown_report(title, study, sheets, sources, openings),
         LATEX: latex_tables(sheets, sources),
         NUMBERS: csv_numbers(study),
     }
     out.mkdir(parents=True, exist_ok=True)
-    return study, [_write(out / name, text) for name, text in texts.items()]
+    files = [_write(out / name, text) for name, text in texts.items()]
+    return Report(study, openings, files)
 
 
 def _write(path: Path, text: str) -> Path:

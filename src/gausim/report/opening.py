@@ -1,0 +1,234 @@
+"""What a report begins with: per run a video, three sentences, and one table."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import Any
+
+from gausim.core import RunError
+from gausim.metrics.lpips import HOW_TO_GET_WEIGHTS, NO_WEIGHTS
+from gausim.report.curves import ERROR_3D, STATIC
+from gausim.report.film import Film, make_film
+from gausim.report.runs import FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
+from gausim.report.sheets import NOTHING
+from gausim.report.study import Cell, Group, Study, cell, dig, pooled
+from gausim.report.summary import MOTION_ENERGY
+from gausim.report.tables import Table
+from gausim.report.verdict import outcome, sentences
+
+# Videos are most of a page's size; the page of a run alone has its video.
+MOST_OPENINGS = 6
+# Of the one table; the last is the prediction of no motion.
+MOST_ROWS = 6
+_STILL = "no motion"
+# Metric, views (None: those of the row), heading, digits.
+_COLUMNS = (
+    ("psnr", None, "PSNR [dB] ↑", 1),
+    ("ssim", None, "SSIM ↑", 3),
+    ("lpips", None, "LPIPS ↓", 3),
+    (ERROR_3D, "points", "3D error ÷ static ↓", 2),
+    (MOTION_ENERGY, "points", "motion energy → 1", 2),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Opening:
+    """The first screen of one run and object.
+
+    Attributes:
+        label: what it is chosen by.
+        name: of the object.
+        title: heading: the object and the row.
+        row: label of its row.
+        seed: which of several seeds; empty for one.
+        run: the run of the video.
+        sentences: three, over all seeds of the row.
+        table: the one table.
+        film: the video; None without one.
+        problem: why there is none, and what to do.
+        unfinished: whether the figures are of a checkpoint in the middle of training.
+    """
+
+    label: str
+    name: str
+    title: str
+    row: str
+    seed: str
+    run: RunRecord
+    sentences: tuple[str, str, str]
+    table: Table
+    film: Film | None
+    problem: str
+    unfinished: bool
+
+
+def make_openings(study: Study, *, pictures: bool = True) -> tuple[list[Opening], int]:
+    """The openings of the best runs: the best of every object, then the next; one per row before further seeds.
+
+    Args:
+        study: what the report is about.
+        pictures: whether they have videos.
+
+    Returns:
+        At most ``MOST_OPENINGS``, and the number of those left out.
+    """
+    ranked = [_ranked(study, name) for name in study.objects]
+    turns = [run for turn in zip_longest(*ranked) for run in turn if run is not None]
+    shown = [_opening(study, *item, pictures=pictures) for item in turns[:MOST_OPENINGS]]
+    return shown, len(turns) - len(shown)
+
+
+def _ranked(study: Study, name: str) -> list[tuple[str, Group, RunRecord]]:
+    """The evaluated runs about an object, the best seed of every row first, by their errors."""
+    found: list[tuple[int, float, Group, RunRecord]] = []
+    for group in study.groups:
+        seeds = sorted(
+            ((outcome([entry], group.method).merit, run) for run, entry in group.entries(name)), key=lambda s: s[0]
+        )
+        found += [(place, merit, group, run) for place, (merit, run) in enumerate(seeds)]
+    return [(name, group, run) for _, _, group, run in sorted(found, key=lambda item: item[:2])]
+
+
+def unanswered(study: Study) -> list[str]:
+    """For every run without figures, the command that leads to them; in words, backquotes about the command."""
+    return [_remedy(run) for run in study.runs if run.summary is None]
+
+
+def _remedy(run: RunRecord) -> str:
+    path = shlex.quote(str(run.path))
+    if run.status == NOT_EVALUATED:
+        return f"{run.name} is trained and not evaluated: `gausim evaluate {path}` measures it."
+    if run.status == UNFINISHED:
+        return (
+            f"{run.name} is not finished ({run.detail}): give its `gausim train` command again, or measure what there "
+            f"is with `gausim evaluate {path}`."
+        )
+    if run.status == FAILURE:
+        return f"{run.name} failed ({run.detail}): mend the cause and give its `gausim train` command again."
+    return f"{run.name} has {run.status}: {run.detail}"
+
+
+def _opening(study: Study, name: str, group: Group, run: RunRecord, *, pictures: bool) -> Opening:
+    entries = [entry for _, entry in group.entries(name)]
+    seed = f"seed {run.seed}" if len(entries) > 1 else ""
+    parts = [name] if len(study.objects) > 1 else []
+    parts += [group.label] if len(study.groups) > 1 else []
+    film, problem = None, "Videos were left out (--no-pictures)."
+    if pictures:
+        try:
+            film = make_film(run, name, group.method)
+        except RunError as error:
+            problem = f"There is no video: {error}"
+    return Opening(
+        label=" · ".join([*parts, seed] if seed else parts) or name,
+        name=name,
+        title=f"{name}, predicted by {group.label}",
+        row=group.label,
+        seed=seed,
+        run=run,
+        sentences=sentences(outcome(entries, group.method)),
+        table=first_table(study, group, name),
+        film=film,
+        problem=problem,
+        unfinished=any(r.is_from_unfinished for r, _ in group.entries(name)),
+    )
+
+
+def first_table(study: Study, group: Group, name: str) -> Table:
+    """The one table: of a row alone its frames and views, else all rows in the frames never seen."""
+    rivals = [g for g in study.groups if name in g.objects]
+    return _own_table(study, group, name) if len(rivals) == 1 else _comparison(study, rivals, name)
+
+
+def _own_table(study: Study, group: Group, name: str) -> Table:
+    splits = study.splits(name)
+    rows = []
+    for split in ("seen", "unseen"):
+        rows += _rows(group, name, split, f"{split} {_span(splits[split])}") if split in splits else []
+    last = "unseen" if "unseen" in splits else "seen"
+    rows += _rows(group, name, last, _STILL, row=STATIC)
+    seeds = "± standard deviation over seeds. " if len(group.entries(name)) > 1 else ""
+    caption = (
+        f"No motion: the static prediction of the {last} frames. New views: never trained on. {seeds}{_legend(rows)}"
+    )
+    return _tidy(["frames", "views"], rows, caption)
+
+
+def _comparison(study: Study, rivals: list[Group], name: str) -> Table:
+    splits = study.splits(name)
+    split = "unseen" if "unseen" in splits else "seen"
+
+    def merit(group: Group) -> float:
+        entries = [entry for _, entry in group.entries(name)]
+        return outcome(entries, group.method).merit if entries else math.inf
+
+    ordered = sorted(rivals, key=merit)
+    shown = ordered[: MOST_ROWS - 1]
+    views = "heldout" if any(_rows(g, name, split, "")[1:] for g in shown) else "train"
+    rows = [_row(g, name, split, views, g.label) for g in shown]
+    rows.append(_row(shown[0], name, split, views, _STILL, row=STATIC))
+    where = "views never trained on" if views == "heldout" else "training views"
+    left = f" The best {len(shown)} of {len(ordered)} rows; all are below." if len(ordered) > len(shown) else ""
+    caption = f"Frames {_span(splits[split])} ({split}), {where}. {_legend(rows)}{left}"
+    return _tidy(["method"], rows, caption)
+
+
+def _span(split: tuple[int, int]) -> str:
+    return f"{split[0]}–{split[1] - 1}"
+
+
+def _rows(group: Group, name: str, split: str, label: str, *, row: str | None = None) -> list[list[str]]:
+    """The line of the training views, and that of the views never trained on where they were measured."""
+    lines: list[list[str]] = []
+    for views, title in (("train", "training"), ("heldout", "new")):
+        line = _row(group, name, split, views, label, row=row)
+        if any(map(_is_figure, line[1:4])) or views == "train":
+            lines.append([label if not lines else "", title, *(line[1:] if not lines else [*line[1:4], "", ""])])
+    return lines
+
+
+def _row(group: Group, name: str, split: str, views: str, label: str, *, row: str | None = None) -> list[str]:
+    texts = []
+    for metric, own, _, digits in _COLUMNS:
+        if metric == ERROR_3D:
+            found = _ratio(group, name, split, row)
+        else:
+            found = cell(group, name, split, own or views, metric, row=row)
+        texts.append(_text(found, digits, spread=row is None))
+    return [label, *texts]
+
+
+def _ratio(group: Group, name: str, split: str, row: str | None) -> Cell:
+    def find(entry: dict[str, Any]) -> Any:
+        return {"mean": dig(entry["rows"], row or group.method, split, "points", ERROR_3D, "ratio")}
+
+    return pooled(group, name, find, ERROR_3D)
+
+
+def _text(found: Cell, digits: int, *, spread: bool) -> str:
+    if found.value is None:
+        return found.status or NOTHING
+    over = found.value.seed_std if spread else None
+    return f"{found.value.mean:.{digits}f}" + ("" if over is None else f" ± {over:.{digits}f}")
+
+
+def _is_figure(text: str) -> bool:
+    return text[:1].isdigit() or text[:1] == "-"
+
+
+def _legend(rows: list[list[str]]) -> str:
+    text = "3D error: over that of no motion, below 1 is better. Motion energy: predicted over true, 1 is right."
+    if any(NO_WEIGHTS in row for row in rows):
+        text += f" LPIPS: its weights were not there; `{HOW_TO_GET_WEIGHTS}` gets them, then evaluate again."
+    return text
+
+
+def _tidy(stubs: list[str], rows: list[list[str]], caption: str) -> Table:
+    """The table without columns that no row has anything for."""
+    head = [*stubs, *(heading for _, _, heading, _ in _COLUMNS)]
+    kept = [i for i in range(len(head)) if i < len(stubs) or any(_is_figure(row[i]) for row in rows)]
+    breaks = [i for i, row in enumerate(rows) if i and (row[0] == _STILL or (len(stubs) > 1 and row[0]))]
+    return Table(caption, [head[i] for i in kept], [[row[i] for i in kept] for row in rows], breaks)

@@ -1,0 +1,233 @@
+"""The first screen of a report: a video, three sentences, one table, and what stands there where one is missing."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+import runpy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gausim.io.video import read_video
+from gausim.report.frames import SEEN
+from gausim.report.opening import MOST_OPENINGS, MOST_ROWS, make_openings
+from gausim.report.runs import find_runs
+from gausim.report.study import make_study
+from gausim.report.verdict import outcome, sentences
+from gausim.report.write import write_report
+
+MADE = runpy.run_path(str(Path(__file__).with_name("report_runs.py")))
+config, write_run, evaluate, make_curves = (MADE[n] for n in ("config", "write_run", "evaluate", "make_curves"))
+EVIL = "<script>alert(1)</script>&\"'|`"
+
+
+def entry(
+    error: float | None = 0.3, seen: float | None = 0.2, energy: float | None = 0.9, *, views: str = "points",
+    new: float | None = 27.0, **more: Any,
+) -> dict[str, Any]:  # fmt: skip
+    """An object in metrics.json; PSNR 27.4 dB in the training views, 21.5 dB without motion."""
+    metric = "error_3d" if views == "points" else "l2"
+
+    def row(unseen: float | None, known: float | None, trained: float, heldout: float | None) -> dict[str, Any]:
+        def cells(ratio: float | None) -> dict[str, Any]:
+            found: dict[str, Any] = {"train": {"psnr": {"mean": trained}}, "heldout": {"psnr": {"mean": heldout}}}
+            figures = {metric: {"mean": 1.0, "ratio": ratio}, "motion_energy": {"pooled": energy}}
+            found[views] = found.get(views, {}) | figures
+            return found
+
+        return {"seen": cells(known), "unseen": cells(unseen)}
+
+    return {
+        "splits": {"seen": [0, 16], "unseen": [16, 50]}, "heldout_views": ["cam_4"] if new is not None else [],
+        "rows": {"m": row(error, seen, 27.4, new), "static": row(1.0, 1.0, 21.5, None if new is None else 21.0)},
+        **more,
+    }  # fmt: skip
+
+
+def said(*entries: dict[str, Any]) -> tuple[str, str, str]:
+    return sentences(outcome(entries, "m"))
+
+
+def test_a_good_run_is_called_good():
+    assert said(entry()) == (
+        "On frames never seen (16–49), its points are 0.30 times as far off as those of a model that predicts no "
+        "motion (0.20 on the frames it was trained on): it foresees most of the motion.",
+        "Its motion there has 0.90 times the energy of the true motion: it is about as lively as the object.",
+        "In a view that it was never trained on (cam_4), its images have a PSNR of 27.0 dB, about as good as in the "
+        "training views (27.4 dB) and 6.0 dB above those of a model that predicts no motion.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("error", "seen", "words"),
+    [
+        (0.1, 0.1, "it foresees the motion closely"),
+        (0.7, 0.3, "it foresees part of the motion"),
+        (0.97, 0.5, "no better than predicting no motion, although it learned the frames it was trained on"),
+        (1.4, 0.95, "worse than predicting no motion, and it learned no more of the frames it was trained on"),
+        (1.4, None, "that is worse than predicting no motion"),
+    ],
+)
+def test_mediocre_and_failed_runs_are_called_so(error: float, seen: float | None, words: str):
+    assert said(entry(error, seen))[0].endswith(f"{words}.")
+
+
+@pytest.mark.parametrize(
+    ("energy", "error", "words"),
+    [
+        (0.02, 0.9, "it all but stands still"), (0.6, 0.4, "it dies down sooner than the object does"),
+        (1.0, 0.95, "it moves as much as the object, but not as the object does"),
+        (1.5, 0.4, "it is livelier than the object"), (7.0, 2.0, "it gains energy that the object does not have"),
+    ],
+)  # fmt: skip
+def test_too_still_and_too_lively(energy: float, error: float, words: str):
+    assert said(entry(error, energy=energy))[1].endswith(f"{words}.")
+
+
+def test_views_that_are_worse_or_missing():
+    assert "(cam_4), its images have a PSNR of 20.0 dB, worse than in" in said(entry(new=20.0))[2]
+    assert "1.0 dB below those of a model" in said(entry(new=20.0))[2]
+    alone = said(entry(new=None))[2]
+    assert alone.startswith("No view was kept out of training") and "27.4 dB and 5.9 dB above" in alone
+
+
+def test_what_is_not_measured_is_not_made_up():
+    first, second, _ = said(entry(None, None, None))
+    assert all("`gausim evaluate RUN`" in s for s in (first, second)) and not re.search(r"nan|None|inf", first + second)
+    images = said(entry(views="train"))[0]
+    assert "its images in the training views are 0.30 times as far off (l2)" in images
+    short = entry()
+    del short["splits"]["unseen"], short["rows"]["m"]["unseen"]
+    assert said(short)[0].startswith("The recordings end with the frames trained on") and "0.20 times" in said(short)[0]
+
+
+def test_seeds_are_averaged_and_a_fit_that_repeats_is_no_foresight():
+    assert "(16–49; mean of 2 seeds), its points are 0.40 times" in said(entry(0.3), entry(0.5))[0]
+    repeats = {"m": {"extrapolates": False, "notes": []}}
+    assert said(entry(footnotes=repeats))[0].endswith(
+        "does not foresee, but repeats what was fitted to the frames it was trained on."
+    )
+
+
+def with_psnr(error: float, name: str = "toy_bunny") -> Any:
+    """Curves with a PSNR that goes with their l2, and the second view held out (as their pictures have it)."""
+    curves = make_curves(error, name=name)
+    psnr = MADE["ImageMetricInfo"]("psnr", "PSNR", 1.0, "dB", True)
+    for row in ("gausim", "static"):
+        curves.values[row]["psnr"] = -10 * np.log10(curves.values[row]["l2"])
+    return replace(curves, facts=replace(curves.facts, metrics=(*curves.facts.metrics, psnr)))
+
+
+def first_screen(page: str) -> str:
+    return page.split("<details", 1)[0]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> str:
+    root = tmp_path_factory.mktemp("one")
+    evaluate(write_run(root / "a", config()), with_psnr(1.0))
+    write_report([root], root / "report")
+    return (root / "report" / "report.html").read_text()
+
+
+def test_the_first_screen_is_a_video_three_sentences_and_a_small_table(page: str):
+    first = first_screen(page)
+    assert first.count("<video") == 1 and 'src="data:video/mp4;base64,' in first and "autoplay" in first
+    text = re.search(r'<div class="sentences">(.*?)</div>', first, re.S)[1]
+    assert len(re.findall(r"<p>[^<]+\.</p>", text)) == 3 and "0.25 times as far off" in text
+    assert first.count("<table") == 1
+    rows = re.findall(r"<tr class=.*?</tr>", first, re.S)
+    cells = [re.findall(r"<t[hd]>(.*?)</t[hd]>", row) for row in rows]
+    assert len(rows) == MOST_ROWS and [row[:2] for row in cells] == [
+        ["seen 0–15", "training"], ["", "new"], ["unseen 16–49", "training"], ["", "new"], ["no motion", "training"],
+        ["", "new"],
+    ]  # fmt: skip
+    assert cells[2][2:] == ["20.6", "0.990", "0.25", "0.50"]  # PSNR, SSIM, 3D over static, energy
+    assert "LPIPS: its weights were not there" in first and page.count("<details") >= 5
+
+
+def test_the_video_is_truth_prediction_and_error_in_the_view_never_trained_on(page: str, tmp_path: Path):
+    assert "a in y (never trained on), at half speed" in page
+    (tmp_path / "v.mp4").write_bytes(base64.b64decode(re.search(r'data:video/mp4;base64,([^"]+)', page)[1]))
+    frames = list(read_video(tmp_path / "v.mp4"))
+    assert len(frames) == 20 and frames[0].shape == (264 + 8, 3 * 352, 3)
+    truth, prediction, error = (frames[10][:264, i * 352 : (i + 1) * 352].astype(int) for i in range(3))
+    at = [float(np.nonzero((p[..., 0] > 180).any(0))[0].mean()) for p in (truth, prediction)]
+    assert at[1] - at[0] == pytest.approx(22, abs=4)  # two pixels of 32, eleven times as large
+    assert error.mean() < truth.mean() and error.max() > 150
+    line = frames[10][-5].astype(int)
+    assert np.abs(line[100] - SEEN).max() < 12 and line[500, 0] > 200 > line[500, 2]  # blue, then orange
+
+
+def test_several_rows_are_compared_in_the_one_table_and_runs_can_be_chosen(tmp_path: Path):
+    for i in range(8):
+        settings = config(name=f"run{i}")
+        settings["optimizer"]["network_lr"] = 0.1 * (i + 1)
+        evaluate(write_run(tmp_path / f"r{i}", settings), with_psnr(3.0 - 0.3 * i))
+    study = make_study(find_runs([tmp_path]))
+    openings, left = make_openings(study, pictures=False)
+    assert len(openings) == MOST_OPENINGS and left == 2
+    assert openings[0].run.name == "r7" and openings[0].label == "gausim (run7)"
+    table = openings[0].table
+    assert [row[0] for row in table.rows] == [*(f"gausim (run{i})" for i in (7, 6, 5, 4, 3)), "no motion"]
+    assert "views never trained on" in table.title and "best 5 of 8" in table.title
+    write_report([tmp_path], tmp_path / "report", pictures=False)
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert page.count('type="radio"') == MOST_OPENINGS == page.count('<section class="opening"')
+    assert page.count(" checked>") == 1 and "and 2 more:" in page and "<script" not in page
+
+
+def test_every_object_has_its_turn_before_the_second_best(tmp_path: Path):
+    evaluate(write_run(tmp_path / "both", config()), with_psnr(2.0, "one"), with_psnr(1.0, "two"))
+    evaluate(write_run(tmp_path / "both_again", config(1)), with_psnr(1.5, "one"), with_psnr(3.0, "two"))
+    openings, _ = make_openings(make_study(find_runs([tmp_path])), pictures=False)
+    assert [o.label for o in openings] == ["one · seed 1", "two · seed 0", "one · seed 0", "two · seed 1"]
+
+
+def test_what_is_missing_is_named_with_the_command_that_makes_it(tmp_path: Path):
+    trained = write_run(tmp_path / "my run", config())
+    failed = write_run(tmp_path / "failed", config(conserve_mass=False), finished=False)
+    (failed / "FAILED").write_text("RuntimeError: out of memory")
+    write_report([tmp_path], tmp_path / "report")
+    first = html.unescape(first_screen((tmp_path / "report" / "report.html").read_text()))
+    assert "Nothing has been evaluated" in first and f"<code>gausim evaluate '{trained}'</code>" in first
+    assert "failed (RuntimeError: out of memory)" in first and "<video" not in first
+
+    (evaluate(trained, with_psnr(1.0)) / "evaluation" / "pictures.npz").unlink()
+    write_report([trained], tmp_path / "report")
+    first = html.unescape(first_screen((tmp_path / "report" / "report.html").read_text()))
+    assert "There is no video:" in first and f"<code>gausim evaluate {trained}</code>" in first
+    assert first.count("<table") == 1
+
+
+def test_a_run_without_a_view_kept_out_says_so(tmp_path: Path):
+    curves = with_psnr(1.0)
+    facts = replace(curves.facts, train_views=curves.facts.views)
+    evaluate(
+        write_run(tmp_path / "a", config()),
+        replace(curves, facts=facts, pictures=replace(curves.pictures, heldout_views=())),
+    )
+    (opening,) = make_openings(make_study(find_runs([tmp_path])))[0]
+    assert "a in x (a training view; the evaluation has no other)" in opening.film.caption
+    assert [row[1] for row in opening.table.rows] == ["training"] * 3
+    assert opening.sentences[2].startswith("No view was kept out of training")
+
+
+def test_hostile_names_stay_text_on_the_first_screen(tmp_path: Path):
+    name = EVIL.replace("/", "∕")
+    curves = with_psnr(1.0, name)
+    evil = replace(curves.pictures, object=name, sequence=EVIL, views=("x", EVIL), heldout_views=(EVIL,))
+    run = evaluate(write_run(tmp_path / name, config(name=EVIL), model=EVIL), replace(curves, pictures=evil))
+    summary = json.loads((run / "evaluation" / "metrics.json").read_text())
+    summary["objects"][name]["heldout_views"] = [EVIL]
+    (run / "evaluation" / "metrics.json").write_text(json.dumps(summary))
+    write_run(tmp_path / "b", config(name=EVIL, conserve_mass=False), model=EVIL)
+    write_report([tmp_path], tmp_path / "report")
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "<script" not in page and first_screen(page).count("&lt;script&gt;") >= 4 and "<video" in page
