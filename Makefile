@@ -80,12 +80,10 @@ report: install ## Tables, figures and videos: make report DIRS="outputs/a outpu
 benchmark: install ## Measure: make benchmark ARGS=step (alone: every case at tiny sizes, to see that it works)
 	$(BIN)/gausim benchmark $(or $(ARGS),all --quick)
 
-demo: data ## From nothing to a simulator that foresees: install, make data, train, evaluate, simulate
+demo: data ## From nothing to a simulator that foresees: install, make data, train, evaluate, and a page about it
 	test -e outputs/demo/seed_0/FINISHED || $(BIN)/gausim train experiment=demo
 	$(BIN)/gausim evaluate outputs/demo/seed_0
-	$(BIN)/gausim simulate outputs/demo/seed_0
-	echo "Numbers and pictures of the demo:"
-	find outputs/demo/seed_0 -type f \( -name '*.json' -o -name '*.md' -o -name '*.png' -o -name '*.mp4' \) | sort | sed 's/^/  /'
+	$(BIN)/gausim report outputs/demo/seed_0
 
 clean: ## Remove caches and builds (not .venv, data or outputs)
 	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -48,9 +48,12 @@ def test_whole_evaluation(run, capsys, monkeypatch):
     monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(run.run_dir / "none"))
     assert evaluate.main([str(run.run_dir)]) == 0
     captured = capsys.readouterr()
-    assert "views never trained on" in captured.out and "not finished" not in captured.err
-    assert "`gausim prepare lpips` gets them" in captured.out
     folder = run.run_dir / "evaluation"
+    assert "`gausim prepare lpips` gets them" in (folder / "table.md").read_text()
+    lines = captured.out.splitlines()
+    assert lines[0].startswith("toy: On frames never seen") and "it foresees the motion closely." in lines[0]
+    assert lines[1] == f"tables: {(folder / 'table.md').as_uri()}" and lines[2] == f"next: gausim report {run.run_dir}"
+    assert len(lines) == 4 and "not finished" not in captured.err
     names = {p.name for p in folder.iterdir()}
     assert names == {"metrics.json", "metrics.npz", "pictures.npz", "table.md", "errors_toy.png", "motion_toy.png"}
     summary = json.loads((folder / "metrics.json").read_text())
@@ -58,6 +61,15 @@ def test_whole_evaluation(run, capsys, monkeypatch):
     assert summary["run"] == expected
     row = summary["objects"]["toy"]["rows"]["gausim"]["unseen"]
     assert row["points"]["error_3d"]["ratio"] < 1e-3 and row["heldout"]["l2"]["mean"] < 0.003
+
+
+def test_tables_and_files_are_listed_on_demand(run, capsys):
+    assert evaluate.main([str(run.run_dir), "--verbose", "--sequences", "seq_000"]) == 0
+    shown = capsys.readouterr().out
+    assert (
+        "views never trained on" in shown and f"wrote {run.run_dir / 'evaluation' / 'partial' / 'metrics.npz'}" in shown
+    )
+    assert shown.splitlines()[-1] == f"next: gausim evaluate {run.run_dir}"  # a part leads to the whole
 
 
 def test_a_part_does_not_overwrite_the_whole(run, capsys):

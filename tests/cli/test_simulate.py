@@ -22,7 +22,10 @@ def test_a_sequence_gives_all_files(run, capsys):
     folder = run.run_dir / "simulation" / "toy" / "seq_000"
     views = [f"{view}{end}" for view in ("cam_0", "cam_2") for end in (".gif", ".mp4", "_sheet.png", "_slices.png")]
     assert {p.name for p in folder.iterdir()} == {*views, "errors.png", "trajectory.safetensors"}
-    assert "trajectory.safetensors" in capsys.readouterr().out
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("toy seq_000: On frames never seen (8–19), its points are 0.00 times as far off")
+    assert lines[1] == f"videos: {folder.parent.as_uri()}" and len(lines) == 4
+    assert lines[3].split() == ["gausim", "simulate", str(run.run_dir), *"--force on=tip weights=3 direction=x".split()]
     frames = list(read_video(folder / "cam_2.mp4"))
     assert len(frames) == 20 and frames[0].shape[1] == 3 * 320
     # The prediction is the truth here: the first two panels agree, the error panel is dark.
@@ -73,7 +76,8 @@ def test_a_bare_scene_moves_and_stays_finite(bare, tmp_path, capsys):
     scene, path = bare
     options = ["--random-weights", "--pin-below", "z=0.1", "--steps", "7", "--size", "48", "--out", str(tmp_path / "o")]
     assert simulate.main(["--scene", str(path), *options]) == 0
-    assert "all finite: True" in capsys.readouterr().out
+    lines = capsys.readouterr().out.splitlines()
+    assert "all finite: True" in lines[1] and lines[3] == f"video: {(tmp_path / 'o' / 'video.mp4').as_uri()}"
     trajectory = load_trajectory(tmp_path / "o" / "trajectory.safetensors")
     moved = (trajectory.positions - scene.means).abs().amax((0, 2))
     assert trajectory.frames == 8 and (moved[scene.pinned] == 0).all() and (moved[~scene.pinned] > 0).all()

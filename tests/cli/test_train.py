@@ -48,7 +48,11 @@ def test_a_run_leaves_everything_and_loads_again(arguments: list[str], capsys: p
     assert [(r["epoch"], float(r["steps"])) for r in rows] == [("1", 1.0), ("2", 2.0)]
     assert [p.name for p in sorted((run / "panels").iterdir())] == ["step_000001", "step_000002"]
     printed = capsys.readouterr().out
-    assert "36 kernels" in printed and "gausim evaluate" in printed
+    assert "36 kernels" in printed
+    result, address, *following = printed.splitlines()[-4:]
+    assert result.startswith("Trained for 2 epochs (") and "times that of a model that predicts no motion" in result
+    assert address == f"run: {run.resolve().as_uri()}"
+    assert [line.split("gausim ")[1].split()[0] for line in following] == ["evaluate", "report"]
     loaded = load_run(run)
     assert not loaded.module.training and loaded.objects[0].name == "toy"
     for name, value in loaded.module.state_dict().items():

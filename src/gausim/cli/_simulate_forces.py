@@ -37,6 +37,7 @@ def simulate_forces(run: LoadedRun, arguments: argparse.Namespace) -> int:
         DataError: a session that is broken or of another scene; an object, sequence or view that is not there.
         DivergenceError: the simulation left the finite numbers.
     """
+    from gausim.cli._end import end
     from gausim.cli._foresee import run_objects
     from gausim.view.arrows import arrows_of
     from gausim.view.interaction import replay
@@ -52,8 +53,10 @@ def simulate_forces(run: LoadedRun, arguments: argparse.Namespace) -> int:
     _write(run, run_objects(run, [item.data.name])[0], session, trajectory, folder)
     for view in views:
         _write_view(run, item, trajectory, arrows, view, arguments, folder)
-    _report(interaction, trajectory)
-    print("\n".join(f"wrote {path}" for path in sorted(folder.iterdir())))
+    if arguments.verbose:
+        print("\n".join(f"wrote {path}" for path in sorted(folder.iterdir())))
+    replayed = ["simulate", arguments.run, "--session", folder / "session.json"]
+    end(_told(interaction, trajectory), "videos", folder, ["view", arguments.run], replayed)
     return 0
 
 
@@ -178,15 +181,19 @@ def _pictures(
         yield np.concatenate((shown, label_bar(text, shown.shape[1])))
 
 
-def _report(interaction: Interaction, trajectory: Trajectory) -> None:
+def _told(interaction: Interaction, trajectory: Trajectory) -> list[str]:
+    """How far it went, and what kept it from going further."""
     scene = interaction.scene
     away = (trajectory.positions - scene.means.to(trajectory.positions)).norm(dim=-1) / scene.diagonal
     held = ~scene.simulated | scene.pinned
-    print(f"frames       {trajectory.frames} of {scene.name}, {scene.count} kernels")
-    print(f"farthest     {float(away.max()):.3f} diagonals from rest, at frame {int(away.amax(1).argmax())}")
+    slipped = float(away[:, held].max()) if bool(held.any()) else 0.0
+    sentences = [
+        f"{scene.name}: {trajectory.frames} frames; it is farthest from rest at frame {int(away.amax(1).argmax())}, by "
+        f"{float(away.max()):.3f} of its diagonal; what is pinned moved by {slipped:g}."
+    ]
     if interaction.limited:
-        print(
-            f"limited      in {interaction.limited} frames forces acted only in part: they would carry {scene.name} "
-            "beyond what was learned"
+        sentences.append(
+            f"In {interaction.limited} frames forces acted only in part: they would carry {scene.name} beyond what was "
+            "learned."
         )
-    print(f"pinned       moved {float(away[:, held].max()) if bool(held.any()) else 0.0:g} diagonals")
+    return sentences

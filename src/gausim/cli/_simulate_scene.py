@@ -33,6 +33,7 @@ def simulate_scene(arguments: argparse.Namespace) -> int:
     import torch
 
     from gausim.cli._config import compose, instantiate
+    from gausim.cli._end import OWN_OBJECT, end
     from gausim.cli.inspect import pinned_by
     from gausim.cli.simulate import parse_background
     from gausim.core.errors import ConfigError
@@ -53,8 +54,9 @@ def simulate_scene(arguments: argparse.Namespace) -> int:
     size = (arguments.size, arguments.size)
     cameras = orbit_cameras(scene.means[scene.foreground], azimuths=AZIMUTHS, up=arguments.up, size=size)
     _write(folder, scene, trajectory, instantiate(render), cameras, background)
-    _report(scene, trajectory, seconds)
-    print("\n".join(f"wrote {path}" for path in sorted(folder.iterdir())))
+    if arguments.verbose:
+        print("\n".join(f"wrote {path}" for path in sorted(folder.iterdir())))
+    end(_told(scene, trajectory, seconds), "video", folder / "video.mp4", OWN_OBJECT)
     return 0
 
 
@@ -119,7 +121,7 @@ def _write(
     write_video(folder / "video.mp4", images(list(range(last + 1)), cameras.select([0]))[:, 0], trajectory.fps)
 
 
-def _report(scene: GaussianScene, trajectory: Trajectory, seconds: float) -> None:
+def _told(scene: GaussianScene, trajectory: Trajectory, seconds: float) -> list[str]:
     import torch
 
     from gausim.metrics import motion_energy
@@ -131,7 +133,9 @@ def _report(scene: GaussianScene, trajectory: Trajectory, seconds: float) -> Non
     farthest, slipped = float(moved.max()) / scene.diagonal, float(moved[:, held].max())
     energy = motion_energy(trajectory.positions)
     kept = float(energy[-1] / energy[0].clamp_min(1e-30))
-    print(f"scene        {scene.name}: {scene.count} kernels, {int(held.sum())} held, {units} units")
-    print(f"steps        {steps} in {seconds:.1f} s ({1000 * seconds / steps:.0f} ms per step); all finite: {finite}")
-    print(f"farthest     {farthest:.3f} diagonals from rest; held kernels {slipped:g}")
-    print(f"motion       energy of the last step is {kept:.3g} of the first's")
+    return [
+        f"{scene.name}: {scene.count} kernels, {int(held.sum())} of them held, in {units} units.",
+        f"{steps} steps in {seconds:.1f} s ({1000 * seconds / steps:.0f} ms per step); all finite: {finite}.",
+        f"Farthest from rest {farthest:.3f} diagonals, held kernels {slipped:g}; the last step has {kept:.3g} of the "
+        "first one's energy.",
+    ]

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gausim.report.curves import ObjectCurves
 
 HELP = "Measure a run on seen, unseen and held-out frames."
+WRITTEN = ("metrics.json", "metrics.npz", "pictures.npz", "table.md")
 
 
 def main(argv: list[str]) -> int:
@@ -34,6 +35,7 @@ def main(argv: list[str]) -> int:
     arguments = _parser().parse_args(argv)
     if arguments.endurance is not None and arguments.endurance < 300:
         raise ConfigError(f"--endurance: expected at least 300 frames, got {arguments.endurance}.")
+    from gausim.cli._end import end, told
     from gausim.cli._foresee import state_of
     from gausim.cli._run import load_run
     from gausim.engine.evaluation import write_evaluation
@@ -47,24 +49,21 @@ def main(argv: list[str]) -> int:
     summary = write_evaluation(folder, results, _facts(run, arguments, state))
     drawn: list[str] = []
     for curves in results:
-        error_figure(curves, folder / f"errors_{curves.facts.name}.png")
-        entry, motion = summary["objects"][curves.facts.name], folder / f"motion_{curves.facts.name}.png"
-        drawn += [motion.name] if diagnosis_figure(curves.facts.name, entry, motion) else []
+        name = curves.facts.name
+        error_figure(curves, folder / f"errors_{name}.png")
+        shown = diagnosis_figure(name, summary["objects"][name], folder / f"motion_{name}.png")
+        drawn += [f"errors_{name}.png", *([f"motion_{name}.png"] if shown else [])]
     if arguments.endurance is not None:
         drawn += _endure(run, arguments, folder)
     if arguments.json:
         print((folder / "metrics.json").read_text(), end="")
         return 0
-    _print_tables(summary)
-    for name in [
-        "metrics.json",
-        "metrics.npz",
-        "pictures.npz",
-        "table.md",
-        *(f"errors_{c.facts.name}.png" for c in results),
-        *drawn,
-    ]:
-        print(f"wrote {folder / name}")
+    if arguments.verbose:
+        _print_tables(summary)
+        print("\n".join(f"wrote {folder / name}" for name in [*WRITTEN, *drawn]))
+    whole = folder == Path(run.run_dir) / "evaluation"
+    commands = [["report", arguments.run], ["simulate", arguments.run]] if whole else [["evaluate", arguments.run]]
+    end(told(summary["objects"]), "tables", folder / "table.md", *commands)
     return 0
 
 
@@ -84,7 +83,8 @@ def _parser() -> argparse.ArgumentParser:
         help="also roll N frames far, free and under random pushes in the first 240 (at least 300; 1000 is a good "
         "number); writes endurance.json and a figure per object",
     )  # fmt: skip
-    add("--json", action="store_true", help="print metrics.json instead of tables")
+    add("--verbose", action="store_true", help="print all tables, and list the files that are written")
+    add("--json", action="store_true", help="print metrics.json and nothing else")
     return parser
 
 

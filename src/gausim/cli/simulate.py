@@ -49,6 +49,7 @@ def main(argv: list[str]) -> int:
         from gausim.cli._simulate_scene import simulate_scene
 
         return simulate_scene(arguments)
+    from gausim.cli._end import end, push
     from gausim.cli._foresee import run_objects, state_of
     from gausim.cli._run import load_run
 
@@ -59,8 +60,11 @@ def main(argv: list[str]) -> int:
 
         return simulate_forces(run, arguments)
     folder = Path(arguments.out) if arguments.out else Path(run.run_dir) / "simulation"
-    for item in run_objects(run, arguments.object):
-        _simulate_object(run, item, arguments, folder / item.data.name)
+    items = run_objects(run, arguments.object)
+    sentences = [_simulate_object(run, item, arguments, folder / item.data.name) for item in items]
+    first = items[0].data.name
+    push_it = push(arguments.run, first if len(run.objects) > 1 else None)
+    end(sentences, "videos", folder if len(items) > 1 else folder / first, ["view", arguments.run], push_it)
     return 0
 
 
@@ -87,6 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--brighten", type=float, default=1.0, metavar="GAIN", help="gain of the pictures; numbers are never touched")
     add("--slow", type=float, default=1.0, metavar="FACTOR", help="slow motion of the videos, e.g. 3")
     add("--gif", action="store_true", help="write GIFs besides")
+    add("--verbose", action="store_true", help="list the files that are written")
     add_force_options(parser)
     bare = parser.add_argument_group("a scene without a run")
     bare.add_argument("--scene", type=Path, metavar="SCENE.ply", help="simulate this scene instead of a run")
@@ -133,12 +138,15 @@ def parse_background(text: str) -> Tensor | None:
     return torch.tensor(color)
 
 
-def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namespace, folder: Path) -> None:
+def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namespace, folder: Path) -> str:
+    """Writes everything of an object's sequences; returns a sentence on how far off they are."""
+    from gausim.cli._end import told
     from gausim.cli._foresee import TrainedPrediction, progress, scene_of
     from gausim.core.errors import DataError
     from gausim.data.records import SequenceRecord
     from gausim.engine.evaluation import evaluate_object
     from gausim.report.figures import error_figure
+    from gausim.report.summary import summarise
 
     records = {record.name: record for record in item.data.sequences}
     names = arguments.sequence or list(records)[:1]
@@ -163,8 +171,11 @@ def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namesp
             for view in views:
                 _write_view(run, item, record, predict, view, arguments, folder / name)
                 advance(f"{name} {view}")
-    for name in names:
-        print("\n".join(f"wrote {path}" for path in sorted((folder / name).iterdir())))
+    if arguments.verbose:
+        for name in names:
+            print("\n".join(f"wrote {path}" for path in sorted((folder / name).iterdir())))
+    of = names[0] if len(names) == 1 else f"{len(names)} sequences"
+    return told({f"{item.data.name} {of}": summarise(curves)})[0]
 
 
 def _write_sequence(

@@ -183,6 +183,7 @@ def _fit(
     parts: tuple[GausSimModule, ReadyDataModule],
     crew: Crew,
 ) -> float | None:
+    from gausim.cli._end import end
     from gausim.engine.fitting import FittedModule
     from gausim.engine.judge import EpochJudge
 
@@ -206,9 +207,21 @@ def _fit(
         if isinstance(module, FittedModule):
             facts["notes"] = module.notes()
         run.finish({**facts, **({"pruned": True} if pruned else {})})
-        following = "" if cfg.evaluate else f"gausim evaluate {run.path}\n      "
-        print(f"\nrun: {run.path}\nnext: {following}gausim simulate {run.path}", flush=True)
+        commands = [] if cfg.evaluate else [["evaluate", run.path], ["report", run.path]]
+        end([_result(facts)], "run", run.path, *commands)
     return module.summary.get("excess_static")
+
+
+def _result(facts: dict[str, Any]) -> str:
+    """How long it trained, and how near it came on the frames that it was shown."""
+    excess = facts["last_epoch"].get("excess_static")
+    begin = f"Trained for {facts['epochs']} epochs ({facts['optimizer_steps']} steps)"
+    if excess is None:
+        return f"{begin}."
+    return (
+        f"{begin}: on the frames shown, the loss beyond that of the reconstruction is {excess:.2f} times that of a "
+        "model that predicts no motion."
+    )
 
 
 def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None:
