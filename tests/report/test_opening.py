@@ -68,6 +68,7 @@ def test_a_good_run_is_called_good():
     ("error", "seen", "words"),
     [
         (0.1, 0.1, "it foresees the motion closely"),
+        (0.199, 0.1, "it foresees most of the motion"),  # printed as 0.20
         (0.7, 0.3, "it foresees part of the motion"),
         (0.97, 0.5, "no better than predicting no motion, although it learned the frames it was trained on"),
         (1.4, 0.95, "worse than predicting no motion, and it learned no more of the frames it was trained on"),

@@ -180,4 +180,5 @@ def _gain(found: Outcome, views: str) -> str:
 
 
 def _words(scale: Sequence[tuple[float, str]], value: float) -> str:
-    return next(words for end, words in scale if value < end)
+    """The words of a figure as it is printed."""
+    return next(words for end, words in scale if round(value, 2) < end)
