@@ -7,7 +7,6 @@ from importlib.resources import files
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
-from markupsafe import Markup, escape
 
 from gausim.report.frames import FORESEEN, SEEN
 from gausim.report.media import Exhibit
@@ -41,7 +40,6 @@ def html_page(
         notes: what a reader must know.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    environment.filters["commands"] = _with_commands
     template = environment.from_string(files("gausim.report").joinpath("page.html").read_text(encoding="utf-8"))
     sections = [(name, [_sheet(sheet, sources) for sheet in sheets if sheet.section == name]) for name in SECTIONS]
     return template.render(
@@ -59,12 +57,6 @@ def html_page(
         names={anchor: source.name for anchor, source in sources.by_anchor().items()},
         runs=sources.runs,
     )
-
-
-def _with_commands(text: str) -> Markup:
-    """Escaped text with what stands between backquotes as code."""
-    parts = text.split("`")
-    return Markup("").join(Markup("<code>{}</code>").format(p) if i % 2 else escape(p) for i, p in enumerate(parts))
 
 
 def _rgb(color: tuple[int, int, int]) -> str:
