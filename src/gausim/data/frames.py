@@ -18,6 +18,8 @@ from gausim.io.transforms import PosedFrame, read_transforms
 
 # A camera stands still through a sequence: its poses may differ by rounding only.
 POSE_TOLERANCE = 1e-5
+# What cameras write, whatever the codec: none is a frame.
+FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".hevc", ".h265", ".mts")
 
 
 @runtime_checkable
@@ -36,6 +38,10 @@ class FrameSource(Protocol):
         """Straight-alpha RGBA of these frames and cameras, all of which exist."""
         ...
 
+    def absent(self) -> list[Path]:
+        """Files of frames that are named but not there."""
+        ...
+
 
 def open_frames(root: Path, views: Sequence[str], fps: float) -> FrameSource:
     """The frames of a sequence's folder; only headers are read.
@@ -48,7 +54,15 @@ def open_frames(root: Path, views: Sequence[str], fps: float) -> FrameSource:
     Raises:
         DataError: a file is missing or a field is wrong, a view or a frame of a view is missing, or a camera moves.
     """
-    return PackedSource(root, views, fps) if is_packed(root) else ImageSource(root, views, fps)
+    if is_packed(root):
+        return PackedSource(root, views, fps)
+    films = [p.name for p in sorted(root.glob("*")) if p.suffix.lower() in FILMS]
+    if films and not (root / "transforms.json").is_file():
+        raise DataError(
+            f"{root}: expected transforms.json and a folder of PNG frames per camera, found films ({films[0]} …). Make "
+            "frames of them with `python -m data_prep.ingest`, then `poses` and `segment` (docs/own_capture.md)."
+        )
+    return ImageSource(root, views, fps)
 
 
 class PackedSource:
@@ -71,6 +85,10 @@ class PackedSource:
     def read(self, frames: range, columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:
         """See :class:`FrameSource`."""
         return self._packed.read(frames, [self._columns[column] for column in columns])
+
+    def absent(self) -> list[Path]:
+        """See :class:`FrameSource`; a header is read with its pixels' size, so nothing can be."""
+        return []
 
 
 class ImageSource:
@@ -103,6 +121,10 @@ class ImageSource:
         for f, v in missing:
             self._decoded[f, v] = True
         return torch.from_numpy(self._pixels[np.ix_(list(frames), list(columns))])
+
+    def absent(self) -> list[Path]:
+        """See :class:`FrameSource`."""
+        return [frame.path for row in self._frames for frame in row if not frame.path.is_file()]
 
 
 def _frames_of_views(

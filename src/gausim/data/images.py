@@ -82,7 +82,7 @@ def read_rgba(path: Path, size: tuple[int, int], *, opaque: bool = False) -> np.
         )
     pixels = decode(path)
     if pixels is None:
-        raise DataError(f"{path}: cannot be decoded as an image. Re-export the frame as PNG.")
+        raise DataError(f"{path}: cannot be decoded as an image{_film_hint(path)}. Re-export the frame as PNG.")
     if opaque and pixels.ndim == 3 and pixels.shape[-1] in (3, 4):
         pixels = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_BGR2BGRA)
     expected = (size[1], size[0], 4)
@@ -94,6 +94,18 @@ def read_rgba(path: Path, size: tuple[int, int], *, opaque: bool = False) -> np.
             f"{path}: expected {size[0]}x{size[1]} RGBA (8 bit), got {found}. Re-export the frame {remedy}."
         )
     return cv2.cvtColor(pixels, cv2.COLOR_BGRA2RGBA)
+
+
+def _film_hint(path: Path) -> str:
+    """What to do where the file is a film or a phone's photo (HEVC, MP4, MOV, HEIC), which begin alike."""
+    with path.open("rb") as stream:
+        is_container = stream.read(12)[4:8] == b"ftyp"
+    if not is_container:
+        return ""
+    return (
+        ": it is a film or a photo in a film's container (MP4, MOV, HEIC). Frames are PNG files with alpha; "
+        "`python -m data_prep.ingest` makes them of films, `python -m data_prep.segment` cuts the object out"
+    )
 
 
 def read_rgba_into(

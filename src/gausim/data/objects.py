@@ -162,8 +162,12 @@ def find_objects(root: Path | str) -> list[Path]:
         return [root]
     found = sorted(p.parent for p in root.glob("*/dataset.json"))
     if not found:
+        above = next((p for p in root.absolute().parents if (p / "dataset.json").is_file()), None)
+        if above is not None:
+            raise DataError(f"{root}: no data set here; it is a part of the one in {above}. Give that directory.")
+        why = "no dataset.json in it or in a folder of it" if root.is_dir() else "there is no such directory"
         raise DataError(
-            f"{root}: no data set here (no dataset.json in it or in a folder of it). "
+            f"{root}: no data set here ({why}). "
             "Make the embedded one with `python -m data_prep.synthesize`, or point the data config at yours."
         )
     return found

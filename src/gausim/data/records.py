@@ -114,6 +114,10 @@ class SequenceRecord:
             raise DataError(f"{self.root}: frames {frames} asked for, it has frames 0..{self.count - 1}.")
         return self._source.read(frames, self.camera_indices(views))
 
+    def absent(self) -> list[Path]:
+        """Images that ``transforms.json`` names but that are not there."""
+        return self._source.absent()
+
     def ground_truth(self, rest: Float[Tensor, "P 3"] | None) -> GroundTruth | None:
         """True motion of the object's points, or None where the data set has none (real captures).
 

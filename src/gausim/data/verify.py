@@ -32,12 +32,13 @@ class Fault:
     what: str
 
 
-def verify(root: Path, *, quick: bool = False) -> list[Fault]:
+def verify(root: Path, *, quick: bool = False, scene: bool = True) -> list[Fault]:
     """Checks one object: facts, sequences with all their images, true motion, stills, scene, hashes of a packed store.
 
     Args:
         root: its directory.
         quick: look at headers and sizes only; no image is read and nothing is hashed.
+        scene: check ``scene.ply`` and its masks too.
 
     Returns:
         The faults; none of a data set that is as it should be.
@@ -48,7 +49,7 @@ def verify(root: Path, *, quick: bool = False) -> list[Fault]:
     except GausSimError as error:
         return [*faults, Fault("dataset.json", str(error))]
     faults += _sequences(data, quick=quick)
-    if data.scene_path.is_file():
+    if scene and data.scene_path.is_file():
         faults += _check("scene.ply", data.scene)
     if (root / "static").is_dir() and not quick:
         faults += _check("static", data.stills)
@@ -78,7 +79,15 @@ def _sequences(data: ObjectData, *, quick: bool) -> Iterator[Fault]:
             continue
         if record.count < data.train_frames.stop:
             yield Fault(where, f"has {record.count} frames, dataset.json trains on {data.train_frames}.")
-        if not quick:
+        absent = record.absent()
+        if absent:
+            first = absent[0].relative_to(folder) if absent[0].is_relative_to(folder) else absent[0]
+            yield Fault(
+                where,
+                f"{len(absent)} of its images are missing, though its transforms.json names them (first: {first}). "
+                "Restore them, or cut all cameras before the gap and number the frames again.",
+            )
+        elif not quick:
             yield from _images(record, where)
         yield from _check(f"{where}/ground_truth.npz", lambda record=record: data.ground_truth(record))
 

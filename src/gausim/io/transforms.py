@@ -227,7 +227,11 @@ def pinhole_of(fields: dict[str, Any], size: tuple[int, int], field: str) -> Flo
     elif "camera_angle_x" in fields:
         angle = number_field(fields, "camera_angle_x", field)
         if not 0 < angle < math.pi:
-            raise DataError(f"{field}: field 'camera_angle_x' must be between 0 and pi [radian], got {angle:g}.")
+            degrees = f" In degrees that would be {math.radians(angle):.4g} radian." if math.pi <= angle < 180 else ""
+            raise DataError(
+                f"{field}: field 'camera_angle_x' must be between 0 and pi [radian], got {angle:g}.{degrees} Write the "
+                "horizontal field of view in radian."
+            )
         fl_x = size[0] / (2 * math.tan(angle / 2))
     else:
         raise DataError(f"{field}: neither field 'fl_x' [pixels] nor 'camera_angle_x' [radian] is there.")
