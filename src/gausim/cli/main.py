@@ -33,6 +33,10 @@ COMMANDS: dict[str, Command] = {
     "inspect": Command("gausim.cli.inspect", "Print a scene's kernels and hierarchy and draw its clusters."),
     "reconstruct": Command("gausim.cli.reconstruct", "Fit the Gaussians of the rest scene to posed stills."),
     "verify": Command("gausim.cli.verify", "Check a data set and name every fault."),
+    "doctor": Command(
+        "gausim.cli.doctor",
+        "Look at cameras, masks, clock and motion of a data set before training: what to mend.",
+    ),
     "train": Command("gausim.cli.train", "Learn an object's dynamics from multi-view videos."),
     "adapt": Command(
         "gausim.cli.adapt", "Fit how new sequences begin to their first frames, with a trained run as it is."

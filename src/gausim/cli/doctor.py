@@ -1,0 +1,136 @@
+"""`gausim doctor`: what is wrong with a data set, and how to mend it, before hours of training are spent on it."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gausim.cli.inspect import add_pin_options, pinned_by
+
+if TYPE_CHECKING:
+    from gausim.core.scene import GaussianScene
+    from gausim.data.objects import ObjectData
+    from gausim.doctor.evidence import Tick
+    from gausim.doctor.examine import Examination
+
+HELP = "Look at cameras, masks, clock and motion of a data set before training: what to mend."
+
+
+def main(argv: list[str]) -> int:
+    """Runs the command.
+
+    Args:
+        argv: the arguments after the command's name.
+
+    Returns:
+        0 where a training may begin, 1 where a fault would ruin it.
+
+    Raises:
+        DataError: there is no data set at ROOT, or the scene that was named is not there.
+        SceneError: the scene is unusable.
+    """
+    arguments = _parser().parse_args(argv)
+    import torch
+
+    from gausim.data.objects import find_objects
+
+    torch.set_num_threads(arguments.threads)
+    roots = find_objects(arguments.root)
+    alone = len(roots) == 1
+    told: dict[str, Any] = {}
+    for root in roots:
+        out = None if arguments.out is None else arguments.out if alone else arguments.out / root.name
+        told[str(root)] = _one(root, arguments, out)
+    if arguments.json:
+        print(json.dumps(told, indent=1))
+    return 1 if any(entry["ruinous"] for entry in told.values()) else 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="gausim doctor",
+        description=f"{HELP} Exits with 1 if a fault would ruin a training. Files and formats are checked first, as "
+        "`gausim verify --quick` does.",
+    )
+    add = parser.add_argument
+    add("root", metavar="ROOT", type=Path, help="object directory, or a folder of them")
+    add("--scene", metavar="SCENE.ply", type=Path, help="rest scene of a single object; default ROOT/scene.ply")
+    add("--masks", metavar="FILE", type=Path, help="its masks (npz); default beside the scene")
+    add_pin_options(parser)
+    add("--out", metavar="DIR", type=Path, help="folder for pictures and a page that shows them (index.html)")
+    add("--json", action="store_true", help="print an object: {DIRECTORY: {ruinous, faults, findings, left_out}}")
+    add("--threads", type=int, default=1, help="processor threads (default %(default)s)")
+    return parser
+
+
+def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[str, Any]:
+    """Examines one object, prints what was found and returns it as plain data."""
+    from gausim.data.objects import ObjectData
+    from gausim.data.verify import verify
+    from gausim.doctor.examine import examine
+    from gausim.doctor.page import findings_text, plain_findings
+
+    # Masks and pins are judged below: they may be given here, and no pin is a finding among others.
+    faults = verify(root, quick=True, scene=False)
+    if faults:
+        if not arguments.json:
+            count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
+            print(f"{root}: {count} in its files; nothing else was looked at")
+            print("\n".join(f"  {fault.where}: {fault.what}" for fault in faults))
+        return {"ruinous": True, "faults": [[f.where, f.what] for f in faults], "findings": [], "left_out": {}}
+    data = ObjectData(root, scene=arguments.scene, masks=arguments.masks)
+    with _bars() as tick:
+        found = examine(data, _scene(data, arguments), tick)
+        if out is not None and found.evidence is not None:
+            _show(found, out, tick)
+    if not arguments.json:
+        print(findings_text(str(root), found))
+        if out is not None and found.evidence is not None:
+            print(f"page  {out / 'index.html'}")
+    return {"ruinous": found.ruinous, "faults": [], **plain_findings(found)}
+
+
+def _scene(data: ObjectData, arguments: argparse.Namespace) -> GaussianScene | None:
+    """The rest scene with the pins that were asked for; None where the object has none yet."""
+    from gausim.core.errors import DataError
+    from gausim.io.ply import load_scene
+
+    if not data.scene_path.is_file():
+        if arguments.scene is not None:
+            raise DataError(f"{data.scene_path}: no such file. Give --scene the PLY that `gausim reconstruct` wrote.")
+        return None
+    scene = load_scene(data.scene_path, masks=data.masks_path, name=data.name)
+    return pinned_by(scene, arguments.pin_below, arguments.pin_above)
+
+
+def _show(found: Examination, out: Path, tick: Tick) -> None:
+    from gausim.doctor.page import write_page
+    from gausim.doctor.pictures import draw_pictures
+
+    assert found.evidence is not None
+    write_page(out / "index.html", found, draw_pictures(found.evidence, out, tick))
+
+
+def _bars() -> Any:
+    """A context manager that gives what advances a progress bar per step, on standard error."""
+    from contextlib import contextmanager
+
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    @contextmanager
+    def bars():  # type: ignore[no-untyped-def]
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+            known: dict[str, Any] = {}
+
+            def tick(step: str, done: int, total: int) -> None:
+                if step not in known:
+                    known[step] = progress.add_task(step, total=total)
+                progress.update(known[step], completed=done, total=total)
+
+            yield tick
+
+    return bars()

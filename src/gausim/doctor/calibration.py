@@ -1,0 +1,131 @@
+"""Calibration: whether every camera sees the rest scene where frame 0 shows the object."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from gausim.doctor.conventions import try_readings
+from gausim.doctor.evidence import Evidence
+from gausim.doctor.finding import Finding, listed
+from gausim.doctor.silhouettes import Fit
+
+NAME = "calibration"
+# Below this overlap a silhouette does not lie on the object at all; above the other a reading fits.
+_MISSED, _FITS = 0.5, 0.8
+# Displacements of silhouettes, as shares of the picture's longer side: worth a word, and spoiling a training.
+_WORTH, _SPOILS = 0.006, 0.012
+# Overlap after the best shift and turn, below which the scene has another shape than the object.
+_SHAPE = 0.85
+
+
+def find_calibration_faults(evidence: Evidence) -> Iterator[Finding]:
+    """Compares the silhouettes of the rest scene with frame 0, camera by camera, and tries other conventions."""
+    if evidence.fits is None:
+        yield Finding(
+            NAME, "note", "certain", "There is no rest scene yet, so poses and lenses were not compared with it.",
+            f"Make one with `gausim reconstruct {evidence.data.root}` (or give --scene FILE.ply) and run this again.",
+        )  # fmt: skip
+        return
+    fits = [[row[v] for row in evidence.fits] for v in range(len(evidence.views))]
+    raw = {view: float(np.median([fit.overlap for fit in row])) for view, row in zip(evidence.views, fits, strict=True)}
+    missed = [view for view, value in raw.items() if value < _MISSED]
+    if len(missed) > len(evidence.views) / 2:
+        yield _convention(evidence, raw)
+        return
+    yield from _moved(evidence, fits)
+
+
+def consistent_shift(fits: Sequence[Fit]) -> float:
+    """Median displacement over sequences [reduced pixels]; 0 where it differs from sequence to sequence.
+
+    A camera that is not where its file says is off by the same in every sequence; an object that is not at rest in
+    frame 0 is not.
+    """
+    pixels = np.array([fit.pixels for fit in fits])
+    if not np.isfinite(pixels).all():
+        return math.inf if np.median(pixels) == math.inf else 0.0
+    shifts = np.array([fit.shift for fit in fits])
+    scatter = float(np.median(np.linalg.norm(shifts - np.median(shifts, axis=0), axis=1)))
+    return float(np.median(pixels)) if scatter < 0.5 * np.median(pixels) else 0.0
+
+
+def _moved(evidence: Evidence, fits: Sequence[Sequence[Fit]]) -> Iterator[Finding]:
+    longer = max(evidence.first[0].alpha.shape[-2:])
+    off = {view: consistent_shift(row) for view, row in zip(evidence.views, fits, strict=True)}
+    worth = [view for view, pixels in off.items() if pixels > _WORTH * longer]
+    if worth:
+        spoils = max(off[view] for view in worth) > _SPOILS * longer
+        told = "; ".join(_told(view, fits[evidence.views.index(view)], evidence.scale) for view in worth)
+        measured = {view: pixels / evidence.scale for view, pixels in off.items()}
+        if 2 * len(worth) < len(evidence.views):
+            rest = max(pixels for view, pixels in off.items() if view not in worth) / evidence.scale
+            what = (
+                f"{listed(worth)} {'is' if len(worth) == 1 else 'are'} not where the pose says, while the others "
+                f"agree with the rest scene to {max(rest, 0.1):.1f} pixels: {told}."
+            )
+            remedy = (
+                f"Find the pose of {listed(worth)} again (was it moved after the calibration?), or take "
+                f"{'it' if len(worth) == 1 else 'them'} out of dataset.json."
+            )
+        else:
+            what = f"{len(worth)} of {len(evidence.views)} cameras disagree with the rest scene: {told}."
+            remedy = (
+                "Calibrate all cameras together with the stills that the scene was made of (`python -m data_prep.poses "
+                "--images STILLS --sequences FRAMES`), or make the scene again if it is of another object or world."
+            )
+        sure = "certain" if spoils and min(min(f.aligned for f in r) for r in fits) > _SHAPE else "likely"
+        yield Finding(NAME, "fault" if spoils else "warning", sure, what, remedy, {"pixels": measured})  # type: ignore[arg-type]
+    yield from _shape(evidence, fits)
+
+
+def _told(view: str, fits: Sequence[Fit], scale: float) -> str:
+    if not math.isfinite(np.median([fit.pixels for fit in fits])):
+        return f"the rest scene is outside the picture of {view}"
+    pixels, degrees = (float(np.median([getattr(fit, key) for fit in fits])) for key in ("pixels", "degrees"))
+    right, down = np.median([fit.shift for fit in fits], axis=0) / scale
+    turn = float(np.median([fit.turn for fit in fits]))
+    return (
+        f"{view} is off by about {degrees:.1f} degrees or {pixels / scale:.1f} pixels "
+        f"(the scene lies {abs(right):.1f} {'right' if right > 0 else 'left'} and "
+        f"{abs(down):.1f} {'below' if down > 0 else 'above'}, turned by {abs(turn):.1f} degrees)"
+    )
+
+
+def _shape(evidence: Evidence, fits: Sequence[Sequence[Fit]]) -> Iterator[Finding]:
+    aligned = [float(np.median([fit.aligned for fit in row])) for row in fits]
+    if float(np.median(aligned)) < _SHAPE:
+        yield Finding(
+            NAME, "warning", "likely",
+            f"Even at the best shift the rest scene's silhouettes overlap those of frame 0 by {np.median(aligned):.2f} "
+            "only: parts are missing in the scene, or frame 0 shows another shape.",
+            "Look at views.png (--out DIR). Reconstruct the scene again, or check the masks and that sequences begin "
+            "at rest.",
+            {"aligned": dict(zip(evidence.views, aligned, strict=True))},
+        )  # fmt: skip
+
+
+def _convention(evidence: Evidence, raw: dict[str, float]) -> Finding:
+    assert evidence.scene is not None
+    item = evidence.first[0]
+    readings = try_readings(evidence.scene, item.alpha[0] / np.float32(255), item.cameras)
+    best, now = readings[0], float(np.mean(list(raw.values())))
+    measured = {"overlap": raw, "readings": {r.name: r.overlap for r in readings}}
+    start = f"The cameras do not see the rest scene where frame 0 shows the object (mean overlap {now:.2f})."
+    if best.overlap > max(_FITS, now + 0.2):
+        return Finding(
+            NAME, "fault", "certain",
+            f"{start} The silhouettes would fit ({best.overlap:.2f}) if transforms.json held {best.name}.",
+            f"In every sequences/*/transforms.json {best.remedy}.",
+            measured,
+        )  # fmt: skip
+    return Finding(
+        NAME, "fault", "likely",
+        f"{start} No convention that is known to be mixed up would make them fit (best: {best.name}, overlap "
+        f"{best.overlap:.2f}).",
+        "Check that scene and sequences are of one object and one world, and that angles in degrees were turned into "
+        "radians; calibrate the cameras again (`python -m data_prep.poses`).",
+        measured,
+    )  # fmt: skip

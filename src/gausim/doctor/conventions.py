@@ -1,0 +1,144 @@
+"""Ways to misread calibration files: which of them would put the rest scene where the pictures show it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import Cameras, GaussianScene
+from gausim.doctor.silhouettes import draw_silhouettes, overlap
+from gausim.io.transforms import OPENGL_TO_OPENCV
+
+# Lengths that people write beside each other: millimetres, centimetres and metres.
+_UNITS = (0.001, 0.01, 0.1, 10.0, 100.0, 1000.0)
+# The focal length is estimated from areas, each time from a better picture.
+_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The calibration as another convention reads it.
+
+    Attributes:
+        name: what the file would hold then.
+        remedy: what to change.
+        overlap: mean intersection over union of the silhouettes over the views.
+    """
+
+    name: str
+    remedy: str
+    overlap: float
+
+
+def try_readings(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], cameras: Cameras) -> list[Reading]:
+    """Reads the cameras in every way that is known to happen, the best fit first.
+
+    Args:
+        scene: at rest.
+        masks: of frame 0, 0 to 1.
+        cameras: as the file states them.
+    """
+    readings = []
+    for name, remedy, change in _POSES:
+        viewmats = torch.stack([change(pose) for pose in _stored(cameras)]).float()
+        other = Cameras(viewmats, cameras.Ks, cameras.width, cameras.height, cameras.names)
+        readings.append(Reading(name, remedy, _fit(scene, masks, other)))
+    readings.append(_another_lens(scene, masks, cameras))
+    return sorted(readings, key=lambda reading: -reading.overlap)
+
+
+def _fit(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], cameras: Cameras) -> float:
+    drawn = draw_silhouettes(scene, cameras).alpha
+    return float(np.mean([overlap(mask, alpha) for mask, alpha in zip(masks, drawn, strict=True)]))
+
+
+def _stored(cameras: Cameras) -> Float[Tensor, "V 4 4"]:
+    """The matrices as the file has them: camera to world, OpenGL axes, as it was read."""
+    return torch.linalg.inv(cameras.viewmats.double()) * torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
+
+
+def _read(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    return torch.linalg.inv(pose * torch.tensor(OPENGL_TO_OPENCV, dtype=pose.dtype))
+
+
+def _opencv(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    return torch.linalg.inv(pose)
+
+
+def _inverted(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    return pose
+
+
+def _inverted_opengl(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    return torch.tensor(OPENGL_TO_OPENCV, dtype=pose.dtype)[:, None] * pose
+
+
+def _transposed(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
+    turned = pose.clone()
+    turned[:3, :3] = pose[:3, :3].T
+    return _read(turned)
+
+
+def _world(quarter: int) -> Callable[[Tensor], Tensor]:
+    """The world turned about x by a quarter, forwards or backwards."""
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[1:3, 1:3] = torch.tensor([[0.0, -quarter], [quarter, 0.0]], dtype=torch.float64)
+    return lambda pose: _read(turn @ pose)
+
+
+def _unit(factor: float) -> Callable[[Tensor], Tensor]:
+    scale = torch.tensor([1.0, 1.0, 1.0, factor], dtype=torch.float64)
+    corner = torch.ones(4, 4, dtype=torch.float64)
+    corner[:3] = scale
+    return lambda pose: _read(pose * corner)
+
+
+_POSES: list[tuple[str, str, Callable[[Tensor], Tensor]]] = [
+    ("camera-to-world matrices in OpenCV axes (y down, looking along +z)",
+     "negate the second and third column of every transform_matrix (OpenGL axes: y up, looking along -z)", _opencv),
+    ("world-to-camera matrices in OpenCV axes",
+     "invert every transform_matrix (it must be camera to world), then negate its second and third column", _inverted),
+    ("world-to-camera matrices in OpenGL axes",
+     "invert every transform_matrix: it must be camera to world", _inverted_opengl),
+    ("poses whose rotations are transposed",
+     "transpose the upper left 3 x 3 part of every transform_matrix", _transposed),
+    ("poses of a world whose up is y, while the scene's up is z",
+     "turn every transform_matrix by +90 degrees about x (x, y, z to x, -z, y), or the scene the other way", _world(1)),
+    ("poses of a world whose up is z, while the scene's up is y",
+     "turn every transform_matrix by -90 degrees about x (x, y, z to x, z, -y), or the scene the other way",
+     _world(-1)),
+    *((f"positions of cameras in another unit than the scene's (times {factor:g})",
+       f"multiply the last column of every transform_matrix by {factor:g}", _unit(factor)) for factor in _UNITS),
+]  # fmt: skip
+
+
+def _another_lens(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], cameras: Cameras) -> Reading:
+    """The same poses with the focal length that gives silhouettes of the right size."""
+    lenses = cameras.Ks.clone()
+    for _ in range(_ROUNDS):
+        drawn = draw_silhouettes(
+            scene, Cameras(cameras.viewmats, lenses, cameras.width, cameras.height, cameras.names)
+        ).alpha
+        seen = [v for v in range(len(masks)) if drawn[v].sum() > 0 and masks[v].sum() > 0]
+        if not seen:
+            break
+        ratio = math.sqrt(float(np.median([masks[v].sum() / drawn[v].sum() for v in seen])))
+        lenses[:, 0, 0] *= ratio
+        lenses[:, 1, 1] *= ratio
+    factor = float((lenses[:, 0, 0] / cameras.Ks[:, 0, 0]).median())
+    field = math.degrees(2 * math.atan(cameras.width / (2 * float(lenses[:, 0, 0].median()))))
+    found = Cameras(cameras.viewmats, lenses, cameras.width, cameras.height, cameras.names)
+    name = (
+        f"a focal length that is wrong by a factor: {factor:.3g} times the stated one, a field of view of {field:.3g}"
+    )
+    remedy = (
+        f"multiply fl_x and fl_y by {factor:.3g} (they may have been made from an angle in degrees where radians were "
+        "expected, or for pictures of another size; then cx and cy are wrong too)"
+    )
+    return Reading(name, remedy, _fit(scene, masks, found))

@@ -1,0 +1,109 @@
+"""What the cameras see together: directions, and whether the object lies well in their pictures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from gausim.doctor.evidence import Evidence
+from gausim.doctor.finding import Finding, listed
+from gausim.ops.visual_hull import search_cube
+
+NAME = "views"
+# Angle between views below which depth is a guess, and below which it is hardly seen at all [degrees].
+_NARROW, _SAME = 25.0, 10.0
+# Share of the frames in which an object may touch the border.
+_OFTEN = 0.2
+# An object is tiny below this share of the picture's longer side, or this many of its pixels.
+_TINY_SHARE, _TINY_PIXELS = 0.12, 24
+
+
+def find_view_faults(evidence: Evidence) -> Iterator[Finding]:
+    """Looks at the training views' directions and at where the object lies in every view."""
+    yield from _directions(evidence)
+    yield from _border(evidence)
+    yield from _tiny(evidence)
+
+
+def view_directions(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors from the cameras to what they look at, (V, 3), and that point (3,) [scene units]."""
+    cameras = evidence.first[0].cameras
+    if evidence.scene is not None:
+        middle = evidence.scene.means[evidence.scene.foreground].mean(0)
+    else:
+        middle, _ = search_cube(cameras.viewmats, cameras.Ks, (cameras.width, cameras.height))
+    away = (middle - cameras.centers).numpy()
+    return away / np.linalg.norm(away, axis=1, keepdims=True).clip(1e-9), middle.numpy()
+
+
+def seen_angle(directions: np.ndarray) -> float:
+    """Angle between two views [degrees] that would see depth as well as these; opposite ones see it no better.
+
+    The sum of I - d d^T over unit directions d says how well motion along each axis is seen; its smallest eigenvalue
+    for two views at angle a is 1 - |cos a|.
+    """
+    across = np.mean(np.eye(3) - directions[:, :, None] * directions[:, None, :], axis=0)
+    least = float(np.linalg.eigvalsh(across)[0])
+    return math.degrees(math.acos(min(1.0, max(0.0, 1 - 2 * least))))
+
+
+def _directions(evidence: Evidence) -> Iterator[Finding]:
+    names = list(evidence.data.train_views)
+    directions = view_directions(evidence)[0][[evidence.views.index(name) for name in names]]
+    angle = seen_angle(directions)
+    if len(names) == 1:
+        yield Finding(
+            NAME, "fault", "certain",
+            f"There is one training view only ({names[0]}): motion towards it and away from it is not seen.",
+            "Film with at least two cameras, better four, 40 degrees or more apart, or move a held-out view to "
+            "'train_views' of dataset.json.",
+            {"views": 1, "angle": angle},
+        )  # fmt: skip
+    elif angle < _NARROW:
+        yield Finding(
+            NAME, "fault" if angle < _SAME else "warning", "certain",
+            f"The training views {listed(names)} look along nearly the same line ({angle:.0f} degrees): depth is "
+            f"{'not seen' if angle < _SAME else 'hardly seen'}.",
+            "Move a camera to the side, so that at least two look at the object 40 to 140 degrees apart.",
+            {"views": len(names), "angle": angle},
+        )  # fmt: skip
+
+
+def _border(evidence: Evidence) -> Iterator[Finding]:
+    for v, view in enumerate(evidence.views):
+        masks = np.concatenate([item.alpha[:, v] > 127 for item in evidence.watched])
+        sides = {"top": masks[:, 0], "bottom": masks[:, -1], "left": masks[:, :, 0], "right": masks[:, :, -1]}
+        often = {side: float(rim.any(-1).mean()) for side, rim in sides.items()}
+        cut = [side for side, share in often.items() if share > _OFTEN]
+        if not cut:
+            continue
+        moves = any(bool((sides[side] != sides[side][:1]).any()) for side in cut)
+        yield Finding(
+            NAME, "warning", "likely" if moves else "possible",
+            f"The object is cut off at the {listed(cut)} of {view} in {max(often.values()):.0%} of the frames"
+            f"{'' if moves else ', where nothing moves'}.",
+            "Move the camera back or turn it. Where only a part that is held leaves the picture, this does no harm.",
+            {"view": view, "share": often},
+        )  # fmt: skip
+
+
+def _tiny(evidence: Evidence) -> Iterator[Finding]:
+    for v, view in enumerate(evidence.views):
+        lengths = []
+        for alpha in (item.alpha[0, v] > 127 for item in evidence.first):
+            rows, columns = np.nonzero(alpha)
+            if len(rows):
+                lengths.append(max(np.ptp(rows), np.ptp(columns)) + 1)
+        if not lengths:
+            continue
+        length, longer = float(np.median(lengths)), max(evidence.first[0].alpha.shape[-2:])
+        if length < _TINY_SHARE * longer or length / evidence.scale < _TINY_PIXELS:
+            yield Finding(
+                NAME, "warning", "certain",
+                f"The object is tiny in {view}: {length / evidence.scale:.0f} pixels, {length / longer:.0%} of the "
+                "picture's longer side.",
+                "Film from nearer or with a longer lens, or crop the pictures (and shift cx, cy, w and h with them).",
+                {"view": view, "pixels": length / evidence.scale},
+            )  # fmt: skip

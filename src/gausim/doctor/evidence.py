@@ -1,0 +1,163 @@
+"""What the checks look at: some frames of some sequences, reduced, and the rest scene drawn by every camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from gausim.core import Cameras, GaussianScene
+from gausim.data.objects import ObjectData
+from gausim.data.records import SequenceRecord
+from gausim.doctor.silhouettes import Fit, Silhouettes, draw_silhouettes, fit_silhouette
+
+# Sequences whose motion is watched, and whose first frames are compared with the rest scene.
+WATCHED_SEQUENCES, FIRST_FRAMES = 4, 12
+# Frames of each that are watched, from frame 0 on, and how many are decoded at a time.
+WATCHED_FRAMES, FRAMES_AT_A_TIME = 64, 8
+# Pictures are reduced to this length of their longer side [pixels].
+LONGEST = 192
+
+# What a progress bar shows: step, how much of it is done, how much there is.
+Tick = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Watched:
+    """Consecutive frames of one sequence from frame 0 on, reduced.
+
+    Attributes:
+        name: of the sequence.
+        cameras: of the reduced pictures.
+        rgb: over black.
+        alpha: foreground.
+    """
+
+    name: str
+    cameras: Cameras
+    rgb: UInt8[np.ndarray, "F V h w 3"]
+    alpha: UInt8[np.ndarray, "F V h w"]
+
+    @cached_property
+    def gray(self) -> Float[np.ndarray, "F V h w"]:
+        """Mean of the colours over black, 0 to 1."""
+        return self.rgb.mean(-1, dtype=np.float32) / np.float32(255)
+
+
+class Evidence:
+    """What is known of one object.
+
+    Attributes:
+        data: its facts.
+        sequences: how many there are.
+        scene: the rest scene, pinned or not; None where there is none yet.
+        scale: length of a pixel of the pictures over one of the reduced pictures, at most 1.
+        watched: sequences whose motion is watched.
+        first: frame 0 of sequences, these and more.
+    """
+
+    def __init__(
+        self,
+        data: ObjectData,
+        sequences: int,
+        scene: GaussianScene | None,
+        scale: float,
+        watched: tuple[Watched, ...],
+        first: tuple[Watched, ...],
+    ) -> None:
+        """Holds what was read; see :func:`gather`."""
+        self.data, self.sequences, self.scene, self.scale = data, sequences, scene, scale
+        self.watched, self.first = watched, first
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of the cameras, in the order of all arrays."""
+        return self.data.views
+
+    @cached_property
+    def rest(self) -> tuple[Silhouettes, ...] | None:
+        """The rest scene as the cameras of each of :attr:`first` draw it; None without a scene."""
+        if self.scene is None:
+            return None
+        drawn: list[tuple[Cameras, Silhouettes]] = []
+        for item in self.first:
+            if not any(same_cameras(known, item.cameras) for known, _ in drawn):
+                drawn.append((item.cameras, draw_silhouettes(self.scene, item.cameras)))
+        return tuple(next(s for known, s in drawn if same_cameras(known, i.cameras)) for i in self.first)
+
+    @cached_property
+    def fits(self) -> tuple[tuple[Fit, ...], ...] | None:
+        """How the rest scene must be moved in each view to lie on frame 0, [sequence][view]; None without a scene."""
+        if self.rest is None:
+            return None
+        return tuple(
+            tuple(
+                fit_silhouette(item.alpha[0, v] / np.float32(255), rest.alpha[v], float(item.cameras.Ks[v, 0, 0]))
+                for v in range(len(self.views))
+            )
+            for item, rest in zip(self.first, self.rest, strict=True)
+        )
+
+
+def same_cameras(a: Cameras, b: Cameras) -> bool:
+    """True where two sets of cameras have the same poses and lenses."""
+    return bool(torch.equal(a.viewmats, b.viewmats) and torch.equal(a.Ks, b.Ks))
+
+
+def gather(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Evidence:
+    """Reads and reduces what the checks need.
+
+    Args:
+        data: the object.
+        scene: its rest scene, where there is one.
+        tick: is told how far it is.
+
+    Raises:
+        DataError: an image is missing or malformed.
+    """
+    names = sorted(p.name for p in (data.root / "sequences").iterdir() if p.is_dir())
+    watched_names, first_names = _spread(names, WATCHED_SEQUENCES), _spread(names, FIRST_FRAMES)
+    watched, first, scale = [], [], 1.0
+    chosen = [name for name in names if name in watched_names or name in first_names]
+    for number, name in enumerate(chosen):
+        tick("frames", number, len(chosen))
+        # Not one of data.sequences: these keep all pictures that were ever decoded.
+        record = SequenceRecord(data.root / "sequences" / name, views=data.views, fps=data.fps)
+        frames = min(record.count, WATCHED_FRAMES) if name in watched_names else 1
+        item, scale = _reduced(record, frames), _factor(record.cameras)
+        watched += [item] if name in watched_names else []
+        first.append(Watched(item.name, item.cameras, item.rgb[:1], item.alpha[:1]))
+    tick("frames", len(chosen), len(chosen))
+    return Evidence(data, len(names), scene, scale, tuple(watched), tuple(first))
+
+
+def _spread(names: list[str], count: int) -> list[str]:
+    """At most so many of the names, evenly, the first one among them."""
+    chosen = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)
+    return [names[i] for i in chosen]
+
+
+def _factor(cameras: Cameras) -> float:
+    return min(1.0, LONGEST / max(cameras.width, cameras.height))
+
+
+def _reduced(record: SequenceRecord, frames: int) -> Watched:
+    cameras = record.cameras
+    factor = _factor(cameras)
+    width, height = max(1, round(cameras.width * factor)), max(1, round(cameras.height * factor))
+    shape = (frames, len(record.views), height, width)
+    rgb, alpha = np.empty((*shape, 3), np.uint8), np.empty(shape, np.uint8)
+    for start in range(0, frames, FRAMES_AT_A_TIME):
+        block = record.frames(range(start, min(start + FRAMES_AT_A_TIME, frames))).numpy()
+        for (f, v), pixels in ((i, block[i]) for i in np.ndindex(block.shape[:2])):
+            over_black = (pixels[..., :3] * (pixels[..., 3:] / np.float32(255)) + 0.5).astype(np.uint8)
+            rgb[start + f, v] = cv2.resize(over_black, (width, height), interpolation=cv2.INTER_AREA)
+            alpha[start + f, v] = cv2.resize(pixels[..., 3], (width, height), interpolation=cv2.INTER_AREA)
+    stretch = torch.tensor([[width / cameras.width], [height / cameras.height], [1.0]])
+    small = Cameras(cameras.viewmats, cameras.Ks * stretch, width, height, cameras.names)
+    return Watched(record.name, small, rgb, alpha)

@@ -1,0 +1,78 @@
+"""Runs all checks on one object, in an order in which none is led astray by the fault of another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gausim.core import DataError, GaussianScene
+from gausim.data.objects import ObjectData
+from gausim.doctor.appearance import find_appearance_faults
+from gausim.doctor.calibration import find_calibration_faults
+from gausim.doctor.clock import find_clock_faults
+from gausim.doctor.coverage import find_view_faults
+from gausim.doctor.evidence import Evidence, Tick, gather
+from gausim.doctor.extent import find_extent_faults
+from gausim.doctor.finding import SEVERITIES, Check, Finding
+from gausim.doctor.masks import find_mask_faults
+from gausim.doctor.motion import find_motion_faults
+
+CHECKS = (
+    Check("extent", find_extent_faults),
+    Check("masks", find_mask_faults),
+    Check("calibration", find_calibration_faults, needs=("masks",)),
+    Check("views", find_view_faults, needs=("masks", "calibration")),
+    Check("clock", find_clock_faults, needs=("masks",)),
+    Check("motion", find_motion_faults, needs=("masks",)),
+    Check("appearance", find_appearance_faults, needs=("masks", "calibration")),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Examination:
+    """What was found in one object.
+
+    Attributes:
+        findings: faults first.
+        left_out: checks that another check's fault made useless, with that check.
+        evidence: what was looked at; None where it could not be read.
+    """
+
+    findings: tuple[Finding, ...]
+    left_out: dict[str, str]
+    evidence: Evidence | None
+
+    @property
+    def ruinous(self) -> bool:
+        """True where a training would be ruined."""
+        return any(finding.severity == "fault" for finding in self.findings)
+
+
+def examine(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Examination:
+    """Looks at some frames of an object and at its rest scene.
+
+    Args:
+        data: the object, whose files are in order (:func:`gausim.data.verify.verify`).
+        scene: its rest scene, pinned or not; None where there is none yet.
+        tick: is told (step, how much is done, of how much).
+    """
+    try:
+        evidence = gather(data, scene, tick)
+    except DataError as error:
+        remedy = "Mend this file; `gausim verify` without --quick finds all others that cannot be read."
+        return Examination((Finding("files", "fault", "certain", str(error), remedy),), {}, None)
+    findings: list[Finding] = []
+    spoilt: set[str] = set()
+    left_out: dict[str, str] = {}
+    for number, check in enumerate(CHECKS):
+        tick("checks", number, len(CHECKS))
+        blocking = next((name for name in check.needs if name in spoilt), None)
+        if blocking is not None:
+            left_out[check.name] = blocking
+            continue
+        found = list(check.run(evidence))
+        findings += found
+        if any(finding.severity == "fault" for finding in found):
+            spoilt.add(check.name)
+    tick("checks", len(CHECKS), len(CHECKS))
+    ordered = sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
+    return Examination(tuple(ordered), left_out, evidence)

@@ -1,0 +1,154 @@
+"""Masks: inverted, missing, empty, blinking, or with a haze around the object."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from gausim.doctor.evidence import Evidence
+from gausim.doctor.finding import Finding, listed
+from gausim.doctor.silhouettes import overlap
+
+NAME = "masks"
+# Foreground along the picture's border: an object may touch it, but does not run all around.
+_AROUND, _EVERYWHERE = 0.8, 0.999
+# Standard deviation of the colours along the border of a uniform background, and how far red, green and blue lie apart
+# in a coloured one [of 255].
+_UNIFORM, _COLOURED = 8.0, 40.0
+# Alpha that nobody sees (of 255), and how far from the object it counts as haze [reduced pixels].
+_FAINT, _AWAY, _HAZE = 26, 4, 0.02
+# Relative jump of a mask's area against the frames around it, and the radius of these.
+_JUMP, _RADIUS = 0.15, 2
+# Share of empty frames from which on a training is spoilt.
+_MANY = 0.1
+
+
+def find_mask_faults(evidence: Evidence) -> Iterator[Finding]:
+    """Compares alpha with what a mask of one object looks like."""
+    around = {view: [_border(item.alpha[0, v]) for item in evidence.first] for v, view in enumerate(evidence.views)}
+    full = [view for view, shares in around.items() if np.median(shares) > _AROUND]
+    if full:
+        yield _inverted_or_absent(evidence, full)
+        return
+    yield from _empty(evidence)
+    yield from _haze(evidence)
+    yield from _blinking(evidence)
+
+
+def _border(alpha: np.ndarray) -> float:
+    """Share of the picture's border that is foreground."""
+    rim = np.concatenate((alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
+    return float((rim > 127).mean())
+
+
+def _inverted_or_absent(evidence: Evidence, views: list[str]) -> Finding:
+    index = [evidence.views.index(view) for view in views]
+    covered = float(np.mean([(item.alpha[0, index] > 127).mean() for item in evidence.first]))
+    if covered > _EVERYWHERE:
+        return _not_cut_out(evidence, views, index)
+    fits: dict[str, float] = {}
+    if evidence.rest is not None:
+        pairs = [
+            (item.alpha[0, v] / np.float32(255), rest.alpha[v])
+            for item, rest in zip(evidence.first, evidence.rest, strict=True)
+            for v in index
+        ]
+        fits = {"overlap": float(np.mean([overlap(a, b) for a, b in pairs])),
+                "overlap_inverted": float(np.mean([overlap(1 - a, b) for a, b in pairs]))}  # fmt: skip
+    known = bool(fits) and fits["overlap_inverted"] > fits["overlap"] + 0.3
+    proof = (
+        f" Inverted, they would overlap the rest scene's silhouettes by {fits['overlap_inverted']:.2f} instead of "
+        f"{fits['overlap']:.2f}." if known else ""
+    )  # fmt: skip
+    return Finding(
+        NAME,
+        "fault",
+        "certain" if known else "likely",
+        f"The masks of {listed(views)} are inverted: alpha keeps the border of the picture and leaves out its middle, "
+        f"so the background would be trained on and not the object.{proof}",
+        "Write 255 - alpha into the images (alpha 255 is the object), or segment again.",
+        {"views": views, "border": _AROUND, **fits},
+    )
+
+
+def _not_cut_out(evidence: Evidence, views: list[str], index: list[int]) -> Finding:
+    rims = [np.concatenate((p[0], p[-1], p[:, 0], p[:, -1])) for i in evidence.first for p in i.rgb[0, index]]
+    spread = float(np.median([rim.astype(np.float32).std(0).max() for rim in rims]))
+    hue = float(np.median([np.ptp(rim.astype(np.float32).mean(0)) for rim in rims]))
+    looks = "uniform" if spread < _UNIFORM else "not uniform"
+    backend = "chroma" if spread < _UNIFORM and hue > _COLOURED else "background, --backend onnx or --backend sam2"
+    return Finding(
+        NAME,
+        "fault",
+        "certain",
+        f"Nothing is cut out in {listed(views)}: alpha is 255 all over the picture, so the background, which is "
+        f"{looks}, would be taken for the object.",
+        f"Make masks: `python -m data_prep.segment PICTURES --out OUT --backend {backend}`.",
+        {"views": views, "border_deviation": spread},
+    )
+
+
+def _empty(evidence: Evidence) -> Iterator[Finding]:
+    for v, view in enumerate(evidence.views):
+        shown = np.concatenate([item.alpha[:, v].max((-1, -2)) > 0 for item in evidence.watched])
+        first = next((f"{i.name} frame {f}" for i in evidence.watched for f in range(len(i.alpha))
+                      if not i.alpha[f, v].any()), "")  # fmt: skip
+        share = 1 - float(shown.mean())
+        if share == 0:
+            continue
+        never = share == 1
+        yield Finding(
+            NAME,
+            "fault" if share > _MANY else "warning",
+            "certain",
+            f"{view} {'never shows the object' if never else f'does not show the object in {share:.0%} of the frames'}"
+            f": the mask is empty (first: {first}).",
+            f"Segment {view} again; where it does not see the object, take it out of dataset.json (field 'views').",
+            {"view": view, "empty": share},
+        )
+
+
+def _haze(evidence: Evidence) -> Iterator[Finding]:
+    kernel = np.ones((2 * _AWAY + 1, 2 * _AWAY + 1), np.uint8)
+    shares: dict[str, float] = {}
+    for v, view in enumerate(evidence.views):
+        found = []
+        for alpha in (item.alpha[0, v] for item in evidence.first):
+            near = cv2.dilate((alpha > 127).astype(np.uint8), kernel) > 0
+            found.append(float(((alpha > 0) & (alpha <= _FAINT) & ~near).mean()))
+        shares[view] = float(np.median(found))
+    hazy = [view for view, share in shares.items() if share > _HAZE]
+    if hazy:
+        yield Finding(
+            NAME,
+            "warning",
+            "certain",
+            f"A haze of faint alpha (1 to {_FAINT} of 255) lies around the object in {listed(hazy)}, over up to "
+            f"{max(shares.values()):.0%} of the picture. All alpha above 0 counts as foreground.",
+            "Set alpha below 0.1 to 0 in the images, or segment again with `--floor 0.1`.",
+            {"haze": shares},
+        )
+
+
+def _blinking(evidence: Evidence) -> Iterator[Finding]:
+    for v, view in enumerate(evidence.views):
+        jumps = []
+        for item in evidence.watched:
+            area = item.alpha[:, v].astype(np.float64).sum((-1, -2))
+            padded = np.pad(area, _RADIUS, mode="reflect") if len(area) > _RADIUS else area
+            if len(padded) == len(area):
+                continue
+            around = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * _RADIUS + 1), -1)
+            off = np.abs(area - around) > _JUMP * np.maximum(around, 1)
+            jumps += [f"{item.name} frame {f}" for f in np.nonzero(off)[0] if area[f] > 0]
+        if jumps:
+            yield Finding(
+                NAME,
+                "warning",
+                "likely",
+                f"The mask of {view} jumps in size by more than {_JUMP:.0%} for a frame or two: {listed(jumps)}.",
+                "Look at these frames; segment them again (`--radius 3` mends what flashes up or drops out).",
+                {"view": view, "frames": len(jumps)},
+            )

@@ -1,0 +1,222 @@
+"""Motion: how much there is, how fast it swings against the frame rate, and whether it begins at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from gausim.doctor.evidence import Evidence, Watched, same_cameras
+from gausim.doctor.finding import Finding, listed
+from gausim.doctor.silhouettes import overlap
+from gausim.metrics.oscillation import coordinates, principal_motions, spectrum
+
+NAME = "motion"
+# Frames whose optical flow against frame 0 is looked at, per view, and the part of the foreground that counts.
+_FLOW_FRAMES, _QUANTILE = 6, 95
+# Pixels of the pictures below which nothing moves, and below which motion is hidden by noise and mask edges.
+_STILL, _SMALL = 0.2, 1.0
+# Overlap of frame 0 with that of the other sequences or the rest scene: below these it is not at rest.
+_AT_REST, _FAR_FROM_REST = 0.95, 0.85
+# Pictures are reduced to this length for the spectrum, of so many principal motions [pixels].
+_SPECTRUM_LONGEST, _MOTIONS = 48, 3
+# Shares of the frame rate: faster motion is not resolved well, or not at all (0.5 is Nyquist's).
+_FAST, _TOO_FAST = 0.2, 0.34
+# Swings within the frames that were watched, below which there is no telling how fast they are.
+_CYCLES = 2.0
+# Frequencies at which elastic objects on a table swing [Hz].
+_SLOWEST, _FASTEST = 0.3, 15.0
+# Rates of cameras and of what is usually made from their films [frames per second].
+_USUAL_RATES = (
+    10, 12, 12.5, 15, 20, 24, 25, 30, 48, 50, 60, 75, 90, 100, 120, 144, 150, 180, 200, 240, 300, 400, 480, 500, 600,
+    960, 1000,
+)  # fmt: skip
+# NTSC's rates are these times a thousandth less.
+_RATE_TOLERANCE = 2e-3
+
+
+def find_motion_faults(evidence: Evidence) -> Iterator[Finding]:
+    """Measures displacement, frame 0 and frequency."""
+    yield from _begins_at_rest(evidence)
+    moving = {item.name: _displacements(item, evidence.scale) for item in evidence.watched}
+    largest = max(float(d.max()) for d in moving.values())
+    if largest < _STILL:
+        yield Finding(
+            NAME, "fault", "certain",
+            f"Nothing moves: no part of the object leaves its place by more than {largest:.2f} pixels in any of "
+            f"{len(moving)} sequences.",
+            "Record sequences in which the object is set off, or check that the frames are not one picture repeated.",
+            {"pixels": largest},
+        )  # fmt: skip
+        return
+    yield from _amount(evidence, moving)
+    yield from _rates(evidence)
+
+
+def _amount(evidence: Evidence, moving: dict[str, np.ndarray]) -> Iterator[Finding]:
+    largest = {name: float(d.max()) for name, d in moving.items()}
+    still = [name for name, pixels in largest.items() if pixels < _STILL]
+    if still:
+        yield Finding(
+            NAME, "warning", "certain", f"Nothing moves in {listed(still)}.",
+            "Leave these sequences out; they teach nothing.", {"pixels": largest},
+        )  # fmt: skip
+    typical = float(np.median([p for p in largest.values() if p >= _STILL]))
+    if typical < _SMALL:
+        yield Finding(
+            NAME, "warning", "likely",
+            f"The motion is smaller than a pixel (at most {typical:.2f} pixels): noise and the edges of the masks are "
+            "as large.",
+            "Push harder, film from nearer, or at a higher resolution.", {"pixels": largest},
+        )  # fmt: skip
+    for v, view in enumerate(evidence.views):
+        here = max(float(d[:, v].max()) for d in moving.values())
+        if here < _STILL and len(evidence.views) > 1:
+            yield Finding(
+                NAME, "fault", "likely",
+                f"{view} shows no motion (at most {here:.2f} pixels), while others show {typical:.1f}: it may be one "
+                "picture repeated.", f"Export the frames of {view} again, or take it out of dataset.json.",
+                {"view": view, "pixels": here},
+            )  # fmt: skip
+
+
+def _displacements(item: Watched, scale: float) -> np.ndarray:
+    """Optical flow of some frames against frame 0, the upper twentieth of the foreground, (f, V) [pixels]."""
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow.setFinestScale(0)
+    gray = (item.gray * 255 + 0.5).astype(np.uint8)
+    chosen = np.unique(np.linspace(0, len(gray) - 1, _FLOW_FRAMES + 1).round().astype(int))
+    found = np.zeros((len(chosen), gray.shape[1]))
+    for i, v in np.ndindex(len(chosen), gray.shape[1]):
+        shown = item.alpha[0, v] > 127
+        if shown.any() and (gray[chosen[i], v] != gray[0, v]).any():
+            moved = flow.calc(gray[0, v], gray[chosen[i], v], None)  # type: ignore[call-overload]
+            found[i, v] = np.percentile(np.linalg.norm(moved[shown], axis=-1), _QUANTILE) / scale
+    return found
+
+
+def _begins_at_rest(evidence: Evidence) -> Iterator[Finding]:
+    overlaps = _first_overlaps(evidence)
+    off = {name: value for name, value in overlaps.items() if value < _AT_REST}
+    if not off:
+        return
+    worst = min(off.values())
+    against = "those of the other sequences" if evidence.fits is None else "the rest scene and other sequences"
+    yield Finding(
+        NAME, "fault" if worst < _FAR_FROM_REST else "warning", "likely",
+        f"Frame 0 is not at rest in {listed(list(off))}: its silhouettes overlap {against} by {worst:.2f} only. A "
+        "prediction starts from the rest scene, so it would begin at the wrong place.",
+        "Begin each sequence at the last frame before the object is set off, or leave the sequence out.",
+        {"overlap": overlaps},
+    )  # fmt: skip
+
+
+def _first_overlaps(evidence: Evidence) -> dict[str, float]:
+    """How well frame 0 of each sequence agrees with the median over sequences of the same cameras, and the scene.
+
+    The worse of the two, each as a median over the cameras. The scene counts relative to the sequence that fits it
+    best, so that a coarse scene or a camera that was moved is no fault of a sequence.
+    """
+    found = {}
+    cameras = evidence.first[0].cameras
+    alike = [item for item in evidence.first if same_cameras(item.cameras, cameras)]
+    usual = np.median([item.alpha[0] for item in alike], axis=0).astype(np.float32) / 255
+    best = max((float(np.median([fit.aligned for fit in row])) for row in evidence.fits or ()), default=1.0)
+    for s, item in enumerate(evidence.first):
+        values = [1.0]
+        if item in alike:
+            values.append(float(np.median([overlap(a / np.float32(255), b) for a, b in zip(item.alpha[0], usual,
+                                                                                           strict=True)])))  # fmt: skip
+        if evidence.fits is not None and best > _AT_REST / 2:  # less is a matter of the calibration
+            values.append(float(np.median([fit.aligned for fit in evidence.fits[s]])) / max(best, 1e-6))
+        found[item.name] = min(values)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Swing:
+    """How the object swings, as far as pictures tell.
+
+    Attributes:
+        frequency: of the spectrum [Hz].
+        power: of it, 1 at its peak.
+        dominant: where the power peaks [Hz].
+        cycles: of it within the frames that were watched; of a single one nothing can be told.
+    """
+
+    frequency: np.ndarray
+    power: np.ndarray
+    dominant: float
+    cycles: float
+
+
+def swing(evidence: Evidence) -> Swing:
+    """Frequency of the largest change of the pictures, all views together.
+
+    Pictures are taken for displacements: what changes most is a fixed pattern times a coordinate that swings as the
+    object does, as long as it moves by less than its own width.
+    """
+    motions = [_pattern(item) for item in evidence.watched if len(item.gray) > 3]
+    if not motions:
+        return Swing(np.zeros(1), np.zeros(1), 0.0, 0.0)
+    shapes, _ = principal_motions(motions, _MOTIONS)
+    series = [coordinates(motion, shapes) for motion in motions]
+    frequency, power = spectrum(series, evidence.data.fps)
+    dominant = float(frequency[1:][power[1:].argmax()])  # without what does not swing
+    seconds = min(len(s) for s in series) / evidence.data.fps
+    return Swing(frequency, power / max(float(power.max()), 1e-30), dominant, dominant * seconds)
+
+
+def _pattern(item: Watched) -> np.ndarray:
+    """Blurred pictures of all views less frame 0, (F, P, 3)."""
+    frames, views, height, width = item.alpha.shape
+    factor = min(1.0, _SPECTRUM_LONGEST / max(height, width))
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    small = np.stack(
+        [[cv2.resize(item.rgb[f, v], size, interpolation=cv2.INTER_AREA) for v in range(views)] for f in range(frames)]
+    ).astype(np.float32)
+    return (small - small[:1]).reshape(frames, -1, 3)
+
+
+def _rates(evidence: Evidence) -> Iterator[Finding]:
+    fps, found = evidence.data.fps, swing(evidence)
+    measured = {"frequency": found.dominant, "cycles": found.cycles, "fps": fps}
+    swings = found.cycles >= _CYCLES
+    share = found.dominant / fps
+    if swings and share > _FAST:
+        yield Finding(
+            NAME, "fault" if share > _TOO_FAST else "warning", "likely",
+            f"The object swings at about {found.dominant:.2g} Hz, once in {1 / share:.1f} frames at {fps:g} frames per "
+            "second: that is too fast for steps of a frame.",
+            "Film at a higher rate (five frames per swing or more), or keep every frame of the film.", measured,
+        )  # fmt: skip
+    usual = any(abs(fps / rate - 1) < _RATE_TOLERANCE for rate in _USUAL_RATES)
+    plausible = not swings or _SLOWEST <= found.dominant <= _FASTEST
+    if usual and plausible:
+        if swings:
+            yield _noted(found, fps)
+        return
+    reason = f"{fps:g} frames per second is no usual rate of a camera" if not usual else ""
+    if swings:
+        reason += f"{' and' if reason else 'At ' + format(fps, 'g') + ' frames per second'} the object would swing at "
+        reason += f"{found.dominant:.2g} Hz"
+    others = ", ".join(f"{found.dominant * rate / fps:.2g} Hz at {rate}" for rate in (24, 30, 60, 120, 240))
+    check = f" By a stopwatch: it would be {others}." if swings else ""
+    yield Finding(
+        NAME, "warning", "possible" if plausible else "likely",
+        f"{reason}: field 'fps' of dataset.json may be wrong. Velocities, stiffness and damping scale with it.",
+        "Set 'fps' in dataset.json and every sequences/*/transforms.json to the rate of the frames that are there (a "
+        f"film of 120 of which every fifth frame was kept has 24).{check}", measured,
+    )  # fmt: skip
+
+
+def _noted(found: Swing, fps: float) -> Finding:
+    return Finding(
+        NAME, "note", "likely",
+        f"The object swings at about {found.dominant:.2g} Hz, once in {fps / found.dominant:.0f} frames at {fps:g} "
+        "frames per second.",
+        "None is needed. If it swings faster or slower by the eye, 'fps' of dataset.json is wrong.",
+        {"frequency": found.dominant, "cycles": found.cycles, "fps": fps},
+    )  # fmt: skip

@@ -1,0 +1,87 @@
+"""Findings as text, as plain data, and as a page with the pictures."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+
+from gausim.doctor.examine import Examination
+from gausim.doctor.finding import SEVERITIES, listed
+
+_WIDTH = 118
+
+
+def findings_text(root: str, found: Examination) -> str:
+    """All findings of an object, for a terminal."""
+    lines = [f"{root}: {summary_line(found)}"]
+    for finding in found.findings:
+        head = f"  {finding.severity.upper()}  {finding.check} ({finding.sureness}): {finding.what}"
+        lines += textwrap.wrap(head, _WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+        lines += textwrap.wrap(f"Remedy: {finding.remedy}", _WIDTH, initial_indent="    ", subsequent_indent="    ",
+                               break_long_words=False, break_on_hyphens=False)  # fmt: skip
+    for cause in dict.fromkeys(found.left_out.values()):
+        names = listed([name for name, other in found.left_out.items() if other == cause])
+        lines.append(f"  Not looked at until the fault of '{cause}' is mended: {names}.")
+    return "\n".join(lines)
+
+
+def summary_line(found: Examination) -> str:
+    """How many findings of each severity there are, and what was looked at."""
+    counts = [(severity, sum(f.severity == severity for f in found.findings)) for severity in SEVERITIES]
+    told = ", ".join(f"{n} {severity}{'s' if n > 1 else ''}" for severity, n in counts if n)
+    if not counts[0][1] and not counts[1][1]:
+        told = "nothing is wrong"
+    evidence = found.evidence
+    if evidence is None:
+        return f"{told}."
+    frames = max(len(item.alpha) for item in evidence.watched)
+    return (
+        f"{told} ({len(evidence.views)} cameras, {evidence.sequences} sequences; looked at frames 0 to {frames - 1} of "
+        f"{len(evidence.watched)} and frame 0 of {len(evidence.first)})."
+    )
+
+
+def plain_findings(found: Examination) -> dict[str, Any]:
+    """Findings and what was left out as plain data, for JSON."""
+    return {
+        "findings": [{**vars(finding), "measured": _plain(finding.measured)} for finding in found.findings],
+        "left_out": found.left_out,
+    }
+
+
+def write_page(path: Path, found: Examination, pictures: Sequence[tuple[str, str]]) -> None:
+    """Writes the page; names are escaped, and its policy forbids the browser to load anything from elsewhere.
+
+    Args:
+        path: HTML to write, beside the pictures.
+        found: the findings.
+        pictures: file name and caption of each.
+    """
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    template = environment.from_string(files("gausim.doctor").joinpath("page.html").read_text(encoding="utf-8"))
+    assert found.evidence is not None
+    text = template.render(
+        name=found.evidence.data.name,
+        summary=summary_line(found),
+        findings=found.findings,
+        left_out=found.left_out,
+        pictures=pictures,
+    )
+    path.write_text(text, encoding="utf-8")
+
+
+def _plain(value: Any) -> Any:
+    """Numbers that JSON knows: what is not finite becomes null."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, (bool, int, str)):
+        return value
+    number = float(value)
+    return number if abs(number) < float("inf") else None

@@ -1,0 +1,105 @@
+"""Silhouettes of the rest scene, and how far they lie from those of the pictures."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from gausim.core import Cameras, GaussianScene
+from gausim.render.cpu import CpuRenderer
+from gausim.render.draw import draw
+
+# The alignment's own smoothing [pixels], steps and precision (cv2.findTransformECC).
+_SMOOTHING, _STEPS, _PRECISION = 5, 100, 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouettes:
+    """The rest scene's foreground in V views.
+
+    Attributes:
+        alpha: coverage, 0 to 1.
+        rgb: colours over black, 0 to 1.
+    """
+
+    alpha: Float[np.ndarray, "V h w"]
+    rgb: Float[np.ndarray, "V h w 3"]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a drawn silhouette lies on that of a picture.
+
+    Attributes:
+        overlap: intersection over union as it is.
+        aligned: the same after the best shift and turn in the picture.
+        shift: at the middle of the mask, right and down [reduced pixels]; NaN where nothing is drawn.
+        turn: in the picture [degrees].
+        pixels: root mean square of the displacement over the mask [reduced pixels]; infinite where nothing is drawn.
+        degrees: turn of the camera that would explain it.
+    """
+
+    overlap: float
+    aligned: float
+    shift: tuple[float, float]
+    turn: float
+    pixels: float
+    degrees: float
+
+
+def draw_silhouettes(scene: GaussianScene, cameras: Cameras) -> Silhouettes:
+    """Draws the rest scene's foreground."""
+    shown = scene.select(scene.foreground)
+    identity, unit = torch.eye(3)[None, None], torch.zeros(shown.count, dtype=torch.int64)
+    with torch.no_grad():
+        drawn = draw(CpuRenderer(), shown, shown.means[None], identity, identity, unit, cameras)
+    return Silhouettes(drawn.alpha[0].clamp(0, 1).numpy(), drawn.rgb[0].clamp(0, 1).numpy())
+
+
+def overlap(a: Float[np.ndarray, "*shape"], b: Float[np.ndarray, "*shape"]) -> float:
+    """Intersection over union of two soft masks; 0 where both are empty."""
+    union = float(np.maximum(a, b).sum())
+    return float(np.minimum(a, b).sum()) / union if union > 0 else 0.0
+
+
+def fit_silhouette(mask: Float[np.ndarray, "h w"], drawn: Float[np.ndarray, "h w"], focal: float) -> Fit:
+    """Finds the shift and turn in the picture that lay a drawn silhouette on a mask (enhanced correlation).
+
+    Args:
+        mask: of the picture, 0 to 1.
+        drawn: silhouette of the rest scene, 0 to 1.
+        focal: focal length [pixels of both].
+    """
+    raw = overlap(mask, drawn)
+    if mask.sum() < 1 or drawn.sum() < 1:
+        return Fit(raw, raw, (math.nan, math.nan), 0.0, math.inf, math.inf)
+    middle = _middle(mask)
+    warp = np.eye(2, 3, dtype=np.float32)
+    warp[:, 2] = _middle(drawn) - middle
+    stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _STEPS, _PRECISION)
+    try:
+        _, found = cv2.findTransformECC(mask, drawn, warp.copy(), cv2.MOTION_EUCLIDEAN, stop, None, _SMOOTHING)  # type: ignore[call-overload]
+    except cv2.error:  # no overlap to begin with: the shift of the middles is all that can be said
+        found = warp
+    size = (mask.shape[1], mask.shape[0])
+    moved = cv2.warpAffine(drawn, found, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    rows, columns = np.nonzero(mask > 0.5) if (mask > 0.5).any() else np.nonzero(mask > 0)
+    places = np.stack((columns, rows)).astype(np.float64)
+    away = found[:, :2] @ places + found[:, 2:] - places
+    # Positive where the drawn silhouette lies right of and below that of the picture.
+    shift = found[:, :2].astype(np.float64) @ middle + found[:, 2] - middle
+    turn = math.degrees(math.atan2(found[1, 0], found[0, 0]))
+    tilt = math.degrees(math.atan(float(np.hypot(*shift)) / focal))
+    pixels = float(np.sqrt((away**2).sum(0).mean()))
+    return Fit(raw, overlap(mask, moved), (float(shift[0]), float(shift[1])), turn, pixels, math.hypot(tilt, turn))
+
+
+def _middle(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, " 2"]:
+    total = mask.sum(dtype=np.float64)
+    rows, columns = np.indices(mask.shape)
+    return np.array([(columns * mask).sum(), (rows * mask).sum()], np.float64) / total
