@@ -77,7 +77,7 @@ def _moved(evidence: Evidence, fits: Sequence[Sequence[Fit]]) -> Iterator[Findin
                 "--images STILLS --sequences FRAMES`), or make the scene again if it is of another object or world."
             )
         sure = "certain" if spoils and min(min(f.aligned for f in r) for r in fits) > _SHAPE else "likely"
-        yield Finding(NAME, "fault" if spoils else "warning", sure, what, remedy, {"pixels": measured})  # type: ignore[arg-type]
+        yield Finding(NAME, "fault" if spoils else "warning", sure, what, remedy, {"views": worth, "pixels": measured})  # type: ignore[arg-type]
     yield from _shape(evidence, fits)
 
 

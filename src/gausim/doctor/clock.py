@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from gausim.core import Cameras
+from gausim.doctor.coverage import view_directions
 from gausim.doctor.evidence import Evidence, Watched
 from gausim.doctor.finding import Finding
 
@@ -15,6 +17,12 @@ FURTHEST = 8
 # Correlation that a shift must reach, and gain over no shift, of several sequences together and of one alone.
 _REACHED, _GAIN = 0.5, 0.25
 _REACHED_ALONE, _GAIN_ALONE = 0.65, 0.5
+# Energy is seen at another phase from another side where the object runs round, so the middles of the masks count as
+# much, where their correlation tells anything. Where it does not, energy must reach so much, and gain so much.
+_TELLING = 0.5
+_REACHED_BY_ITSELF, _GAIN_BY_ITSELF = 0.8, 0.6
+# Overlap with the rest scene below which a camera's pose is no help.
+_SOMEWHERE = 0.5
 # A camera whose motion correlates less than this with the others' cannot be placed.
 _UNLIKE = 0.3
 # Frames below which nothing can be correlated.
@@ -22,22 +30,23 @@ _FEW = 2 * FURTHEST
 
 
 def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
-    """Correlates every camera's motion energy over time with that of the others."""
-    energies = [motion_energy(item) for item in evidence.watched if len(item.alpha) >= _FEW]
+    """Correlates every camera's motion energy over time with that of the others, and the middles of the masks."""
+    items = [item for item in evidence.watched if len(item.alpha) >= _FEW]
+    energies = [motion_energy(item) for item in items]
     if not energies or len(evidence.views) < 2 or max(float(e.max()) for e in energies) == 0:
         return
-    lags, unsure = _lags(energies, _REACHED, _GAIN)
-    for view in (evidence.views[v] for v in unsure):
+    lags, unsure = _lags(evidence, items, energies, _REACHED, _GAIN)
+    for view in (evidence.views[v] for v in sorted(unsure)):
         yield Finding(
             NAME, "note", "possible",
             f"Whether {view} is in step with the other cameras cannot be told: its motion over time is unlike theirs.",
             "Compare it by eye in motion.png (--out DIR).", {"view": view},
         )  # fmt: skip
     if any(lags.values()):
-        yield from _told(evidence, lags, [item.name for item in evidence.watched])
+        yield from _told(evidence, lags, [item.name for item in items])
         return
-    for item, energy in zip((i for i in evidence.watched if len(i.alpha) >= _FEW), energies, strict=True):
-        alone, _ = _lags([energy], _REACHED_ALONE, _GAIN_ALONE)
+    for item, energy in zip(items, energies, strict=True):
+        alone, _ = _lags(evidence, [item], [energy], _REACHED_ALONE, _GAIN_ALONE)
         if any(alone.values()):
             yield from _told(evidence, alone, [item.name])
 
@@ -65,30 +74,100 @@ def correlations(energies: Sequence[np.ndarray], view: int, lags: dict[int, int]
     for energy in energies:
         z = (energy - energy.mean(0)) / (energy.std(0) + 1e-12)
         others = np.mean([np.roll(z[:, v], -lags.get(v, 0)) for v in range(z.shape[1]) if v != view], axis=0)
-        count = len(z)
-        for i, lag in enumerate(range(-FURTHEST, FURTHEST + 1)):
-            own = z[max(0, lag) : count + min(0, lag), view]
-            theirs = others[max(0, -lag) : count + min(0, -lag)]
-            own, theirs = own - own.mean(), theirs - theirs.mean()
-            found[i] += (own @ theirs) / (np.sqrt((own @ own) * (theirs @ theirs)) + 1e-12) / len(energies)
+        found += _by_lag(z[:, view, None], others[:, None]) / len(energies)
     return found
 
 
-def _lags(energies: Sequence[np.ndarray], reached: float, gain: float) -> tuple[dict[int, int], list[int]]:
-    """By how many frames each view is late; the one that gains most by a shift is shifted first, then the next."""
+def agreement(evidence: Evidence, items: Sequence[Watched], view: int, lags: dict[int, int]) -> np.ndarray:
+    """Correlation of the way of a mask's middle with the one that follows from the other views, by lag.
+
+    The middle's way in each picture is a linear picture of one way in space, whose three coordinates the other views
+    give (least squares).
+    """
+    found = np.zeros(2 * FURTHEST + 1)
+    for item in items:
+        seen = _jacobians(evidence, item.cameras)
+        ways = _middles(item)
+        others = [v for v in range(len(seen)) if v != view]
+        moved = np.concatenate([np.roll(ways[:, v], -lags.get(v, 0), axis=0) for v in others], axis=1)
+        in_space = moved @ np.linalg.pinv(np.concatenate([seen[v] for v in others])).T
+        found += _by_lag(ways[:, view], in_space @ seen[view].T) / len(items)
+    return found
+
+
+def _by_lag(own: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Correlation of two series (F, n), the first one late by -FURTHEST to FURTHEST frames."""
+    found, count = np.zeros(2 * FURTHEST + 1), len(own)
+    for i, lag in enumerate(range(-FURTHEST, FURTHEST + 1)):
+        a = own[max(0, lag) : count + min(0, lag)]
+        b = theirs[max(0, -lag) : count + min(0, -lag)]
+        a, b = a - a.mean(0), b - b.mean(0)
+        found[i] = (a * b).sum() / (np.sqrt((a * a).sum() * (b * b).sum()) + 1e-12)
+    return found
+
+
+def _middles(item: Watched) -> np.ndarray:
+    """Middles of the masks, (F, V, 2) [reduced pixels]; the one before where a mask is empty."""
+    weights = item.alpha.astype(np.float64)
+    total = weights.sum((-1, -2))
+    rows, columns = np.indices(item.alpha.shape[-2:])
+    sums = np.stack(((weights * columns).sum((-1, -2)), (weights * rows).sum((-1, -2))), -1)
+    middles = sums / np.maximum(total, 1)[..., None]
+    for f in range(1, len(middles)):
+        middles[f] = np.where(total[f, :, None] > 0, middles[f], middles[f - 1])
+    return middles
+
+
+def _jacobians(evidence: Evidence, cameras: Cameras) -> np.ndarray:
+    """Change of the picture by a change in space at the object, (V, 2, 3) [reduced pixels per scene unit]."""
+    middle = view_directions(evidence)[1]
+    rotations = cameras.viewmats[:, :3, :3].double().numpy()
+    x, y, z = (rotations @ middle + cameras.viewmats[:, :3, 3].double().numpy()).T
+    z = np.where(np.abs(z) > 1e-6, z, 1e-6)
+    fx, fy = cameras.Ks[:, 0, 0].double().numpy(), cameras.Ks[:, 1, 1].double().numpy()
+    zero = np.zeros_like(z)
+    projection = np.stack(
+        (np.stack((fx / z, zero, -fx * x / z**2), -1), np.stack((zero, fy / z, -fy * y / z**2), -1)), 1
+    )
+    return projection @ rotations
+
+
+def _lags(
+    evidence: Evidence, items: Sequence[Watched], energies: Sequence[np.ndarray], reached: float, gain: float
+) -> tuple[dict[int, int], set[int]]:
+    """By how many frames each view is late, and which cannot be told.
+
+    The view that gains most by a shift is shifted first, then the next.
+    """
     views = energies[0].shape[1]
-    lags = dict.fromkeys(range(views), 0)
-    for _ in range(max(1, views - 1)):
-        curves = {v: correlations(energies, v, lags) for v in range(views) if lags[v] == 0}
-        gains = {v: float(c.max() - c[FURTHEST]) for v, c in curves.items() if c.max() >= reached}
+    lags: dict[int, int] = dict.fromkeys(range(views), 0)
+    settled: set[int] = set()
+    unsure: set[int] = set()
+    while len(settled) < views - (views == 2):
+        scores = {v: _score(evidence, items, energies, v, lags) for v in range(views) if v not in settled}
+        gains = {v: float(c.max() - c[FURTHEST]) for v, (c, _) in scores.items() if c.max() >= reached}
         best = max(gains, key=lambda v: gains[v], default=None)
         if best is None or gains[best] < gain:
             break
-        lags[best] = int(curves[best].argmax()) - FURTHEST
-        if views == 2:
-            break
-    unsure = [v for v in range(views) if lags[v] == 0 and correlations(energies, v, lags).max() < _UNLIKE]
-    return lags, unsure
+        curve, telling = scores[best]
+        settled.add(best)
+        if telling or (curve.max() >= _REACHED_BY_ITSELF and gains[best] >= _GAIN_BY_ITSELF):
+            lags[best] = int(curve.argmax()) - FURTHEST
+        else:
+            unsure.add(best)
+    unlike = {v for v in range(views) if v not in settled and correlations(energies, v, lags).max() < _UNLIKE}
+    return lags, unsure | unlike
+
+
+def _score(
+    evidence: Evidence, items: Sequence[Watched], energies: Sequence[np.ndarray], view: int, lags: dict[int, int]
+) -> tuple[np.ndarray, bool]:
+    """Correlation of a view with the others by lag, and whether the middles of the masks are in it."""
+    energy = correlations(energies, view, lags)
+    if evidence.fits is not None and np.median([[f.overlap for f in row] for row in evidence.fits]) < _SOMEWHERE:
+        return energy, False
+    middles = agreement(evidence, items, view, lags)
+    return ((energy + middles) / 2, True) if middles.max() >= _TELLING else (energy, False)
 
 
 def _told(evidence: Evidence, lags: dict[int, int], sequences: list[str]) -> Iterator[Finding]:

@@ -18,7 +18,7 @@ _AROUND, _EVERYWHERE = 0.8, 0.999
 # in a coloured one [of 255].
 _UNIFORM, _COLOURED = 8.0, 40.0
 # Alpha that nobody sees (of 255), and how far from the object it counts as haze [reduced pixels].
-_FAINT, _AWAY, _HAZE = 26, 4, 0.02
+_FAINT, _AWAY, _HAZE = 26, 6, 0.02
 # Relative jump of a mask's area against the frames around it, and the radius of these.
 _JUMP, _RADIUS = 0.15, 2
 # Share of empty frames from which on a training is spoilt.

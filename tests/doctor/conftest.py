@@ -1,0 +1,82 @@
+"""A small object on disk that is in order: a crooked body that sways in two directions, seen by four cameras."""
+
+from __future__ import annotations
+
+import math
+import runpy
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from gausim.core import Cameras, GaussianScene, Trajectory
+
+TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
+SIZE, FRAMES, OMEGA = 64, 32, 0.7
+VIEWS = ("cam_0", "cam_1", "cam_2", "cam_3")
+# Direction and phase of the two swings of each sequence.
+SWINGS = {"seq_000": (0.3, 0.0), "seq_001": (1.4, 0.9), "seq_002": (2.3, 1.7), "seq_003": (-0.8, 2.4)}
+
+
+class Swaying(TOY["ToyObject"]):
+    """Sways about its pinned foot in two directions that come and go."""
+
+    def truth(self, sequence: str, frames: int | None = None) -> Trajectory:
+        count = frames or self.frames
+        direction, phase = SWINGS[sequence]
+        t = torch.arange(count)
+        wave = torch.sin(OMEGA * t) * (1 + 0.6 * torch.sin(0.23 * t + phase)) * 0.12
+        cross = torch.sin(OMEGA * 1.31 * t) * 0.06
+        height = self.scene.means[:, 2] ** 2
+        shift = torch.zeros(count, self.scene.count, 3)
+        shift[:, :, 0] = (math.cos(direction) * wave - math.sin(direction) * cross)[:, None] * height
+        shift[:, :, 1] = (math.sin(direction) * wave + math.cos(direction) * cross)[:, None] * height
+        identity = torch.eye(3).expand(count, 1, 3, 3)
+        return Trajectory(self.scene.means + shift, identity, identity,
+                          torch.zeros(self.scene.count, dtype=torch.long), self.fps)  # fmt: skip
+
+
+def body() -> GaussianScene:
+    trunk = torch.cartesian_prod(torch.tensor([-0.2, 0.0, 0.2]), torch.tensor([-0.15, 0.1]), torch.linspace(0, 1.2, 7))
+    arm = torch.stack((torch.linspace(0.3, 0.9, 6), torch.linspace(0.1, 0.5, 6), torch.linspace(0.7, 1.1, 6)), 1)
+    means = torch.cat((trunk, arm))
+    generator = torch.Generator().manual_seed(0)
+    return GaussianScene.create(
+        means=means,
+        log_scales=torch.full((len(means), 3), math.log(0.08)),
+        quats=torch.tensor([1.0, 0, 0, 0]).expand(len(means), 4).clone(),
+        opacity_logits=torch.full((len(means),), 4.0),
+        sh=2 * torch.rand(len(means), 1, 3, generator=generator) - 1,
+        pinned=means[:, 2] < 0.1,
+        name="swaying",
+    )
+
+
+def ring() -> Cameras:
+    viewmats = []
+    for angle, height in ((0.0, 1.4), (1.5, 1.9), (-0.9, 0.8), (2.6, 1.2)):
+        eye = torch.tensor([4 * math.sin(angle), -4 * math.cos(angle), height])
+        forward = torch.nn.functional.normalize(torch.tensor([0.1, 0.1, 0.6]) - eye, dim=0)
+        right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
+        viewmat = torch.eye(4)
+        viewmat[:3, :3] = torch.stack((right, torch.linalg.cross(forward, right), forward))
+        viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+        viewmats.append(viewmat)
+    k = torch.tensor([[110.0, 0, SIZE / 2], [0, 110.0, SIZE / 2], [0, 0, 1]])
+    return Cameras(torch.stack(viewmats), k.expand(4, 3, 3).clone(), SIZE, SIZE, VIEWS)
+
+
+@pytest.fixture(scope="session")
+def swaying(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One object that is in order, not to be changed."""
+    root = tmp_path_factory.mktemp("doctor") / "swaying"
+    toy = Swaying(root, body(), FRAMES, 16, amplitudes=dict.fromkeys(SWINGS, 1.0), cameras=ring())
+    TOY["write_object"](toy)
+    return root
+
+
+@pytest.fixture
+def spoilt(swaying: Path, tmp_path: Path) -> Path:
+    """A copy of it, to be spoilt."""
+    return Path(shutil.copytree(swaying, tmp_path / "swaying"))

@@ -1,0 +1,301 @@
+"""`gausim doctor`: nothing to say of a good object, and the right word about every mistake that a stranger makes."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gausim.cli.main import main
+
+HERE = Path(__file__).parent
+TOOLS = runpy.run_path(str(HERE.parent / "mistakes.py"))
+MISTAKES = TOOLS["MISTAKES"]
+VIEWS = ("cam_0", "cam_1", "cam_2", "cam_3")
+
+
+def told(root: Path, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[int, dict]:
+    status = main(["doctor", str(root), "--json", *more])
+    return status, json.loads(capsys.readouterr().out)[str(root)]
+
+
+def found(entry: dict) -> dict[str, dict]:
+    """Findings but notes by check; the first of each."""
+    return {f["check"]: f for f in reversed(entry["findings"]) if f["severity"] != "note"}
+
+
+def test_a_good_object_has_no_fault_and_no_warning(swaying: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, entry = told(swaying, capsys)
+    assert status == 0 and not entry["ruinous"] and not entry["faults"] and not entry["left_out"]
+    assert found(entry) == {}
+
+
+# Mistake: check that must name it, its severity, what its sentence and its remedy must hold.
+SAID = {
+    "focal length from degrees": ("calibration", "fault", "focal length", "degrees"),
+    "OpenCV poses": ("calibration", "fault", "OpenCV axes", "negate the second and third column"),
+    "inverted poses": ("calibration", "fault", "world-to-camera", "invert every transform_matrix"),
+    "millimetres": ("calibration", "fault", "another unit", "by 0.001"),
+    "inverted masks": ("masks", "fault", "are inverted", "255 - alpha"),
+    "nothing cut out": ("masks", "fault", "Nothing is cut out", "data_prep.segment"),
+    "rate over 4": ("motion", "warning", "6 frames per second is no usual rate", "'fps'"),
+    "one camera moved": ("calibration", "fault", "cam_1 is not where the pose says", "pose of cam_1"),
+    "all cameras moved": ("calibration", "fault", "4 of 4 cameras disagree", "Calibrate all cameras"),
+    "one camera 2 frames late": ("clock", "fault", "cam_1 is out of step: it shows the motion 2 frames later", "cam_1"),
+    "one camera 2 frames early": (
+        "clock",
+        "fault",
+        "cam_1 is out of step: it shows the motion 2 frames earlier",
+        "but",
+    ),
+    "nothing moves": ("motion", "fault", "Nothing moves", "Record sequences"),
+    "16-bit PNG": ("files", "fault", "got 64x64 RGBA (16 bit)", "gausim verify"),
+    "no alpha": ("files", "fault", "Re-export the frame with alpha", "gausim verify"),
+    "a film for frames": ("files", "fault", "it is a film", "gausim verify"),
+    "no pin": ("pins", "fault", "no kernel is pinned", "--pin-below"),
+    "not at rest": ("motion", "warning", "Frame 0 is not at rest in seq_003", "last frame before"),
+    "one view": ("views", "fault", "one training view only (cam_0)", "two cameras"),
+    "a dark camera": ("appearance", "warning", "cam_1 -", "exposure"),
+    "a flickering camera": ("appearance", "warning", "The brightness of cam_1 jumps", "fixed exposure"),
+}
+
+
+@pytest.mark.parametrize("mistake", SAID)
+def test_a_mistake_is_named_with_its_remedy(mistake: str, spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    check, severity, what, remedy = SAID[mistake]
+    MISTAKES[mistake](spoilt)
+    status, entry = told(spoilt, capsys)
+    findings = found(entry)
+    assert list(findings) == [check], findings
+    assert findings[check]["severity"] == severity and status == (severity == "fault")
+    assert what in findings[check]["what"] and remedy in findings[check]["remedy"], findings[check]
+
+
+# What verify finds before anything is looked at, word by word.
+BROKEN = {
+    "field of view in degrees": "In degrees that would be 0.",
+    "rate in one file": "field 'fps' is 24, dataset.json says 96",
+    "missing images": "3 of its images are missing",
+    "missing frames": "view 'cam_1' lacks 3 of 32 frames (first: 5)",
+    "films for folders": "found films (cam_0.MP4",
+}
+
+
+@pytest.mark.parametrize("mistake", BROKEN)
+def test_broken_files_are_named_before_all_else(mistake: str, spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    MISTAKES[mistake](spoilt)
+    status, entry = told(spoilt, capsys)
+    assert status == 1 and entry["findings"] == []
+    assert all(BROKEN[mistake] in what for _, what in entry["faults"]), entry["faults"]
+
+
+def test_no_mistake_goes_untested() -> None:
+    assert set(MISTAKES) - set(SAID) - set(BROKEN) == {"rate times 4"}  # on the bunny: 96 is a multiple here as well
+
+
+def test_a_folder_within_an_object_is_sent_to_the_object(swaying: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", str(swaying / "sequences")]) == 2
+    assert f"part of the one in {swaying}" in capsys.readouterr().err
+
+
+def test_the_size_of_a_move_is_measured(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    TOOLS["moved_camera"](spoilt, view=2, degrees=3.0)
+    _, entry = told(spoilt, capsys)
+    finding = found(entry)["calibration"]
+    assert "cam_2 is off by about 3.0 degrees" in finding["what"]
+    pixels = finding["measured"]["pixels"]
+    assert max(pixels, key=pixels.get) == "cam_2" and max(p for v, p in pixels.items() if v != "cam_2") < 0.2
+
+
+def test_a_camera_out_of_step_in_one_sequence_only(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    aside = spoilt.parent / "aside"
+    shutil.copytree(spoilt / "sequences", aside)
+    TOOLS["out_of_step"](spoilt, view=3, frames=3)
+    for name in ("seq_000", "seq_001", "seq_003"):
+        shutil.rmtree(spoilt / "sequences" / name)
+        shutil.copytree(aside / name, spoilt / "sequences" / name)
+    _, entry = told(spoilt, capsys)
+    finding = found(entry)["clock"]
+    assert "3 frames later than the other cameras, in seq_002" in finding["what"]
+    assert finding["measured"]["view"] == "cam_3"
+
+
+def change_images(root: Path, change, pattern: str = "*/*/*") -> None:
+    TOOLS["every_image"](root, change, pattern)
+
+
+def test_empty_masks(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change_images(spoilt, np.zeros_like, "*/cam_2/*")
+    status, entry = told(spoilt, capsys)
+    assert status == 1 and "cam_2 never shows the object" in found(entry)["masks"]["what"]
+
+
+def test_a_haze_of_alpha(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change_images(spoilt, lambda p: np.concatenate((p[..., :3], np.maximum(p[..., 3:], 5)), -1), "*/cam_0/*")
+    status, entry = told(spoilt, capsys)
+    assert (
+        status == 0
+        and "haze of faint alpha (1 to 26 of 255) lies around the object in cam_0" in (found(entry)["masks"]["what"])
+    )
+
+
+def test_a_mask_that_drops_out(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def half(pixels: np.ndarray) -> np.ndarray:
+        pixels[SIZE // 2 :, :, 3] = 0
+        return pixels
+
+    SIZE = 64
+    change_images(spoilt, half, "seq_000/cam_3/0010")
+    _, entry = told(spoilt, capsys)
+    assert "The mask of cam_3 jumps in size" in found(entry)["masks"]["what"]
+    assert "seq_000 frame 10" in found(entry)["masks"]["what"]
+
+
+def test_an_object_that_is_cut_off(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Pictures of one camera are cropped on the left, as its lens says, through the object."""
+
+    def crop(data: dict) -> None:
+        for entry in data["frames"]:
+            if entry["camera"] == "cam_1":
+                entry.update({"fl_x": data["fl_x"], "fl_y": data["fl_y"], "cx": data["cx"] - 20, "cy": data["cy"]})
+
+    TOOLS["every_transforms"](spoilt, crop)
+    change_images(spoilt, lambda p: np.concatenate((p[:, 20:], np.zeros_like(p[:, :20])), 1), "*/cam_1/*")
+    _, entry = told(spoilt, capsys)
+    assert "The object is cut off at the left of cam_1" in found(entry)["views"]["what"]
+
+
+def test_a_tiny_object(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def shrink(pixels: np.ndarray) -> np.ndarray:
+        small = np.zeros_like(pixels)
+        small[24:40, 24:40] = cv2.resize(pixels, (16, 16), interpolation=cv2.INTER_AREA)
+        return small
+
+    TOOLS["every_transforms"](spoilt, lambda data: data.update(fl_x=data["fl_x"] / 4, fl_y=data["fl_y"] / 4))
+    change_images(spoilt, shrink)
+    _, entry = told(spoilt, capsys)
+    assert "The object is tiny in cam_" in found(entry)["views"]["what"]
+
+
+def test_views_along_one_line(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Opposite views see depth no better than equal ones."""
+    from gausim.doctor.coverage import seen_angle
+
+    a, b = np.array([1.0, 0, 0]), np.array([np.cos(0.1), np.sin(0.1), 0])
+    assert seen_angle(np.stack((a, b))) == pytest.approx(np.degrees(0.1), rel=1e-3)
+    assert seen_angle(np.stack((a, -b))) == pytest.approx(np.degrees(0.1), rel=1e-3)
+    assert seen_angle(np.stack((a, np.array([0.0, 1, 0])))) == pytest.approx(90)
+
+
+def test_few_frames_and_sequences(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    TOOLS["edit"](spoilt / "dataset.json", lambda data: data.update(train_frames=[0, 4]))
+    for name in ("seq_001", "seq_002", "seq_003"):
+        shutil.rmtree(spoilt / "sequences" / name)
+    status, entry = told(spoilt, capsys)
+    texts = [f["what"] for f in entry["findings"] if f["check"] == "extent"]
+    assert status == 0 and "Training sees 4 frames" in texts[0] and "There is one sequence only" in texts[1]
+
+
+def test_pins_may_be_given(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    MISTAKES["no pin"](spoilt)
+    assert told(spoilt, capsys, "--pin-below", "z=0.1")[0] == 0
+    status, entry = told(spoilt, capsys, "--pin-below", "z=9")
+    assert status == 1 and "pins" in found(entry)
+
+
+def test_without_a_scene_the_rest_is_examined(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (spoilt / "scene.ply").unlink()
+    TOOLS["out_of_step"](spoilt, view=0, frames=2)
+    status, entry = told(spoilt, capsys)
+    assert status == 1 and "cam_0 is out of step" in found(entry)["clock"]["what"]
+    notes = [f for f in entry["findings"] if f["severity"] == "note" and f["check"] == "calibration"]
+    assert "gausim reconstruct" in notes[0]["remedy"]
+
+
+def test_a_plain_object_is_noted(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def white_block(pixels: np.ndarray) -> np.ndarray:
+        block = np.zeros_like(pixels)
+        block[20:44, 24:40] = 255
+        return block
+
+    change_images(spoilt, white_block)
+    (spoilt / "scene.ply").unlink()
+    _, entry = told(spoilt, capsys)
+    assert [f["severity"] for f in entry["findings"] if "The object is plain" in f["what"]] == ["note"]
+
+
+def test_motion_too_fast_for_the_frames(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every fifth frame is kept, so that a swing takes less than two frames."""
+    for folder in spoilt.glob("sequences/*/*/"):
+        paths = sorted(folder.iterdir())
+        content = [path.read_bytes() for path in paths]
+        # Forth and back over the recording: frames enough for the clock, though it is short.
+        there = [*range(0, 32, 3), *range(30, 0, -3)]
+        for number, path in enumerate(paths):
+            path.write_bytes(content[there[number % len(there)]])
+    _, entry = told(spoilt, capsys)
+    assert "too fast for steps of a frame" in found(entry)["motion"]["what"]
+
+
+def test_pictures_and_page(swaying: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "seen"
+    assert main(["doctor", str(swaying), "--out", str(out)]) == 0
+    assert "nothing is wrong (4 cameras, 4 sequences" in capsys.readouterr().out
+    page = (out / "index.html").read_text()
+    for name in ("views.png", "motion.png", "spectrum.png", "coverage.png"):
+        picture = cv2.imread(str(out / name))
+        assert f'src="{name}"' in page and picture.std() > 5
+    orange = cv2.imread(str(out / "views.png"))[..., ::-1].astype(int)
+    outline = (orange[..., 0] > 200) & (abs(orange[..., 1] - 150) < 30) & (orange[..., 2] < 90)
+    assert outline.sum() > 200
+
+
+def test_the_page_shows_findings_and_escapes_names(spoilt: Path, tmp_path: Path) -> None:
+    TOOLS["edit"](spoilt / "dataset.json", lambda data: data.update(name="<b>$x$"))
+    MISTAKES["one camera moved"](spoilt)
+    assert main(["doctor", str(spoilt), "--out", str(tmp_path / "seen")]) == 1
+    page = (tmp_path / "seen" / "index.html").read_text()
+    assert "cam_1 is not where the pose says" in page and "&lt;b&gt;$x$" in page and "<b>$" not in page
+
+
+def test_a_scene_that_is_not_there(swaying: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", str(swaying), "--scene", str(swaying / "none.ply")]) == 2
+    assert "none.ply: no such file" in capsys.readouterr().err
+
+
+# The same on real pictures.
+ON_THE_BUNNY = {**{k: v for k, v in SAID.items() if k != "no pin"},
+                "rate times 4": ("motion", "warning", "96 frames per second is no usual rate", "'fps'")}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bunny(data_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four sequences of the bunny with a rest scene of its own."""
+    source, folder = data_root / "bunny", tmp_path_factory.mktemp("bunny")
+    options = ["--pin-below", "z=0.33", "--iterations", "1500"]
+    assert main(["reconstruct", str(source), "--out", str(folder / "rest.ply"), *options]) == 0
+    return TOOLS["copy_object"](source, folder / "good", scene=folder / "rest.ply", sequences=4)
+
+
+@pytest.mark.slow
+def test_the_bunny_is_in_order(bunny: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, entry = told(bunny, capsys)
+    assert status == 0 and found(entry) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mistake", ON_THE_BUNNY)
+def test_mistakes_on_the_bunny(mistake: str, bunny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = Path(shutil.copytree(bunny, tmp_path / "bunny"))
+    check, severity, what, remedy = ON_THE_BUNNY[mistake]
+    MISTAKES[mistake](root)
+    status, entry = told(root, capsys)
+    finding = found(entry)[check]
+    assert finding["severity"] == severity and status == (severity == "fault")
+    what = what.replace("64x64", "128x128").replace("4 of 4", "5 of 5")
+    assert what in finding["what"] and remedy in finding["remedy"]
