@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from gausim.cli.main import main
+from gausim.doctor.coverage import seen_angle
 
 HERE = Path(__file__).parent
 TOOLS = runpy.run_path(str(HERE.parent / "mistakes.py"))
@@ -65,7 +66,11 @@ SAID = {
 }
 
 
-@pytest.mark.parametrize("mistake", SAID)
+# The others take a second each.
+QUICK = ("OpenCV poses", "inverted masks", "one camera moved", "one camera 2 frames late", "16-bit PNG", "no pin")
+
+
+@pytest.mark.parametrize("mistake", [m if m in QUICK else pytest.param(m, marks=pytest.mark.slow) for m in SAID])
 def test_a_mistake_is_named_with_its_remedy(mistake: str, spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     check, severity, what, remedy = SAID[mistake]
     MISTAKES[mistake](spoilt)
@@ -103,6 +108,7 @@ def test_a_folder_within_an_object_is_sent_to_the_object(swaying: Path, capsys: 
     assert f"part of the one in {swaying}" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_size_of_a_move_is_measured(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     TOOLS["moved_camera"](spoilt, view=2, degrees=3.0)
     _, entry = told(spoilt, capsys)
@@ -112,6 +118,7 @@ def test_the_size_of_a_move_is_measured(spoilt: Path, capsys: pytest.CaptureFixt
     assert max(pixels, key=pixels.get) == "cam_2" and max(p for v, p in pixels.items() if v != "cam_2") < 0.2
 
 
+@pytest.mark.slow
 def test_a_camera_out_of_step_in_one_sequence_only(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     aside = spoilt.parent / "aside"
     shutil.copytree(spoilt / "sequences", aside)
@@ -129,12 +136,14 @@ def change_images(root: Path, change, pattern: str = "*/*/*") -> None:
     TOOLS["every_image"](root, change, pattern)
 
 
+@pytest.mark.slow
 def test_empty_masks(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change_images(spoilt, np.zeros_like, "*/cam_2/*")
     status, entry = told(spoilt, capsys)
     assert status == 1 and "cam_2 never shows the object" in found(entry)["masks"]["what"]
 
 
+@pytest.mark.slow
 def test_a_haze_of_alpha(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change_images(spoilt, lambda p: np.concatenate((p[..., :3], np.maximum(p[..., 3:], 5)), -1), "*/cam_0/*")
     status, entry = told(spoilt, capsys)
@@ -144,18 +153,19 @@ def test_a_haze_of_alpha(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> No
     )
 
 
+@pytest.mark.slow
 def test_a_mask_that_drops_out(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def half(pixels: np.ndarray) -> np.ndarray:
-        pixels[SIZE // 2 :, :, 3] = 0
+        pixels[len(pixels) // 2 :, :, 3] = 0
         return pixels
 
-    SIZE = 64
     change_images(spoilt, half, "seq_000/cam_3/0010")
     _, entry = told(spoilt, capsys)
     assert "The mask of cam_3 jumps in size" in found(entry)["masks"]["what"]
     assert "seq_000 frame 10" in found(entry)["masks"]["what"]
 
 
+@pytest.mark.slow
 def test_an_object_that_is_cut_off(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Pictures of one camera are cropped on the left, as its lens says, through the object."""
 
@@ -170,6 +180,7 @@ def test_an_object_that_is_cut_off(spoilt: Path, capsys: pytest.CaptureFixture[s
     assert "The object is cut off at the left of cam_1" in found(entry)["views"]["what"]
 
 
+@pytest.mark.slow
 def test_a_tiny_object(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def shrink(pixels: np.ndarray) -> np.ndarray:
         small = np.zeros_like(pixels)
@@ -182,10 +193,7 @@ def test_a_tiny_object(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "The object is tiny in cam_" in found(entry)["views"]["what"]
 
 
-def test_views_along_one_line(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Opposite views see depth no better than equal ones."""
-    from gausim.doctor.coverage import seen_angle
-
+def test_opposite_views_see_depth_no_better_than_equal_ones() -> None:
     a, b = np.array([1.0, 0, 0]), np.array([np.cos(0.1), np.sin(0.1), 0])
     assert seen_angle(np.stack((a, b))) == pytest.approx(np.degrees(0.1), rel=1e-3)
     assert seen_angle(np.stack((a, -b))) == pytest.approx(np.degrees(0.1), rel=1e-3)
@@ -201,6 +209,7 @@ def test_few_frames_and_sequences(spoilt: Path, capsys: pytest.CaptureFixture[st
     assert status == 0 and "Training sees 4 frames" in texts[0] and "There is one sequence only" in texts[1]
 
 
+@pytest.mark.slow
 def test_pins_may_be_given(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     MISTAKES["no pin"](spoilt)
     assert told(spoilt, capsys, "--pin-below", "z=0.1")[0] == 0
@@ -208,6 +217,7 @@ def test_pins_may_be_given(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert status == 1 and "pins" in found(entry)
 
 
+@pytest.mark.slow
 def test_without_a_scene_the_rest_is_examined(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (spoilt / "scene.ply").unlink()
     TOOLS["out_of_step"](spoilt, view=0, frames=2)
@@ -217,6 +227,7 @@ def test_without_a_scene_the_rest_is_examined(spoilt: Path, capsys: pytest.Captu
     assert "gausim reconstruct" in notes[0]["remedy"]
 
 
+@pytest.mark.slow
 def test_a_plain_object_is_noted(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def white_block(pixels: np.ndarray) -> np.ndarray:
         block = np.zeros_like(pixels)
@@ -229,6 +240,7 @@ def test_a_plain_object_is_noted(spoilt: Path, capsys: pytest.CaptureFixture[str
     assert [f["severity"] for f in entry["findings"] if "The object is plain" in f["what"]] == ["note"]
 
 
+@pytest.mark.slow
 def test_motion_too_fast_for_the_frames(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every fifth frame is kept, so that a swing takes less than two frames."""
     for folder in spoilt.glob("sequences/*/*/"):
@@ -255,6 +267,7 @@ def test_pictures_and_page(swaying: Path, tmp_path: Path, capsys: pytest.Capture
     assert outline.sum() > 200
 
 
+@pytest.mark.slow
 def test_the_page_shows_findings_and_escapes_names(spoilt: Path, tmp_path: Path) -> None:
     TOOLS["edit"](spoilt / "dataset.json", lambda data: data.update(name="<b>$x$"))
     MISTAKES["one camera moved"](spoilt)

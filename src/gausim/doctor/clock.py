@@ -35,7 +35,13 @@ def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
     energies = [motion_energy(item) for item in items]
     if not energies or len(evidence.views) < 2 or max(float(e.max()) for e in energies) == 0:
         return
-    lags, unsure = _lags(evidence, items, energies, _REACHED, _GAIN)
+    if evidence.fits is not None and np.median([[f.overlap for f in row] for row in evidence.fits]) < _SOMEWHERE:
+        yield Finding(
+            NAME, "note", "certain", "Whether the cameras are in step was not looked at: their poses are wrong.",
+            "Mend the calibration and run this again.",
+        )  # fmt: skip
+        return
+    lags, unsure, guessed = _lags(evidence, items, energies, _REACHED, _GAIN)
     for view in (evidence.views[v] for v in sorted(unsure)):
         yield Finding(
             NAME, "note", "possible",
@@ -43,12 +49,12 @@ def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
             "Compare it by eye in motion.png (--out DIR).", {"view": view},
         )  # fmt: skip
     if any(lags.values()):
-        yield from _told(evidence, lags, [item.name for item in items])
+        yield from _told(evidence, lags, guessed, [item.name for item in items])
         return
     for item, energy in zip(items, energies, strict=True):
-        alone, _ = _lags(evidence, [item], [energy], _REACHED_ALONE, _GAIN_ALONE)
+        alone, _, guessed = _lags(evidence, [item], [energy], _REACHED_ALONE, _GAIN_ALONE)
         if any(alone.values()):
-            yield from _told(evidence, alone, [item.name])
+            yield from _told(evidence, alone, guessed, [item.name])
 
 
 def motion_energy(item: Watched) -> np.ndarray:
@@ -134,8 +140,8 @@ def _jacobians(evidence: Evidence, cameras: Cameras) -> np.ndarray:
 
 def _lags(
     evidence: Evidence, items: Sequence[Watched], energies: Sequence[np.ndarray], reached: float, gain: float
-) -> tuple[dict[int, int], set[int]]:
-    """By how many frames each view is late, and which cannot be told.
+) -> tuple[dict[int, int], set[int], set[int]]:
+    """By how many frames each view is late, which cannot be told, and which rest on energy alone.
 
     The view that gains most by a shift is shifted first, then the next.
     """
@@ -143,6 +149,7 @@ def _lags(
     lags: dict[int, int] = dict.fromkeys(range(views), 0)
     settled: set[int] = set()
     unsure: set[int] = set()
+    guessed: set[int] = set()
     while len(settled) < views - (views == 2):
         scores = {v: _score(evidence, items, energies, v, lags) for v in range(views) if v not in settled}
         gains = {v: float(c.max() - c[FURTHEST]) for v, (c, _) in scores.items() if c.max() >= reached}
@@ -153,10 +160,11 @@ def _lags(
         settled.add(best)
         if telling or (curve.max() >= _REACHED_BY_ITSELF and gains[best] >= _GAIN_BY_ITSELF):
             lags[best] = int(curve.argmax()) - FURTHEST
+            guessed |= set() if telling else {best}
         else:
             unsure.add(best)
     unlike = {v for v in range(views) if v not in settled and correlations(energies, v, lags).max() < _UNLIKE}
-    return lags, unsure | unlike
+    return lags, unsure | unlike, guessed
 
 
 def _score(
@@ -164,13 +172,11 @@ def _score(
 ) -> tuple[np.ndarray, bool]:
     """Correlation of a view with the others by lag, and whether the middles of the masks are in it."""
     energy = correlations(energies, view, lags)
-    if evidence.fits is not None and np.median([[f.overlap for f in row] for row in evidence.fits]) < _SOMEWHERE:
-        return energy, False
     middles = agreement(evidence, items, view, lags)
     return ((energy + middles) / 2, True) if middles.max() >= _TELLING else (energy, False)
 
 
-def _told(evidence: Evidence, lags: dict[int, int], sequences: list[str]) -> Iterator[Finding]:
+def _told(evidence: Evidence, lags: dict[int, int], guessed: set[int], sequences: list[str]) -> Iterator[Finding]:
     place = f"in {sequences[0]}" if len(sequences) == 1 else f"in all {len(sequences)} sequences that were looked at"
     for v, lag in lags.items():
         if lag == 0:
@@ -182,7 +188,7 @@ def _told(evidence: Evidence, lags: dict[int, int], sequences: list[str]) -> Ite
             f"or give {view} back the {frames} that were cut from its start"
         )  # fmt: skip
         yield Finding(
-            NAME, "fault", "likely",
+            NAME, "warning" if v in guessed else "fault", "possible" if v in guessed else "likely",
             f"{view} is out of step: it shows the motion {frames} {'later' if lag > 0 else 'earlier'} than {against}, "
             f"{place}.",
             f"Number the frames again: {cut}, and cut all cameras to one length. With films: `python -m "

@@ -81,6 +81,6 @@ def examine(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Examin
 
 def _without_consequences(findings: list[Finding]) -> list[Finding]:
     """Leaves out that a camera is off the rest scene where its frame 0 is a later one, which says all."""
-    early = {f.measured["view"] for f in findings if f.check == "clock" and f.severity == "fault"}
+    early = {f.measured["view"] for f in findings if f.check == "clock" and f.severity != "note"}
     return [f for f in findings if f.check != "calibration" or not f.measured.get("views")
             or not set(f.measured["views"]) <= early]  # fmt: skip
