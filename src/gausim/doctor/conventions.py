@@ -134,9 +134,7 @@ def _another_lens(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], camer
     factor = float((lenses[:, 0, 0] / cameras.Ks[:, 0, 0]).median())
     field = math.degrees(2 * math.atan(cameras.width / (2 * float(lenses[:, 0, 0].median()))))
     found = Cameras(cameras.viewmats, lenses, cameras.width, cameras.height, cameras.names)
-    name = (
-        f"a focal length that is wrong by a factor: {factor:.3g} times the stated one, a field of view of {field:.3g}"
-    )
+    name = f"a focal length {factor:.3g} times the stated one, which makes a field of view of {field:.3g} degrees"
     remedy = (
         f"multiply fl_x and fl_y by {factor:.3g} (they may have been made from an angle in degrees where radians were "
         "expected, or for pictures of another size; then cx and cy are wrong too)"
