@@ -20,7 +20,7 @@ write_toy_object = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py
 
 TINY = (
     "data.curriculum.t_max=3", "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1",
-    "render=reference", "callbacks.panels.every_epochs=0", "name=toy",
+    "render=reference", "callbacks.panels.every_epochs=0", "name=toy", "doctor=false",
 )  # fmt: skip
 STAGES = "model.plan.stages"
 SMALL: dict[str, list[str]] = {

@@ -21,6 +21,7 @@ TINY = (
     "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
     "data.curriculum.t_start=2", "data.curriculum.t_max=2", "trainer.max_epochs=2", "trainer.accelerator=cpu",
     "trainer.progress=false", "trainer.threads=1", "render=reference", "callbacks.panels=null", "logger=none",
+    "doctor=false",
 )  # fmt: skip
 SHARED = ("model.network.", "model.node_normaliser.", "model.edge_normaliser.")
 

@@ -19,7 +19,8 @@ write_toy_object = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py
 TINY = (
     "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
     "data.curriculum.t_max=2", "data.batch_size=2", "trainer.max_epochs=2", "trainer.accelerator=cpu",
-    "trainer.progress=false", "trainer.threads=1", "render=reference", "callbacks.panels.every_epochs=1", "name=toy",
+    "trainer.progress=false", "trainer.threads=1", "render=reference", "doctor=false", "name=toy",
+    "callbacks.panels.every_epochs=1",
 )  # fmt: skip
 
 
@@ -59,11 +60,14 @@ def test_a_run_leaves_everything_and_loads_again(arguments: list[str], capsys: p
         torch.testing.assert_close(value, weights(run)[name])
 
 
-def test_motion_is_watched_as_evaluation_measures_it_and_training_does_not_notice(
+def test_motion_and_data_are_looked_at_and_training_does_not_notice(
     arguments: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert command.main([*arguments, "name=watched", "callbacks.motion.every_epochs=1"]) == 0
+    assert command.main([*arguments, "name=watched", "callbacks.motion.every_epochs=1", "doctor=true"]) == 0
+    told = capsys.readouterr().out
+    assert "WARNING  extent" in told and "frames of each sequence only" in told and "NOTE" not in told
     assert command.main([*arguments, "name=alone", "callbacks.motion=null"]) == 0
+    assert "WARNING" not in capsys.readouterr().out
     watched, alone = (Path(f"outputs/{name}/seed_0") for name in ("watched", "alone"))
     rows = list(csv.DictReader((watched / "motion.csv").open()))
     assert [(r["epoch"], r["object"]) for r in rows] == [("1", "toy"), ("2", "toy")]

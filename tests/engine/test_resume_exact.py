@@ -25,7 +25,7 @@ TINY = (
     "data.repeats=2", "data.curriculum.t_max=3", "+data.curriculum.threshold=0.9", "+data.curriculum.patience=1",
     "data.curriculum._target_=gausim.engine.curriculum.LossGatedCurriculum",
     "render=reference", "optimizer.ema_decay=0.9", "loss.input_noise=0.001", "trainer=cpu", "trainer.threads=1",
-    "trainer.progress=false", "trainer.log_every_n_steps=1", "callbacks.panels=null",
+    "trainer.progress=false", "trainer.log_every_n_steps=1", "callbacks.panels=null", "doctor=false",
 )  # fmt: skip
 SAVED = "gausim.engine.checkpoint._check_written"
 STEP = "gausim.engine.module.GausSimModule.training_step"

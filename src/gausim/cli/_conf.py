@@ -56,6 +56,7 @@ class RootConfig:
         init_from: run whose network, with the statistics of its inputs, this one starts from; null starts anew.
         freeze: `network` keeps that network as it is, so that only what a scene has of its own is learned; `model`
             takes all of the simulator from that run and keeps it, so that only initial states are learned.
+        doctor: whether what `gausim doctor` would find wrong with the data is told before training (not in sweeps).
         evaluate: whether the run is evaluated once it is trained (`gausim evaluate`), for reports.
         name: of the run; its directory is `${paths.output_root}/${name}/seed_${seed}`.
         task_name: what is being done, for logs and dashboards.
@@ -77,6 +78,7 @@ class RootConfig:
     seed: int = 0
     init_from: str | None = None
     freeze: str | None = None
+    doctor: bool = True
     evaluate: bool = False
     name: str = MISSING
     task_name: str = "train"

@@ -183,6 +183,7 @@ def _fit(
     parts: tuple[GausSimModule, ReadyDataModule],
     crew: Crew,
 ) -> float | None:
+    from gausim.cli import _config
     from gausim.cli._end import end
     from gausim.engine.fitting import FittedModule
     from gausim.engine.judge import EpochJudge
@@ -194,6 +195,8 @@ def _fit(
         logger.log_hyperparams(_plain(cfg))
     if crew.is_first:
         _introduce(trainer, module, datamodule, run, resumed=resume is not None)
+        if cfg.doctor and resume is None and not _config.in_sweep():
+            _warn_of_data(datamodule)
     trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
     if plan is not None and not plan.order:  # nothing to learn: no epoch has saved it
         trainer.save_checkpoint(run.checkpoint, weights_only=False)
@@ -222,6 +225,17 @@ def _result(facts: dict[str, Any]) -> str:
         f"{begin}: on the frames shown, the loss beyond that of the reconstruction is {excess:.2f} times that of a "
         "model that predicts no motion."
     )
+
+
+def _warn_of_data(datamodule: ReadyDataModule) -> None:
+    """Prints faults and warnings that `gausim doctor` finds in the objects; notes are left to the command itself."""
+    from gausim.doctor.examine import examine
+    from gausim.doctor.page import findings_text
+
+    for item in datamodule.objects:
+        found = examine(item, item.scene(), lambda step, done, total: None).graver
+        if found.findings:
+            print(findings_text(str(item.root), found), flush=True)
 
 
 def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None:

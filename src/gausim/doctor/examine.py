@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from gausim.core import DataError, GaussianScene
 from gausim.data.objects import ObjectData
@@ -45,6 +45,11 @@ class Examination:
     def ruinous(self) -> bool:
         """True where a training would be ruined."""
         return any(finding.severity == "fault" for finding in self.findings)
+
+    @property
+    def graver(self) -> Examination:
+        """The same without the notes."""
+        return replace(self, findings=tuple(f for f in self.findings if f.severity != "note"))
 
 
 def examine(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Examination:

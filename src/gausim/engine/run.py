@@ -43,6 +43,7 @@ FREE_KEYS = (
     "callbacks",
     "sweep",
     "task_name",
+    "doctor",
     "evaluate",
     "trainer.threads",
     "trainer.accelerator",
