@@ -304,9 +304,9 @@ class PreparedMaterial:
 
     def change(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
         """z_{t+1} - 2 z_t + z_{t-1} (see the module's text)."""
-        links = self.matrices.links
-        force = self.springs(z, links) - z @ self.matrices.stiffness - (z - previous) @ self.matrices.damping
-        operator = self.operator + self.springs.stiffening(z, links) / 4
+        beyond, stiffer = self.springs.linearised(z, self.matrices.links)
+        force = beyond - z @ self.matrices.stiffness - (z - previous) @ self.matrices.damping
+        operator = self.operator + stiffer / 4
         return torch.linalg.solve(operator, force[..., None])[..., 0]
 
     def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:

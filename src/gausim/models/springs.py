@@ -114,26 +114,33 @@ class Springs(nn.Module):
 
     def forward(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, "S M"]:
         """Modal forces beyond the linear ones; ``factor`` on the stiffness, one of all springs or (E,)."""
-        change, squared, along, now, stretch = self._stretched(z)
-        shrink = stretch / now
-        beyond = shrink[..., None] * change + (shrink - along / squared)[..., None] * self.offset
-        beyond = (factor * self.stiffness)[:, None] * beyond
-        return -(beyond.flatten(-2) @ self.modes)
+        return self._force(self._stretched(z), factor)
 
-    def stiffening(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, "S M M"]:
-        """How much stiffer springs are at ``z`` than at rest: change of the second derivative of their energy.
+    def linearised(
+        self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0
+    ) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M M"]]:
+        """The force at ``z`` and how much stiffer springs are there than at rest.
 
-        A spring in direction n of length |d| has (1 - t) n n^T + t I for n n^T at rest, t = 1 - |d_0| / |d|. Compressed
-        springs (t < 0) buckle; they count as t = 0, so that with what they have at rest it is positive semi-definite.
+        The second is the change of the second derivative of their energy. A spring in direction n of length |d| has
+        (1 - t) n n^T + t I for n n^T at rest, t = 1 - |d_0| / |d|. Compressed springs (t < 0) buckle; they count as
+        t = 0, so that with what they have at rest it is positive semi-definite.
         """
-        change, _, _, now, stretch = self._stretched(z)
+        stretched = self._stretched(z)
+        change, _, _, now, stretch = stretched
         towards, rest = (change + self.offset) / now[..., None], self.offset / self.length[:, None]
         share = (stretch / now).clamp_min(0)[..., None, None]
         blocks = (1 - share) * towards[..., :, None] * towards[..., None, :] - rest[:, :, None] * rest[:, None, :]
         blocks = blocks + share * torch.eye(3, dtype=z.dtype, device=z.device)
         modes = self.modes.unflatten(0, (-1, 3))
         turned = ((factor * self.stiffness)[:, None, None] * blocks) @ modes
-        return self.modes.mT @ turned.flatten(-3, -2)
+        return self._force(stretched, factor), self.modes.mT @ turned.flatten(-3, -2)
+
+    def _force(self, stretched: tuple[Tensor, ...], factor: Tensor | float) -> Tensor:
+        change, squared, along, now, stretch = stretched
+        shrink = stretch / now
+        beyond = shrink[..., None] * change + (shrink - along / squared)[..., None] * self.offset
+        beyond = (factor * self.stiffness)[:, None] * beyond
+        return -(beyond.flatten(-2) @ self.modes)
 
     def potential(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, " S"]:
         """Energy of which :meth:`forward` is minus the gradient."""
