@@ -28,7 +28,7 @@ def loaded(tmp_path_factory: pytest.TempPathFactory):
 def run(loaded, monkeypatch):
     from gausim import api
 
-    monkeypatch.setattr(api, "load_run", lambda path: loaded)
+    monkeypatch.setattr(api, "load_run", lambda path, data=None: loaded)
     return loaded
 
 

@@ -9,8 +9,9 @@ sim.save_session("push.json")
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -162,6 +163,7 @@ def load(
     gravity: float | None = None,
     most_force: float | None = None,
     keep: int | None = None,
+    data: Mapping[str, Any] | None = None,
 ) -> Simulation:
     """Loads an object of a trained run.
 
@@ -172,12 +174,13 @@ def load(
         gravity: acceleration that makes a weight of a mass [scene units / s^2]; 9.81 when None.
         most_force: the largest force [weights]; 10 when None.
         keep: so many of the latest frames are kept for the trajectory; None keeps all.
+        data: keys of the run's data configuration to replace, e.g. ``{"root": "/elsewhere"}``.
 
     Raises:
         RunError: there is no run, or it holds another scene than it was trained on.
         DataError: there is no such object or sequence.
     """
-    loaded = load_run(run)
+    loaded = load_run(run, data=data)
     interaction = open_interaction(
         loaded, name=object, sequence=sequence, gravity=gravity, most_force=most_force, keep=keep
     )

@@ -40,7 +40,7 @@ def run(tmp_path, monkeypatch):
     (directory / "FINISHED").write_text("{}")
     loaded = SimpleNamespace(config={"name": "toy", "seed": 5}, module=module, objects=[ObjectData(toy.root)],
                              renderer=ReferenceRenderer(), run_dir=directory)  # fmt: skip
-    monkeypatch.setattr(_run, "load_run", lambda path: loaded)
+    monkeypatch.setattr(_run, "load_run", lambda path, data=None: loaded)
     return loaded
 
 

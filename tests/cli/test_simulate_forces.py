@@ -27,7 +27,7 @@ def loaded(tmp_path_factory: pytest.TempPathFactory):
 
 @pytest.fixture
 def run(loaded, monkeypatch):
-    monkeypatch.setattr(_run, "load_run", lambda path: loaded)
+    monkeypatch.setattr(_run, "load_run", lambda path, data=None: loaded)
     return loaded
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from gausim.cli._config import instantiate
+from gausim.cli._data_paths import located
 from gausim.core import ConfigError, Renderer
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData
@@ -125,11 +126,12 @@ def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mappin
 
     Raises:
         RunError: there is no run or checkpoint, or the data holds another scene than it was trained on.
+        DataError: the data set or scene of the configuration is not on this machine, and no other is given.
     """
     directory = RunDirectory(run_dir)
     config = directory.config()
-    config["data"] = {**config.get("data", {}), **(data or {})}
     loaded = read_checkpoint(directory.path / checkpoint)
+    config["data"] = located(directory.path, config.get("data", {}), data or {})
     module, datamodule = build(config)
     check_scenes(loaded, module.simulator.scenes, str(directory.path / checkpoint))
     load_weights(module, loaded)

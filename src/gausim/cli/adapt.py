@@ -97,7 +97,8 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
 
     if arguments.frames < 2:
         raise ConfigError(f"--frames: expected at least 2 (frame 0 shows rest only), got {arguments.frames}.")
-    data = {**config["data"], "root": _roots(config, arguments.data), "scene": None, "masks": None, "selections": None}
+    roots = _roots(config, run, arguments.data)
+    data = {**config["data"], "root": roots, "scene": None, "masks": None, "selections": None}
     count = len(arguments.sequences or ())
     data |= {"sequences": arguments.sequences, "repeats": REPEATS}
     data["batch_size"] = min(4, count) if count else config["data"].get("batch_size", 1)
@@ -135,13 +136,14 @@ def _checked(overrides: Sequence[str]) -> list[str]:
     return list(overrides)
 
 
-def _roots(config: dict[str, Any], stores: Sequence[str] | None) -> list[dict[str, Any]]:
+def _roots(config: dict[str, Any], run: Path, stores: Sequence[str] | None) -> list[dict[str, Any]]:
     """Entries of data.root: the stores' objects that the run knows, each with the rest scene that it was trained on."""
     from gausim.cli._config import instantiate
+    from gausim.cli._data_paths import located
     from gausim.core.errors import DataError
     from gausim.data.objects import ObjectData, find_objects
 
-    data = {**config["data"], "sequences": None}
+    data = {**located(run, config["data"], {}), "sequences": None}
     known: dict[str, ObjectData] = {item.name: item for item in instantiate(data).objects}
     if stores is None:
         return [_entry(item.root, item) for item in known.values()]

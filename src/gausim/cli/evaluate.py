@@ -35,6 +35,7 @@ def main(argv: list[str]) -> int:
     arguments = _parser().parse_args(argv)
     if arguments.endurance is not None and arguments.endurance < 300:
         raise ConfigError(f"--endurance: expected at least 300 frames, got {arguments.endurance}.")
+    from gausim.cli._data_paths import data_option
     from gausim.cli._end import end, told
     from gausim.cli._foresee import state_of
     from gausim.cli._run import load_run
@@ -42,7 +43,7 @@ def main(argv: list[str]) -> int:
     from gausim.report.diagnosis import diagnosis_figure
     from gausim.report.figures import error_figure
 
-    run = load_run(arguments.run)
+    run = load_run(arguments.run, data=data_option(arguments.data))
     state = state_of(run)
     results = _evaluate(run, arguments)
     folder = Path(arguments.out) if arguments.out else _default_folder(run, arguments)
@@ -68,6 +69,8 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from gausim.cli._data_paths import add_data_option
+
     parser = argparse.ArgumentParser(
         prog="gausim evaluate",
         description=f"{HELP} Writes metrics.json, metrics.npz, table.md and an error plot per object.",
@@ -77,6 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--object", nargs="+", metavar="NAME", help="only these objects")
     add("--sequences", nargs="+", metavar="NAME", help="only these sequences (of every object)")
     add("--views", default="all", choices=("all", "train", "heldout"), help="which cameras (default: all)")
+    add_data_option(parser)
     add("--out", metavar="DIR", help="folder to write; default RUN/evaluation, or RUN/evaluation/partial for a part")
     add(
         "--endurance", type=int, metavar="N",

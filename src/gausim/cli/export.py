@@ -132,6 +132,8 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from gausim.cli._data_paths import add_data_option
+
     width = max(map(len, FORMATS))
     rows = []
     for name, form in FORMATS.items():
@@ -151,6 +153,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--scene", type=Path, metavar="SCENE.ply", help="the rest scene of a trajectory")
     add("--object", metavar="NAME", help="of a run; default its first")
     add("--sequence", metavar="NAME", help="of a run; default its first")
+    add_data_option(parser)
     add("--frames", type=_positive, metavar="N", help="frames to predict; default as many as were recorded")
     add("--every", type=_positive, default=1, metavar="N", help="take every so many frames")
     add("--fps", type=float, help="of a folder of PLY files that does not say it")
@@ -214,10 +217,11 @@ def _from_trajectory(source: Path, scene_path: Path | None) -> Motion:
 
 
 def _from_run(arguments: argparse.Namespace) -> Motion:
+    from gausim.cli._data_paths import data_option
     from gausim.cli._foresee import TrainedPrediction, head, run_objects, scene_of, state_of
     from gausim.cli._run import load_run
 
-    run: LoadedRun = load_run(arguments.source)
+    run: LoadedRun = load_run(arguments.source, data=data_option(arguments.data))
     state_of(run)
     item = run_objects(run, None if arguments.object is None else [arguments.object])[0]
     records = {record.name: record for record in item.data.sequences}

@@ -49,11 +49,12 @@ def main(argv: list[str]) -> int:
         from gausim.cli._simulate_scene import simulate_scene
 
         return simulate_scene(arguments)
+    from gausim.cli._data_paths import data_option
     from gausim.cli._end import end, push
     from gausim.cli._foresee import run_objects, state_of
     from gausim.cli._run import load_run
 
-    run = load_run(arguments.run)
+    run = load_run(arguments.run, data=data_option(arguments.data))
     state_of(run)
     if arguments.session or has_forces(arguments):
         from gausim.cli._simulate_forces import simulate_forces
@@ -69,6 +70,7 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from gausim.cli._data_paths import add_data_option
     from gausim.cli._force_words import EPILOG, add_force_options
     from gausim.cli.inspect import add_pin_options
 
@@ -86,6 +88,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--sequence", nargs="+", metavar="NAME", help="sequences, or `all`; default the first of each object")
     add("--frames", type=_positive, metavar="N", help="frames to predict; default as many as were recorded")
     add("--view", nargs="+", metavar="NAME", help="cameras; default the first trained and the first held-out one")
+    add_data_option(parser)
     add("--out", metavar="DIR", help="folder to write; default RUN/simulation")
     add("--background", default="black", metavar="COLOR", help="black, white or R,G,B in 0..1 (default: black)")
     add("--brighten", type=float, default=1.0, metavar="GAIN", help="gain of the pictures; numbers are never touched")

@@ -58,6 +58,7 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
+    from gausim.cli._data_paths import add_data_option
     from gausim.cli.inspect import add_pin_options
 
     parser = argparse.ArgumentParser(
@@ -71,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--object", metavar="NAME", help="of the run; default its first")
     add("--sequence", metavar="NAME", default="rest", help="whose beginning is the initial state (default: rest)")
     add("--beside", metavar="RUN", type=Path, help="another run of the same object, to which the same is done")
-    add("--data", metavar="DIR", help="where the run's data set lies now; default where it was trained")
+    add_data_option(parser)
     add("--gravity", type=float, metavar="G", help="what makes a weight of a mass [scene units / s^2] (default: 9.81)")
     add("--up", choices=_UP, default="z", help="vertical axis of the scene (default: z)")
     add("--sessions", metavar="DIR", type=Path, help="where sessions are saved; default RUN/sessions or ./sessions")
@@ -109,11 +110,12 @@ def _subject(arguments: argparse.Namespace) -> Subject:
 
 
 def _of_run(path: Path, arguments: argparse.Namespace, *, name: str | None = None) -> Playable:
+    from gausim.cli._data_paths import data_option
     from gausim.cli._foresee import state_of
     from gausim.cli._run import load_run
     from gausim.cli._subject import playable_run
 
-    run = load_run(path, data={"root": arguments.data} if arguments.data else None)
+    run = load_run(path, data=data_option(arguments.data))
     state_of(run)
     return playable_run(
         run, name=name or arguments.object, sequence=arguments.sequence, gravity=arguments.gravity

@@ -35,6 +35,7 @@ from gausim.io.files import remove_leftovers, write_durably
 
 CONFIG, FINISHED, FAILED, LOCK = "config.yaml", "FINISHED", "FAILED", ".lock"
 EVALUATION, EVENTS = "evaluation/metrics.json", "events.jsonl"
+FETCHED = "FETCHED"  # in a directory that `gausim fetch` made: from where
 DAMAGED_CHECKPOINT = "last.damaged.ckpt"
 # What may differ when a run is resumed: where it is kept, how it is shown and what computes it, not what is learned.
 FREE_KEYS = (
