@@ -1,0 +1,189 @@
+"""`gausim card RUN`: what others must know of a run before they use it, from what its directory records."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gausim.report.card import CardFacts
+    from gausim.report.runs import RunRecord
+
+HELP = "Write the card of a run: data, figures, cost, limitations, licence."
+# Groups of the configuration in which a run chooses; the rest says where and how it is shown.
+_GROUPS = (
+    "data", "model", "supervision", "loss", "optimizer", "render", "trainer", "logger", "callbacks", "budget",
+    "experiment", "ablation",
+)  # fmt: skip
+# Paths of the machine that trained, and what changes neither the run nor its figures.
+_PATHS = ("data.root", "data.scene", "data.masks", "paths")
+_UNTOLD = (*_PATHS, "data.seed", "logger", "callbacks", "name", "task_name", "evaluate", "trainer.progress")
+_ABSENT = "(absent)"
+
+
+def main(argv: list[str]) -> int:
+    """Runs the command.
+
+    Args:
+        argv: the arguments after the command's name.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        RunError: there is no run, its files are broken, or a card is there already.
+        DataError: the data set given with ``--data`` is not there.
+    """
+    arguments = _parser().parse_args(argv)
+    from gausim.core.errors import RunError
+    from gausim.io.files import write_durably
+    from gausim.report.card import CARD, card
+
+    run = _record(arguments.run)
+    path = arguments.out or arguments.run / CARD
+    if path.exists() and not arguments.force:
+        raise RunError(f"{path}: is there already, perhaps with words of yours. --force replaces it, --out FILE writes "
+                       "elsewhere.")  # fmt: skip
+    write_durably(path, card(run, _facts(run, arguments)).encode())
+    print(f"wrote {path}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    from gausim.cli._data_paths import add_data_option
+
+    parser = argparse.ArgumentParser(
+        prog="gausim card",
+        description=f"{HELP} Markdown with the front matter of Hugging Face, from what the run's directory records; "
+        "what is missing is named with the command that makes it.",
+    )
+    add = parser.add_argument
+    add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
+    add("--licence", metavar="ID", help="under which others may use the run, e.g. CC-BY-4.0")
+    add_data_option(parser)
+    add("--out", metavar="FILE", type=Path, help="default RUN/README.md")
+    add("--force", action="store_true", help="replace a card that is there")
+    return parser
+
+
+def _record(folder: Path) -> RunRecord:
+    from gausim.core.errors import RunError
+    from gausim.report.runs import BROKEN, find_runs
+
+    found = find_runs([folder])
+    if [run.path for run in found] != [folder]:
+        raise RunError(f"{folder}: expected one run directory, found {len(found)} below it. Name one of them.")
+    if found[0].status == BROKEN:
+        raise RunError(found[0].detail)
+    return found[0]
+
+
+def _facts(run: RunRecord, arguments: argparse.Namespace) -> CardFacts:
+    from gausim.engine.run import RunDirectory
+    from gausim.report.card import CardFacts
+
+    directory = RunDirectory(run.path)
+    base, differences = _differences(run)
+    return CardFacts(
+        command=str(arguments.run),
+        about=_about(run.choices.get("model")),
+        data=_data(run, arguments.data),
+        base=base,
+        differences=differences,
+        overrides=_overrides(run.path),
+        finished=directory.facts() if directory.is_finished else {},
+        endurance=_endurance(run.path / "evaluation" / "endurance.json"),
+        licence=arguments.licence,
+    )
+
+
+def _data(run: RunRecord, words: list[str]) -> dict[str, Mapping[str, Any]] | None:
+    """What ``dataset.json`` of every object says; None where the data set is not on this machine."""
+    from gausim.cli._data_paths import data_option, located
+    from gausim.core.errors import DataError
+    from gausim.data.objects import find_objects
+    from gausim.io.transforms import read_json
+
+    data: Mapping[str, Any] = run.config.get("data", {})
+    try:
+        roots = located(run.path, data, data_option(words))["root"]
+        folders = [
+            folder
+            for root in (roots if isinstance(roots, list) else [roots])
+            if root is not None
+            for folder in find_objects(root["root"] if isinstance(root, Mapping) else root)
+        ]
+    except DataError:
+        if words:
+            raise
+        return None
+    every = [(folder.name, read_json(folder / "dataset.json")) for folder in folders]
+    facts = {str(said.get("name", name)): said for name, said in every}
+    return {name: said for name, said in facts.items() if name in (data.get("names") or facts)}
+
+
+def _endurance(path: Path) -> dict[str, Any]:
+    from gausim.core.errors import RunError
+    from gausim.io.plain_json import parse_json
+
+    if not path.is_file():
+        return {}
+    try:
+        return dict(parse_json(path.read_bytes()))
+    except (OSError, ValueError, TypeError) as error:
+        raise RunError(
+            f"{path}: cannot be read ({error}). Run `gausim evaluate RUN --endurance 1000` again."
+        ) from error
+
+
+def _about(preset: str | None) -> str:
+    """The comment at the head of a model's preset."""
+    from gausim.cli._config import conf_dir
+
+    path = conf_dir() / "model" / f"{preset}.yaml"
+    if preset is None or not path.is_file():
+        return ""
+    lines = []
+    for line in path.read_text().splitlines():
+        if not line.startswith("#"):
+            break
+        lines.append(line.lstrip("# ").strip())
+    return " ".join(lines)
+
+
+def _overrides(folder: Path) -> list[str]:
+    import yaml
+
+    try:
+        said = yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError):
+        return []
+    words = [str(word) for word in said] if isinstance(said, list) else []
+    return [f"{word.partition('=')[0]}=..." if _is_one_of(word.partition("=")[0], _PATHS) else word for word in words]
+
+
+def _is_one_of(key: str, keys: Sequence[str]) -> bool:
+    return any(key == one or key.startswith((f"{one}.", f"{one}[")) for one in keys)
+
+
+def _differences(run: RunRecord) -> tuple[str, list[tuple[str, str, str]]]:
+    """With what the configuration is compared, and every key that differs."""
+    from omegaconf import OmegaConf
+
+    import gausim
+    from gausim.cli._config import compose
+    from gausim.core.errors import ConfigError
+    from gausim.report.runs import flatten
+
+    chosen = [f"{group}={run.choices[group]}" for group in _GROUPS if run.choices.get(group) not in (None, "None")]
+    words = f"`gausim train {' '.join(chosen)}`" if chosen else "`gausim train`"
+    try:
+        default = compose("train", chosen)
+    except ConfigError:  # a preset of a version that is gone
+        default, words = compose("train"), "`gausim train` (its own presets are not of this version)"
+    own, base = dict(flatten(run.config)), dict(flatten(OmegaConf.to_container(default, resolve=True)))
+    keys = [key for key in own if own[key] != base.get(key)] + [key for key in base if key not in own]
+    rows = [(k, own.get(k, _ABSENT), base.get(k, _ABSENT)) for k in keys if not _is_one_of(k, _UNTOLD)]
+    return f"{words} of gausim {gausim.__version__}", rows
