@@ -55,6 +55,7 @@ COMMANDS: dict[str, Command] = {
         "gausim.cli.config", "Check a training configuration, print its JSON schema, complete it in the shell."
     ),
     "card": Command("gausim.cli.card", "Write the card of a run: data, figures, cost, limitations, licence."),
+    "fetch": Command("gausim.cli.fetch", "Fetch a published run or data set, or pack one for others."),
     "report": Command("gausim.cli.report", "Compare runs and sweeps: one HTML page, Markdown, LaTeX and CSV."),
 }
 

@@ -3,7 +3,16 @@
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from gausim.core.errors import BusyError, ConfigError, DataError, DivergenceError, GausSimError, RunError, SceneError
+from gausim.core.errors import (
+    BusyError,
+    ConfigError,
+    DataError,
+    DivergenceError,
+    FetchError,
+    GausSimError,
+    RunError,
+    SceneError,
+)
 
 # The errors alone load at once: what a command line says before it works must not wait for torch.
 if TYPE_CHECKING:
@@ -30,6 +39,7 @@ __all__ = [
     "ConfigError",
     "DataError",
     "DivergenceError",
+    "FetchError",
     "Dynamics",
     "FittedDynamics",
     "FittedMethod",

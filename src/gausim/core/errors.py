@@ -27,3 +27,7 @@ class BusyError(RunError):
 
 class DivergenceError(GausSimError):
     """Training or simulation left the finite numbers; the message names the step and the term that broke."""
+
+
+class FetchError(GausSimError):
+    """A published run or data set cannot be had: unknown, out of reach, damaged, unsafe, or no room for it."""

@@ -21,8 +21,12 @@ DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCE
 
 
 @contextmanager
-def sole_writer(lock: Path) -> Iterator[None]:
+def sole_writer(lock: Path, *, doing: str = "training here") -> Iterator[None]:
     """Keeps other processes out of a directory until the block, or this process, ends, however it ends.
+
+    Args:
+        lock: a file in it.
+        doing: what the others are told that this process does.
 
     Raises:
         BusyError: another process is in it.
@@ -35,7 +39,7 @@ def sole_writer(lock: Path) -> Iterator[None]:
         except BlockingIOError as error:
             file.seek(0)
             raise BusyError(
-                f"{lock.parent}: another process ({file.read().strip() or 'unknown'}) is training here. Wait for it or "
+                f"{lock.parent}: another process ({file.read().strip() or 'unknown'}) is {doing}. Wait for it or "
                 "end it; then the same command continues."
             ) from error
         except OSError as error:

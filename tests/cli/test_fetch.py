@@ -1,0 +1,270 @@
+"""`gausim fetch`: from a trained run through an archive and a server to a run that works elsewhere."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import re
+import runpy
+import shutil
+import tarfile
+from contextlib import redirect_stdout
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from gausim.cli import _fetch, card, fetch, simulate
+from gausim.cli import train as command
+from gausim.cli._run import load_run
+from gausim.core import BusyError, ConfigError, DataError, FetchError, RunError
+from gausim.engine.files import sole_writer
+from gausim.io import download
+from gausim.io.files import sha256
+
+TESTS = Path(__file__).parents[1]
+write_toy_object = runpy.run_path(str(TESTS / "toy_object.py"))["write_toy_object"]
+serving = runpy.run_path(str(TESTS / "local_server.py"))["serving"]
+TINY = runpy.run_path(str(Path(__file__).with_name("test_train.py")))["TINY"]
+
+
+def publish(home: Path, mirror: Path) -> Path:
+    """Packs ``home/run`` and ``home/toy`` into a mirror with a registry, and moves them from where they were made."""
+    asked = [(home / "run", "toy", "--licence", "MIT", "--data", "toy-data"), (home / "toy", "toy-data")]
+    texts = []
+    for source, name, *more in asked:
+        said = io.StringIO()
+        with redirect_stdout(said):
+            argv = ["--pack", str(source), "--name", name, "--out", str(mirror), *(more or ["--licence", "CC0-1.0"])]
+            assert fetch.main(argv) == 0
+        texts.append(said.getvalue().replace("addresses = []", f'addresses = ["{name}.tar"]'))
+    (mirror / "registry.toml").write_text('schema = "gausim.registry/1"\n' + "\n".join(texts))
+    os.replace(home, home.with_name("moved"))
+    return mirror
+
+
+@pytest.fixture(scope="module")
+def published(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A mirror of a data set, and of a run as far as its files go: nothing in it was trained."""
+    home = tmp_path_factory.mktemp("bare") / "home"
+    (home / "run").mkdir(parents=True)
+    (home / "toy").mkdir()
+    (home / "toy" / "dataset.json").write_text('{"name": "toy"}')
+    (home / "run" / "config.yaml").write_text(f"name: toy\nseed: 0\ndata: {{root: {home}/toy}}\n")
+    (home / "run" / "FINISHED").write_text('{"last_epoch": {}}')
+    weights = {"a": torch.arange(9000.0)}
+    torch.save({"state_dict": weights, "gausim": {"scenes": [{"name": "toy"}]}}, home / "run" / "last.ckpt")
+    (home / "run" / "events.jsonl").write_text("whose machine it was")
+    return publish(home, tmp_path_factory.mktemp("mirror"))
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """A mirror of the toy and a run whose scene lay apart from it."""
+    home = tmp_path_factory.mktemp("trained") / "home"
+    toy = write_toy_object(home / "toy").root
+    (home / "apart").mkdir()
+    for name in ("scene.ply", "scene.masks.npz"):
+        os.replace(toy / name, home / "apart" / name)
+    asked = [f"data.root={toy}", f"data.scene={home}/apart/scene.ply", f"hydra.run.dir={home}/run"]
+    assert command.main([*TINY, *asked, "trainer.max_epochs=1", "logger=none", "callbacks.panels=null"]) == 0
+    assert card.main([str(home / "run"), "--licence", "MIT"]) == 0
+    return ["--registry", str(publish(home, tmp_path_factory.mktemp("mirror")) / "registry.toml")]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(download, "PAUSE", 0.0)
+    (tmp_path / "user").mkdir()
+    monkeypatch.chdir(tmp_path / "user")
+
+
+def left() -> list[str]:
+    return sorted(path.as_posix() for path in Path().rglob("*") if path.is_file())
+
+
+def copy_of(published: Path, to: Path) -> Path:
+    shutil.copytree(published, to)
+    return to
+
+
+def rewrite(mirror: Path, **fields: object) -> None:
+    """Changes fields of the first entry."""
+    path = mirror / "registry.toml"
+    text = path.read_text()
+    for key, value in fields.items():
+        text = re.sub(rf"(?m)^{key} = .*$", f"{key} = {json.dumps(value)}", text, count=1)
+    path.write_text(text)
+
+
+@pytest.mark.slow
+def test_a_fetched_run_names_what_it_misses_and_works_with_it(trained: list[str], capsys) -> None:
+    assert fetch.main(["toy", *trained]) == 0
+    shown = capsys.readouterr().out
+    assert "licence MIT" in shown and "gausim fetch toy-data" in shown and "--data data/toy-data" in shown
+    run = Path("outputs/fetched/toy")
+    assert {"config.yaml", "last.ckpt", "FINISHED", "README.md", "scenes", "FETCHED"} <= {p.name for p in run.iterdir()}
+    missing = r"toy/config.yaml: field data.root names .*, expected a directory, found none on this"
+    with pytest.raises(DataError, match=missing + " machine. `gausim fetch toy-data` .* --data DIR .* data.root=DIR"):
+        simulate.main([str(run)])
+    assert fetch.main(["toy-data", *trained]) == 0
+    assert simulate.main([str(run), "--data", "data/toy-data", "--frames", "3", "--view", "cam_0"]) == 0
+    assert list(run.glob("simulation/toy/*/trajectory.safetensors"))
+    assert load_run(run, data={"root": "data/toy-data"}).objects[0].scene_path == run / "scenes" / "scene.ply"
+    shutil.rmtree(run / "scenes")
+    with pytest.raises(DataError, match=r"field data.scene names .*, expected a file, .* --data scene=FILE"):
+        load_run(run, data={"root": "data/toy-data"})
+
+
+@pytest.mark.slow
+def test_the_network_of_a_fetched_run_starts_another(trained: list[str]) -> None:
+    fetch.main(["toy", "toy-data", *trained])
+    asked = ["data.root=data/toy-data", "data.scene=outputs/fetched/toy/scenes/scene.ply", "trainer.max_epochs=1"]
+    assert command.main([*TINY, *asked, "init_from=outputs/fetched/toy", "freeze=network", "logger=none"]) == 0
+    runs = [torch.load(f"{run}/last.ckpt", weights_only=True)["state_dict"]
+            for run in ("outputs/fetched/toy", "outputs/toy/seed_0")]  # fmt: skip
+    network = [name for name in runs[0] if ".network" in name and runs[0][name].is_floating_point()]
+    assert network and all(torch.equal(runs[0][name], runs[1][name]) for name in network)
+
+
+def test_it_is_fetched_whole_and_says_where_from(published: Path, capsys) -> None:
+    assert fetch.main(["toy", "--registry", str(published / "registry.toml")]) == 0
+    assert left() == [f"outputs/fetched/toy/{name}" for name in ("FETCHED", "FINISHED", "config.yaml", "last.ckpt")]
+    note = json.loads(Path("outputs/fetched/toy/FETCHED").read_text())
+    assert note["sha256"] == sha256(published / "toy.tar") and note["licence"] == "MIT" and note["data"] == "toy-data"
+    with pytest.raises(DataError, match="data.root names .* found none on this machine. `gausim fetch toy-data`"):
+        simulate.main(["outputs/fetched/toy"])
+    with pytest.raises(ConfigError, match="scene is given twice"):
+        simulate.main(["outputs/fetched/toy", "--data", "scene=a", "--data", "scene=b"])
+
+
+@pytest.mark.parametrize("ranges", [True, False])
+def test_an_interrupted_download_goes_on_when_asked_again(published: Path, monkeypatch, ranges: bool) -> None:
+    monkeypatch.setattr(download, "ATTEMPTS", 1)
+    size = (published / "toy.tar").stat().st_size
+    with serving(published, ranges=ranges, cut_after=[size + 1, 20_000]) as server:
+        asked = ["toy", "--registry", f"{server.url}/registry.toml"]
+        with pytest.raises(FetchError, match=f"after 20000 of {size} bytes.*The 20000 bytes that came are kept"):
+            fetch.main(asked)
+        assert not Path("outputs/fetched/toy").exists()
+        assert fetch.main(asked) == 0
+    assert server.asked[-1] == ("/toy.tar", "bytes=20000-")
+    assert os.listdir("outputs/fetched") == ["toy"]
+
+
+def test_a_tampered_file_is_refused_before_it_is_unpacked(published: Path, tmp_path: Path) -> None:
+    mirror = copy_of(published, tmp_path / "mirror")
+    data = bytearray((mirror / "toy.tar").read_bytes())
+    data[len(data) // 2] ^= 1
+    good = sha256(mirror / "toy.tar")
+    (mirror / "toy.tar").write_bytes(data)
+    told = f"toy.tar: expected SHA-256 {good}, found {sha256(mirror / 'toy.tar')}. The file was removed, nothing was"
+    with pytest.raises(FetchError, match=told):
+        fetch.main(["toy", "--registry", str(mirror / "registry.toml")])
+    assert left() == []
+    # The next address has it; a mirror replaces them all.
+    rewrite(mirror, addresses=["toy.tar", str(published / "toy.tar")])
+    with pytest.raises(FetchError, match="SHA-256"):
+        fetch.main(["toy", "--registry", str(mirror / "registry.toml"), "--mirror", str(mirror)])
+    assert fetch.main(["toy", "--registry", str(mirror / "registry.toml")]) == 0
+
+
+def hostile(mirror: Path, name: str, *, kind: bytes = tarfile.REGTYPE, link: str = "") -> None:
+    with tarfile.open(mirror / "toy.tar", "w") as tar:
+        info = tarfile.TarInfo(name)
+        info.type, info.linkname = kind, link
+        tar.addfile(info)
+    rewrite(mirror, sha256=sha256(mirror / "toy.tar"), size=(mirror / "toy.tar").stat().st_size)
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"name": "../../../escaped"}, "leaves the folder"),
+        ({"name": "toy/link", "kind": tarfile.SYMTYPE, "link": "/"}, "a link"),
+        ({"name": "toy/disk", "kind": tarfile.BLKTYPE}, "a device"),
+        ({"name": "toy/readme"}, "expected a run, found none: config.yaml and last.ckpt missing"),
+    ],
+)
+def test_a_hostile_archive_leaves_nothing(published: Path, tmp_path: Path, options: dict, what: str) -> None:
+    mirror = copy_of(published, tmp_path / "mirror")
+    hostile(mirror, **options)
+    with pytest.raises(FetchError, match=what):
+        fetch.main(["toy", "--registry", str(mirror / "registry.toml")])
+    assert left() == []
+    assert not list(tmp_path.rglob("escaped"))
+
+
+def test_a_full_disk_is_left_clean(published: Path, monkeypatch) -> None:
+    asked = ["toy", "--registry", str(published / "registry.toml")]
+    with monkeypatch.context() as patch:
+        patch.setattr(_fetch.shutil, "disk_usage", lambda path: SimpleNamespace(free=1))
+        with pytest.raises(FetchError, match=r"expected \d+ bytes of free space for toy, found 1. Make room"):
+            fetch.main(asked)
+    write = Path.open
+
+    def full(self, mode="r", *args, **options):
+        if "x" in mode and self.name == "last.ckpt":
+            raise OSError(errno.ENOSPC, "No space left on device", str(self))
+        return write(self, mode, *args, **options)
+
+    monkeypatch.setattr(Path, "open", full)
+    with pytest.raises(FetchError, match=r"the disk is full .*What was written was removed again"):
+        fetch.main(asked)
+    assert left() == [] and os.listdir("outputs/fetched") == []
+
+
+def test_what_is_there_is_not_touched(published: Path) -> None:
+    asked = ["toy", "--registry", str(published / "registry.toml"), "--out", "mine"]
+    Path("mine").mkdir()
+    Path("mine", "thesis.txt").write_text("years")
+    with pytest.raises(FetchError, match="mine: expected nothing there, found something else. .*--out DIR"):
+        fetch.main(asked)
+    assert left() == ["mine/thesis.txt"]
+    asked[-1] = "other"
+    assert fetch.main(asked) == 0
+    before = Path("other/last.ckpt").stat().st_mtime_ns
+    assert fetch.main(asked) == 0 and Path("other/last.ckpt").stat().st_mtime_ns == before
+
+
+def test_two_processes_do_not_fetch_into_one_directory(published: Path) -> None:
+    with sole_writer(Path(".here.fetching/.lock")), pytest.raises(BusyError, match="is fetching here"):
+        fetch.main(["toy", "--registry", str(published / "registry.toml"), "--out", "here"])
+
+
+def test_no_address_or_no_network_names_a_way_out(published: Path, tmp_path: Path) -> None:
+    mirror = copy_of(published, tmp_path / "mirror")
+    rewrite(mirror, addresses=[])
+    with pytest.raises(FetchError, match="entry.toy: has no address. Give a copy of toy.tar with --mirror"):
+        fetch.main(["toy", "--registry", str(mirror / "registry.toml")])
+    with serving(published) as server:
+        url = server.url
+    rewrite(mirror, addresses=[f"{url}/toy.tar"])
+    with pytest.raises(FetchError, match="refused.*Check the connection.*--mirror DIR"):
+        fetch.main(["toy", "--registry", str(mirror / "registry.toml")])
+    assert fetch.main(["toy", "--registry", str(mirror / "registry.toml"), "--mirror", str(mirror)]) == 0
+
+
+def test_the_list_shows_what_there_is(published: Path, capsys) -> None:
+    assert fetch.main(["--list", "--registry", str(published / "registry.toml")]) == 0
+    shown = capsys.readouterr().out
+    assert all(word in shown for word in ("toy-data", "CC0-1.0", "MIT", "run", "data"))
+    assert fetch.main(["--list"]) == 0 and "lists nothing yet" in capsys.readouterr().out
+
+
+def test_only_what_others_can_use_is_packed(published: Path, tmp_path: Path, capsys) -> None:
+    fetch.main(["toy", "toy-data", "--registry", str(published / "registry.toml")])
+    with pytest.raises(FetchError, match="under which licence may others use it"):
+        fetch.main(["--pack", "data/toy-data", "--name", "again"])
+    with pytest.raises(FetchError, match="--name two words: expected"):
+        fetch.main(["--pack", "data/toy-data", "--name", "two words", "--licence", "MIT"])
+    facts = json.loads(Path("data/toy-data/dataset.json").read_text())
+    Path("data/toy-data/dataset.json").write_text(json.dumps({**facts, "licence": "CC-BY-4.0"}))
+    assert fetch.main(["--pack", "data/toy-data", "--name", "again", "--out", "p"]) == 0
+    assert 'licence = "CC-BY-4.0"' in capsys.readouterr().out
+    os.remove("outputs/fetched/toy/FINISHED")
+    with pytest.raises(RunError, match="expected a finished run"):
+        fetch.main(["--pack", "outputs/fetched/toy", "--name", "again", "--licence", "MIT"])

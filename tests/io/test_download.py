@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+import random
+import runpy
+from pathlib import Path
+
+import pytest
+
+from gausim.core import FetchError
+from gausim.io import download
+from gausim.io.download import continue_download, read_text
+
+serving = runpy.run_path(str(Path(__file__).parents[1] / "local_server.py"))["serving"]
+DATA = random.Random(0).randbytes(700_000)
+
+
+@pytest.fixture
+def mirror(tmp_path, monkeypatch):
+    monkeypatch.setattr(download, "PAUSE", 0.0)
+    (tmp_path / "mirror").mkdir()
+    (tmp_path / "mirror" / "x.tar").write_bytes(DATA)
+    return tmp_path / "mirror"
+
+
+def bring(address: str, part: Path) -> list[int]:
+    seen: list[int] = []
+    continue_download(address, part, size=len(DATA), advance=seen.append)
+    assert part.read_bytes() == DATA
+    return seen
+
+
+def test_a_file_is_brought_whole_and_told_on_the_way(mirror, tmp_path):
+    with serving(mirror) as server:
+        seen = bring(f"{server.url}/x.tar", tmp_path / "part")
+    assert seen == sorted(seen) and seen[-1] == len(DATA) and len(server.asked) == 1
+    assert bring(str(mirror / "x.tar"), tmp_path / "other")[-1] == len(DATA)
+
+
+def test_a_connection_that_ends_early_is_continued_where_it_was(mirror, tmp_path):
+    with serving(mirror, cut_after=[300_000, 100_000]) as server:
+        bring(f"{server.url}/x.tar", tmp_path / "part")
+    assert [asked for _, asked in server.asked] == [None, "bytes=300000-", "bytes=400000-"]
+
+
+def test_without_range_it_begins_anew(mirror, tmp_path):
+    with serving(mirror, ranges=False, cut_after=[300_000]) as server:
+        bring(f"{server.url}/x.tar", tmp_path / "part")
+    assert [asked for _, asked in server.asked] == [None, "bytes=300000-"]
+
+
+@pytest.mark.parametrize("source", ["web", "disk"])
+def test_what_an_earlier_call_left_is_not_asked_for_again(mirror, tmp_path, source):
+    (tmp_path / "part").write_bytes(DATA[:500_000])
+    with serving(mirror) as server:
+        bring(f"{server.url}/x.tar" if source == "web" else str(mirror / "x.tar"), tmp_path / "part")
+        assert server.asked == ([("/x.tar", "bytes=500000-")] if source == "web" else [])
+        bring(f"{server.url}/gone.tar", tmp_path / "part")  # whole: nobody is asked
+
+
+def test_too_long_a_rest_is_thrown_away(mirror, tmp_path):
+    (tmp_path / "part").write_bytes(DATA + b"more")
+    with serving(mirror) as server:
+        bring(f"{server.url}/x.tar", tmp_path / "part")
+    assert [asked for _, asked in server.asked] == [None]
+
+
+def test_servers_that_are_busy_are_asked_again_and_those_that_refuse_are_not(mirror, tmp_path):
+    with serving(mirror, statuses=[503, 429]) as server:
+        bring(f"{server.url}/x.tar", tmp_path / "part")
+        assert len(server.asked) == 3
+        with pytest.raises(FetchError, match=r"gone.tar: cannot be read \(HTTP 404, .*\). Check the address"):
+            bring(f"{server.url}/gone.tar", tmp_path / "other")
+        assert len(server.asked) == 4
+
+
+def test_a_connection_that_never_holds_leaves_what_came(mirror, tmp_path):
+    with serving(mirror, cut_after=[10_000] * 9) as server:
+        with pytest.raises(FetchError, match=r"after 50000 of 700000 bytes\). The 50000 bytes that came are kept"):
+            bring(f"{server.url}/x.tar", tmp_path / "part")
+    assert (tmp_path / "part").read_bytes() == DATA[:50_000] and len(server.asked) == download.ATTEMPTS
+
+
+def test_another_length_is_refused_before_it_is_brought(mirror, tmp_path):
+    (mirror / "x.tar").write_bytes(DATA + b"x")
+    with serving(mirror) as server, pytest.raises(FetchError, match="expected 700000 bytes, .* found 700001"):
+        bring(f"{server.url}/x.tar", tmp_path / "part")
+    assert not (tmp_path / "part").exists()
+    with pytest.raises(FetchError, match="expected 700000 bytes, .* found 700001"):
+        bring(str(mirror / "x.tar"), tmp_path / "part")
+
+
+def test_nobody_there_names_the_mirror_as_a_way_out(mirror, tmp_path):
+    with serving(mirror) as server:
+        pass
+    with pytest.raises(FetchError, match=r"cannot be read \(.*refused.*\). Check the connection .* --mirror DIR"):
+        bring(f"{server.url}/x.tar", tmp_path / "part")
+    with pytest.raises(FetchError, match=r"nowhere.tar: cannot be read \(No such file.*Check that the file is there"):
+        bring(str(mirror / "nowhere.tar"), tmp_path / "part")
+
+
+def test_texts_are_short_and_utf8(mirror):
+    (mirror / "a.toml").write_text("schema = 'ä'")
+    with serving(mirror) as server:
+        assert read_text(f"{server.url}/a.toml", most_bytes=100) == "schema = 'ä'"
+        with pytest.raises(FetchError, match="at most 100 bytes"):
+            read_text(f"{server.url}/x.tar", most_bytes=100)
+    with pytest.raises(FetchError, match="UTF-8"):
+        read_text(str(mirror / "x.tar"), most_bytes=len(DATA))
