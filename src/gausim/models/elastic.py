@@ -187,6 +187,10 @@ class PreparedElastic:
             self.still = self.force(a.new_zeros(1, 2 * len(scene.values)))
         self.transition = torch.cat(parts)
 
+    def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
+        """All of it: the network's corrections are small here."""
+        return displacement
+
     def coordinates(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S M"]:
         """Modal coordinates at t + 1 from the displacements at t and t - 1 of S sequences."""
         z, previous = modal_coordinates(now, before, self.projection)

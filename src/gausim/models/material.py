@@ -297,7 +297,7 @@ class PreparedMaterial:
     def __init__(self, body: BodyModes, matrices: Matrices) -> None:
         """Computes the constants; gradients flow through them."""
         self.matrices, self.springs = matrices, body.springs
-        self.projection = body.projection.flatten(0, 1)
+        self.projection, self.positions = body.projection.flatten(0, 1), body.modes.flatten(0, 1)
         # Positions and gradients of a unit side by side: one product gives both.
         self.motions = torch.cat((body.modes, body.gradients.flatten(1, 2)), 1).flatten(0, 1)
         self.operator = matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2
@@ -314,6 +314,15 @@ class PreparedMaterial:
         z, previous = modal_coordinates(now, before, self.projection)
         after = 2 * z - previous + self.change(z, previous)
         return (after @ self.motions.mT).view(*now.shape[:2], 12)
+
+    def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
+        """Its projection onto the modes.
+
+        With it a state is 2 M numbers to the whole step. What the network adds beyond the modes is seen in the frame
+        that it predicts and forgotten in the next; seen again, it could feed itself and grow where no energy tells.
+        """
+        z = displacement.flatten(1) @ self.projection
+        return (z @ self.positions.mT).view_as(displacement)
 
     def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:
         """v^T M v / 2 + m^T K m / 2 and the links' beyond it: v the step, m the middle of both states, constants all.

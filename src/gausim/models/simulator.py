@@ -359,6 +359,9 @@ class GausSim(nn.Module):
         The network's outputs, before anything is taken off, are appended to ``outputs``.
         """
         batch = prepared.batch
+        if isinstance(prepared.template, PreparedScenes):
+            seen = prepared.template.carried(Motion(prepared.levels[-1].rest, now[-1], before[-1]))
+            now, before = prepared.per_level(seen.now), prepared.per_level(seen.before)
         units = [
             Units(fixed.rest, x, y, fixed.mass, fixed.log_density, fixed.attributes)
             for fixed, x, y in zip(prepared.levels, now, before, strict=True)

@@ -106,6 +106,9 @@ class PreparedScene(Protocol):
     def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:
         """Energy; what is trained counts as constant."""
 
+    def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
+        """The part of a displacement that the network sees, of what the template carries from frame to frame."""
+
 
 class PreparedScenes:
     """The template of a batch, scene by scene."""
@@ -143,6 +146,15 @@ class PreparedScenes:
         gradients = moved[:, 3:].reshape(-1, 3, 3) + torch.eye(3, dtype=moved.dtype, device=moved.device)
         gradients = bounded_deformation(gradients, MIN_DETERMINANT, unit=self._conserve_volume)
         return TemplateState(motion.rest + moved[:, :3], gradients)
+
+    def carried(self, motion: Motion) -> Motion:
+        """The part of the motion that goes on: what the network sees of both states."""
+        made = []
+        for part, rows, members in self.parts:
+            both = torch.cat(self._displacements(motion, rows, members))
+            made.append(torch.stack([x.flatten(0, 1) for x in part.carried(both).chunk(2)]))
+        seen = made[0] if len(made) == 1 else torch.cat(made, 1).index_select(1, self._places)
+        return Motion(motion.rest, motion.rest + seen[0], motion.rest + seen[1])
 
     def energy(self, motion: Motion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch."""
