@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from gausim.core import SimState
+from gausim.engine.stability import _LinearStep
 from gausim.models.frames import body_axes
 from gausim.models.hierarchy import build_hierarchy
 from gausim.models.material import DAMPING_GAIN, MaterialTemplate
@@ -258,6 +259,20 @@ def test_scenes_share_everything_but_densities_and_attributes(make_scene, make_m
     assert all(n.startswith(shared) for n in names if n not in own)
     model.freeze()
     assert sorted(n for n, p in model.named_parameters() if p.requires_grad) == sorted(own)
+
+
+def test_the_network_reads_only_what_the_modes_carry(neural) -> None:
+    """A state is nine modal coordinates and their step; what the network does at rest is part of the Jacobian."""
+    model = neural()
+    with torch.no_grad():
+        for weights in model.network.decoder.parameters():
+            weights.normal_(generator=torch.Generator().manual_seed(3))
+    step = _LinearStep(model, 0)
+    blocks = step.rows()
+    alone = np.linalg.svd(blocks, compute_uv=False)
+    assert step.count == 45 and (alone > 1e-6 * alone[0]).sum() == 18
+    model.output_scale = model.lever_head = 0.0
+    assert np.abs(step.rows() - blocks).max() > 1e-3 * np.abs(blocks).max()
 
 
 @torch.no_grad()
