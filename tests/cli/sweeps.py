@@ -15,7 +15,8 @@ TESTS = Path(__file__).parents[1]
 write_toy_object = runpy.run_path(str(TESTS / "toy_object.py"))["write_toy_object"]
 TINY = (
     "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
-    "data.curriculum.t_max=2", "data.repeats=2", "trainer=cpu", "trainer.threads=1", "trainer.max_epochs=2",
+    "data.curriculum.t_max=2", "data.curriculum.t_start=1", "data.repeats=2", "data.batch_size=1",
+    "trainer=cpu", "trainer.threads=1", "trainer.max_epochs=2",
     "trainer.progress=false", "render=reference", "callbacks.panels=null", "logger=none",
 )  # fmt: skip
 

@@ -85,7 +85,7 @@ def test_no_mass_leaves_det_F_free_in_the_head_and_in_the_template(toy: Path, mo
         assert max(errors[ablation]) < 1e-4, errors
     for ablation in ("no_mass", "no_mass_no_momentum", "no_mass_no_hierarchy"):
         own, whole, template = errors[ablation]
-        assert min(own, whole) > 0.05, errors
+        assert min(own, whole) > 0.01, errors  # a hundred times what conservation leaves
         assert (template > 1e-3) == (model == "gausim"), errors
 
 

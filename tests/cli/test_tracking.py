@@ -21,7 +21,8 @@ write_toy_object = runpy.run_path(str(TESTS / "toy_object.py"))["write_toy_objec
 FakeWandb = runpy.run_path(str(TESTS / "engine" / "test_dashboards.py"))["FakeWandb"]
 TINY = (
     "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
-    "data.curriculum.t_max=2", "data.batch_size=2", "trainer.max_epochs=2", "trainer.accelerator=cpu",
+    "data.curriculum.t_max=2", "data.curriculum.t_start=1", "data.repeats=1", "data.batch_size=2",
+    "trainer.max_epochs=2", "trainer.accelerator=cpu",
     "trainer.progress=false", "trainer.threads=1", "trainer.log_every_n_steps=1", "render=reference", "name=toy",
     "callbacks.panels.every_epochs=1",
 )  # fmt: skip

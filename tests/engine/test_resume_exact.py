@@ -22,8 +22,8 @@ from gausim.engine.checkpoint import digest, read_checkpoint
 TESTS = Path(__file__).parents[1]
 TINY = (
     "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
-    "data.repeats=2", "data.curriculum.t_max=3", "+data.curriculum.threshold=0.9", "+data.curriculum.patience=1",
-    "data.curriculum._target_=gausim.engine.curriculum.LossGatedCurriculum",
+    "data.repeats=2", "data.curriculum.t_max=3", "data.curriculum.t_start=1", "trainer.convergence.held_back=1",
+    "trainer.convergence.window=2", "optimizer.schedule.warmup=0.5", "data.batch_size=1",
     "render=reference", "optimizer.ema_decay=0.9", "loss.input_noise=0.001", "trainer=cpu", "trainer.threads=1",
     "trainer.progress=false", "trainer.log_every_n_steps=1", "callbacks.panels=null", "doctor=false",
 )  # fmt: skip

@@ -14,9 +14,8 @@ from torch import Tensor, nn
 from gausim.core import ConfigError, DivergenceError, SimState
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
-from gausim.engine.curriculum import LossGatedCurriculum
 from gausim.engine.module import GausSimModule
-from gausim.engine.optim import CosineSchedule, HalvingSchedule, OptimizerSettings
+from gausim.engine.optim import CosineSchedule, HalvingSchedule, OptimizerSettings, StableDecaySchedule
 from gausim.engine.run import make_trainer
 from gausim.losses import ImageLoss, Objective
 from gausim.models.elastic import ElasticTemplate
@@ -177,6 +176,9 @@ def test_schedules() -> None:
     cosine = CosineSchedule(warmup=0.1, final=0.1)
     values = [cosine.factor(e, 100) for e in (1, 10, 55, 100)]
     assert values == pytest.approx([0.1, 1.0, 0.55, 0.1])
+    stable = StableDecaySchedule(warmup=2.0, decay=0.25, final=0.1)
+    assert [stable.factor(e, 100) for e in (1, 2, 75, 87.5, 100)] == pytest.approx([0.5, 1.0, 1.0, 0.55, 0.1])
+    assert stable.factor(75, 80) < 0.5  # an end that comes earlier brings the fall forward
 
 
 def test_clipping_by_group_and_altogether() -> None:
@@ -188,15 +190,6 @@ def test_clipping_by_group_and_altogether() -> None:
         norms = settings.clip(optimizer)
         assert {k: float(v) for k, v in norms.items()} == {"network": 30.0, "scene": 40.0}
         assert (float(a.grad.norm()), float(b.grad.norm())) == pytest.approx(expected, rel=1e-4)
-
-
-def test_the_gated_curriculum_waits_for_the_loss_or_its_patience() -> None:
-    gated = LossGatedCurriculum(t_max=3, threshold=0.5, patience=3)
-    assert gated.steps(99) == 1
-    assert [gated.observe(r) for r in (0.9, 0.4, 0.9, 0.9, 0.9, 0.1)] == [False, True, False, False, True, False]
-    other = LossGatedCurriculum(t_max=3)
-    other.load_state_dict(gated.state_dict())
-    assert other.steps(0) == 3
 
 
 def test_absent_sequences_and_scenes_do_not_move_in_the_real_model(tmp_path: Path) -> None:

@@ -93,7 +93,8 @@ def _build_fit(config: DictConfig) -> tuple[FittedModule, ReadyDataModule]:
     plan = instantiate(config.model.plan)
     seen = int(config.data.curriculum.t_max)
     curriculum = StagedCurriculum(t_start=1, t_max=seen, plan=plan)
-    datamodule = instantiate(config.data, curriculum=curriculum, repeats=plan.shows)
+    alone = config.data.batch_size or 1  # the fits of the sequences do not see each other
+    datamodule = instantiate(config.data, curriculum=curriculum, repeats=plan.shows, batch_size=alone)
     objects = datamodule.objects
     scenes = [item.scene() for item in objects]
     method = instantiate(

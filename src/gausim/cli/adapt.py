@@ -111,7 +111,7 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
         "init_from": str(run.resolve()),
         "freeze": "model",
         "evaluate": True,
-        "trainer": {**config["trainer"], "max_epochs": arguments.epochs, "max_minutes": None, "overwrite": False},
+        "trainer": {**config["trainer"], "max_epochs": arguments.epochs, **ALL_EPOCHS, "overwrite": False},
     }
     if arguments.supervision is not None:
         target = SUPERVISIONS[arguments.supervision]

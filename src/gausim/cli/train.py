@@ -38,7 +38,8 @@ Learns an object's dynamics from multi-view videos. Every setting is a key of co
   gausim train --cfg job                        print the whole configuration, run nothing
 
 A run goes to OUTPUT_ROOT/NAME/seed_SEED (paths.output_root, name, seed). Started again, it resumes from its last
-checkpoint; once finished it is refused, unless trainer.overwrite=true. A sweep (-m) that is started again leaves out
+checkpoint; cut short by trainer.max_minutes or max_epochs before it had learned, the same command grants it as much
+again; once finished it is refused, unless trainer.overwrite=true. A sweep (-m) that is started again leaves out
 what is finished, resumes what is not, and tries again what failed if sweep.retry_failed=true."""
 
 COMPARED = {
@@ -185,6 +186,7 @@ def _fit(
 ) -> float | None:
     from gausim.cli import _config
     from gausim.cli._end import end
+    from gausim.engine.convergence import Convergence
     from gausim.engine.fitting import FittedModule
     from gausim.engine.judge import EpochJudge
 
@@ -209,22 +211,26 @@ def _fit(
         facts: dict[str, Any] = {"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary}
         if isinstance(module, FittedModule):
             facts["notes"] = module.notes()
+        judged = [c.summary() for c in cast(Any, trainer).callbacks if isinstance(c, Convergence)]
+        facts |= {"learning": judged[0]} if judged and judged[0] else {}
         run.finish({**facts, **({"pruned": True} if pruned else {})})
         commands = [] if cfg.evaluate else [["evaluate", run.path], ["report", run.path]]
-        end([_result(facts)], "run", run.path, *commands)
+        end(_result(facts), "run", run.path, *commands)
     return module.summary.get("excess_static")
 
 
-def _result(facts: dict[str, Any]) -> str:
-    """How long it trained, and how near it came on the frames that it was shown."""
+def _result(facts: dict[str, Any]) -> list[str]:
+    """How long it trained, how near it came on the frames that it was shown, and whether more would help."""
+    learned = [facts["learning"]["verdict"]] if "learning" in facts else []
     excess = facts["last_epoch"].get("excess_static")
     begin = f"Trained for {facts['epochs']} epochs ({facts['optimizer_steps']} steps)"
     if excess is None:
-        return f"{begin}."
-    return (
+        return [f"{begin}.", *learned]
+    return [
         f"{begin}: on the frames shown, the loss beyond that of the reconstruction is {excess:.2f} times that of a "
-        "model that predicts no motion."
-    )
+        "model that predicts no motion.",
+        *learned,
+    ]
 
 
 def _warn_of_data(datamodule: ReadyDataModule) -> None:
@@ -302,7 +308,11 @@ def make(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | None =
     callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node] + judges(cfg)
     wanted = (cfg.logger or {}).values() if crew.is_first else ()
     loggers = [instantiate(node, save_dir=str(run.path)) for node in wanted if node]
-    length = {} if epochs is None else {"max_epochs": epochs}
+    length: dict[str, Any] = {"max_epochs": cfg.trainer.max_epochs * run.allowances}
+    if cfg.trainer.max_minutes is not None:
+        length["max_minutes"] = cfg.trainer.max_minutes * run.allowances
+    if epochs is not None:
+        length["max_epochs"] = epochs
     return instantiate(cfg.trainer, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew, **length)
 
 
@@ -337,7 +347,7 @@ def _introduce(
     lines.append(f"  compared with {COMPARED.get(kind, kind)}")
     frames = sum(datamodule.steps(epoch) * batches for epoch in range(epochs))
     lines.append(
-        f"  {epochs} epochs x {batches} steps; T {datamodule.steps(0)} to {datamodule.curriculum.t_max}, "
-        f"at least {frames} predicted frames"
+        f"  at most {epochs} epochs of {batches} steps, {epochs * datamodule.repeats} shows of each sequence; "
+        f"T {datamodule.steps(0)} to {datamodule.curriculum.t_max}, {frames} predicted frames"
     )
     print("\n".join(lines), file=sys.stdout, flush=True)

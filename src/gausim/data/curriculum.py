@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gausim.core import ConfigError
 
 
-@dataclass(frozen=True)
+@dataclass
 class Curriculum:
     """T grows by one every few epochs up to ``t_max`` (METHOD section 4).
 
@@ -15,17 +15,20 @@ class Curriculum:
         t_start: predicted steps in epoch 0.
         t_max: most predicted steps; 15 steps see frames 0..15 and no unseen one.
         epochs_per_increase: epochs between increases.
+        longest: most predicted steps for now, at most ``t_max``; what judges a run holds frames back by it.
     """
 
     t_start: int = 1
     t_max: int = 15
     epochs_per_increase: int = 1
+    longest: int = field(init=False)
 
     def __post_init__(self) -> None:
         """Checks the bounds."""
         if not 1 <= self.t_start <= self.t_max or self.epochs_per_increase < 1:
             raise ConfigError(f"curriculum: expected 1 <= t_start <= t_max and epochs_per_increase >= 1, got {self}.")
+        self.longest = self.t_max
 
     def steps(self, epoch: int) -> int:
         """Predicted steps T in an epoch (counted from 0)."""
-        return min(self.t_max, self.t_start + epoch // self.epochs_per_increase)
+        return min(self.longest, self.t_start + epoch // self.epochs_per_increase)

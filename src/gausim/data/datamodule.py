@@ -12,7 +12,14 @@ from torch.utils.data import DataLoader
 
 from gausim.core import ConfigError
 from gausim.data.curriculum import Curriculum
-from gausim.data.dataset import SequenceIndex, TrainingDataset, WholeSequenceDataset, collate
+from gausim.data.dataset import (
+    SampleKey,
+    SequenceIndex,
+    SequenceSample,
+    TrainingDataset,
+    WholeSequenceDataset,
+    collate,
+)
 from gausim.data.objects import ObjectData, find_objects
 from gausim.data.prefetch import PrefetchingLoader
 from gausim.data.sampler import SequenceBatchSampler
@@ -24,6 +31,10 @@ class ReadyDataModule(LightningDataModule):
 
     Training batches are lists of :class:`SequenceSample` (frames 0..T of the training views only); test batches
     hold one whole sequence in all views.
+
+    Attributes:
+        repeats: how many times each sequence is shown per epoch.
+        curriculum: predicted steps per epoch.
     """
 
     def __init__(
@@ -33,8 +44,8 @@ class ReadyDataModule(LightningDataModule):
         scene: str | Path | None = None,
         masks: str | Path | None = None,
         selections: Mapping[str, Selection | str] | None = None,
-        batch_size: int = 1,
-        repeats: int = 1,
+        batch_size: int | None = None,
+        repeats: int = 4,
         curriculum: Curriculum | None = None,
         seed: int = 0,
         prefetch: int = 1,
@@ -49,7 +60,7 @@ class ReadyDataModule(LightningDataModule):
             scene: PLY of the rest scene of a single object; ``scene.ply`` in its directory when None.
             masks: npz of its masks; beside the PLY when None.
             selections: what replaces its masks, see :func:`gausim.data.scenes.select_masks`.
-            batch_size: sequences per optimiser step, divided over the ranks.
+            batch_size: sequences per optimiser step, divided over the ranks; a third of all, 1 to 4, when None.
             repeats: how many times each sequence is shown per epoch.
             curriculum: predicted steps per epoch; METHOD's when None.
             seed: of the order.
@@ -60,7 +71,7 @@ class ReadyDataModule(LightningDataModule):
         super().__init__()
         self._root, self._names, self._sequences = root, names, sequences
         self._options: dict[str, Any] = {"scene": scene, "masks": masks, "selections": selections}
-        self._batch_size, self._repeats, self._seed = batch_size, repeats, seed
+        self._batch_size, self.repeats, self._seed = batch_size, repeats, seed
         self._prefetch = prefetch
         self.curriculum = curriculum if curriculum is not None else Curriculum()
         self._sampler: SequenceBatchSampler | None = None
@@ -96,13 +107,23 @@ class ReadyDataModule(LightningDataModule):
             self._check_curriculum()
             self._sampler = SequenceBatchSampler(
                 len(self.index),
-                batch_size=self._batch_size,
-                repeats=self._repeats,
+                batch_size=self._sequences_per_step(),
+                repeats=self.repeats,
                 curriculum=self.curriculum,
                 seed=self._seed,
                 rank=self.trainer.global_rank if self.trainer else 0,
                 world_size=self.trainer.world_size if self.trainer else 1,
             )
+
+    def _sequences_per_step(self) -> int:
+        if self._batch_size is not None:
+            return self._batch_size
+        ranks = self.trainer.world_size if self.trainer else 1
+        return max(ranks, min(4, len(self.index) // 3), 1)
+
+    def training_sample(self, sequence: int, steps: int) -> SequenceSample:
+        """Frames 0..``steps`` of a sequence in the training views."""
+        return TrainingDataset(self.index)[SampleKey(sequence, steps)]
 
     def steps(self, epoch: int) -> int:
         """Predicted steps T in an epoch."""

@@ -14,7 +14,8 @@ from lightning.pytorch.callbacks import Checkpoint, RichProgressBar
 from gausim.core import ConfigError
 from gausim.data.datamodule import ReadyDataModule
 from gausim.engine.cadence import has_come
-from gausim.engine.checkpoint import LAST_CHECKPOINT, digest
+from gausim.engine.checkpoint import BEFORE_THE_END, LAST_CHECKPOINT, digest
+from gausim.engine.convergence import Convergence
 from gausim.engine.epoch_table import EpochTable, short
 from gausim.engine.loggers import Resumable
 from gausim.engine.module import GausSimModule
@@ -25,7 +26,10 @@ EPOCHS = "epochs.csv"
 
 
 class RunCheckpoint(Checkpoint):
-    """Saves ``last.ckpt`` every so often, within epochs too, and numbered snapshots where asked for."""
+    """Saves ``last.ckpt`` every so often, within epochs too, and numbered snapshots where asked for.
+
+    Where a run's allowance and not its convergence begins its end, ``before_the_end.ckpt`` is what more time goes on from.
+    """
 
     def __init__(
         self, *, every_epochs: int = 1, every_minutes: float = 1.0, every_steps: int = 0, snapshot_every: int = 0
@@ -66,6 +70,8 @@ class RunCheckpoint(Checkpoint):
         if has_come(trainer, self._every) or self._due(trainer):
             self._save(trainer)
         epoch = trainer.current_epoch + 1
+        if any(isinstance(c, Convergence) and c.began_to_end(trainer) for c in cast(Any, trainer).callbacks):
+            trainer.save_checkpoint(Path(trainer.default_root_dir) / BEFORE_THE_END, weights_only=False)
         if self._snapshot_every and epoch % self._snapshot_every == 0:
             snapshots = Path(trainer.default_root_dir) / "snapshots"
             trainer.save_checkpoint(snapshots / f"epoch_{epoch:04d}.ckpt", weights_only=False)
@@ -126,7 +132,7 @@ class EpochSummary(Callback):
     """One line per epoch on the console and one row per epoch in ``epochs.csv`` of the run."""
 
     COLUMNS = (
-        "epoch", "step", "steps", "loss_image", "ratio_static", "excess_static", "ratio_first", "motion_energy",
+        "epoch", "step", "steps", "loss_image", "ratio_static", "excess_static", "held_back", "ratio_first", "motion_energy",
         "loss_momentum", "momentum_share", "loss_static", "energy_growth", "grad_network", "grad_scene",
         "grad_template", "grad_initial", "exploded",
         "lr", "seconds",
@@ -173,7 +179,7 @@ class EpochSummary(Callback):
         parts = [f"epoch {means['epoch']}/{trainer.max_epochs}", f"T {means.get('steps', math.nan):.0f}"]
         labels = {
             "loss_image": "loss {:.4g}", "excess_static": "{:.3f} of static", "ratio_first": "first frame {:.3f}",
-            "motion_energy": "motion {:.2f}", "grad_network": "|g| {:.3g}", "momentum_share": "momentum {:.1%}",
+            "held_back": "held back {:.3f}", "motion_energy": "motion {:.2f}", "grad_network": "|g| {:.3g}", "momentum_share": "momentum {:.1%}",
         }  # fmt: skip
         parts += [text.format(means[name]) for name, text in labels.items() if name in means]
         if means.get("exploded", 0) > 0:
@@ -181,7 +187,8 @@ class EpochSummary(Callback):
         parts.append(f"{means['seconds']:.1f} s")
         fitted = hasattr(trainer.lightning_module, "plan")  # in stages, which have lengths of their own
         left = None if fitted else _minutes_left(trainer, means["seconds"])
-        return "  ".join([*parts, *([] if left is None else [f"about {left:.0f} min left"])])
+        judged = any(isinstance(c, Convergence) and c.is_learning for c in cast(Any, trainer).callbacks)
+        return "  ".join([*parts, *([] if left is None else [f"{'at most' if judged else 'about'} {left:.0f} min left"])])
 
     def _table(self, trainer: Trainer) -> EpochTable:
         return EpochTable(Path(trainer.default_root_dir) / EPOCHS, self.COLUMNS)

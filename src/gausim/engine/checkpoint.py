@@ -17,6 +17,7 @@ from gausim.core import GaussianScene, RunError
 from gausim.io.files import write_durably
 
 LAST_CHECKPOINT, PREVIOUS_CHECKPOINT = "last.ckpt", "last.previous.ckpt"
+BEFORE_THE_END = "before_the_end.ckpt"  # of a run that was cut short: more time goes on from it
 DIGEST = "digest"
 # Raise it when a checkpoint holds something new without which a run would not resume bit for bit.
 RESUME_FORMAT = 2

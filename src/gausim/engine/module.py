@@ -18,9 +18,8 @@ from gausim.data.sampler import hash_seed
 from gausim.engine.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes, fingerprints
 from gausim.engine.contracts import Foreseeing, InitialVelocities, Mixing, SceneBatch, Simulator
 from gausim.engine.cost import TrainingCost
-from gausim.engine.curriculum import LossGatedCurriculum
 from gausim.engine.exchange import Exchange
-from gausim.engine.optim import OptimizerSettings
+from gausim.engine.optim import OptimizerSettings, StableDecaySchedule
 from gausim.engine.passivity import FreeMotion
 from gausim.engine.ranks import Ranks, interleave
 from gausim.engine.reference import Yardsticks
@@ -95,7 +94,7 @@ class GausSimModule(LightningModule):
         self.average = WeightAverage(self.settings.ema_decay)
         self.summary: dict[str, float] = {}
         self.last_stats: dict[str, float] = {}
-        self.time_fraction = 0.0
+        self.time_fraction, self.holds_rates = 0.0, False
         self._sums: dict[str, list[float]] = {}
         self._warned, self._barren = False, 0
         self.ranks, self._shown, self.cost = Ranks(), 0, TrainingCost()
@@ -206,7 +205,11 @@ class GausSimModule(LightningModule):
     def _set_rates(self, optimizer: Any, batch_idx: int) -> float:
         batches, epochs = self.trainer.num_training_batches, self.trainer.max_epochs or 1
         done = self.current_epoch + batch_idx / max(1.0, float(batches))
-        return self.settings.set_rates(optimizer.optimizer, max(done, self.time_fraction * epochs), epochs)
+        done = max(done, self.time_fraction * epochs)
+        schedule = self.settings.schedule
+        if self.holds_rates and isinstance(schedule, StableDecaySchedule):
+            done = min(done, (1 - schedule.decay) * epochs)
+        return self.settings.set_rates(optimizer.optimizer, done, epochs)
 
     def _rollout(self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator) -> Tally:
         steps = whole[0].steps
@@ -385,6 +388,10 @@ class GausSimModule(LightningModule):
             for logger in self.trainer.loggers:
                 logger.log_metrics({f"train/{k}": v for k, v in stats.items()}, step=self.global_step)
 
+    def note(self, name: str, value: float) -> None:
+        """Adds a number of the epoch under way to its means."""
+        self._sums[name] = [value, 1.0]
+
     def epoch_means(self) -> dict[str, float]:
         """Means over the sequences of the epoch so far."""
         return {name: total / weight for name, (total, weight) in self._sums.items() if weight}
@@ -398,7 +405,7 @@ class GausSimModule(LightningModule):
         self._sums.clear()
 
     def on_train_epoch_end(self) -> None:
-        """Forms the epoch's means, warns of a collapse and lets the curriculum look at the loss."""
+        """Forms the epoch's means and warns of a collapse."""
         self.summary = self.epoch_means()
         row = {f"epoch/{name}": value for name, value in self.summary.items()}
         for logger in self.trainer.loggers:  # not log_dict: Lightning would write it after the epoch's checkpoint
@@ -408,32 +415,21 @@ class GausSimModule(LightningModule):
             self._warned = True
             warnings.warn(
                 f"the prediction has collapsed to the rest state: it moves with {100 * energy:.1f} % of the true "
-                "motion energy. Let T grow more slowly (a loss-gated curriculum), raise optimizer.initial_lr or use "
-                "loss.backprop_steps > 1.",
+                "motion energy. Let T grow more slowly (data.curriculum.epochs_per_increase), raise "
+                "optimizer.initial_lr or use loss.backprop_steps > 1.",
                 stacklevel=2,
             )
-        curriculum = self._curriculum()
-        if curriculum is not None and "excess_static" in self.summary:
-            curriculum.observe(self.summary["excess_static"])
-
-    def _curriculum(self) -> LossGatedCurriculum | None:
-        datamodule = getattr(self.trainer, "datamodule", None) if self._trainer is not None else None
-        curriculum = getattr(datamodule, "curriculum", None)
-        return curriculum if isinstance(curriculum, LossGatedCurriculum) else None
 
     # ------------------------------------------------------------------------------------------------ checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds the scenes' fingerprints, the averaged weights, the curriculum's state and the epoch's numbers."""
+        """Adds the scenes' fingerprints, the averaged weights and the epoch's numbers."""
         own: dict[str, Any] = {"format": RESUME_FORMAT, "scenes": fingerprints(self.simulator.scenes)}
         own["average"] = self.average.state_dict()
         own["epoch"] = {"sums": self._sums, "summary": self.summary, "warned": self._warned, "barren": self._barren}
         own["yardsticks"] = self.yardsticks.state_dict()
         if isinstance(self.supervision, TrackSupervision):
             own["tracks"] = self.supervision.state_dict()
-        curriculum = self._curriculum()
-        if curriculum is not None:
-            own["curriculum"] = curriculum.state_dict()
         checkpoint["gausim"], checkpoint["cost"] = own, self.cost.state_dict()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -452,9 +448,6 @@ class GausSimModule(LightningModule):
         self.yardsticks.load_state_dict(own["yardsticks"])
         if isinstance(self.supervision, TrackSupervision):
             self.supervision.load_state_dict(own.get("tracks", {}))
-        curriculum = self._curriculum()
-        if curriculum is not None and "curriculum" in own:
-            curriculum.load_state_dict(own["curriculum"])
 
     def take_notes(self, checkpoint: Mapping[str, Any]) -> None:
         """What a checkpoint says of its training, for :attr:`footnotes`."""

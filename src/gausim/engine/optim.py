@@ -50,7 +50,7 @@ class HalvingSchedule:
 
 @dataclass(frozen=True)
 class CosineSchedule:
-    """A linear start over ``warmup`` of the run, then half a cosine down to ``final``.
+    """A linear start over ``warmup`` of the run, then half a cosine down to ``final``; for runs of a length that is known.
 
     Attributes:
         warmup: fraction of the run that the start takes.
@@ -67,6 +67,37 @@ class CosineSchedule:
             return max(0.05, done / self.warmup)
         fraction = (done - self.warmup) / max(1e-9, 1 - self.warmup)
         return self.final + (1 - self.final) * 0.5 * (1 + math.cos(math.pi * fraction))
+
+
+@dataclass(frozen=True)
+class StableDecaySchedule:
+    """A linear start, constant rates, and a fall along half a cosine over the last part of the run.
+
+    What ends a run early moves its last part forward: nothing that was learned before has to be learned again.
+
+    Attributes:
+        warmup: epochs that the start takes.
+        decay: fraction of the run over which the rates fall.
+        final: factor at the end of the run.
+    """
+
+    warmup: float = 1.0
+    decay: float = 1 / 3
+    final: float = 0.05
+
+    def __post_init__(self) -> None:
+        """Checks the ranges."""
+        if self.warmup < 0 or not 0 < self.decay < 1 or not 0 <= self.final <= 1:
+            raise ConfigError(
+                f"optimizer.schedule: expected warmup >= 0, 0 < decay < 1 and final in [0, 1], got {self}."
+            )
+
+    def factor(self, epoch: float, epochs: int) -> float:
+        """Between ``final`` and 1 (below that during the start)."""
+        if epoch < self.warmup:
+            return max(0.05, epoch / self.warmup)
+        fraction = (min(1.0, epoch / max(1, epochs)) - 1 + self.decay) / self.decay
+        return self.final + (1 - self.final) * 0.5 * (1 + math.cos(math.pi * max(0.0, fraction)))
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,14 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from gausim.core import ConfigError, GausSimError, RunError
 from gausim.engine.callbacks import EPOCHS, ExactResume, TimeBudget
-from gausim.engine.checkpoint import LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, AtomicCheckpointIO, check_resumable
+from gausim.engine.checkpoint import (
+    BEFORE_THE_END,
+    LAST_CHECKPOINT,
+    PREVIOUS_CHECKPOINT,
+    AtomicCheckpointIO,
+    check_resumable,
+)
+from gausim.engine.convergence import Convergence
 from gausim.engine.files import sole_writer, unwritable
 from gausim.engine.launch import Crew
 from gausim.engine.layout import RanksStrategy
@@ -63,6 +70,7 @@ OWN_FILES = (
     EVENTS,
     LAST_CHECKPOINT,
     PREVIOUS_CHECKPOINT,
+    BEFORE_THE_END,
     DAMAGED_CHECKPOINT,
     EPOCHS,
     MOTION,
@@ -176,11 +184,13 @@ class RunDirectory:
             overwrite: remove what an earlier run left here.
 
         Raises:
-            RunError: the run here is finished, was started with another configuration, or no checkpoint of it is whole.
+            RunError: the run here is finished (one that was cut short goes on, once more for as long), was started with another configuration, or no checkpoint of it is whole.
         """
         remove_leftovers(self.path)
         if overwrite:
             self._clear()
+        if self.is_finished and self._was_cut_short(config):
+            self._go_on()
         if self.is_finished:
             raise RunError(
                 f"{self.path}: this run is finished. Give the new one another name (name=NAME) or seed, or remove the "
@@ -194,6 +204,26 @@ class RunDirectory:
         self.record("resumed" if resume else "started")
         self._prepared = True
         return resume
+
+    @property
+    def allowances(self) -> int:
+        """How often this run was granted its epochs and minutes: once, and once more each time it was cut short."""
+        path = self.path / EVENTS
+        lines = path.read_text().splitlines() if path.is_file() else []
+        return 1 + sum(json.loads(line)["event"] == "granted more" for line in lines)
+
+    def _was_cut_short(self, config: Mapping[str, Any]) -> bool:
+        """Whether this very configuration ended here before it had learned, and can go on."""
+        if not (self.path / BEFORE_THE_END).is_file() or changed_keys(self.config(), config):
+            return False
+        return bool(dict(self.facts().get("learning") or {}).get("cut_short"))
+
+    def _go_on(self) -> None:
+        check_resumable(self.path / BEFORE_THE_END)
+        self.record("granted more")
+        (self.path / PREVIOUS_CHECKPOINT).unlink(missing_ok=True)
+        os.replace(self.path / BEFORE_THE_END, self.checkpoint)
+        (self.path / FINISHED).unlink()
 
     def check_unchanged(self, config: Mapping[str, Any]) -> None:
         """Compares the configuration of the run here with one that meets it.
@@ -323,6 +353,7 @@ def make_trainer(
     log_every_n_steps: int = 20,
     progress: bool = True,
     overwrite: bool = False,
+    convergence: Convergence | None = None,
     run_dir: Path | str | None = None,
     callbacks: Sequence[Callback] = (),
     loggers: Sequence[Logger] = (),
@@ -343,6 +374,7 @@ def make_trainer(
         log_every_n_steps: optimiser steps between rows of the loggers.
         progress: whether a progress bar is shown.
         overwrite: what the run directory is prepared with (:meth:`RunDirectory.prepare`); nothing to the trainer.
+        convergence: ends the run when it has learned; None leaves it all of its epochs.
         run_dir: where checkpoints, panels and tables go.
         callbacks: further ones.
         loggers: where numbers go.
@@ -360,7 +392,8 @@ def make_trainer(
     if threads is not None:
         torch.set_num_threads(threads)
     keep_freed_memory()
-    own = [c for c in callbacks if progress or not isinstance(c, ProgressBar)]
+    own: list[Callback] = [] if convergence is None else [convergence]  # before what tells of its judgement
+    own += [c for c in callbacks if progress or not isinstance(c, ProgressBar)]
     if max_minutes is not None:
         own.append(TimeBudget(minutes=max_minutes, clock=clock))
     own.append(ExactResume())

@@ -133,7 +133,7 @@ class FitPlan:
         return name, stage, min(float(stage.iterations), rest * self.shows)
 
 
-@dataclass(frozen=True)
+@dataclass
 class StagedCurriculum(Curriculum):
     """T as the stages have it: set by :meth:`enter` before every epoch; ``t_max`` is what training may see.
 
