@@ -21,8 +21,9 @@ from gausim.view.session import Event, Force, Gravity, Impulse, Pin, Release, Un
 TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
 TINY = (
     "model.simulator.radii=[0.3,0.7]", "model.simulator.template.modes=8", "model.simulator.template.solid=null",
-    "model.simulator.hidden=8", "data.curriculum.t_max=3", "data.repeats=1", "data.batch_size=2", "trainer.max_epochs=4",
-    "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1", "render=reference",
+    "model.simulator.hidden=8", "data.curriculum.t_max=3", "data.repeats=1", "data.batch_size=2",
+    "trainer.max_epochs=4", "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1",
+    "render=reference",
     "callbacks.panels=null", "logger=none", "name=toy",
 )  # fmt: skip
 

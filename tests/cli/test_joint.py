@@ -19,8 +19,9 @@ from gausim.engine.checkpoint import read_checkpoint
 TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
 TINY = (
     "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
-    "data.curriculum.t_start=2", "data.curriculum.t_max=2", "data.repeats=1", "trainer.max_epochs=2", "trainer.accelerator=cpu",
-    "trainer.progress=false", "trainer.threads=1", "render=reference", "callbacks.panels=null", "logger=none",
+    "data.curriculum.t_start=2", "data.curriculum.t_max=2", "data.repeats=1", "trainer.max_epochs=2",
+    "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1", "render=reference",
+    "callbacks.panels=null", "logger=none",
     "doctor=false",
 )  # fmt: skip
 SHARED = ("model.network.", "model.node_normaliser.", "model.edge_normaliser.")

@@ -22,8 +22,9 @@ def test_the_process_that_compiles_trains_to_the_same_bits_as_one_that_loads_fro
     for run in ("first", "second"):
         command = [
             sys.executable, "-m", "gausim.cli.main", "train", f"data.root={toy}", "render=cpu", "trainer.threads=1",
-            "trainer.accelerator=cpu", "trainer.max_epochs=2", "trainer.progress=false", "data.curriculum.t_max=3", "data.repeats=1",
-            "data.batch_size=2", "model.simulator.radii=[0.3,0.7]", "logger=none", f"hydra.run.dir={tmp_path / run}",
+            "trainer.accelerator=cpu", "trainer.max_epochs=2", "trainer.progress=false", "data.curriculum.t_max=3",
+            "data.repeats=1", "data.batch_size=2", "model.simulator.radii=[0.3,0.7]",
+            "logger=none", f"hydra.run.dir={tmp_path / run}",
         ]  # fmt: skip
         done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr

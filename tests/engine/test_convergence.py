@@ -21,8 +21,8 @@ TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
 TINY = (
     "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
     "data.curriculum.t_max=3", "data.repeats=2", "trainer.accelerator=cpu", "trainer.progress=false",
-    "trainer.threads=1", "trainer.convergence.held_back=1", "trainer.convergence.window=4", "render=cpu", "doctor=false",
-    "callbacks.panels=null", "callbacks.motion=null", "logger=none", "evaluate=false",
+    "trainer.threads=1", "trainer.convergence.held_back=1", "trainer.convergence.window=4", "render=cpu",
+    "doctor=false", "callbacks.panels=null", "callbacks.motion=null", "logger=none", "evaluate=false",
 )  # fmt: skip
 
 
@@ -60,8 +60,9 @@ def test_improvement_is_per_ten_shows_whatever_an_epoch_is() -> None:
 
 
 def test_a_run_ends_when_it_no_longer_improves_and_then_sees_all_frames(toy: Path) -> None:
-    # Nothing is an improvement for this tolerance: the end begins as soon as it can be told, long before the last epoch.
-    run = train(toy, "early", "trainer.convergence.tolerance=0.99", "trainer.max_epochs=40", "optimizer.schedule.decay=0.5")
+    # Nothing is an improvement for this tolerance: the end begins as soon as it can be told.
+    settings = ("trainer.convergence.tolerance=0.99", "trainer.max_epochs=40", "optimizer.schedule.decay=0.5")
+    run = train(toy, "early", *settings)
     rows = _rows(run)
     told = [float(row["held_back"]) if row["held_back"] else None for row in rows]
     steps = [float(row["steps"]) for row in rows]
@@ -74,7 +75,7 @@ def test_a_run_ends_when_it_no_longer_improves_and_then_sees_all_frames(toy: Pat
     facts = json.loads((run / "FINISHED").read_text())
     assert facts["epochs"] == 8 and facts["learning"]["converged"] and not (run / "before_the_end.ckpt").exists()
     with pytest.raises(RunError, match="this run is finished"):
-        train(toy, "early", "trainer.convergence.tolerance=0.99", "trainer.max_epochs=40", "optimizer.schedule.decay=0.5")
+        train(toy, "early", *settings)
 
 
 def _rows(run: Path) -> list[dict[str, str]]:

@@ -19,6 +19,7 @@ Only frames 0 .. FRAMES - 1 of the training views are looked at.
   gausim adapt outputs/bunny/seed_0 --data NEW_STORE --frames 3
   gausim adapt outputs/bunny/seed_0 --data NEW_STORE --set trainer.threads=1 optimizer.initial_lr=0.02"""
 EPOCHS, REPEATS = 60, 4
+ALL_EPOCHS = {"max_minutes": None, "convergence": None}
 # What `--supervision` stands for (the defaults of these are those of conf/supervision).
 SUPERVISIONS = {
     "images": None,

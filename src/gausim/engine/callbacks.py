@@ -28,7 +28,8 @@ EPOCHS = "epochs.csv"
 class RunCheckpoint(Checkpoint):
     """Saves ``last.ckpt`` every so often, within epochs too, and numbered snapshots where asked for.
 
-    Where a run's allowance and not its convergence begins its end, ``before_the_end.ckpt`` is what more time goes on from.
+    Where its allowance and not convergence begins the end of a run, ``before_the_end.ckpt`` is what more time goes on
+    from.
     """
 
     def __init__(
@@ -132,8 +133,8 @@ class EpochSummary(Callback):
     """One line per epoch on the console and one row per epoch in ``epochs.csv`` of the run."""
 
     COLUMNS = (
-        "epoch", "step", "steps", "loss_image", "ratio_static", "excess_static", "held_back", "ratio_first", "motion_energy",
-        "loss_momentum", "momentum_share", "loss_static", "energy_growth", "grad_network", "grad_scene",
+        "epoch", "step", "steps", "loss_image", "ratio_static", "excess_static", "held_back", "ratio_first",
+        "motion_energy", "loss_momentum", "momentum_share", "loss_static", "energy_growth", "grad_network", "grad_scene",
         "grad_template", "grad_initial", "exploded",
         "lr", "seconds",
     )  # fmt: skip
@@ -179,7 +180,8 @@ class EpochSummary(Callback):
         parts = [f"epoch {means['epoch']}/{trainer.max_epochs}", f"T {means.get('steps', math.nan):.0f}"]
         labels = {
             "loss_image": "loss {:.4g}", "excess_static": "{:.3f} of static", "ratio_first": "first frame {:.3f}",
-            "held_back": "held back {:.3f}", "motion_energy": "motion {:.2f}", "grad_network": "|g| {:.3g}", "momentum_share": "momentum {:.1%}",
+            "held_back": "held back {:.3f}", "motion_energy": "motion {:.2f}", "grad_network": "|g| {:.3g}",
+            "momentum_share": "momentum {:.1%}",
         }  # fmt: skip
         parts += [text.format(means[name]) for name, text in labels.items() if name in means]
         if means.get("exploded", 0) > 0:
@@ -188,7 +190,9 @@ class EpochSummary(Callback):
         fitted = hasattr(trainer.lightning_module, "plan")  # in stages, which have lengths of their own
         left = None if fitted else _minutes_left(trainer, means["seconds"])
         judged = any(isinstance(c, Convergence) and c.is_learning for c in cast(Any, trainer).callbacks)
-        return "  ".join([*parts, *([] if left is None else [f"{'at most' if judged else 'about'} {left:.0f} min left"])])
+        return "  ".join(
+            [*parts, *([] if left is None else [f"{'at most' if judged else 'about'} {left:.0f} min left"])]
+        )
 
     def _table(self, trainer: Trainer) -> EpochTable:
         return EpochTable(Path(trainer.default_root_dir) / EPOCHS, self.COLUMNS)

@@ -1,8 +1,8 @@
 """Ends training when it has learned: judged by a forecast of frames that it is not trained on until then.
 
-A run learns at constant rates, on rollouts that stop short of the last training frames. After each epoch the frames held
-back are foreseen. Once that forecast no longer gets better, or the run's allowance of epochs or minutes nears its end, the
-run finishes: all training frames are shown, and the rates fall (``gausim.engine.optim.StableDecaySchedule``).
+A run learns at constant rates, on rollouts that stop short of the last training frames. After each epoch the frames
+held back are foreseen. Once that forecast no longer gets better, or the run's allowance of epochs or minutes nears its
+end, the run finishes: all training frames are shown, and the rates fall (``engine.optim.StableDecaySchedule``).
 """
 
 from __future__ import annotations
@@ -191,7 +191,9 @@ def foresee_frames(module: GausSimModule, samples: Sequence[SequenceSample], fir
     try:
         for sample in samples:
             batch = module.simulator.batch([sample.scene_id])
-            _, made = next(windows(module.simulator, batch, module.initial([sample], batch), sample.steps, sample.steps))
+            _, made = next(
+                windows(module.simulator, batch, module.initial([sample], batch), sample.steps, sample.steps)
+            )
             losses, _ = module.supervision.comparison([sample], batch)(States.of(made[first:]), first)
             yard = module.yardsticks.of(sample, batch.rest)
             still = sum(yard.static[first : sample.steps])

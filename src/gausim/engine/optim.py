@@ -50,7 +50,7 @@ class HalvingSchedule:
 
 @dataclass(frozen=True)
 class CosineSchedule:
-    """A linear start over ``warmup`` of the run, then half a cosine down to ``final``; for runs of a length that is known.
+    """A linear start over ``warmup`` of the run, then half a cosine down to ``final``; for runs of known length.
 
     Attributes:
         warmup: fraction of the run that the start takes.

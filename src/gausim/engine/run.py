@@ -184,7 +184,8 @@ class RunDirectory:
             overwrite: remove what an earlier run left here.
 
         Raises:
-            RunError: the run here is finished (one that was cut short goes on, once more for as long), was started with another configuration, or no checkpoint of it is whole.
+            RunError: the run here is finished (one that was cut short goes on, once more for as long), was started with
+                another configuration, or no checkpoint of it is whole.
         """
         remove_leftovers(self.path)
         if overwrite:
