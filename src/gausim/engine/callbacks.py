@@ -134,8 +134,8 @@ class EpochSummary(Callback):
 
     COLUMNS = (
         "epoch", "step", "steps", "loss_image", "ratio_static", "excess_static", "held_back", "ratio_first",
-        "motion_energy", "loss_momentum", "momentum_share", "loss_static", "energy_growth", "grad_network", "grad_scene",
-        "grad_template", "grad_initial", "exploded",
+        "motion_energy", "loss_momentum", "momentum_share", "loss_static", "energy_growth", "grad_network",
+        "grad_scene", "grad_template", "grad_initial", "exploded",
         "lr", "seconds",
     )  # fmt: skip
 
