@@ -21,7 +21,7 @@ class Curriculum:
     t_start: int = 1
     t_max: int = 15
     epochs_per_increase: int = 1
-    longest: int = field(init=False)
+    longest: int = field(default=0, init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Checks the bounds."""
