@@ -114,7 +114,7 @@ def test_fewer_sequences_per_step_than_ranks_are_refused() -> None:
 
 
 def test_samples_of_several_objects_are_numbered_through(two_objects: Path) -> None:
-    data = ReadyDataModule(two_objects, batch_size=5)
+    data = ReadyDataModule(two_objects, batch_size=5, repeats=1)
     data.setup("fit")
     assert [o.name for o in data.objects] == ["apple", "pear"] and len(data.index) == 5
     (batch,) = list(data.train_dataloader())
@@ -187,7 +187,7 @@ def test_a_resumed_run_sees_what_an_uninterrupted_one_sees(two_objects: Path, tm
             max_epochs=2, default_root_dir=tmp_path, accelerator="cpu", enable_model_summary=False, **quiet
         )
         recorder = Recorder(stop)
-        trainer.fit(recorder, ReadyDataModule(two_objects, batch_size=2), ckpt_path=checkpoint, weights_only=True)
+        trainer.fit(recorder, ReadyDataModule(two_objects, batch_size=2, repeats=1), ckpt_path=checkpoint, weights_only=True)
         return recorder.seen if stop is None else recorder.seen[:stop]
 
     whole = fit(None)

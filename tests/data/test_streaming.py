@@ -46,7 +46,7 @@ def mixed(tmp_path_factory: pytest.TempPathFactory, tiny: SimpleNamespace) -> Pa
 
 
 def stream(root: Path, **options: object) -> ReadyDataModule:
-    settings: dict = {"batch_size": 2, "curriculum": Curriculum(t_max=5), **options}
+    settings: dict = {"batch_size": 2, "repeats": 1, "curriculum": Curriculum(t_max=5), **options}
     data = ReadyDataModule(root, **settings)
     data.setup("fit")
     return data
@@ -168,7 +168,7 @@ def test_a_rank_reads_only_its_share(mixed: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(SequenceRecord, "frames", noted)
     shares = []
     for rank in range(world):
-        data = ReadyDataModule(mixed, batch_size=3, curriculum=Curriculum(t_max=5), prefetch=2)
+        data = ReadyDataModule(mixed, batch_size=3, repeats=1, curriculum=Curriculum(t_max=5), prefetch=2)
         data.trainer = SimpleNamespace(global_rank=rank, world_size=world)  # type: ignore[assignment]
         data.setup("fit")
         read.clear()
@@ -216,7 +216,7 @@ def test_one_batch_holds_objects_of_other_rates_views_and_lengths(mixed: Path) -
 def test_a_packed_and_an_unpacked_object_train_together(mixed: Path, tmp_path: Path) -> None:
     pack(mixed / "pear", tmp_path / "pear")
     both = stream(mixed)
-    half = ReadyDataModule([mixed / "apple", tmp_path / "pear"], batch_size=2, curriculum=Curriculum(t_max=5))
+    half = ReadyDataModule([mixed / "apple", tmp_path / "pear"], batch_size=2, repeats=1, curriculum=Curriculum(t_max=5))
     half.setup("fit")
     for number in (0, 3):
         for one, other in zip(_whole(both, number), _whole(half, number), strict=True):

@@ -54,7 +54,7 @@ def test_same_seed_same_bytes_other_seed_others(made: Path, tmp_path: Path) -> N
 
 
 def test_set_is_read_by_the_data_module(made: Path) -> None:
-    data = ReadyDataModule(made, batch_size=4)
+    data = ReadyDataModule(made, batch_size=4, repeats=1)
     data.setup("fit")
     (batch,) = list(data.train_dataloader())
     assert sorted(s.object_name for s in batch) == ["flower_soft"] * 2 + ["pudding_soft"] * 2
