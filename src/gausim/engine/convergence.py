@@ -19,9 +19,12 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from gausim.core import ConfigError, DivergenceError
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
+from gausim.engine.cadence import training_data
 from gausim.engine.module import GausSimModule
 from gausim.engine.optim import StableDecaySchedule
+from gausim.engine.reference import excess
 from gausim.engine.rollout import States, windows
+from gausim.nn.mode import evaluating
 
 # Shows of a sequence that an improvement is stated for.
 PER_SHOWS = 10
@@ -85,7 +88,7 @@ class Convergence(Callback):
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Holds frames back, or goes on with the end of a resumed run."""
-        data = _data(trainer)
+        data = training_data(trainer)
         self._shows = data.repeats
         allowance = trainer.max_epochs or 0
         if self._ending_since is not None and allowance > self._allowance and not self.converged:
@@ -97,7 +100,7 @@ class Convergence(Callback):
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Judges, and begins the end where it is time; all ranks hear the same."""
-        data = _data(trainer)
+        data = training_data(trainer)
         if not self.is_learning:
             return
         assert isinstance(pl_module, GausSimModule)
@@ -128,9 +131,9 @@ class Convergence(Callback):
         )
 
     def _apply(self, trainer: Trainer, module: LightningModule) -> None:
-        curriculum = _data(trainer).curriculum
+        curriculum = training_data(trainer).curriculum
         ending = self._ending_since
-        cast(GausSimModule, module).holds_rates = ending is None
+        cast(GausSimModule, module).progress_limit = 1 - _decay(module) if ending is None else 1.0
         curriculum.longest = curriculum.t_max - (self._held_back if ending is None else 0)
         if ending is not None and self.converged:
             length = math.ceil(ending / (1 - _decay(module)))
@@ -186,26 +189,22 @@ class Convergence(Callback):
 def foresee_frames(module: GausSimModule, samples: Sequence[SequenceSample], first: int) -> Forecast:
     """Predicts the frames after ``first`` of all samples, each from its own initial state, and compares them."""
     loss = floor = static = 0.0
-    was_training = module.training
-    module.eval()
     try:
-        for sample in samples:
-            batch = module.simulator.batch([sample.scene_id])
-            _, made = next(
-                windows(module.simulator, batch, module.initial([sample], batch), sample.steps, sample.steps)
-            )
-            losses, _ = module.supervision.comparison([sample], batch)(States.of(made[first:]), first)
-            yard = module.yardsticks.of(sample, batch.rest)
-            still = sum(yard.static[first : sample.steps])
-            own = float(losses.sum())
-            loss += own if math.isfinite(own) else 10.0 * still
-            static, floor = static + still, floor + yard.floor * (sample.steps - first)
+        with evaluating(module):
+            for sample in samples:
+                batch = module.simulator.batch([sample.scene_id])
+                _, made = next(
+                    windows(module.simulator, batch, module.initial([sample], batch), sample.steps, sample.steps)
+                )
+                losses, _ = module.supervision.comparison([sample], batch)(States.of(made[first:]), first)
+                yard = module.yardsticks.of(sample, batch.rest)
+                still = sum(yard.static[first : sample.steps])
+                own = float(losses.sum())
+                loss += own if math.isfinite(own) else 10.0 * still
+                static, floor = static + still, floor + yard.floor * (sample.steps - first)
     except DivergenceError:
         return Forecast(10.0, 1.0)
-    finally:
-        module.train(was_training)
-    above = max(static - floor, 1e-3 * static, 1e-12)
-    return Forecast((loss - floor) / above, (static - floor) / max(static, 1e-12))
+    return Forecast(excess(loss, static, floor), (static - floor) / max(static, 1e-12))
 
 
 def verdict(found: dict[str, Any]) -> str:
@@ -237,9 +236,3 @@ def verdict(found: dict[str, Any]) -> str:
 
 def _decay(module: LightningModule) -> float:
     return float(cast(Any, module).settings.schedule.decay)
-
-
-def _data(trainer: Trainer) -> ReadyDataModule:
-    data = getattr(trainer, "datamodule", None)
-    assert isinstance(data, ReadyDataModule)
-    return data

@@ -19,7 +19,7 @@ from gausim.engine.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes,
 from gausim.engine.contracts import Foreseeing, InitialVelocities, Mixing, SceneBatch, Simulator
 from gausim.engine.cost import TrainingCost
 from gausim.engine.exchange import Exchange
-from gausim.engine.optim import OptimizerSettings, StableDecaySchedule
+from gausim.engine.optim import OptimizerSettings
 from gausim.engine.passivity import FreeMotion
 from gausim.engine.ranks import Ranks, interleave
 from gausim.engine.reference import Yardsticks
@@ -29,6 +29,7 @@ from gausim.engine.tally import Found, Tally
 from gausim.engine.tracks import TrackSupervision
 from gausim.losses.objective import Objective
 from gausim.losses.static import static_loss
+from gausim.nn.mode import evaluating
 from gausim.render.draw import draw
 
 # Below this share of the true motion energy a prediction counts as collapsed to the rest state.
@@ -94,7 +95,7 @@ class GausSimModule(LightningModule):
         self.average = WeightAverage(self.settings.ema_decay)
         self.summary: dict[str, float] = {}
         self.last_stats: dict[str, float] = {}
-        self.time_fraction, self.holds_rates = 0.0, False
+        self.time_fraction, self.progress_limit = 0.0, 1.0
         self._sums: dict[str, list[float]] = {}
         self._warned, self._barren = False, 0
         self.ranks, self._shown, self.cost = Ranks(), 0, TrainingCost()
@@ -205,10 +206,7 @@ class GausSimModule(LightningModule):
     def _set_rates(self, optimizer: Any, batch_idx: int) -> float:
         batches, epochs = self.trainer.num_training_batches, self.trainer.max_epochs or 1
         done = self.current_epoch + batch_idx / max(1.0, float(batches))
-        done = max(done, self.time_fraction * epochs)
-        schedule = self.settings.schedule
-        if self.holds_rates and isinstance(schedule, StableDecaySchedule):
-            done = min(done, (1 - schedule.decay) * epochs)
+        done = min(max(done, self.time_fraction * epochs), self.progress_limit * epochs)
         return self.settings.set_rates(optimizer.optimizer, done, epochs)
 
     def _rollout(self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator) -> Tally:
@@ -345,17 +343,13 @@ class GausSimModule(LightningModule):
     @torch.no_grad()
     def predict_images(self, sample: SequenceSample) -> Float[Tensor, "F V H W 3"]:
         """Images of frames 0..T of one training sequence, in evaluation mode."""
-        was_training = self.training
-        self.eval()
         batch = self.simulator.batch([sample.scene_id])
         look, units = self.images.looks.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
         frames = [self.images.rest_image(sample, batch.rest).rgb]
-        try:
+        with evaluating(self):
             for _, made in windows(self.simulator, batch, self.initial([sample], batch), sample.steps, 1):
                 states = States.of(made).tensors()
                 frames.append(draw(self.images.renderer, look, *states, units, sample.cameras).rgb)
-        finally:
-            self.train(was_training)
         return torch.cat(frames)
 
     # ------------------------------------------------------------------------------------------------ numbers

@@ -11,10 +11,9 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from gausim.core import ConfigError, DivergenceError
-from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth
-from gausim.engine.cadence import has_come
+from gausim.engine.cadence import has_come, training_data
 from gausim.engine.contracts import Hierarchical
 from gausim.engine.diagnosis import Diagnosis
 from gausim.engine.epoch_table import EpochTable
@@ -22,6 +21,7 @@ from gausim.engine.module import GausSimModule
 from gausim.engine.points import attach_points
 from gausim.engine.randomness import undisturbed
 from gausim.metrics.motion_energy import motion_energy
+from gausim.nn.mode import evaluating
 from gausim.report.diagnosis import read_diagnosis
 
 MOTION = "motion.csv"
@@ -83,19 +83,13 @@ class MotionWatch(Callback):
         return EpochTable(Path(trainer.default_root_dir) / MOTION, self.COLUMNS)
 
     def _look(self, trainer: Trainer, module: GausSimModule) -> dict[str, dict[str, float]]:
-        data = getattr(trainer, "datamodule", None)
-        assert isinstance(data, ReadyDataModule)
         rows, first = {}, 0
-        was_training = module.training
-        module.eval()
-        try:
-            for scene_id, item in enumerate(data.objects):
+        with evaluating(module):
+            for scene_id, item in enumerate(training_data(trainer).objects):
                 found = list(self._foreseen(module, item, scene_id, first))
                 first += len(item.sequences)
                 if found:
                     rows[item.name] = figures(found, item, _units(module, scene_id))
-        finally:
-            module.train(was_training)
         return rows
 
     def _foreseen(

@@ -13,10 +13,9 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
 from gausim.core import ConfigError, DivergenceError
-from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
-from gausim.engine.cadence import has_come
+from gausim.engine.cadence import has_come, training_data
 from gausim.engine.media import Clip, MediaLog, forget_media, safe_name, write_media
 from gausim.engine.module import GausSimModule
 from gausim.engine.randomness import undisturbed
@@ -89,8 +88,7 @@ class Panels(Callback):
                 logger.log_media(media)
 
     def _samples(self, trainer: Trainer, module: GausSimModule) -> list[SequenceSample]:
-        data = getattr(trainer, "datamodule", None)
-        assert isinstance(data, ReadyDataModule)
+        data = training_data(trainer)
         first: dict[int, int] = {}
         for sequence, (scene_id, _) in enumerate(data.index.entries):
             first.setdefault(scene_id, sequence)

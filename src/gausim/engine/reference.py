@@ -27,6 +27,11 @@ class Yardstick:
     motion: list[float] = field(default_factory=list)
 
 
+def excess(loss: float, static: float, floor: float) -> float:
+    """A loss over that of the rest state, both above what the reconstruction leaves; finite where nothing moves yet."""
+    return (loss - floor) / max(static - floor, 1e-3 * static, 1e-12)
+
+
 class Yardsticks:
     """Measures each sequence once; later batches look the numbers up."""
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from gausim.core import DivergenceError
 from gausim.data.dataset import SampleFacts
 from gausim.engine.ranks import interleave
-from gausim.engine.reference import Yardstick
+from gausim.engine.reference import Yardstick, excess
 from gausim.engine.rollout import check_reach, describe
 
 Table = list[list[float]]
@@ -73,11 +73,9 @@ class Numbers:
             moved += sum(yard.motion[: len(table)])
             first += yard.static[0]
         loss = sum(map(sum, table))
-        # Above the floor a static loss can be next to nothing in the first frames; the ratio must stay finite.
-        above = max(static - floor, 1e-3 * static, 1e-12)
         return {
             "ratio_static": loss / max(static, 1e-12),
-            "excess_static": (loss - floor) / above,
+            "excess_static": excess(loss, static, floor),
             "ratio_first": sum(table[0]) / max(first, 1e-12),
             "motion_energy": self.motion / max(moved, 1e-12),
         }

@@ -9,7 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import Forces, SimState, Trajectory, roll_out
-from gausim.models.stepper import SceneStepper, evaluating
+from gausim.models.stepper import SceneStepper
+from gausim.nn.mode import evaluating
 
 if TYPE_CHECKING:
     from gausim.models.simulator import GausSim

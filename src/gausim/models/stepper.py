@@ -2,35 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from gausim.core import SimState, SteppedFrame
 from gausim.models.cuda_graph import GraphedStep, Predicted, StepFunction
 from gausim.models.passive import EnergyGuard
 from gausim.models.prepared import Prepared
 from gausim.models.watch import Watch
+from gausim.nn.mode import evaluating
 
 if TYPE_CHECKING:
     from gausim.models.simulator import GausSim
-
-
-@contextmanager
-def evaluating(model: nn.Module) -> Iterator[None]:
-    """Evaluation mode, and afterwards the mode that was."""
-    was_training = model.training
-    if was_training:
-        model.eval()
-    try:
-        yield
-    finally:
-        if was_training:
-            model.train()
 
 
 class SceneStepper:
