@@ -187,7 +187,8 @@ def test_a_resumed_run_sees_what_an_uninterrupted_one_sees(two_objects: Path, tm
             max_epochs=2, default_root_dir=tmp_path, accelerator="cpu", enable_model_summary=False, **quiet
         )
         recorder = Recorder(stop)
-        trainer.fit(recorder, ReadyDataModule(two_objects, batch_size=2, repeats=1), ckpt_path=checkpoint, weights_only=True)
+        data = ReadyDataModule(two_objects, batch_size=2, repeats=1)
+        trainer.fit(recorder, data, ckpt_path=checkpoint, weights_only=True)
         return recorder.seen if stop is None else recorder.seen[:stop]
 
     whole = fit(None)

@@ -216,7 +216,8 @@ def test_one_batch_holds_objects_of_other_rates_views_and_lengths(mixed: Path) -
 def test_a_packed_and_an_unpacked_object_train_together(mixed: Path, tmp_path: Path) -> None:
     pack(mixed / "pear", tmp_path / "pear")
     both = stream(mixed)
-    half = ReadyDataModule([mixed / "apple", tmp_path / "pear"], batch_size=2, repeats=1, curriculum=Curriculum(t_max=5))
+    roots = [mixed / "apple", tmp_path / "pear"]
+    half = ReadyDataModule(roots, batch_size=2, repeats=1, curriculum=Curriculum(t_max=5))
     half.setup("fit")
     for number in (0, 3):
         for one, other in zip(_whole(both, number), _whole(half, number), strict=True):
