@@ -41,7 +41,7 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
 
 
 def test_a_run_leaves_everything_and_loads_again(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert command.main(arguments) == 0
+    assert command.main([*arguments, "optimizer.initial_lr=0.01"]) == 0
     run = Path("outputs/toy/seed_0")
     assert {"config.yaml", "FINISHED", "last.ckpt", "epochs.csv", "panels", "tensorboard", "csv"} <= {
         p.name for p in run.iterdir()
@@ -51,6 +51,7 @@ def test_a_run_leaves_everything_and_loads_again(arguments: list[str], capsys: p
     assert [p.name for p in sorted((run / "panels").iterdir())] == ["step_000001", "step_000002"]
     printed = capsys.readouterr().out
     assert "36 kernels" in printed
+    assert "warning: in 2 shows at optimizer.initial_lr=" in printed and "diagonal at most" in printed
     result, address, *following = printed.splitlines()[-4:]
     assert result.startswith("Trained for 2 epochs (") and "times that of a model that predicts no motion" in result
     assert address == f"run: {run.resolve().as_uri()}"

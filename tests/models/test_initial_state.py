@@ -71,3 +71,15 @@ def test_modal_velocity_moves_units_as_the_basis_says(model) -> None:
 def test_template_without_a_basis_is_refused(make_scene, make_model) -> None:
     with pytest.raises(ConfigError, match="RestTemplate carries no basis.*FreeInitialStates"):
         ModalInitialStates(make_model(make_scene(40)), [0])
+
+
+@pytest.mark.parametrize("kind", [FreeInitialStates, ModalInitialStates])
+def test_reach_is_the_largest_motion_of_a_change_where_it_is_least(model, kind) -> None:
+    initial = kind(model, [0, 1])
+    furthest = []
+    for number, scene in enumerate(model.scenes):
+        with torch.no_grad():
+            list(initial.parameters())[number][..., :1] = 0.3  # one direction of a free offset, the first amplitude
+        moved = (initial.previous(number) - scene.means).norm(dim=-1)
+        furthest.append(float(moved.detach().max()) / scene.diagonal)
+    assert initial.reach(0.3) == pytest.approx(min(furthest), rel=1e-5)

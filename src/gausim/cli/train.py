@@ -42,6 +42,9 @@ checkpoint; cut short by trainer.max_minutes or max_epochs before it had learned
 again; once finished it is refused, unless trainer.overwrite=true. A sweep (-m) that is started again leaves out
 what is finished, resumes what is not, and tries again what failed if sweep.retry_failed=true."""
 
+# Largest motion from frame to frame that small pushes were seen to begin with [diagonals]; others begin with less.
+FIRST_STEP = 0.065
+
 COMPARED = {
     "ImageSupervision": "the images (supervision=images)",
     "TrackSupervision": "motion tracked in the images (supervision=tracks), each frame when it is first shown",
@@ -350,4 +353,18 @@ def _introduce(
         f"  at most {epochs} epochs of {batches} steps, {epochs * datamodule.repeats} shows of each sequence; "
         f"T {datamodule.steps(0)} to {datamodule.curriculum.t_max}, {frames} predicted frames"
     )
+    lines += _slow_beginnings(module, epochs * datamodule.repeats)
     print("\n".join(lines), file=sys.stdout, flush=True)
+
+
+def _slow_beginnings(module: GausSimModule, shows: int) -> list[str]:
+    """A warning where the initial states cannot come to the first step of a common motion in so many shows."""
+    states, rate = cast(Any, module.initial_states), module.settings.initial_lr
+    reach = states.reach(rate * shows)
+    if reach >= FIRST_STEP:
+        return []
+    return [
+        f"  warning: in {shows} shows at optimizer.initial_lr={rate:g} an initial state moves by {reach:.2g} of the "
+        f"diagonal at most; objects that are pushed move by up to {FIRST_STEP:g} in their first frame. Raise "
+        f"optimizer.initial_lr to {rate * FIRST_STEP / max(reach, 1e-12):.2g}, or trainer.max_epochs."
+    ]

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import Checkpoint, RichProgressBar
 
@@ -23,6 +26,8 @@ from gausim.engine.randomness import random_state, restore_random_state
 from gausim.engine.ranks import Ranks
 
 EPOCHS = "epochs.csv"
+# Epochs that the time left is told from.
+RECENT = 8
 
 
 class RunCheckpoint(Checkpoint):
@@ -142,6 +147,7 @@ class EpochSummary(Callback):
     def __init__(self, *, console: bool = True) -> None:
         """``console`` prints the line; the row is written in any case."""
         self._console, self._began, self._elapsed = console, time.monotonic(), 0.0
+        self._paces: deque[tuple[int, float]] = deque(maxlen=RECENT)
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Starts the clock."""
@@ -188,7 +194,8 @@ class EpochSummary(Callback):
             parts.append(f"exploded {means['exploded']:.0%}")
         parts.append(f"{means['seconds']:.1f} s")
         fitted = hasattr(trainer.lightning_module, "plan")  # in stages, which have lengths of their own
-        left = None if fitted else _minutes_left(trainer, means["seconds"])
+        self._paces.append((int(means.get("steps", 0)), means["seconds"]))
+        left = None if fitted else _minutes_left(trainer, self._paces)
         judged = any(isinstance(c, Convergence) and c.is_learning for c in cast(Any, trainer).callbacks)
         return "  ".join(
             [*parts, *([] if left is None else [f"{'at most' if judged else 'about'} {left:.0f} min left"])]
@@ -198,16 +205,22 @@ class EpochSummary(Callback):
         return EpochTable(Path(trainer.default_root_dir) / EPOCHS, self.COLUMNS)
 
 
-def _minutes_left(trainer: Trainer, seconds: float) -> float | None:
-    """What the epochs to come will take at the pace of the one that is over, each in proportion to its T [minutes].
+def _minutes_left(trainer: Trainer, paces: Sequence[tuple[int, float]]) -> float | None:
+    """What the epochs to come will take, by a line through T and seconds of those that are over [minutes].
 
-    None where there are none, or nothing says how many frames they predict.
+    None where there are none, where nothing says how many frames they predict, or one epoch alone is over, whose T
+    tells nothing about others.
     """
     data: Any = getattr(trainer, "datamodule", None)
     done, epochs = trainer.current_epoch + 1, trainer.max_epochs or 0
     if not isinstance(data, ReadyDataModule) or done >= epochs:
         return None
-    left = sum(data.steps(epoch) for epoch in range(done, epochs)) / data.steps(done - 1) * seconds / 60.0
+    coming = np.array([data.steps(epoch) for epoch in range(done, epochs)])
+    steps, seconds = np.array(paces).T
+    if len({*steps, *coming}) > len({*steps}) == 1:
+        return None
+    slope = 0.0 if len({*steps}) == 1 else max(0.0, float(np.polyfit(steps, seconds, 1)[0]))
+    left = float(np.maximum(seconds.mean() + slope * (coming - steps.mean()), 0.0).sum()) / 60.0
     budgets = [c.minutes_left for c in cast(Any, trainer).callbacks if isinstance(c, TimeBudget)]
     return float(min([left, *budgets]))
 

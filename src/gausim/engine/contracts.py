@@ -152,3 +152,7 @@ class InitialVelocities(Protocol):
     def previous(self, sequence_id: int) -> Tensor:
         """(K, 3) positions one frame before frame 0 [scene units]."""
         ...
+
+    def reach(self, change: float) -> float:
+        """How far that frame moves when a parameter changes by ``change`` [diagonals]."""
+        ...

@@ -30,6 +30,10 @@ class FreeInitialStates(nn.Module):
         rest, free = self._rest[scene].to(offset), self._free[scene].to(offset.device)
         return rest + torch.where(free, offset * self._diagonal[scene], torch.zeros_like(offset))
 
+    def reach(self, change: float) -> float:
+        """How far x_{-1} moves when every number of its parameter changes by ``change`` [diagonals]."""
+        return change
+
 
 class ModalInitialStates(nn.Module):
     """x_{-1} = X - sum_m v_m phi_m(X): the motions that the elastic template can carry, M numbers per sequence.
@@ -42,6 +46,7 @@ class ModalInitialStates(nn.Module):
         super().__init__()
         self.scene_of_sequence = tuple(scene_of_sequence)
         self._rest = [s.means for s in model.scenes]
+        self._diagonal = [h.diagonal for h in model.hierarchies]
         self._basis = [_basis(model, i) for i in range(len(model.scenes))]
         self.velocity = nn.ParameterList(torch.zeros(self._basis[i].shape[-1]) for i in self.scene_of_sequence)
 
@@ -49,6 +54,13 @@ class ModalInitialStates(nn.Module):
         """x_{-1} of one sequence [scene units]."""
         scene, velocity = self.scene_of_sequence[sequence_id], self.velocity[sequence_id]
         return self._rest[scene].to(velocity) - self._basis[scene].to(velocity) @ velocity
+
+    def reach(self, change: float) -> float:
+        """The same when the slowest motion's amplitude changes by ``change``, in the scene where it is least."""
+        return change * min(
+            float(basis[..., 0].norm(dim=1).max()) / diagonal
+            for basis, diagonal in zip(self._basis, self._diagonal, strict=True)
+        )
 
 
 def _basis(model: GausSim, scene_id: int) -> Float[Tensor, "K 3 M"]:
