@@ -126,7 +126,7 @@ def test_threads_are_shared_among_the_jobs_of_a_machine(monkeypatch: pytest.Monk
         with hydra.initialize_config_dir(str(_conf.conf_dir()), version_base="1.3"):
             config = hydra.compose("train", ["hydra.mode=MULTIRUN", *overrides], return_hydra_config=True)
         monkeypatch.setattr(HydraConfig.instance(), "cfg", config)
-        return config.trainer.threads
+        return config.render.threads
 
     joblib = "hydra/launcher=joblib"
     assert threads(2) == threads(64) == 2
@@ -135,7 +135,7 @@ def test_threads_are_shared_among_the_jobs_of_a_machine(monkeypatch: pytest.Monk
     assert threads(2, joblib, "hydra.launcher.n_jobs=8") == 1
     assert threads(64, "hydra/launcher=submitit_slurm") == 1
     assert threads(64, "hydra/launcher=submitit_slurm", "hydra.launcher.cpus_per_task=8") == 2
-    assert threads(2, joblib, "trainer.threads=5") == 5
+    assert threads(2, joblib, "render.threads=5") == 5
 
 
 def learned(run: Path) -> str:

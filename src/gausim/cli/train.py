@@ -33,7 +33,7 @@ Learns an object's dynamics from multi-view videos. Every setting is a key of co
   gausim train -m ablation=none,no_mass seed=0,1,2 evaluate=true     a sweep: all combinations
   gausim train -m seed=0,1,2,3 hydra/launcher=joblib                 several jobs at a time (also submitit_slurm)
   gausim train -m hydra/sweeper=optuna 'optimizer.network_lr=tag(log,interval(1e-4,1e-2))'      a search
-  gausim train trainer.max_minutes=30 trainer.threads=2
+  gausim train trainer.max_minutes=30 render.threads=4
   gausim train trainer=ddp trainer.devices=4 data.batch_size=8
   gausim train --cfg job                        print the whole configuration, run nothing
 

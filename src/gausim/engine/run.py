@@ -55,6 +55,7 @@ FREE_KEYS = (
     "doctor",
     "evaluate",
     "trainer.threads",
+    "render.threads",
     "trainer.accelerator",
     "trainer.devices",
     "trainer.num_nodes",
