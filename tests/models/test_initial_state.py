@@ -73,7 +73,9 @@ def test_template_without_a_basis_is_refused(make_scene, make_model) -> None:
         ModalInitialStates(make_model(make_scene(40)), [0])
 
 
-@pytest.mark.parametrize("kind", [FreeInitialStates, ModalInitialStates])
+@pytest.mark.parametrize(
+    "kind", [FreeInitialStates, ModalInitialStates, partial(ModalInitialStates, in_diagonals=True)]
+)
 def test_reach_is_the_largest_motion_of_a_change_where_it_is_least(model, kind) -> None:
     initial = kind(model, [0, 1])
     furthest = []
@@ -83,3 +85,16 @@ def test_reach_is_the_largest_motion_of_a_change_where_it_is_least(model, kind) 
         moved = (initial.previous(number) - scene.means).norm(dim=-1)
         furthest.append(float(moved.detach().max()) / scene.diagonal)
     assert initial.reach(0.3) == pytest.approx(min(furthest), rel=1e-5)
+
+
+def test_in_diagonals_every_mode_of_every_scene_moves_alike(model) -> None:
+    initial, plain = ModalInitialStates(model, [0, 1], in_diagonals=True), ModalInitialStates(model, [0, 1])
+    for number, scene in enumerate(model.scenes):
+        for mode in range(5):
+            for states in (initial, plain):
+                with torch.no_grad():
+                    states.velocity[number].zero_()[mode] = 0.01
+            moved, other = (states.previous(number).detach() - scene.means for states in (initial, plain))
+            assert float(moved.norm(dim=-1).max()) == pytest.approx(0.01 * scene.diagonal, rel=1e-4)
+            along = (moved * other).sum() / (moved.norm() * other.norm())
+            assert float(along) == pytest.approx(1.0, abs=1e-5)

@@ -140,8 +140,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(_unknown(name), file=sys.stderr)
         return EXIT_USAGE
-    # torch's operators are small here and gain little from a second thread, which spins while it waits and takes the core
-    # from whoever else runs. The renderer's workers (render.threads) sleep.
+    # torch's operators are small here and gain little from a second thread, which spins while it waits and takes the
+    # core from whoever else runs. The renderer's workers (render.threads) sleep.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     return run_command(COMMANDS[name], rest)
 

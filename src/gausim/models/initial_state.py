@@ -11,6 +11,8 @@ from torch import Tensor, nn
 from gausim.core import ConfigError
 from gausim.models.simulator import GausSim
 
+TINY = 1e-12
+
 
 class FreeInitialStates(nn.Module):
     """x_{-1} = X + free displacement of every kernel, K x 3 numbers per sequence, zero at the start."""
@@ -41,13 +43,23 @@ class ModalInitialStates(nn.Module):
     A velocity field of an elastic body is smooth; free offsets leave most of their numbers undetermined by 16 frames.
     """
 
-    def __init__(self, model: GausSim, scene_of_sequence: Sequence[int]) -> None:
-        """``model``'s template must offer a basis (:class:`gausim.models.elastic.ElasticTemplate`)."""
+    def __init__(self, model: GausSim, scene_of_sequence: Sequence[int], *, in_diagonals: bool = False) -> None:
+        """One parameter per sequence, zero at the start.
+
+        Args:
+            model: its template must offer a basis (:class:`gausim.models.elastic.ElasticTemplate`).
+            scene_of_sequence: which scene each sequence shows.
+            in_diagonals: v_m = 1 moves the kernel that moves furthest in phi_m by one diagonal, so that one learning
+                rate means the same motion for every object and template; else v_m is an amplitude of the template's.
+        """
         super().__init__()
         self.scene_of_sequence = tuple(scene_of_sequence)
         self._rest = [s.means for s in model.scenes]
         self._diagonal = [h.diagonal for h in model.hierarchies]
         self._basis = [_basis(model, i) for i in range(len(model.scenes))]
+        if in_diagonals:
+            largest = [b.norm(dim=1).amax(0).clamp_min(TINY) for b in self._basis]
+            self._basis = [b * (d / most) for b, d, most in zip(self._basis, self._diagonal, largest, strict=True)]
         self.velocity = nn.ParameterList(torch.zeros(self._basis[i].shape[-1]) for i in self.scene_of_sequence)
 
     def previous(self, sequence_id: int) -> Float[Tensor, "K 3"]:
