@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import json
 import runpy
+import shutil
 from pathlib import Path
 
 import pytest
@@ -60,6 +61,26 @@ def test_a_run_leaves_everything_and_loads_again(arguments: list[str], capsys: p
     assert not loaded.module.training and loaded.objects[0].name == "toy"
     for name, value in loaded.module.state_dict().items():
         torch.testing.assert_close(value, weights(run)[name])
+
+
+def test_faults_of_the_data_are_told_again_at_the_end(
+    toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    one_view = Path(shutil.copytree(toy, tmp_path / "one_view"))
+    facts = json.loads((one_view / "dataset.json").read_text())
+    views = facts["train_views"] + facts["heldout_views"]
+    (one_view / "dataset.json").write_text(json.dumps({**facts, "train_views": views[:1], "heldout_views": views[1:]}))
+    ends = []
+    for root in (toy, one_view):
+        asked = [f"data.root={root}", *TINY, "doctor=true", "trainer.max_epochs=1", f"name={root.name}_end"]
+        assert command.main(asked) == 0
+        end = capsys.readouterr().out
+        ends.append(end[end.index("Trained for") :])
+    assert "faulty" not in ends[0]
+    assert "The data are faulty" in ends[1] and "one training view only" in ends[1] and "gausim doctor" in ends[1]
+    finished = json.loads(Path("outputs/one_view_end/seed_0/FINISHED").read_text())
+    assert ["one training view only" in fault for fault in finished["data_faults"]].count(True) == 1
 
 
 def test_motion_and_data_are_looked_at_and_training_does_not_notice(

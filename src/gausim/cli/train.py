@@ -196,12 +196,13 @@ def _fit(
     module, datamodule = parts
     plan = module.plan if isinstance(module, FittedModule) else None
     trainer = make(cfg, run, crew, epochs=None if plan is None else plan.epochs)
+    faults: list[str] = []
     for logger in trainer.loggers:
         logger.log_hyperparams(_plain(cfg))
     if crew.is_first:
         _introduce(trainer, module, datamodule, run, resumed=resume is not None)
-        if cfg.doctor and resume is None and not _config.in_sweep():
-            _warn_of_data(datamodule)
+        if cfg.doctor and not _config.in_sweep():
+            faults = _warn_of_data(datamodule)
     trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
     if plan is not None and not plan.order:  # nothing to learn: no epoch has saved it
         trainer.save_checkpoint(run.checkpoint, weights_only=False)
@@ -216,6 +217,7 @@ def _fit(
             facts["notes"] = module.notes()
         judged = [c.summary() for c in cast(Any, trainer).callbacks if isinstance(c, Convergence)]
         facts |= {"learning": judged[0]} if judged and judged[0] else {}
+        facts |= {"data_faults": faults} if faults else {}
         run.finish({**facts, **({"pruned": True} if pruned else {})})
         commands = [] if cfg.evaluate else [["evaluate", run.path], ["report", run.path]]
         end(_result(facts), "run", run.path, *commands)
@@ -225,6 +227,11 @@ def _fit(
 def _result(facts: dict[str, Any]) -> list[str]:
     """How long it trained, how near it came on the frames that it was shown, and whether more would help."""
     learned = [facts["learning"]["verdict"]] if "learning" in facts else []
+    learned += [
+        f"The data are faulty, and so is what it learned from them. {fault} Mend that and train again: "
+        "`gausim doctor ROOT` has the remedy."
+        for fault in facts.get("data_faults", ())
+    ]
     excess = facts["last_epoch"].get("excess_static")
     begin = f"Trained for {facts['epochs']} epochs ({facts['optimizer_steps']} steps)"
     if excess is None:
@@ -236,15 +243,22 @@ def _result(facts: dict[str, Any]) -> list[str]:
     ]
 
 
-def _warn_of_data(datamodule: ReadyDataModule) -> None:
-    """Prints faults and warnings that `gausim doctor` finds in the objects; notes are left to the command itself."""
+def _warn_of_data(datamodule: ReadyDataModule) -> list[str]:
+    """Prints faults and warnings that `gausim doctor` finds in the objects; notes are left to the command itself.
+
+    Returns:
+        The faults, a sentence each.
+    """
     from gausim.doctor.examine import examine
     from gausim.doctor.page import findings_text
 
+    faults: list[str] = []
     for item in datamodule.objects:
         found = examine(item, item.scene(), lambda step, done, total: None).graver
         if found.findings:
             print(findings_text(str(item.root), found), flush=True)
+        faults += [f"{item.name}: {finding.what}" for finding in found.findings if finding.severity == "fault"]
+    return faults
 
 
 def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None:
