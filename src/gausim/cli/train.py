@@ -234,7 +234,7 @@ def _result(facts: dict[str, Any]) -> list[str]:
     ]
     excess = facts["last_epoch"].get("excess_static")
     begin = f"Trained for {facts['epochs']} epochs ({facts['optimizer_steps']} steps)"
-    if excess is None:
+    if excess is None or excess < -1:  # no frame shows more than what the reconstruction misses already
         return [f"{begin}.", *learned]
     return [
         f"{begin}: on the frames shown, the loss beyond that of the reconstruction is {excess:.2f} times that of a "
