@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
-import yaml
+from omegaconf import OmegaConf
 
+import gausim.cli._conf  # noqa: F401  (the resolvers that the files use)
 from gausim.core import Renderer
 
 CONFIGS = sorted((Path(__file__).parents[2] / "conf" / "render").glob("*.yaml"))
@@ -15,7 +17,7 @@ CONFIGS = sorted((Path(__file__).parents[2] / "conf" / "render").glob("*.yaml"))
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_config_builds_a_renderer(path: Path) -> None:
-    options = yaml.safe_load(path.read_text())
+    options = cast(dict[str, Any], OmegaConf.to_container(OmegaConf.load(path), resolve=True))
     module, name = options.pop("_target_").rsplit(".", 1)
     renderer = getattr(importlib.import_module(module), name)(**options)
     assert isinstance(renderer, Renderer)
