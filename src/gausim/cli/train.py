@@ -225,9 +225,9 @@ def _fit(
 
 
 def _result(facts: dict[str, Any]) -> list[str]:
-    """How long it trained, how near it came on the frames that it was shown, and whether more would help."""
-    learned = [facts["learning"]["verdict"]] if "learning" in facts else []
-    learned += [
+    """How long it trained, how near it came on the frames shown, whether more would help, and faults of the data."""
+    more = [facts["learning"]["verdict"]] if "learning" in facts else []
+    more += [
         f"The data are faulty, and so is what it learned from them. {fault} Mend that and train again: "
         "`gausim doctor ROOT` has the remedy."
         for fault in facts.get("data_faults", ())
@@ -235,11 +235,11 @@ def _result(facts: dict[str, Any]) -> list[str]:
     excess = facts["last_epoch"].get("excess_static")
     begin = f"Trained for {facts['epochs']} epochs ({facts['optimizer_steps']} steps)"
     if excess is None or excess < -1:  # no frame shows more than what the reconstruction misses already
-        return [f"{begin}.", *learned]
+        return [f"{begin}.", *more]
     return [
         f"{begin}: on the frames shown, the loss beyond that of the reconstruction is {excess:.2f} times that of a "
         "model that predicts no motion.",
-        *learned,
+        *more,
     ]
 
 

@@ -208,8 +208,8 @@ class EpochSummary(Callback):
 def _minutes_left(trainer: Trainer, paces: Sequence[tuple[int, float]]) -> float | None:
     """What the epochs to come will take, by a line through T and seconds of those that are over [minutes].
 
-    None where there are none, where nothing says how many frames they predict, or one epoch alone is over, whose T
-    tells nothing about others.
+    None where there are none, where nothing says how many frames they predict, or where all that are over had
+    one T, which tells nothing about another.
     """
     data: Any = getattr(trainer, "datamodule", None)
     done, epochs = trainer.current_epoch + 1, trainer.max_epochs or 0
@@ -217,9 +217,10 @@ def _minutes_left(trainer: Trainer, paces: Sequence[tuple[int, float]]) -> float
         return None
     coming = np.array([data.steps(epoch) for epoch in range(done, epochs)])
     steps, seconds = np.array(paces).T
-    if len({*steps, *coming}) > len({*steps}) == 1:
+    alike = np.ptp(steps) == 0
+    if alike and (coming != steps[0]).any():
         return None
-    slope = 0.0 if len({*steps}) == 1 else max(0.0, float(np.polyfit(steps, seconds, 1)[0]))
+    slope = 0.0 if alike else max(0.0, float(np.polyfit(steps, seconds, 1)[0]))
     left = float(np.maximum(seconds.mean() + slope * (coming - steps.mean()), 0.0).sum()) / 60.0
     budgets = [c.minutes_left for c in cast(Any, trainer).callbacks if isinstance(c, TimeBudget)]
     return float(min([left, *budgets]))

@@ -212,7 +212,7 @@ class RunDirectory:
     def allowances(self) -> int:
         """How often this run was granted its epochs and minutes: once, and once more each time it was cut short."""
         path = self.path / EVENTS
-        granted = f'"event": "{GRANTED}"'  # a line that a kill tore off needs no reading
+        granted = json.dumps({"event": GRANTED})[1:-1]  # looked for as text: a kill may have torn off the last line
         return 1 + (path.read_text().count(granted) if path.is_file() else 0)
 
     def _was_cut_short(self, config: Mapping[str, Any]) -> bool:

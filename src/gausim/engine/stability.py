@@ -10,6 +10,7 @@ from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
 from torch import Tensor
 
 from gausim.core import SimState
+from gausim.nn.mode import evaluating
 
 if TYPE_CHECKING:
     from gausim.models.simulator import GausSim
@@ -56,20 +57,16 @@ class _LinearStep:
 
     def _pull(self, weights: Tensor) -> np.ndarray:
         """weights^T [A, B] for every row of ``weights`` (copies, count)."""
-        model, training = self._model, self._model.training
-        model.eval()
-        try:
-            with torch.enable_grad():
-                batch = model.batch((self._scene_id,) * len(weights))
-                prepared = model.prepare(batch)
-                free = self._free.repeat(len(weights))
-                shifts = batch.rest.new_zeros(2, len(free), 3, requires_grad=True)
-                kernels = (shifts * free[:, None]).index_select(1, batch.finest)
-                state = SimState(batch.rest + kernels[0], batch.rest + kernels[1])
-                after = prepared.aggregate(model.step(batch, state, prepared=prepared).positions)[-1]
-                (pulled,) = torch.autograd.grad((after[free] * weights.view(-1, 3)).sum(), shifts)
-        finally:
-            model.train(training)
+        model = self._model
+        with evaluating(model), torch.enable_grad():
+            batch = model.batch((self._scene_id,) * len(weights))
+            prepared = model.prepare(batch)
+            free = self._free.repeat(len(weights))
+            shifts = batch.rest.new_zeros(2, len(free), 3, requires_grad=True)
+            kernels = (shifts * free[:, None]).index_select(1, batch.finest)
+            state = SimState(batch.rest + kernels[0], batch.rest + kernels[1])
+            after = prepared.aggregate(model.step(batch, state, prepared=prepared).positions)[-1]
+            (pulled,) = torch.autograd.grad((after[free] * weights.view(-1, 3)).sum(), shifts)
         rows = pulled[:, free].view(2, len(weights), self.count)
         return torch.cat((rows[0], rows[1]), 1).double().cpu().numpy()
 

@@ -68,7 +68,7 @@ class ModalInitialStates(nn.Module):
         return self._rest[scene].to(velocity) - self._basis[scene].to(velocity) @ velocity
 
     def reach(self, change: float) -> float:
-        """The same when the slowest motion's amplitude changes by ``change``, in the scene where it is least."""
+        """How far x_{-1} moves when v_0 changes by ``change``, in the scene where that is least [diagonals]."""
         return change * min(
             float(basis[..., 0].norm(dim=1).max()) / diagonal
             for basis, diagonal in zip(self._basis, self._diagonal, strict=True)
