@@ -44,8 +44,7 @@ def run(tmp_path, monkeypatch):
     return loaded
 
 
-def test_whole_evaluation(run, capsys, monkeypatch):
-    monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(run.run_dir / "none"))
+def test_whole_evaluation(run, capsys):
     assert evaluate.main([str(run.run_dir)]) == 0
     captured = capsys.readouterr()
     folder = run.run_dir / "evaluation"

@@ -20,7 +20,7 @@ from gausim.core import Rendered
 from gausim.data.objects import ObjectData
 from gausim.engine import cost
 from gausim.engine.cost import CostMeter
-from gausim.engine.evaluation import default_metrics, evaluate_object, write_evaluation
+from gausim.engine.evaluation import default_metrics, evaluate_object, no_lpips, write_evaluation
 from gausim.engine.memory import keep_freed_memory
 from gausim.engine.provenance import code_provenance, data_provenance, file_hash
 from gausim.engine.recorder import PictureRecorder
@@ -35,11 +35,6 @@ TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
 @pytest.fixture(scope="module")
 def toy(tmp_path_factory):
     return TOY["write_toy_object"](tmp_path_factory.mktemp("data") / "toy")
-
-
-@pytest.fixture(autouse=True)
-def no_weights(monkeypatch, tmp_path):
-    monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(tmp_path / "none.safetensors"))
 
 
 class Oracle:
@@ -78,7 +73,8 @@ def test_lpips_is_measured_where_its_weights_are(monkeypatch, tmp_path):
     assert [m.key for m in default_metrics()] == ["l2", "l2_foreground", "psnr", "psnr_foreground", "ssim", "flip"]
     save_file({n: torch.ones(s) for n, s in expected_shapes().items()}, tmp_path / "w.safetensors")
     monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(tmp_path / "w.safetensors"))
-    assert [m.key for m in default_metrics()][-1] == "lpips"
+    assert [m.key for m in default_metrics()][-1] == "lpips" and no_lpips(31) == ""
+    assert "lpips" not in [m.key for m in default_metrics(30)] and no_lpips(30) == "images under 31 pixels"
 
 
 def test_levels_of_a_trained_prediction(toy):

@@ -39,7 +39,7 @@ from gausim.metrics import (
     motion_energy,
     point_error,
 )
-from gausim.metrics.lpips import NO_WEIGHTS, weights_path
+from gausim.metrics.lpips import NO_WEIGHTS, SMALLEST, TOO_SMALL, weights_path
 from gausim.render.draw import SceneAppearance, draw
 from gausim.report.curves import (
     ERROR_3D,
@@ -69,10 +69,18 @@ AR_MODES = (8, 24)
 PIXELS_AT_ONCE = 1 << 20
 
 
-def default_metrics() -> list[ImageMetric]:
-    """The image metrics of every table; LPIPS only where its weights are."""
-    perceptual = [LPIPS()] if weights_path().is_file() else []
+def default_metrics(side: int = SMALLEST) -> list[ImageMetric]:
+    """The image metrics of every table for images of at least ``side`` pixels a side; LPIPS where :func:`no_lpips`
+    has nothing against it."""
+    perceptual = [] if no_lpips(side) else [LPIPS()]
     return [L2(), ForegroundL2(), PSNR(), ForegroundPSNR(), SSIM(), FLIP(), *perceptual]
+
+
+def no_lpips(side: int) -> str:
+    """Why LPIPS cannot be measured on images of ``side`` pixels; empty where it can."""
+    if side < SMALLEST:
+        return TOO_SMALL
+    return "" if weights_path().is_file() else NO_WEIGHTS
 
 
 def evaluate_object(
@@ -171,7 +179,8 @@ class _ObjectMeasure:
     ) -> None:
         self.data, self.scene, self.renderer = data, scene, renderer
         self.views = list(data.views if views is None else views)
-        self.metrics = list(default_metrics() if metrics is None else metrics)
+        self._side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
+        self.metrics = list(default_metrics(self._side) if metrics is None else metrics)
         self.static = StaticDynamics(scene, fps=data.fps)
         self.look = SceneAppearance.of(scene, scene.foreground)
         points = data.rest_points
@@ -186,7 +195,8 @@ class _ObjectMeasure:
         levels = {name: getattr(predict, "levels", None) for name, predict in methods.items()}
         costs = {name: {**meter.summary(), "levels": levels[name]} for name, meter in self._costs.items()}
         footnotes = {name: found for name, p in methods.items() if (found := getattr(p, "footnotes", None)) is not None}
-        absent = {} if any(m.key == LPIPS.key for m in self.metrics) else {LPIPS.key: NO_WEIGHTS}
+        why = no_lpips(self._side) or NO_WEIGHTS
+        absent = {} if any(m.key == LPIPS.key for m in self.metrics) else {LPIPS.key: why}
         facts = {"efficiency": costs, "sources": data_provenance(self.data), "absent": absent, "footnotes": footnotes}
         diagnosis = self._diagnosis.summary()
         return facts if diagnosis is None else {**facts, "diagnosis": diagnosis}

@@ -32,6 +32,7 @@ _STRIDES, _PADDING = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
 _POOLED_BEFORE = (1, 2)
 # Below this the second pooling has nothing left to pool.
 SMALLEST = 31
+TOO_SMALL = f"images under {SMALLEST} pixels"
 
 
 def weights_path() -> Path:
