@@ -225,13 +225,13 @@ def _fit(
 
 
 def _result(facts: dict[str, Any]) -> list[str]:
-    """How long it trained, how near it came on the frames shown, whether more would help, and faults of the data."""
-    more = [facts["learning"]["verdict"]] if "learning" in facts else []
-    more += [
+    """How long it trained, how near it came on the frames shown, faults of the data, and whether more would help."""
+    more = [
         f"The data are faulty, and so is what it learned from them. {fault} Mend that and train again: "
         "`gausim doctor ROOT` has the remedy."
         for fault in facts.get("data_faults", ())
     ]
+    more += [facts["learning"]["verdict"]] if "learning" in facts else []
     excess = facts["last_epoch"].get("excess_static")
     begin = f"Trained for {facts['epochs']} epochs ({facts['optimizer_steps']} steps)"
     if excess is None or excess < -1:  # no frame shows more than what the reconstruction misses already
