@@ -78,6 +78,15 @@ def test_a_run_ends_when_it_no_longer_improves_and_then_sees_all_frames(toy: Pat
         train(toy, "early", *settings)
 
 
+def test_where_rates_fall_all_along_nothing_is_held_back_and_nothing_judged(toy: Path) -> None:
+    run = train(toy, "falling", "optimizer.schedule.decay=1", "trainer.max_epochs=4")
+    rows = _rows(run)
+    assert [float(row["steps"]) for row in rows] == [2.0, 3.0, 3.0, 3.0] and not any(r["held_back"] for r in rows)
+    rates = [float(row["lr"]) for row in rows]
+    assert rates[1] > rates[2] > rates[3] and "learning" not in json.loads((run / "FINISHED").read_text())
+    assert not (run / "before_the_end.ckpt").exists()
+
+
 def _rows(run: Path) -> list[dict[str, str]]:
     with (run / "epochs.csv").open(newline="") as file:
         return list(csv.DictReader(file))

@@ -50,8 +50,9 @@ class Forecast:
 class Convergence(Callback):
     """Judges after each epoch, and begins the end of the run.
 
-    Inactive where the optimiser has another schedule than :class:`~gausim.engine.optim.StableDecaySchedule`, or the
-    curriculum's first T leaves nothing to hold back; the run then has the length of its ``max_epochs``.
+    Inactive where the optimiser has another schedule than :class:`~gausim.engine.optim.StableDecaySchedule` or one that
+    falls all along, or the curriculum's first T leaves nothing to hold back; the run then has the length of its
+    ``max_epochs``.
 
     Attributes:
         forecasts: one per epoch since T came to its largest without the frames held back.
@@ -125,10 +126,11 @@ class Convergence(Callback):
         return self._ending_since == trainer.current_epoch + 1 and not self.converged
 
     def _active(self, module: LightningModule, data: ReadyDataModule) -> bool:
-        return isinstance(module, GausSimModule) and (
-            isinstance(module.settings.schedule, StableDecaySchedule)
-            and data.curriculum.t_start <= data.curriculum.t_max - self._held_back
-        )
+        if not isinstance(module, GausSimModule):
+            return False
+        schedule = module.settings.schedule
+        falls_at_the_end = isinstance(schedule, StableDecaySchedule) and schedule.decay < 1
+        return falls_at_the_end and data.curriculum.t_start <= data.curriculum.t_max - self._held_back
 
     def _apply(self, trainer: Trainer, module: LightningModule) -> None:
         curriculum = training_data(trainer).curriculum

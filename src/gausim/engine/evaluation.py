@@ -70,8 +70,7 @@ PIXELS_AT_ONCE = 1 << 20
 
 
 def default_metrics(side: int = SMALLEST) -> list[ImageMetric]:
-    """The image metrics of every table for images of at least ``side`` pixels a side; LPIPS where :func:`no_lpips`
-    has nothing against it."""
+    """The image metrics of every table; of images of ``side`` pixels LPIPS where :func:`no_lpips` has no objection."""
     perceptual = [] if no_lpips(side) else [LPIPS()]
     return [L2(), ForegroundL2(), PSNR(), ForegroundPSNR(), SSIM(), FLIP(), *perceptual]
 

@@ -73,7 +73,8 @@ class CosineSchedule:
 class StableDecaySchedule:
     """A linear start, constant rates, and a fall along half a cosine over the last part of the run.
 
-    What ends a run early moves its last part forward: nothing that was learned before has to be learned again.
+    What ends a run early moves its last part forward: nothing that was learned before has to be learned again. With
+    ``decay`` 1 there is no such part: the rates fall all along, and the run has the length that it was given.
 
     Attributes:
         warmup: epochs that the start takes.
@@ -87,9 +88,9 @@ class StableDecaySchedule:
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
-        if self.warmup < 0 or not 0 < self.decay < 1 or not 0 <= self.final <= 1:
+        if self.warmup < 0 or not 0 < self.decay <= 1 or not 0 <= self.final <= 1:
             raise ConfigError(
-                f"optimizer.schedule: expected warmup >= 0, 0 < decay < 1 and final in [0, 1], got {self}."
+                f"optimizer.schedule: expected warmup >= 0, 0 < decay <= 1 and final in [0, 1], got {self}."
             )
 
     def factor(self, epoch: float, epochs: int) -> float:
