@@ -177,7 +177,7 @@ def test_a_directory_that_cannot_be_written_is_named(train: Train) -> None:
 
 @pytest.mark.slow
 def test_twenty_kills_at_random_moments(train: Train) -> None:
-    settings = ("trainer.max_epochs=40", "render=cpu", "data.repeats=5")
+    settings = ("trainer.max_epochs=100", "render=cpu", "data.repeats=5")
     status, output = train("undisturbed", *settings)
     assert status == 0, output
     moments, kills, steps, seen, patience = random.Random(0), 0, set(), 0, 1.0
