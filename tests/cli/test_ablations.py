@@ -22,6 +22,7 @@ MODELS = ["gausim", "gausim_paper"]
 TINY = (
     "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]", "render=reference",
     "data.curriculum.t_max=3", "data.batch_size=2", "seed=1", "loss.explosion=1000",
+    "optimizer.decay.network=0",  # what only fades has not learned
 )  # fmt: skip
 
 

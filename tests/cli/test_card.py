@@ -78,7 +78,7 @@ def test_every_section_says_what_the_run_records(run: Path) -> None:
     assert "epoch 2, 12 updates" in section(text, "Figures") and "12.00 ± 1.00 | 0.250" in section(text, "Figures")
     assert "1.5 minutes, 1.0 minutes of processor time, and held 2.00 GB" in section(text, "Training")
     assert "gausim 9.9 (commit `c0ffee`, with changes that are in no commit), torch 8.8" in section(text, "Versions")
-    assert "| `trainer.max_epochs` | `3` | `120` |" in section(text, "Configuration")
+    assert "| `trainer.max_epochs` | `3` | `60` |" in section(text, "Configuration")
     assert section(text, "Licence").startswith("\nMIT, for the files of this run")
     assert f"gausim evaluate {run} --data DIR" in section(text, "Loading")
     assert "Missing" not in text
