@@ -178,8 +178,10 @@ class _ObjectMeasure:
     ) -> None:
         self.data, self.scene, self.renderer = data, scene, renderer
         self.views = list(data.views if views is None else views)
-        self._side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
-        self.metrics = list(default_metrics(self._side) if metrics is None else metrics)
+        side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
+        self.metrics = list(default_metrics(side) if metrics is None else metrics)
+        measured = any(m.key == LPIPS.key for m in self.metrics)
+        self._absent = {} if measured else {LPIPS.key: no_lpips(side) or NO_WEIGHTS}
         self.static = StaticDynamics(scene, fps=data.fps)
         self.look = SceneAppearance.of(scene, scene.foreground)
         points = data.rest_points
@@ -194,9 +196,8 @@ class _ObjectMeasure:
         levels = {name: getattr(predict, "levels", None) for name, predict in methods.items()}
         costs = {name: {**meter.summary(), "levels": levels[name]} for name, meter in self._costs.items()}
         footnotes = {name: found for name, p in methods.items() if (found := getattr(p, "footnotes", None)) is not None}
-        why = no_lpips(self._side) or NO_WEIGHTS
-        absent = {} if any(m.key == LPIPS.key for m in self.metrics) else {LPIPS.key: why}
-        facts = {"efficiency": costs, "sources": data_provenance(self.data), "absent": absent, "footnotes": footnotes}
+        sources = data_provenance(self.data)
+        facts = {"efficiency": costs, "sources": sources, "absent": self._absent, "footnotes": footnotes}
         diagnosis = self._diagnosis.summary()
         return facts if diagnosis is None else {**facts, "diagnosis": diagnosis}
 
