@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-import runpy
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers import played
 
 import gausim
 from gausim.core import ConfigError, DataError
@@ -16,12 +16,11 @@ from gausim.io.ply import save_scene
 from gausim.ops.orbit import orbit_cameras
 
 ROOT = Path(__file__).resolve().parents[1]
-PLAYED = runpy.run_path(str(Path(__file__).with_name("played.py")))
 
 
 @pytest.fixture(scope="module")
 def loaded(tmp_path_factory: pytest.TempPathFactory):
-    return PLAYED["played_run"](tmp_path_factory.mktemp("played"))
+    return played.played_run(tmp_path_factory.mktemp("played"))
 
 
 @pytest.fixture

@@ -16,12 +16,13 @@ import pytest
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from gausim.cli import _conf, _config
-from gausim.cli._conf import conf_dir
-from gausim.cli._config import check_targets, compose, instantiate, run_hydra
+from gausim.compose import config as _config
+from gausim.compose import root as _conf
+from gausim.compose.config import check_targets, compose, instantiate, run_hydra
+from gausim.compose.root import conf_dir
 from gausim.core.errors import ConfigError, SceneError
-from gausim.engine.launch import Crew
-from gausim.engine.layout import Layout, LocalRanks, RanksStrategy
+from gausim.training.ranks.launch import Crew
+from gausim.training.ranks.layout import Layout, LocalRanks, RanksStrategy
 
 # Values for what a file leaves to the user (`???`), by "group/option".
 MANDATORY: dict[str, list[str]] = {}
@@ -235,7 +236,7 @@ def test_errors_of_the_task_pass_through(tmp_path: Path, monkeypatch: pytest.Mon
         "torch._inductor.codecache.PyCodeCache.load",
         "torch.nn.modules.module.torch.load",
         "lightning.fabric.plugins.io.torch_io.TorchCheckpointIO.load_checkpoint",
-        "gausim.engine.files.sole_writer",
+        "gausim.runs.files.sole_writer",
         "gausim.io.files.write_durably",
         "gausim.cli.main.main",
         "lightning",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import pickle
-import runpy
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,23 +12,22 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from helpers.toy_object import toy_scene
 
 from gausim.cli.main import main
 from gausim.core import GausSimError
 from gausim.data.objects import ObjectData
 from gausim.data.records import read_array
-from gausim.engine.checkpoint import read_checkpoint
-from gausim.engine.run import RunDirectory
 from gausim.io.ply import load_masks, load_scene
 from gausim.io.trajectory import load_trajectory
 from gausim.io.transforms import read_json, read_transforms
 from gausim.metrics import LPIPS
 from gausim.metrics.lpips_weights import convert
-from gausim.report.curves import load_curves
-from gausim.report.pictures import load_pictures
-from gausim.report.summary import load_summary
-
-toy_scene = runpy.run_path(str(Path(__file__).with_name("toy_object.py")))["toy_scene"]
+from gausim.results.curves import load_curves
+from gausim.results.pictures import load_pictures
+from gausim.results.summary import load_summary
+from gausim.runs.checkpoint import read_checkpoint
+from gausim.runs.directory import RunDirectory
 
 # Every function of the product that reads a file of a format, and the name under which it expects it.
 READERS: dict[str, tuple[str, Callable[[Path], object]]] = {

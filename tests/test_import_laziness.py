@@ -52,8 +52,8 @@ def test_core_needs_no_gpu_dashboard_or_viewer() -> None:
 
 
 def test_training_without_a_dashboard_imports_none() -> None:
-    rooms = "import gausim.cli._run, gausim.engine.run, gausim.engine.panels, gausim.engine.loggers"
-    loggers = "import gausim.engine.wandb_log, gausim.engine.mlflow_log"
-    made = "gausim.engine.wandb_log.WandbLog('nowhere').finalize('success')"
+    rooms = "import gausim.compose.build, gausim.training.callbacks.panels, gausim.training.loggers.files"
+    loggers = "import gausim.training.loggers.wandb, gausim.training.loggers.mlflow"
+    made = "gausim.training.loggers.wandb.WandbLog('nowhere').finalize('success')"
     modules = imported_by(f"{rooms}; {loggers}; {made}")
     assert "lightning" in modules and not modules & {"wandb", "mlflow"}

@@ -1,7 +1,7 @@
 """gausim: learn, compare and play with neural simulators of elastic objects made of 3D Gaussians.
 
 ``gausim.load(RUN)`` gives a learned object that can be pushed, watched and drawn (:class:`gausim.api.Simulation`);
-``gausim.load_run(RUN)`` a trained run: model, scenes, data, renderer (:class:`gausim.cli._run.LoadedRun`).
+``gausim.load_run(RUN)`` a trained run: model, scenes, data, renderer (:class:`gausim.compose.build.LoadedRun`).
 """
 
 from importlib import import_module
@@ -9,7 +9,7 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-_LATE = {"load": "gausim.api", "load_run": "gausim.cli._run"}
+_LATE = {"load": "gausim.api", "load_run": "gausim.compose.build"}
 
 
 def __getattr__(name: str) -> Any:

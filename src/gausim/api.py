@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from gausim.cli._force_words import parse_direction, parse_part
-from gausim.cli._foresee import run_objects
-from gausim.cli._live import REST, open_interaction
-from gausim.cli._run import load_run
+from gausim.compose.build import load_run
+from gausim.compose.live import REST, open_interaction
+from gausim.compose.predict import run_objects
 from gausim.core import Cameras, Renderer, SteppedFrame, Trajectory
+from gausim.interaction.interaction import Interaction, replay
+from gausim.interaction.selections import Ball, Kernels, Unit, Whole
+from gausim.interaction.session import Event, Force, Release, load_session, save_session
+from gausim.interaction.words import parse_direction, parse_part
 from gausim.ops.orbit import orbit_cameras
 from gausim.render.draw import SceneAppearance, draw, to_bytes
-from gausim.view.interaction import Interaction, replay
-from gausim.view.selections import Ball, Kernels, Unit, Whole
-from gausim.view.session import Event, Force, Release, load_session, save_session
 
 if TYPE_CHECKING:
     import numpy as np
@@ -93,7 +93,7 @@ class Simulation:
         self.act(Release(name))
 
     def act(self, event: Event) -> None:
-        """Does any event of :mod:`gausim.view.session`: an impulse, wind, gravity, a pin.
+        """Does any event of :mod:`gausim.interaction.session`: an impulse, wind, gravity, a pin.
 
         Raises:
             ConfigError: it cannot be done.

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from hydra.types import HydraContext, TaskFunction
     from omegaconf import DictConfig
 
-    from gausim.cli._sweep import Sweep
+    from gausim.cli.sweeps.grid import Sweep
 
 
 class GridSweeper(Sweeper):
@@ -28,14 +28,14 @@ class GridSweeper(Sweeper):
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Builds the launcher."""
-        from gausim.cli._sweep import Sweep
+        from gausim.cli.sweeps.grid import Sweep
 
         self.hydra_context, self.config = hydra_context, config
         self._sweep = Sweep(config, hydra_context, task_function)
 
     def sweep(self, arguments: list[str]) -> None:
         """Trains what the overrides ask for."""
-        from gausim.cli._sweep import run_grid
+        from gausim.cli.sweeps.grid import run_grid
 
         assert self._sweep is not None
         run_grid(self._sweep, arguments, self._params, self._batch)
@@ -45,20 +45,20 @@ class OptunaSweeper(Sweeper):
     """A search by Optuna that goes on where it was killed (`hydra/sweeper=optuna`)."""
 
     def __init__(self, **settings: Any) -> None:
-        """Keeps the settings; `gausim.cli._optuna.SearchSettings` explains them."""
+        """Keeps the settings; `gausim.cli.sweeps.optuna.SearchSettings` explains them."""
         self._settings = settings
         self._sweep: Sweep | None = None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Builds the launcher."""
-        from gausim.cli._sweep import Sweep
+        from gausim.cli.sweeps.grid import Sweep
 
         self.hydra_context, self.config = hydra_context, config
         self._sweep = Sweep(config, hydra_context, task_function)
 
     def sweep(self, arguments: list[str]) -> None:
         """Trains one trial after another."""
-        from gausim.cli._optuna import Search, SearchSettings
+        from gausim.cli.sweeps.optuna import Search, SearchSettings
 
         assert self._sweep is not None
         Search(self._sweep, SearchSettings(**self._settings)).run(arguments)

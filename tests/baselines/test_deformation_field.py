@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import runpy
-from pathlib import Path
-
 import torch
+from helpers.toy_object import toy_scene
 
 from gausim.baselines.deformation_field import DeformationField
 from gausim.core import FittedMethod, SimState
 from gausim.core.fitted import FittedDynamics
 from gausim.ops.covariance import covariance_from_scales, transport_covariance
 from gausim.ops.quaternion import quaternion_to_matrix
-
-toy_scene = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["toy_scene"]
 
 
 def made(seen: int = 4, **sizes: int) -> DeformationField:

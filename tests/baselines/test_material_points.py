@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import math
-import runpy
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from helpers.toy_object import toy_scene
 from torch import Tensor
 
 pytest.importorskip("warp", reason="the material point method needs warp-lang (extra 'baselines')")
 
-from gausim.baselines.driven import clustered, opaque
-from gausim.baselines.material_points import MaterialPoints
+from gausim.baselines.material_point.driven import clustered, opaque
+from gausim.baselines.material_point.method import MaterialPoints
+from gausim.baselines.material_point.physdreamer import PhysDreamer
+from gausim.baselines.material_point.physgaussian import PhysGaussian
 from gausim.baselines.mpm import Filling, Grid, Material, MPMDynamics
-from gausim.baselines.physdreamer import PhysDreamer
-from gausim.baselines.physgaussian import PhysGaussian
 from gausim.core import ConfigError, FittedMethod, FittedState, GaussianScene, SceneError, SimState, TakesOver
 from gausim.core.fitted import FittedDynamics
 from gausim.ops.quaternion import quaternion_to_matrix
 
-toy_scene: Callable[[], GaussianScene] = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["toy_scene"]
 TRUE = 1e5
 
 

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-import runpy
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from helpers.toy_object import toy_scene
 
-from gausim.baselines.anchors import Anchors
-from gausim.baselines.spring_mass import ConstantVelocity, SpringMass, slowest_vibration
+from gausim.baselines.spring_gaus.anchors import Anchors
+from gausim.baselines.spring_gaus.spring_mass import ConstantVelocity, SpringMass, slowest_vibration
 from gausim.core import ConfigError, DivergenceError, FittedMethod, FittedState, SceneError, SimState
 from gausim.core.fitted import FittedDynamics
 from gausim.ops.quaternion import quaternion_to_matrix
-
-toy_scene = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["toy_scene"]
 
 
 def springs(**options: Any) -> SpringMass:

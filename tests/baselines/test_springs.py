@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from gausim.baselines.springs import Net, forces, move, move_plain
+from gausim.baselines.spring_gaus.springs import Net, forces, move, move_plain
 
 
 def net_and_state(seed: int = 0, *, count: int = 24, neighbours: int = 20) -> tuple[Net, dict[str, torch.Tensor]]:

@@ -8,6 +8,7 @@ import torch
 from gausim.benchmark import interact
 from gausim.benchmark.harness import Options
 from gausim.core import SimState
+from gausim.models.rollout.dynamics import SceneDynamics
 
 
 def test_a_frame_is_divided_into_its_parts() -> None:
@@ -24,7 +25,7 @@ def test_a_frame_is_divided_into_its_parts() -> None:
 
 def test_the_model_is_the_default_one() -> None:
     """What is measured is what `gausim train` trains: the constants here are those of conf/model/gausim.yaml."""
-    from gausim.cli._config import compose, instantiate
+    from gausim.compose.config import compose, instantiate
 
     scene, model = interact.build(300)
     torch.manual_seed(0)
@@ -35,5 +36,5 @@ def test_the_model_is_the_default_one() -> None:
         assert getattr(model, name) == getattr(trained, name), name
     state = SimState(scene.means, scene.means * 0.999)
     model.load_state_dict(trained.state_dict())
-    first, second = (m.dynamics(0).rollout(state, 3).positions for m in (model, trained))
+    first, second = (SceneDynamics(m).rollout(state, 3).positions for m in (model, trained))
     assert torch.equal(first, second)

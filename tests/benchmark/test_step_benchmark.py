@@ -8,7 +8,7 @@ import yaml
 
 from gausim.benchmark import step
 from gausim.benchmark.harness import Options
-from gausim.models.hierarchy import build_hierarchy
+from gausim.models.hierarchy.clusters import build_hierarchy
 
 
 @pytest.mark.slow

@@ -1,24 +1,22 @@
 from __future__ import annotations
 
-import runpy
 from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import toy_object
 
 from gausim.benchmark.harness import Options
 from gausim.benchmark.train import peak_saved_bytes, run
 from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
-from gausim.engine.module import GausSimModule
 from gausim.losses import Objective
-from gausim.models.elastic import ElasticTemplate
 from gausim.models.initial_state import ModalInitialStates
-from gausim.models.simulator import GausSim
+from gausim.models.step.simulator import GausSim
+from gausim.models.template.elastic import ElasticTemplate
 from gausim.render.cpu import CpuRenderer
-
-TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
+from gausim.training.module import GausSimModule
 
 
 def test_peak_counts_what_is_held_at_one_time() -> None:
@@ -37,7 +35,7 @@ def test_peak_counts_what_is_held_at_one_time() -> None:
 
 @pytest.mark.parametrize("backprop_steps", [0, 1])
 def test_rows_of_the_training_benchmark(backprop_steps: int, tmp_path: Path) -> None:
-    toy = TOY["write_toy_object"](tmp_path / "toy", frames=8)
+    toy = toy_object.write_toy_object(tmp_path / "toy", frames=8)
     data = ReadyDataModule(toy.root, curriculum=Curriculum(t_max=3), batch_size=2)
     scenes = [item.scene() for item in data.objects]
     template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=4)

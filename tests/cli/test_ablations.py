@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-import runpy
 from pathlib import Path
 
 import pytest
 import torch
+from helpers.toy_object import write_toy_object
 
-from gausim.cli._conf import conf_dir
-from gausim.cli._config import compose
-from gausim.cli._run import build
+from gausim.compose.build import build
+from gausim.compose.config import compose
+from gausim.compose.root import conf_dir
 from gausim.core import SimState
 from gausim.data.dataset import SampleKey, SequenceSample, TrainingDataset
-from gausim.engine.module import GausSimModule
+from gausim.training.module import GausSimModule
 
-write_toy_object = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["write_toy_object"]
 ABLATIONS = sorted(path.stem for path in (conf_dir() / "ablation").glob("*.yaml"))
 MODELS = ["gausim", "gausim_paper"]
 TINY = (

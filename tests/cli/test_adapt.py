@@ -9,22 +9,24 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers import toy_object
 from torch import Tensor
 
-from gausim.cli import adapt, simulate
+from gausim.cli import adapt
 from gausim.cli import train as command
-from gausim.cli._run import load_run
+from gausim.cli.simulate import command as simulate
+from gausim.compose.build import load_run
 from gausim.core import ConfigError, DataError, RunError
-from gausim.engine.checkpoint import read_checkpoint
+from gausim.runs.checkpoint import read_checkpoint
 
 JOINT = runpy.run_path(str(Path(__file__).parent / "test_joint.py"))
-TOY, TINY = JOINT["TOY"], JOINT["TINY"]
+TINY = JOINT["TINY"]
 
 
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("stores")
-    return TOY["write_toy_object"](folder / "one" / "toy").root, JOINT["other_object"](folder / "two")
+    return toy_object.write_toy_object(folder / "one" / "toy").root, JOINT["other_object"](folder / "two")
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +44,7 @@ def pushed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The toy under pushes that the run has not seen."""
     root = tmp_path_factory.mktemp("new") / "toy"
     amplitudes = {"hard": 0.5, "soft": 0.1, "other_way": -0.4}
-    return TOY["write_object"](TOY["ToyObject"](root, TOY["toy_scene"](), amplitudes=amplitudes)).root
+    return toy_object.write_object(toy_object.ToyObject(root, toy_object.toy_scene(), amplitudes=amplitudes)).root
 
 
 def weights(run: Path) -> dict[str, Tensor]:
@@ -116,7 +118,7 @@ def test_what_does_not_fit_is_named(trained: Path, pushed: Path, tmp_path: Path)
         adapt.main([str(trained), "--frames", "3", "--data", str(pushed), "--sequences", "none", *out])
     with pytest.raises(RunError, match="no run here"):
         adapt.main([str(tmp_path / "nowhere"), *out])
-    TOY["write_object"](TOY["ToyObject"](tmp_path / "strange", TOY["toy_scene"](), amplitudes={"a": 0.1}))
+    toy_object.write_object(toy_object.ToyObject(tmp_path / "strange", toy_object.toy_scene(), amplitudes={"a": 0.1}))
     path = tmp_path / "strange" / "dataset.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "name": "stranger"}))
     with pytest.raises(

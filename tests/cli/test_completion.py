@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from gausim.cli._completion import _hydra_parser, complete
+from gausim.cli.completion import _hydra_parser, complete
 from gausim.cli.main import COMMANDS, main
 
 

@@ -13,12 +13,12 @@ import yaml
 from jsonschema import Draft7Validator
 from omegaconf import OmegaConf
 
-from gausim.cli import _validate
-from gausim.cli._conf import conf_dir
-from gausim.cli._config import compose
-from gausim.cli._places import GLOBAL_PACKAGE, read_places
-from gausim.cli._schema import training_schema
 from gausim.cli.main import main
+from gausim.compose import validate as _validate
+from gausim.compose.config import compose
+from gausim.compose.places import GLOBAL_PACKAGE, read_places
+from gausim.compose.root import conf_dir
+from gausim.compose.schema import training_schema
 from gausim.core import ConfigError
 
 FILES = sorted(
@@ -113,7 +113,7 @@ def test_arguments_are_those_of_the_signatures(schema) -> None:
 
 
 def test_the_schema_is_printed(capsys, schema, monkeypatch) -> None:
-    monkeypatch.setattr("gausim.cli._schema.training_schema", lambda: schema)
+    monkeypatch.setattr("gausim.compose.schema.training_schema", lambda: schema)
     assert main(["config", "schema"]) == 0
     assert json.loads(capsys.readouterr().out) == schema
 
@@ -140,7 +140,7 @@ def test_a_file_beside_conf_is_composed_as_with_config_dir(once, tmp_path, capsy
     assert main(["config", "validate", str(own), "sed=1"]) == 1
     assert capsys.readouterr().out.splitlines() == [
         "sed: unknown key. Did you mean 'seed'?",
-        "model.simulator.achor: unknown key of gausim.models.simulator.GausSim. Did you mean 'anchor'?",
+        "model.simulator.achor: unknown key of gausim.models.step.simulator.GausSim. Did you mean 'anchor'?",
     ]
 
 
@@ -164,7 +164,7 @@ def test_keys_that_hydra_merges_silently_are_named(once, capsys) -> None:
     wrong = ["+model.simulator.layer=3", "+callbacks.progess.refresh_rate=3", "+model.plan=null", "+model.plans=null"]
     assert main(["config", "validate", *wrong]) == 1
     told = capsys.readouterr().out
-    assert "model.simulator.layer: unknown key of gausim.models.simulator.GausSim. Did you mean 'layers'?" in told
+    assert "model.simulator.layer: unknown key of gausim.models.step.simulator.GausSim. Did you mean 'layers'?" in told
     assert "callbacks.progess: expected a node with `_target_`" in told and "Did you mean 'progress'?" in told
     assert "model.plans: unknown key. Did you mean 'plan'?" in told and told.count("\n") == 3
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from gausim.cli._data_paths import data_option, located, outside_files
+from gausim.compose.data_paths import data_option, located, outside_files
 from gausim.core import ConfigError, DataError
 
 

@@ -1,25 +1,23 @@
 from __future__ import annotations
 
 import json
-import runpy
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
+from helpers import toy_object
 
-from gausim.cli import _run, evaluate
+from gausim.cli import evaluate
+from gausim.compose import build as _run
 from gausim.core import DataError, RunError, SimState
 from gausim.data.objects import ObjectData
 from gausim.render.reference import ReferenceRenderer
-
-TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
 
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
     """A run whose model knows the toy's formula and reads the sequence from its initial state."""
-    toy = TOY["write_toy_object"](tmp_path / "data" / "toy")
+    toy = toy_object.write_toy_object(tmp_path / "data" / "toy")
     names = list(toy.amplitudes)
     initial = SimpleNamespace(previous=lambda sequence: toy.scene.means + sequence)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import runpy
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import played
 
-from gausim.cli import _run, export
+from gausim.cli import export
+from gausim.compose import build as _run
 from gausim.core import ConfigError, DataError
 from gausim.io.ply import load_scene, save_scene
 from gausim.io.ply_sequence import load_ply_sequence
@@ -16,13 +17,12 @@ from gausim.io.trajectory import load_trajectory
 from gausim.io.video import read_video
 from gausim.ops.deformed_scene import deformed_scene
 
-PLAYED = runpy.run_path(str(Path(__file__).parents[1] / "played.py"))
 FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh", "pinned")
 
 
 @pytest.fixture(scope="module")
 def loaded(tmp_path_factory: pytest.TempPathFactory):
-    return PLAYED["played_run"](tmp_path_factory.mktemp("played"))
+    return played.played_run(tmp_path_factory.mktemp("played"))
 
 
 @pytest.fixture

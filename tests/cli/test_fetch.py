@@ -16,18 +16,20 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from helpers.local_server import serving
+from helpers.toy_object import write_toy_object
 
-from gausim.cli import _fetch, card, fetch, simulate
+from gausim.cli import bring as _fetch
+from gausim.cli import card, fetch
 from gausim.cli import train as command
-from gausim.cli._run import load_run
+from gausim.cli.simulate import command as simulate
+from gausim.compose.build import load_run
 from gausim.core import BusyError, ConfigError, DataError, FetchError, RunError
-from gausim.engine.files import sole_writer
 from gausim.io import download
 from gausim.io.files import sha256
+from gausim.runs.files import sole_writer
 
 TESTS = Path(__file__).parents[1]
-write_toy_object = runpy.run_path(str(TESTS / "toy_object.py"))["write_toy_object"]
-serving = runpy.run_path(str(TESTS / "local_server.py"))["serving"]
 TINY = runpy.run_path(str(Path(__file__).with_name("test_train.py")))["TINY"]
 
 

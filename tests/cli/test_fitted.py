@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import csv
 import json
-import runpy
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+from helpers.toy_object import write_toy_object
 
-from gausim.cli import evaluate, report, simulate, train
-from gausim.cli._run import load_run
+from gausim.cli import evaluate, report, train
+from gausim.cli.simulate import command as simulate
+from gausim.compose.build import load_run
 from gausim.core import ConfigError
-from gausim.engine.checkpoint import read_checkpoint
-
-write_toy_object = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["write_toy_object"]
+from gausim.runs.checkpoint import read_checkpoint
 
 TINY = (
     "data.curriculum.t_max=3", "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1",
@@ -106,7 +105,7 @@ def test_a_resumed_fit_equals_an_uninterrupted_one(
     model: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     needs_warp(model)
-    from gausim.engine.callbacks import RunCheckpoint
+    from gausim.training.callbacks.resume import RunCheckpoint
 
     asked = [f"model={model}", *SMALL[model], *arguments, "callbacks.checkpoint.every_steps=1"]
     train.main([*asked, "name=whole"])
@@ -141,7 +140,7 @@ def test_a_resumed_fit_equals_an_uninterrupted_one(
 def test_a_budget_walks_through_all_stages_and_says_what_was_cut(
     arguments: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gausim.engine import callbacks
+    from gausim.training.callbacks import callbacks
 
     clock = iter(float(i) for i in range(10_000))  # every look at the clock takes a second
     monkeypatch.setattr(callbacks.time, "process_time", lambda: next(clock))

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import random
-import runpy
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import toy_object
 
 from gausim.cli import train
-from gausim.cli._live import ENERGY_ROOM, open_interaction
-from gausim.cli._run import load_run
+from gausim.compose.build import load_run
+from gausim.compose.live import ENERGY_ROOM, open_interaction
+from gausim.interaction.interaction import Interaction, replay
+from gausim.interaction.selections import Ball, Unit, Whole
+from gausim.interaction.session import Event, Force, Gravity, Impulse, Pin, Release, Unpin, Wind
 from gausim.ops.covariance import covariance_from_scales
-from gausim.view.interaction import Interaction, replay
-from gausim.view.selections import Ball, Unit, Whole
-from gausim.view.session import Event, Force, Gravity, Impulse, Pin, Release, Unpin, Wind
 
-TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
 TINY = (
     "model.simulator.radii=[0.3,0.7]", "model.simulator.template.modes=8", "model.simulator.template.solid=null",
     "model.simulator.hidden=8", "data.curriculum.t_max=3", "data.repeats=1", "data.batch_size=2",
@@ -48,7 +47,7 @@ def random_event(r: random.Random, live: Interaction) -> Event:
 @pytest.mark.slow
 def test_a_thousand_steps_of_random_forces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    root = TOY["write_toy_object"](tmp_path / "data" / "toy").root
+    root = toy_object.write_toy_object(tmp_path / "data" / "toy").root
     assert train.main([f"data.root={root}", *TINY]) == 0
     run = load_run("outputs/toy/seed_0")
     live = open_interaction(run, keep=None)

@@ -8,8 +8,8 @@ import cv2
 import pytest
 import torch
 
-from gausim.cli._config import compose
 from gausim.cli.main import main
+from gausim.compose.config import compose
 from gausim.core.scene import GaussianScene
 from gausim.io.ply import load_scene, masks_path, save_scene
 

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import json
-import runpy
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import toy_object
 from torch import Tensor
 
 from gausim.cli import evaluate
 from gausim.cli import train as command
-from gausim.cli._run import load_run
+from gausim.compose.build import load_run
 from gausim.core import Cameras, ConfigError, GaussianScene, RunError
-from gausim.engine.checkpoint import read_checkpoint
+from gausim.runs.checkpoint import read_checkpoint
 
-TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
 TINY = (
     "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
     "data.curriculum.t_start=2", "data.curriculum.t_max=2", "data.repeats=1", "trainer.max_epochs=2",
@@ -29,7 +28,7 @@ SHARED = ("model.network.", "model.node_normaliser.", "model.edge_normaliser.")
 
 def other_object(root: Path) -> Path:
     """An object of other kernels, frame rate, image size, cameras, frames and sequences than the toy's."""
-    means = TOY["toy_scene"]().means
+    means = toy_object.toy_scene().means
     scene = GaussianScene.create(
         means=torch.cat((means * 2, means[9:] * 2 + 0.1)),
         log_scales=torch.full((63, 3), -1.6),
@@ -39,18 +38,18 @@ def other_object(root: Path) -> Path:
         pinned=torch.cat((means, means[9:]))[:, 2] < 0.1,
         name="other",
     )
-    seen = TOY["cameras"]().select([0, 1])
+    seen = toy_object.cameras().select([0, 1])
     smaller = seen.Ks * torch.tensor([[0.75], [0.75], [1.0]])
     cameras = Cameras(seen.viewmats, smaller, 24, 20, ("left", "right"))
     amplitudes = {"a": 0.2, "b": 0.1, "c": -0.2}
     settings = {"frames": 12, "first_unseen": 6, "fps": 50.0, "amplitudes": amplitudes, "cameras": cameras}
-    return TOY["write_object"](TOY["ToyObject"](root, scene, **settings)).root
+    return toy_object.write_object(toy_object.ToyObject(root, scene, **settings)).root
 
 
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("stores")
-    return TOY["write_toy_object"](folder / "one" / "toy").root.parent, other_object(folder / "two")
+    return toy_object.write_toy_object(folder / "one" / "toy").root.parent, other_object(folder / "two")
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +123,7 @@ def test_a_frozen_network_stays_bit_by_bit_and_a_free_one_learns(
 def test_a_resumed_run_keeps_its_own_network(
     joint: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gausim.engine.callbacks import RunCheckpoint
+    from gausim.training.callbacks.resume import RunCheckpoint
 
     new, saved = other_object(tmp_path / "new"), RunCheckpoint.on_train_epoch_end
     whole = tune(new, joint["gausim"], tmp_path / "whole")

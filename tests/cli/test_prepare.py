@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file
 
-from gausim.cli import _prepare_lpips
+from gausim.cli import prepare_lpips as _prepare_lpips
 from gausim.cli.main import main
 from gausim.metrics import lpips_weights
 

@@ -1,19 +1,17 @@
 from __future__ import annotations
 
 import re
-import runpy
 from pathlib import Path
 
 import pytest
+from helpers import report_runs
 
 from gausim.cli import main as cli
-
-MADE = runpy.run_path(str(Path(__file__).parents[1] / "report" / "report_runs.py"))
 
 
 @pytest.fixture
 def sweep(tmp_path) -> Path:
-    return MADE["write_sweep"](tmp_path / "sweep")
+    return report_runs.write_sweep(tmp_path / "sweep")
 
 
 def test_the_whole_report(sweep, capsys):

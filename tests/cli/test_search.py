@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import runpy
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -11,24 +10,21 @@ from typing import Any
 import optuna
 import pytest
 import yaml
+from helpers.sweeps import dying, history, sweeper, write_toy_object
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 
 from gausim.cli import train as command
-from gausim.cli._optuna import distribution
+from gausim.cli.sweeps.optuna import distribution
 from gausim.core import ConfigError
 
-SHARED = runpy.run_path(str(Path(__file__).with_name("sweeps.py")))
-sweeper, dying, history, write_toy_object = (
-    SHARED[name] for name in ("sweeper", "dying", "history", "write_toy_object")
-)
 RATES = (
     "hydra/sweeper=optuna",
     "optimizer.network_lr=tag(log,interval(1e-4,1e-1))",
     "model.simulator.layers=range(1,3)",
 )
-FINISH = "gausim.engine.run.RunDirectory.finish"
-STEP = "gausim.engine.module.GausSimModule.training_step"
+FINISH = "gausim.runs.directory.RunDirectory.finish"
+STEP = "gausim.training.module.GausSimModule.training_step"
 
 Do = Callable[..., "tuple[int, str]"]
 
@@ -56,7 +52,7 @@ def test_a_killed_search_goes_on_with_what_it_would_have_tried(do: Do) -> None:
     # In the third trial, trained but not marked as finished; then after it was told, before the fourth is chosen.
     assert do("cut", *few, **dying(FINISH, 3))[0] == -9
     assert [state for state, _, _ in tried(do, "cut")] == ["complete"] * 2
-    assert do("cut", *few, **dying("gausim.cli._optuna.Search._ready", 2))[0] == -9
+    assert do("cut", *few, **dying("gausim.cli.sweeps.optuna.Search._ready", 2))[0] == -9
     assert [state for state, _, _ in tried(do, "cut")] == ["complete"] * 3
     status, output = do("cut", *few)
     assert status == 0, output

@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from gausim.cli import _simulate_scene, simulate
-from gausim.core import ConfigError, DataError, SceneError
-from gausim.io.ply import load_scene, save_scene
+from gausim.cli.simulate import command as simulate
+from gausim.core import ConfigError, DataError
 from gausim.io.trajectory import load_trajectory
 from gausim.io.video import read_video
 
-TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
 run = runpy.run_path(str(Path(__file__).with_name("test_evaluate.py")))["run"]
 
 
@@ -62,45 +60,3 @@ def test_run_and_scene_exclude_each_other(capsys):
         with pytest.raises(SystemExit):
             simulate.main(argv)
         assert "either a RUN or --scene" in capsys.readouterr().err
-
-
-@pytest.fixture
-def bare(tmp_path):
-    scene = TOY["toy_scene"]()
-    save_scene(scene, tmp_path / "toy.ply")
-    (tmp_path / "toy.masks.npz").unlink()
-    return scene, tmp_path / "toy.ply"
-
-
-def test_a_bare_scene_moves_and_stays_finite(bare, tmp_path, capsys):
-    scene, path = bare
-    options = ["--random-weights", "--pin-below", "z=0.1", "--steps", "7", "--size", "48", "--out", str(tmp_path / "o")]
-    assert simulate.main(["--scene", str(path), *options]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert "all finite: True" in lines[1] and lines[3] == f"video: {(tmp_path / 'o' / 'video.mp4').as_uri()}"
-    trajectory = load_trajectory(tmp_path / "o" / "trajectory.safetensors")
-    moved = (trajectory.positions - scene.means).abs().amax((0, 2))
-    assert trajectory.frames == 8 and (moved[scene.pinned] == 0).all() and (moved[~scene.pinned] > 0).all()
-    last = load_scene(tmp_path / "o" / "last_frame.ply")
-    assert torch.equal(last.means, trajectory.positions[-1])
-    assert len(list(read_video(tmp_path / "o" / "video.mp4"))) == 8
-    assert (tmp_path / "o" / "pictures.png").stat().st_size > 10_000
-
-
-def test_bare_scene_errors(bare):
-    _, path = bare
-    with pytest.raises(ConfigError, match="--random-weights"):
-        simulate.main(["--scene", str(path)])
-    with pytest.raises(SceneError, match="no kernel is pinned"):
-        simulate.main(["--scene", str(path), "--random-weights"])
-    with pytest.raises(ConfigError, match="nosuch"):
-        simulate.main(["--scene", str(path), "--random-weights", "--pin-below", "z=0.1", "--model", "nosuch"])
-
-
-def test_sway_grows_from_the_roots(bare):
-    scene = TOY["toy_scene"]()
-    state = _simulate_scene.initial_sway(scene, 0.01)
-    shift = (state.positions - state.previous)[:, 0]
-    assert (shift[scene.pinned] == 0).all() and (shift[~scene.pinned] > 0).all()
-    assert float(shift.max()) == pytest.approx(0.01 * scene.diagonal, rel=1e-5)
-    assert torch.equal(state.positions, scene.means)

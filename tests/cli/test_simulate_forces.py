@@ -3,26 +3,27 @@
 from __future__ import annotations
 
 import json
-import runpy
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import played
 
-from gausim.cli import _force_words, _run, main, simulate
+from gausim.cli import main
+from gausim.cli.simulate import command as simulate
+from gausim.compose import build as _run
 from gausim.core import ConfigError, DataError
+from gausim.interaction import words as _force_words
+from gausim.interaction.selections import Ball, Kernels, Unit, Whole
+from gausim.interaction.session import Force, Impulse, load_session, save_session
 from gausim.io.trajectory import load_trajectory
 from gausim.io.video import read_video
-from gausim.view.selections import Ball, Kernels, Unit, Whole
-from gausim.view.session import Force, Impulse, load_session, save_session
-
-PLAYED = runpy.run_path(str(Path(__file__).parents[1] / "played.py"))
 
 
 @pytest.fixture(scope="module")
 def loaded(tmp_path_factory: pytest.TempPathFactory):
-    return PLAYED["played_run"](tmp_path_factory.mktemp("played"))
+    return played.played_run(tmp_path_factory.mktemp("played"))
 
 
 @pytest.fixture

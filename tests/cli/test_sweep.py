@@ -5,28 +5,24 @@ from __future__ import annotations
 import json
 import os
 import random
-import runpy
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hydra
 import pytest
+from helpers.sweeps import dying, history, sweeper, write_toy_object
 from hydra.core.hydra_config import HydraConfig
 
-from gausim.cli import _conf
 from gausim.cli import train as command
+from gausim.compose import root as _conf
 from gausim.core import ConfigError
-from gausim.engine.checkpoint import digest, read_checkpoint
-from gausim.engine.files import sole_writer
+from gausim.runs.checkpoint import digest, read_checkpoint
+from gausim.runs.files import sole_writer
 
-SHARED = runpy.run_path(str(Path(__file__).with_name("sweeps.py")))
-sweeper, dying, history, write_toy_object = (
-    SHARED[name] for name in ("sweeper", "dying", "history", "write_toy_object")
-)
-FINISH = "gausim.engine.run.RunDirectory.finish"
-SAVED = "gausim.engine.checkpoint._check_written"
-STEP = "gausim.engine.module.GausSimModule.training_step"
+FINISH = "gausim.runs.directory.RunDirectory.finish"
+SAVED = "gausim.runs.checkpoint._check_written"
+STEP = "gausim.training.module.GausSimModule.training_step"
 
 Do = Callable[..., "tuple[int, str]"]
 

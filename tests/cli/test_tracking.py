@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.toy_object import write_toy_object
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gausim.cli import train as command
-from gausim.engine import panels
-from gausim.engine.checkpoint import read_checkpoint
-from gausim.engine.module import GausSimModule
+from gausim.runs.checkpoint import read_checkpoint
+from gausim.training.callbacks import panels
+from gausim.training.module import GausSimModule
 
 TESTS = Path(__file__).parents[1]
-write_toy_object = runpy.run_path(str(TESTS / "toy_object.py"))["write_toy_object"]
-FakeWandb = runpy.run_path(str(TESTS / "engine" / "test_dashboards.py"))["FakeWandb"]
+FakeWandb = runpy.run_path(str(TESTS / "training" / "test_dashboards.py"))["FakeWandb"]
 TINY = (
     "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
     "data.curriculum.t_max=2", "data.curriculum.t_start=1", "data.repeats=1", "data.batch_size=2",

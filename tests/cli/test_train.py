@@ -2,20 +2,18 @@ from __future__ import annotations
 
 import csv
 import json
-import runpy
 import shutil
 from pathlib import Path
 
 import pytest
 import torch
+from helpers.toy_object import write_toy_object
 
 from gausim.cli import evaluate
 from gausim.cli import train as command
-from gausim.cli._run import load_run
+from gausim.compose.build import load_run
 from gausim.core import ConfigError, RunError
-from gausim.engine.checkpoint import read_checkpoint
-
-write_toy_object = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["write_toy_object"]
+from gausim.runs.checkpoint import read_checkpoint
 
 TINY = (
     "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
@@ -116,7 +114,7 @@ def test_a_finished_run_is_refused_and_can_be_overwritten(arguments: list[str]) 
 def test_resuming_at_an_epochs_end_equals_an_uninterrupted_run(
     arguments: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gausim.engine.callbacks import RunCheckpoint
+    from gausim.training.callbacks.resume import RunCheckpoint
 
     command.main([*arguments, "name=whole"])
     saved = RunCheckpoint.on_train_epoch_end

@@ -1,17 +1,15 @@
 from __future__ import annotations
 
 import os
-import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+from helpers.toy_object import write_toy_object
 
-from gausim.engine.checkpoint import read_checkpoint
-
-write_toy_object = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))["write_toy_object"]
+from gausim.runs.checkpoint import read_checkpoint
 
 
 @pytest.mark.slow  # compiles everything from nothing

@@ -3,7 +3,7 @@ from __future__ import annotations
 import torch
 
 from gausim.data.images import composite
-from gausim.ops.compiled import torch_only
+from gausim.kernels.compiled import torch_only
 
 
 def test_compiled_and_torch_give_the_same_bits_for_every_value() -> None:

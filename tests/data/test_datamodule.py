@@ -13,7 +13,7 @@ from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SampleKey, SequenceIndex, TrainingDataset, collate
 from gausim.data.objects import ObjectData
 from gausim.data.sampler import SequenceBatchSampler
-from gausim.engine.ranks import interleave
+from gausim.training.ranks.ranks import interleave
 
 
 @pytest.fixture(scope="module")

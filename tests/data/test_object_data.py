@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from gausim.cli._config import compose
+from gausim.compose.config import compose
 from gausim.core import ConfigError, DataError, SceneError
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData, find_objects

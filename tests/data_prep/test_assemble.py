@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import runpy
 import shutil
 import sys
 from dataclasses import replace
@@ -17,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from helpers import toy_object
 
 from data_prep.assemble import AssembleOptions, assemble, main
 from data_prep.common.stage import read_manifest
@@ -30,14 +30,13 @@ from gausim.data.verify import verify
 from gausim.io.ply import load_scene, save_scene
 from gausim.io.transforms import write_transforms
 
-TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
 GREEN = np.array([0, 177, 64], np.uint8)
 RATE = Fraction(24)
 
 
 def add_stills(toy: Any, folder: Path) -> None:
     """Posed RGBA stills of the rest state, as `segment` leaves them."""
-    images = TOY["rgba"](toy.scene, toy.truth("seq_000", 1))[0]
+    images = toy_object.rgba(toy.scene, toy.truth("seq_000", 1))[0]
     entries = []
     for view, pixels in zip(toy.views.names, images, strict=True):
         (folder / "images").mkdir(parents=True, exist_ok=True)
@@ -49,7 +48,7 @@ def add_stills(toy: Any, folder: Path) -> None:
 @pytest.fixture
 def toy(tmp_path: Path) -> Any:
     """What `segment` leaves: stills and sequences with poses, no dataset.json; the scene apart."""
-    found = TOY["write_toy_object"](tmp_path / "cut", frames=9)
+    found = toy_object.write_toy_object(tmp_path / "cut", frames=9)
     add_stills(found, tmp_path / "cut")
     (tmp_path / "scene").mkdir()
     for name in ("scene.ply", "scene.masks.npz"):
@@ -192,12 +191,14 @@ class Capture:
     """A capture of the toy as a user has it: films of three cameras before a green screen, photos, a calibration."""
 
     def __init__(self, folder: Path) -> None:
-        narrow = TOY["cameras"]()
+        narrow = toy_object.cameras()
         wide = narrow.Ks * torch.tensor([2.0, 2.0, 1.0])[:, None]
         views = Cameras(narrow.viewmats, wide, 64, 64, narrow.names)
-        self.toy = TOY["ToyObject"](folder, TOY["toy_scene"](), frames=12, cameras=views)
+        self.toy = toy_object.ToyObject(folder, toy_object.toy_scene(), frames=12, cameras=views)
         self.folder = folder
-        self.motion = {name: TOY["rgba"](self.toy.scene, self.toy.truth(name), views) for name in self.toy.amplitudes}
+        self.motion = {
+            name: toy_object.rgba(self.toy.scene, self.toy.truth(name), views) for name in self.toy.amplitudes
+        }
         self._write_photos()
 
     def _before_green(self, rgba: torch.Tensor) -> np.ndarray:

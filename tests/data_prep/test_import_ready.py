@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import os
 import pickle
-import runpy
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from helpers import colmap_files
+from helpers.toy_object import toy_scene
 
 from data_prep.import_ready import ReadyOptions, import_ready, main
 from data_prep.scenes.ready import read_pins
@@ -21,8 +22,6 @@ from gausim.io.ply import load_scene, save_scene
 from gausim.io.transforms import read_transforms
 
 tests = Path(__file__).parents[1]
-files = runpy.run_path(str(tests / "colmap_files.py"))
-toy_scene = runpy.run_path(str(tests / "toy_object.py"))["toy_scene"]
 SIZE = 32, 24
 FRAMES = 3
 OPTIONS = ReadyOptions(train_frames=2)
@@ -54,8 +53,8 @@ def ready(tmp_path: Path) -> Path:
     cameras = {1: ("PINHOLE", 2 * SIZE[0], 2 * SIZE[1], [60.0, 60.0, 32.0, 24.0])}
     names = ["still_a.png", "still_b.png"]
     names += [f"{s}_cam_{c:05d}.png" for s, views in VIDEOS.items() if s != "seq_00002" for c in views]
-    images = {i: (name, 1, *files["turntable"](0.5 * i), []) for i, name in enumerate(names)}
-    files["write_binary"](root / "sparse" / "0", cameras, images, files["small_model"]()[2])
+    images = {i: (name, 1, *colmap_files.turntable(0.5 * i), []) for i, name in enumerate(names)}
+    colmap_files.write_binary(root / "sparse" / "0", cameras, images, colmap_files.small_model()[2])
     for name in names:
         image(root / "images" / name, 120)
     for name in names[:2]:

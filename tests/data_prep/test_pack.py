@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import runpy
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers import toy_object
 
 from data_prep import pack as command
 from data_prep.pack import pack
@@ -24,12 +24,10 @@ from gausim.io import packed_writer
 from gausim.io.packed import HEADER, PIXELS, read_packed
 from gausim.io.packed_writer import bounding_crop
 
-TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
-
 
 @pytest.fixture(scope="module")
 def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return TOY["write_toy_object"](tmp_path_factory.mktemp("data") / "toy", frames=9).root
+    return toy_object.write_toy_object(tmp_path_factory.mktemp("data") / "toy", frames=9).root
 
 
 @pytest.fixture(scope="module")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import runpy
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from helpers import colmap_files
 
 from data_prep import poses as command
 from data_prep.cameras.lenses import rays_of, straighten
@@ -24,7 +24,6 @@ from gausim.data.records import SequenceRecord
 from gausim.io.colmap import ColmapCamera
 from gausim.io.transforms import read_transforms
 
-files = runpy.run_path(str(Path(__file__).parents[1] / "colmap_files.py"))
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 AZIMUTHS = (0.35, 0.55, 0.75, 0.95, 1.15, 1.35)
 OPTIONS = MappingOptions(camera_model="SIMPLE_PINHOLE", features=1500, feature_size=WIDTH)
@@ -247,10 +246,10 @@ def test_projection_matrices_are_taken_over(tmp_path: Path) -> None:
 
 
 def test_distances_and_up_make_the_world(tmp_path: Path) -> None:
-    cameras, images, points = files["small_model"](size=(WIDTH, HEIGHT))
+    cameras, images, points = colmap_files.small_model(size=(WIDTH, HEIGHT))
     cameras = {1: ("PINHOLE", WIDTH, HEIGHT, [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2])}
     images = {n: (f"photo_{n}.png", 1, *i[2:4], []) for n, i in images.items()}
-    files["write_text"](tmp_path / "model", cameras, images, points)
+    colmap_files.write_text(tmp_path / "model", cameras, images, points)
     (tmp_path / "photos").mkdir()
     for name, *_ in images.values():
         cv2.imwrite(str(tmp_path / "photos" / name), np.zeros((HEIGHT, WIDTH, 3), np.uint8))

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import runpy
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from helpers import toy_object
 
 from data_prep import prepare as command
 from data_prep.prepare import Job, plan, prepare
 from gausim.core import ConfigError
 from gausim.data.verify import verify
-
-TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
 
 
 def _config(folder: Path, text: str) -> Path:
@@ -66,7 +64,7 @@ def test_broken_configurations_are_named(tmp_path: Path, text: str, what: str) -
 
 
 def test_a_real_stage_runs_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    TOY["write_toy_object"](tmp_path / "toy", frames=9)
+    toy_object.write_toy_object(tmp_path / "toy", frames=9)
     config = _config(tmp_path, "{work: work, stages: {pack: {root: toy, margin: 1}}}")
     assert command.main([str(config)]) == 0 and "made: 2 sequences" in capsys.readouterr().out
     assert verify(tmp_path / "work" / "pack") == []

@@ -11,9 +11,9 @@ import torch
 from data_prep import prepare, reconstruct
 from gausim.core import Cameras
 from gausim.data.images import write_rgba
-from gausim.engine.reconstruction import Reconstruction
 from gausim.io.ply import load_scene
 from gausim.io.transforms import write_transforms
+from gausim.reconstruction.reconstruction import Reconstruction
 
 SIZE, RADIUS = 36, 0.5
 OPTIONS = ["--iterations", "60", "--kernels", "60", "--coarse", "0"]

@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import math
-import runpy
 import shutil
 from pathlib import Path
 
 import pytest
 import torch
+from helpers import toy_object
 
 from gausim.core import Cameras, GaussianScene, Trajectory
 
-TOY = runpy.run_path(str(Path(__file__).parents[1] / "toy_object.py"))
 SIZE, FRAMES, OMEGA = 64, 32, 0.7
 VIEWS = ("cam_0", "cam_1", "cam_2", "cam_3")
 # Direction and phase of the two swings of each sequence.
 SWINGS = {"seq_000": (0.3, 0.0), "seq_001": (1.4, 0.9), "seq_002": (2.3, 1.7), "seq_003": (-0.8, 2.4)}
 
 
-class Swaying(TOY["ToyObject"]):
+class Swaying(toy_object.ToyObject):
     """Sways about its pinned foot in two directions that come and go."""
 
     def truth(self, sequence: str, frames: int | None = None) -> Trajectory:
@@ -72,7 +71,7 @@ def swaying(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One object that is in order, not to be changed."""
     root = tmp_path_factory.mktemp("doctor") / "swaying"
     toy = Swaying(root, body(), FRAMES, 16, amplitudes=dict.fromkeys(SWINGS, 1.0), cameras=ring())
-    TOY["write_object"](toy)
+    toy_object.write_object(toy)
     return root
 
 

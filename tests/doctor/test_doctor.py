@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import json
-import runpy
 import shutil
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from helpers import mistakes
 
 from gausim.cli.main import main
 from gausim.doctor.coverage import seen_angle
 
 HERE = Path(__file__).parent
-TOOLS = runpy.run_path(str(HERE.parent / "mistakes.py"))
-MISTAKES = TOOLS["MISTAKES"]
+MISTAKES = mistakes.MISTAKES
 VIEWS = ("cam_0", "cam_1", "cam_2", "cam_3")
 
 
@@ -110,7 +109,7 @@ def test_a_folder_within_an_object_is_sent_to_the_object(swaying: Path, capsys: 
 
 @pytest.mark.slow
 def test_the_size_of_a_move_is_measured(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    TOOLS["moved_camera"](spoilt, view=2, degrees=3.0)
+    mistakes.moved_camera(spoilt, view=2, degrees=3.0)
     _, entry = told(spoilt, capsys)
     finding = found(entry)["calibration"]
     assert "cam_2 is off by about 3.0 degrees" in finding["what"]
@@ -122,7 +121,7 @@ def test_the_size_of_a_move_is_measured(spoilt: Path, capsys: pytest.CaptureFixt
 def test_a_camera_out_of_step_in_one_sequence_only(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     aside = spoilt.parent / "aside"
     shutil.copytree(spoilt / "sequences", aside)
-    TOOLS["out_of_step"](spoilt, view=3, frames=3)
+    mistakes.out_of_step(spoilt, view=3, frames=3)
     for name in ("seq_000", "seq_001", "seq_003"):
         shutil.rmtree(spoilt / "sequences" / name)
         shutil.copytree(aside / name, spoilt / "sequences" / name)
@@ -133,7 +132,7 @@ def test_a_camera_out_of_step_in_one_sequence_only(spoilt: Path, capsys: pytest.
 
 
 def change_images(root: Path, change, pattern: str = "*/*/*") -> None:
-    TOOLS["every_image"](root, change, pattern)
+    mistakes.every_image(root, change, pattern)
 
 
 @pytest.mark.slow
@@ -174,7 +173,7 @@ def test_an_object_that_is_cut_off(spoilt: Path, capsys: pytest.CaptureFixture[s
             if entry["camera"] == "cam_1":
                 entry.update({"fl_x": data["fl_x"], "fl_y": data["fl_y"], "cx": data["cx"] - 20, "cy": data["cy"]})
 
-    TOOLS["every_transforms"](spoilt, crop)
+    mistakes.every_transforms(spoilt, crop)
     change_images(spoilt, lambda p: np.concatenate((p[:, 20:], np.zeros_like(p[:, :20])), 1), "*/cam_1/*")
     _, entry = told(spoilt, capsys)
     assert "The object is cut off at the left of cam_1" in found(entry)["views"]["what"]
@@ -187,7 +186,7 @@ def test_a_tiny_object(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None
         small[24:40, 24:40] = cv2.resize(pixels, (16, 16), interpolation=cv2.INTER_AREA)
         return small
 
-    TOOLS["every_transforms"](spoilt, lambda data: data.update(fl_x=data["fl_x"] / 4, fl_y=data["fl_y"] / 4))
+    mistakes.every_transforms(spoilt, lambda data: data.update(fl_x=data["fl_x"] / 4, fl_y=data["fl_y"] / 4))
     change_images(spoilt, shrink)
     _, entry = told(spoilt, capsys)
     assert "The object is tiny in cam_" in found(entry)["views"]["what"]
@@ -201,7 +200,7 @@ def test_opposite_views_see_depth_no_better_than_equal_ones() -> None:
 
 
 def test_few_frames_and_sequences(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    TOOLS["edit"](spoilt / "dataset.json", lambda data: data.update(train_frames=[0, 4]))
+    mistakes.edit(spoilt / "dataset.json", lambda data: data.update(train_frames=[0, 4]))
     for name in ("seq_001", "seq_002", "seq_003"):
         shutil.rmtree(spoilt / "sequences" / name)
     status, entry = told(spoilt, capsys)
@@ -220,7 +219,7 @@ def test_pins_may_be_given(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> 
 @pytest.mark.slow
 def test_without_a_scene_the_rest_is_examined(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (spoilt / "scene.ply").unlink()
-    TOOLS["out_of_step"](spoilt, view=0, frames=2)
+    mistakes.out_of_step(spoilt, view=0, frames=2)
     status, entry = told(spoilt, capsys)
     assert status == 1 and "cam_0 is out of step" in found(entry)["clock"]["what"]
     notes = [f for f in entry["findings"] if f["severity"] == "note" and f["check"] == "calibration"]
@@ -269,7 +268,7 @@ def test_pictures_and_page(swaying: Path, tmp_path: Path, capsys: pytest.Capture
 
 @pytest.mark.slow
 def test_the_page_shows_findings_and_escapes_names(spoilt: Path, tmp_path: Path) -> None:
-    TOOLS["edit"](spoilt / "dataset.json", lambda data: data.update(name="<b>$x$"))
+    mistakes.edit(spoilt / "dataset.json", lambda data: data.update(name="<b>$x$"))
     MISTAKES["one camera moved"](spoilt)
     assert main(["doctor", str(spoilt), "--out", str(tmp_path / "seen")]) == 1
     page = (tmp_path / "seen" / "index.html").read_text()
@@ -292,7 +291,7 @@ def bunny(data_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     source, folder = data_root / "bunny", tmp_path_factory.mktemp("bunny")
     options = ["--pin-below", "z=0.33", "--iterations", "1500"]
     assert main(["reconstruct", str(source), "--out", str(folder / "rest.ply"), *options]) == 0
-    return TOOLS["copy_object"](source, folder / "good", scene=folder / "rest.ply", sequences=4)
+    return mistakes.copy_object(source, folder / "good", scene=folder / "rest.ply", sequences=4)
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import runpy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -14,6 +13,7 @@ import av
 import cv2
 import numpy as np
 import torch
+from helpers import colmap_files, toy_object
 
 from data_prep.cameras.sources import read_lens_transforms, read_projections
 from data_prep.common.photos import open_photo, read_photo
@@ -31,22 +31,20 @@ from gausim.data.images import read_rgba
 from gausim.data.objects import ObjectData
 from gausim.data.records import read_array, read_stills
 from gausim.data.verify import verify
-from gausim.engine.run import RunDirectory
+from gausim.interaction.events import Force, Pin, Reset
+from gausim.interaction.selections import Ball, Kernels
+from gausim.interaction.session import Entry, ForceSession, MadeWith, load_session, save_session
 from gausim.io.colmap import read_colmap
 from gausim.io.ply import load_masks, load_points, load_scene
 from gausim.io.ply_sequence import load_ply_sequence, save_ply_sequence
 from gausim.io.trajectory import load_trajectory, save_trajectory
 from gausim.io.transforms import read_json, read_transforms
 from gausim.io.video import read_video, video_rate
-from gausim.report.summary import SCHEMA, load_summary
-from gausim.view.events import Force, Pin, Reset
-from gausim.view.selections import Ball, Kernels
-from gausim.view.session import Entry, ForceSession, MadeWith, load_session, save_session
+from gausim.results.summary import SCHEMA, load_summary
+from gausim.runs.directory import RunDirectory
 
 TESTS = Path(__file__).parents[1]
-TOY = runpy.run_path(str(TESTS / "toy_object.py"))
-COLMAP = runpy.run_path(str(TESTS / "colmap_files.py"))
-SCENE = TOY["toy_scene"]()
+SCENE = toy_object.toy_scene()
 
 _MADE = MadeWith("toy", "0" * 64, "1" * 64, "2" * 64)
 _PUSH = Force(on=Ball((0.0, 0.0, 1.0), 0.2), direction=(1.0, 0.0, 0.0), weights=2.0, frames=3)
@@ -81,7 +79,7 @@ def readers(folder: Path) -> list[Reader]:
 
 
 def _scenes(folder: Path) -> Iterator[Reader]:
-    toy = TOY["ToyObject"](folder / "scene", SCENE)
+    toy = toy_object.ToyObject(folder / "scene", SCENE)
     (folder / "scene").mkdir()
     from gausim.io.ply import save_scene
 
@@ -110,7 +108,7 @@ def _scenes(folder: Path) -> Iterator[Reader]:
 
 
 def _object(folder: Path) -> Iterator[Reader]:
-    toy = TOY["write_toy_object"](folder / "object", frames=8)
+    toy = toy_object.write_toy_object(folder / "object", frames=8)
     root, sequence = toy.root, toy.root / "sequences" / "seq_000"
 
     def whole(_: Path) -> Any:
@@ -128,7 +126,7 @@ def _object(folder: Path) -> Iterator[Reader]:
 
 
 def _store(folder: Path) -> Iterator[Reader]:
-    root = TOY["write_toy_object"](folder / "packing", frames=8).root
+    root = toy_object.write_toy_object(folder / "packing", frames=8).root
     pack(root, folder / "store")
     place = folder / "store" / "sequences" / "seq_001"
 
@@ -151,8 +149,8 @@ def _store(folder: Path) -> Iterator[Reader]:
 def _posed(folder: Path) -> Iterator[Reader]:
     root = folder / "posed"
     (root / "images").mkdir(parents=True)
-    views = TOY["cameras"]()
-    pixels = TOY["rgba"](SCENE, TOY["ToyObject"](root, SCENE).truth("seq_000", 1))[0]
+    views = toy_object.cameras()
+    pixels = toy_object.rgba(SCENE, toy_object.ToyObject(root, SCENE).truth("seq_000", 1))[0]
     from gausim.data.images import write_rgba
     from gausim.io.transforms import write_transforms
 
@@ -174,7 +172,7 @@ def _posed(folder: Path) -> Iterator[Reader]:
 def _colmap(folder: Path) -> Iterator[Reader]:
     for suffix in ("binary", "text"):
         place = folder / f"colmap_{suffix}"
-        COLMAP[f"write_{suffix}"](place, *COLMAP["small_model"]())
+        getattr(colmap_files, f"write_{suffix}")(place, *colmap_files.small_model())
         for path in sorted(place.iterdir()):
             yield Reader(f"colmap {path.name}", path, suffix, lambda p: read_colmap(p.parent), 6)
 
@@ -182,9 +180,9 @@ def _colmap(folder: Path) -> Iterator[Reader]:
 def _ready(folder: Path) -> Iterator[Reader]:
     root, size = folder / "ready", (32, 24)
     names = ["still.png", "seq_00001_cam_00000.png", "seq_00001_cam_00001.png"]
-    images = {i: (name, 1, *COLMAP["turntable"](0.5 * i), []) for i, name in enumerate(names)}
+    images = {i: (name, 1, *colmap_files.turntable(0.5 * i), []) for i, name in enumerate(names)}
     cameras = {1: ("PINHOLE", *size, [60.0, 60.0, 16.0, 12.0])}
-    COLMAP["write_binary"](root / "sparse" / "0", cameras, images, COLMAP["small_model"]()[2])
+    colmap_files.write_binary(root / "sparse" / "0", cameras, images, colmap_files.small_model()[2])
     for name in names:
         _picture(root / "images" / name, size)
     for camera in ("cam_00000", "cam_00001"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import random
-import runpy
 import struct
 import tracemalloc
 from collections.abc import Callable
@@ -12,24 +11,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import colmap_files
 
 from gausim.core import DataError
 from gausim.io.colmap import ColmapCamera, ColmapModel, find_colmap, read_colmap
 
-files = runpy.run_path(str(Path(__file__).parents[1] / "colmap_files.py"))
-WRITERS: dict[str, Callable] = {"binary": files["write_binary"], "text": files["write_text"]}
+WRITERS: dict[str, Callable] = {"binary": colmap_files.write_binary, "text": colmap_files.write_text}
 MUTATIONS = 400
 
 
 @pytest.fixture(params=list(WRITERS))
 def model(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    WRITERS[request.param](tmp_path, *files["small_model"]())
+    WRITERS[request.param](tmp_path, *colmap_files.small_model())
     return tmp_path
 
 
 def test_both_forms_say_what_was_written(model: Path) -> None:
     read = read_colmap(model)
-    cameras, images, points = files["small_model"]()
+    cameras, images, points = colmap_files.small_model()
     assert {n: (c.model, c.width, c.height, c.params.tolist()) for n, c in read.cameras.items()} == cameras
     assert [i.name for i in read.images] == ["photo_0.png", "photo_1.png", "sub/photo_2.png"]
     assert read.images[1].camera == 7 and read.images[1].point_ids.tolist() == [5, 9]
@@ -55,12 +54,12 @@ def test_pycolmap_reads_the_same(model: Path) -> None:
         np.testing.assert_allclose((k[0, 0], k[1, 1], k[0, 2], k[1, 2]), camera.intrinsics)
 
 
-@pytest.mark.parametrize("name", files["MODEL_NUMBERS"])
+@pytest.mark.parametrize("name", colmap_files.MODEL_NUMBERS)
 def test_every_lens_model_is_read_with_its_intrinsics(tmp_path: Path, name: str) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     theirs = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
     theirs.params = [v + 0.01 * i for i, v in enumerate(theirs.params)]
-    _, images, points = files["small_model"]()
+    _, images, points = colmap_files.small_model()
     images = {n: (i[0], 1, *i[2:]) for n, i in images.items()}
     for form, write in WRITERS.items():
         write(tmp_path / form, {1: (name, 640, 480, [float(v) for v in theirs.params])}, images, points)
@@ -80,7 +79,7 @@ def test_a_scaled_camera_sees_the_same_directions() -> None:
 
 
 def test_the_model_is_found_where_colmap_puts_it(tmp_path: Path) -> None:
-    files["write_binary"](tmp_path / "sparse" / "0", *files["small_model"]())
+    colmap_files.write_binary(tmp_path / "sparse" / "0", *colmap_files.small_model())
     assert find_colmap(tmp_path) == find_colmap(tmp_path / "sparse") == tmp_path / "sparse" / "0"
     (tmp_path / "sparse" / "0" / "points3D.bin").unlink()
     assert len(read_colmap(find_colmap(tmp_path)).points.ids) == 0
@@ -119,7 +118,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_faults_are_named_with_file_and_field(tmp_path: Path, fault: str) -> None:
-    files["write_text"](tmp_path, *files["small_model"]())
+    colmap_files.write_text(tmp_path, *colmap_files.small_model())
     role, old, new, message = FAULTS[fault]
     path = tmp_path / f"{role}.txt"
     text = path.read_text()
@@ -131,17 +130,17 @@ def test_faults_are_named_with_file_and_field(tmp_path: Path, fault: str) -> Non
 
 
 def test_a_quaternion_that_is_none_is_refused(tmp_path: Path) -> None:
-    cameras, images, points = files["small_model"]()
+    cameras, images, points = colmap_files.small_model()
     for bad in ((0.0, 0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0), (float("nan"), 0.0, 0.0, 1.0)):
         images[3] = (*images[3][:2], bad, *images[3][3:])
-        files["write_binary"](tmp_path, cameras, images, points)
+        colmap_files.write_binary(tmp_path, cameras, images, points)
         with pytest.raises(DataError, match="'quaternion'"):
             read_colmap(tmp_path)
 
 
 @pytest.mark.parametrize("role", ["cameras", "images", "points3D"])
 def test_counts_are_not_believed(tmp_path: Path, role: str) -> None:
-    files["write_binary"](tmp_path, *files["small_model"]())
+    colmap_files.write_binary(tmp_path, *colmap_files.small_model())
     path = tmp_path / f"{role}.bin"
     whole = path.read_bytes()
     tracemalloc.start()
@@ -159,7 +158,7 @@ def test_counts_are_not_believed(tmp_path: Path, role: str) -> None:
 
 
 def test_memory_stays_in_proportion_to_the_files(tmp_path: Path) -> None:
-    cameras, images, points = files["small_model"]()
+    cameras, images, points = colmap_files.small_model()
     many = [(float(i % 60), 3.0, i + 20) for i in range(4000)]
     images[3] = (*images[3][:4], many)
     points = points + [(i + 20, (0.1, 0.2, 0.3), (1, 2, 3), 0.5, []) for i in range(4000)]
@@ -205,7 +204,7 @@ def _is_sound(model: ColmapModel) -> bool:
 
 @pytest.mark.parametrize("form", list(WRITERS))
 def test_mutated_files_are_refused_by_name_or_sound(tmp_path: Path, form: str) -> None:
-    WRITERS[form](tmp_path, *files["small_model"]())
+    WRITERS[form](tmp_path, *colmap_files.small_model())
     rng, refused = random.Random(7), 0
     paths = sorted(tmp_path.iterdir())
     contents = {path: path.read_bytes() for path in paths}

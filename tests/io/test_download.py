@@ -1,16 +1,15 @@
 from __future__ import annotations
 
 import random
-import runpy
 from pathlib import Path
 
 import pytest
+from helpers.local_server import serving
 
 from gausim.core import FetchError
 from gausim.io import download
 from gausim.io.download import continue_download, read_text
 
-serving = runpy.run_path(str(Path(__file__).parents[1] / "local_server.py"))["serving"]
 DATA = random.Random(0).randbytes(700_000)
 
 

@@ -1,15 +1,14 @@
 from __future__ import annotations
 
-import runpy
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from helpers.local_server import serving
 
 from gausim.core import FetchError
 from gausim.io.registry import SCHEMA, Entry, entry_text, mirrored, read_registry
 
-serving = runpy.run_path(str(Path(__file__).parents[1] / "local_server.py"))["serving"]
 ENTRY = Entry(
     name="flower", kind="run", title='A "flower", ä \\ 😀', file="flower.tar", sha256="0" * 63 + "f", size=10,
     unpacked=8, licence="CC-BY-4.0", addresses=("flower.tar", "https://example.org/flower.tar"), card="flower.md",

@@ -18,9 +18,9 @@ import pytest
 import torch
 
 from gausim.core import ConfigError
+from gausim.kernels.compiled import torch_only
+from gausim.kernels.image_loss import FAST, blur_moments, gather_row, spread_along_width, ssim_slopes
 from gausim.losses import ImageLoss
-from gausim.losses.fused import FAST, blur_moments, gather_row, spread_along_width, ssim_slopes
-from gausim.ops.compiled import torch_only
 
 # A sum over as many pixels as a full register holds: an addition, or one fused with its product (which of the two LLVM
 # takes differs between processors).

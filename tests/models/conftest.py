@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gausim.core import GaussianScene, SimState
-from gausim.models.simulator import GausSim
+from gausim.models.step.simulator import GausSim
 
 
 def _scene(count: int = 70, *, seed: int = 0, dtype: torch.dtype = torch.float32, spare: int = 6) -> GaussianScene:

@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 import torch
 
-from gausim.models.elastic import ElasticTemplate
+from gausim.models.template.elastic import ElasticTemplate
 
 LEVELS = pytest.mark.parametrize(
     ("predicted", "graph"), [((2, 1), (0.8, 0.35)), ((1,), (0.5,)), ((0,), (0.3,)), ((2, 0), (0.8, 0.3))]

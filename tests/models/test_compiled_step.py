@@ -10,11 +10,11 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from gausim.core import SimState
-from gausim.models import features, recursion
-from gausim.models.elastic import ElasticTemplate
-from gausim.models.recursion import Inheritance, Solved, Units
+from gausim.kernels.compiled import fits, torch_only
+from gausim.models.step import features, recursion
+from gausim.models.step.recursion import Inheritance, Solved, Units
+from gausim.models.template.elastic import ElasticTemplate
 from gausim.ops import aggregation
-from gausim.ops.compiled import fits, torch_only
 from gausim.ops.deformation import bounded_deformation, gradient_from_output, polar_rotation
 
 NAMES = ("positions", "gradients", "rotations", "momentum")

@@ -15,10 +15,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
 from gausim.core import ConfigError, SimState
-from gausim.models.cuda_graph import GraphedStep, StepFunction
-from gausim.models.elastic import ElasticTemplate
-from gausim.models.simulator import GausSim
-from gausim.models.template import RestTemplate
+from gausim.models.rollout.cuda_graph import GraphedStep, StepFunction
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.step.simulator import GausSim
+from gausim.models.template.elastic import ElasticTemplate
+from gausim.models.template.template import RestTemplate
 
 TEMPLATES = {"rest": RestTemplate, "elastic": partial(ElasticTemplate, modes=8, neighbours=6, hidden=8)}
 # What makes the host wait for the device, or gives a shape that depends on values: by name in Python and in ATen.
@@ -183,7 +184,7 @@ def test_what_asks_is_found(ask: Callable) -> None:
 def test_rollouts_on_the_cpu_capture_nothing(make_scene: Callable, make_model: Callable, make_state: Callable) -> None:
     scene = make_scene(50)
     found = [
-        make_model(scene, cuda_graph=chosen).dynamics().rollout(make_state(scene), 3).positions
+        SceneDynamics(make_model(scene, cuda_graph=chosen)).rollout(make_state(scene), 3).positions
         for chosen in (False, True)
     ]
     assert torch.equal(*found) and not torch.equal(found[0][0], found[0][3])
@@ -251,6 +252,6 @@ def test_gpu_rollouts_are_captured_where_it_is_asked_for(bound: Callable, monkey
         model, state = bound(cuda_graph=chosen)
         state = on_gpu(model, state)
         first = SimState(state.positions[:50], state.previous[:50])
-        found.append(model.dynamics().rollout(first, 5).positions)
+        found.append(SceneDynamics(model).rollout(first, 5).positions)
         assert len(replays) == 5 * chosen
     torch.testing.assert_close(found[0], found[1], atol=1e-5, rtol=1e-5)

@@ -6,13 +6,14 @@ import pytest
 import torch
 
 from gausim.core import ConfigError, DivergenceError, Dynamics, SceneError, SimState
-from gausim.models.simulator import GausSim
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.step.simulator import GausSim
 
 
 def test_offers_the_protocol_and_rolls_out_what_steps_give(make_scene, make_model, make_state) -> None:
     scenes = [make_scene(50), make_scene(60, seed=1)]
     model = make_model(scenes)
-    dynamics = model.dynamics(1)
+    dynamics = SceneDynamics(model, 1)
     assert isinstance(dynamics, Dynamics)
     state = make_state(scenes[1])
     force = torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
@@ -41,7 +42,7 @@ def test_rollout_leaves_mode_and_statistics_alone(make_scene, make_model, make_s
     scene = make_scene(50)
     model = make_model(scene).train()
     before = {k: v.clone() for k, v in model.state_dict().items()}
-    model.dynamics().rollout(make_state(scene), 3)
+    SceneDynamics(model).rollout(make_state(scene), 3)
     assert model.training and model.node_normaliser.training
     assert all(torch.equal(v, before[k]) for k, v in model.state_dict().items())
 
@@ -49,7 +50,7 @@ def test_rollout_leaves_mode_and_statistics_alone(make_scene, make_model, make_s
 def test_points_are_carried_by_the_unit_of_their_kernel(make_scene, make_model, make_state) -> None:
     scene = make_scene(80, dtype=torch.float64)
     model = make_model(scene, output_scale=3.0)
-    trajectory = model.dynamics().rollout(make_state(scene), 3)
+    trajectory = SceneDynamics(model).rollout(make_state(scene), 3)
     generator = torch.Generator().manual_seed(0)
     kernel = torch.randint(0, 80, (50,), generator=generator)
     points = scene.means[kernel] + 0.02 * torch.randn(50, 3, generator=generator, dtype=torch.float64)
@@ -84,14 +85,14 @@ def test_numbers_that_are_not_finite_stop_the_rollout_and_name_the_frame(
     model = make_model(scene, edges=edges)
     state, nan = make_state(scene), torch.full((50, 3), float("nan"))
     with pytest.raises(DivergenceError, match="column0: positions are not finite at frame 0"):
-        model.dynamics().rollout(SimState(state.positions, nan), 3)
+        SceneDynamics(model).rollout(SimState(state.positions, nan), 3)
     with pytest.raises(DivergenceError, match="column0: forces are not finite at frame 2"):
-        model.dynamics().rollout(state, 3, forces=lambda frame: nan if frame == 2 else None)
+        SceneDynamics(model).rollout(state, 3, forces=lambda frame: nan if frame == 2 else None)
     with torch.no_grad():
         model.network.decoder[-1].bias.fill_(float("nan"))
     model.train()
     with pytest.raises(DivergenceError, match="column0: positions are not finite at frame 1"):
-        model.dynamics().rollout(state, 3)
+        SceneDynamics(model).rollout(state, 3)
     assert model.training  # restored after the error too
 
 

@@ -9,11 +9,12 @@ import scipy.linalg
 import torch
 
 from gausim.core import SimState
-from gausim.models.elastic import ElasticScene, ElasticTemplate
-from gausim.models.hierarchy import Hierarchy, build_hierarchy
+from gausim.models.hierarchy.clusters import Hierarchy, build_hierarchy
 from gausim.models.initial_state import ModalInitialStates
-from gausim.models.springs import mode_gradients, spring_network, vibration_modes
-from gausim.models.template import Motion
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.template.elastic import ElasticScene, ElasticTemplate
+from gausim.models.template.springs import mode_gradients, spring_network, vibration_modes
+from gausim.models.template.template import Motion
 
 
 def _spring_block(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -244,7 +245,7 @@ def test_simulator_carries_a_mode_through_its_whole_recursion(make_scene, make_m
     offset = scene.means - initial.previous(0)  # amplitude times the first mode, at every kernel
     angle = 2 * math.atan(math.pi / 12.0)
     start = SimState(scene.means, scene.means - offset * math.sin(angle))
-    trajectory = model.dynamics().rollout(start, 40)
+    trajectory = SceneDynamics(model).rollout(start, 40)
     level, unit = model.hierarchies[0].levels[1], model.hierarchies[0].ancestor(0, 1)
     moved = trajectory.positions[:, model.hierarchies[0].kernels] - level.rest[unit]
     weight = model.hierarchies[0].levels[0].volume[:, None]

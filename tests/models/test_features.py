@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gausim.core import SimState
-from gausim.models.features import FeatureOptions, UnitState, edge_features, node_features
+from gausim.models.step.features import FeatureOptions, UnitState, edge_features, node_features
 
 DT = 0.25
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gausim.core import ConfigError
-from gausim.models.graph import EdgeSet
+from gausim.models.hierarchy.edges import EdgeSet
 from gausim.ops.neighbours import radius_edges
 
 

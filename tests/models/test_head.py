@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from gausim.models.head import SHORT, lever_gradient
+from gausim.models.step.head import SHORT, lever_gradient
 
 
 def test_the_lever_moves_by_the_shift_and_the_volume_is_kept() -> None:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gausim.core import ConfigError, SceneError
-from gausim.models.hierarchy import build_hierarchy
+from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.ops.covariance import kernel_volumes
 
 RADII = (0.15, 0.35, 0.7)

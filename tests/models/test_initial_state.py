@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gausim.core import ConfigError
-from gausim.models.elastic import ElasticTemplate
 from gausim.models.initial_state import FreeInitialStates, ModalInitialStates
+from gausim.models.template.elastic import ElasticTemplate
 
 
 @pytest.fixture

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from gausim.core import SimState
-from gausim.engine.stability import _LinearStep
-from gausim.models.frames import body_axes
-from gausim.models.hierarchy import build_hierarchy
-from gausim.models.material import DAMPING_GAIN, MaterialTemplate
-from gausim.models.solid import solid_body
+from gausim.evaluation.stability import _LinearStep
+from gausim.models.hierarchy.clusters import build_hierarchy
+from gausim.models.step.body_frame import body_axes
+from gausim.models.template.material import DAMPING_GAIN, MaterialTemplate
+from gausim.models.template.solid import solid_body
 
 SETTINGS = {"modes": 9, "spacing": 0.2, "links": 4, "hidden": 8}
 TEMPLATE = partial(MaterialTemplate, **SETTINGS)

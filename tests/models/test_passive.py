@@ -8,10 +8,10 @@ from functools import partial
 import torch
 
 from gausim.core import GaussianScene, SimState
-from gausim.models.dynamics import SceneDynamics
-from gausim.models.elastic import ElasticTemplate
-from gausim.models.passive import EnergyGuard
-from gausim.models.simulator import GausSim, Step
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.rollout.energy_guard import EnergyGuard
+from gausim.models.step.simulator import GausSim, Step
+from gausim.models.template.elastic import ElasticTemplate
 
 FRAMES = 10
 MakeModel, MakeScene, MakeState = Callable[..., GausSim], Callable[..., GaussianScene], Callable[..., SimState]
@@ -36,7 +36,7 @@ def test_energy_grows_without_the_guard_and_not_with_it(
     state = SimState(scene.means, make_state(scene).positions)
     found = {}
     for frames in (0, FRAMES):
-        rollout = _model(make_model, scene, frames=frames).dynamics().rollout(state, 150)
+        rollout = SceneDynamics(_model(make_model, scene, frames=frames)).rollout(state, 150)
         found[frames] = _energies(_model(make_model, scene), torch.cat((state.previous[None], rollout.positions)))
     assert max(found[0][FRAMES:]) > 1.5 * max(found[0][:FRAMES])
     kept = found[FRAMES]
@@ -51,7 +51,7 @@ def test_what_adds_no_energy_is_not_touched(
     scene = make_scene()
     state = SimState(scene.means, make_state(scene).positions)
     free, guarded = (
-        _model(make_model, scene, frames=frames, scale=0.0).dynamics().rollout(state, 40) for frames in (0, FRAMES)
+        SceneDynamics(_model(make_model, scene, frames=frames, scale=0.0)).rollout(state, 40) for frames in (0, FRAMES)
     )
     assert torch.equal(free.positions, guarded.positions) and torch.equal(free.gradients, guarded.gradients)
     assert float((free.positions - scene.means).norm(dim=-1).max()) > 1e-4
@@ -63,11 +63,11 @@ def test_a_push_raises_the_limit_by_its_work(make_scene: MakeScene, make_model: 
     still = SimState(scene.means, scene.means)
 
     def push(frame: int) -> torch.Tensor | None:
-        return torch.full_like(scene.means, 1.0) * model.dynamics().masses[:, None] if frame in (3, 4) else None
+        return torch.full_like(scene.means, 1.0) * SceneDynamics(model).masses[:, None] if frame in (3, 4) else None
 
-    guarded = model.dynamics().rollout(still, 20, forces=push)
+    guarded = SceneDynamics(model).rollout(still, 20, forces=push)
     model.passive_frames = 0
-    assert torch.equal(guarded.positions, model.dynamics().rollout(still, 20, forces=push).positions)
+    assert torch.equal(guarded.positions, SceneDynamics(model).rollout(still, 20, forces=push).positions)
     assert float((guarded.positions[8] - scene.means).norm(dim=-1).max()) > 1e-4
 
 
@@ -105,9 +105,9 @@ def test_a_template_without_energy_has_no_guard(make_scene: MakeScene, make_mode
     scene = make_scene()
     model = make_model(scene, passive_frames=FRAMES).eval()
     assert not model.knows_energy
-    moved = model.dynamics().rollout(SimState(scene.means, scene.means), 3)
+    moved = SceneDynamics(model).rollout(SimState(scene.means, scene.means), 3)
     model.passive_frames = 0
-    assert torch.equal(moved.positions, model.dynamics().rollout(SimState(scene.means, scene.means), 3).positions)
+    assert torch.equal(moved.positions, SceneDynamics(model).rollout(SimState(scene.means, scene.means), 3).positions)
 
 
 def test_a_ceiling_bounds_what_forces_do(make_scene: MakeScene, make_model: MakeModel) -> None:
@@ -115,8 +115,8 @@ def test_a_ceiling_bounds_what_forces_do(make_scene: MakeScene, make_model: Make
     scene = make_scene()
     model = _model(make_model, scene, scale=0.002)
     still = SimState(scene.means, scene.means)
-    push = 60.0 * model.dynamics().masses[:, None] * torch.tensor([0.3, 1.0, 0.2])
-    small = model.dynamics().rollout(still, 6, forces=lambda n: 0.2 * push if n < 2 else None)
+    push = 60.0 * SceneDynamics(model).masses[:, None] * torch.tensor([0.3, 1.0, 0.2])
+    small = SceneDynamics(model).rollout(still, 6, forces=lambda n: 0.2 * push if n < 2 else None)
     ceiling = max(_energies(model, small.positions))
 
     def pushed(energy_ceiling: float | None) -> torch.Tensor:

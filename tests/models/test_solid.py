@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from gausim.core import SimState
-from gausim.models import solid
-from gausim.models.elastic import ElasticTemplate
-from gausim.models.hierarchy import build_hierarchy
-from gausim.models.simulator import GausSim
+from gausim.models.hierarchy.clusters import build_hierarchy
+from gausim.models.step.simulator import GausSim
+from gausim.models.template import solid
+from gausim.models.template.elastic import ElasticTemplate
 
 
 def _shell(size: tuple[float, float, float], step: float) -> np.ndarray:

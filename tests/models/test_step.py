@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from gausim.core import SimState
-from gausim.models.elastic import ElasticTemplate
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.template.elastic import ElasticTemplate
 
 LEVELS = pytest.mark.parametrize(
     ("predicted", "graph"), [((2, 1), (0.8, 0.35)), ((0,), (0.3,))], ids=["hierarchy", "no_hierarchy"]
@@ -55,9 +56,9 @@ def test_zero_output_at_rest_stays_at_rest_with_the_elastic_template(make_scene,
     with torch.no_grad():  # an untrained force would be zero anyway
         for p in model.template.networks():
             p.copy_(torch.randn_like(p))
-    trajectory = model.dynamics().rollout(SimState(scene.means, scene.means), 50)
+    trajectory = SceneDynamics(model).rollout(SimState(scene.means, scene.means), 50)
     assert float((trajectory.positions - scene.means).abs().max()) < 1e-6
-    moved = model.dynamics().rollout(SimState(scene.means * 1.01, scene.means), 2)
+    moved = SceneDynamics(model).rollout(SimState(scene.means * 1.01, scene.means), 2)
     assert float((moved.positions[2] - scene.means).abs().max()) > 1e-3
 
 
@@ -74,7 +75,7 @@ def test_pinned_and_never_simulated_kernels_never_move_in_1000_steps(make_scene,
     def push(step: int) -> torch.Tensor:
         return 3.0 * torch.randn(scene.count, 3, generator=generator)
 
-    positions = model.dynamics().rollout(SimState(scene.means, scene.means), 1000, forces=push).positions
+    positions = SceneDynamics(model).rollout(SimState(scene.means, scene.means), 1000, forces=push).positions
     held = scene.pinned | ~scene.simulated
     assert int(scene.pinned.sum()) > 5 and int((~scene.simulated).sum()) == 6
     assert torch.equal(positions[:, held], scene.means[held].expand(1001, -1, 3))

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from gausim.core import SimState
-from gausim.models.elastic import ElasticTemplate
+from gausim.models.template.elastic import ElasticTemplate
 
 
 class _Stepper(nn.Module):

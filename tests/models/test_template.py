@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gausim.models.template import Template, TemplateState
+from gausim.models.template.template import Template, TemplateState
 
 
 class _Given(Template):

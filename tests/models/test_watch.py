@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from gausim.core import DivergenceError
-from gausim.models import watch
-from gausim.models.watch import Watch
+from gausim.models.rollout import watch
+from gausim.models.rollout.watch import Watch
 
 GOOD, NAN, INF = (torch.full((4, 3), x) for x in (1.0, float("nan"), float("inf")))
 

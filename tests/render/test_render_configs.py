@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 from omegaconf import OmegaConf
 
-import gausim.cli._conf  # noqa: F401  (the resolvers that the files use)
+import gausim.compose.root  # noqa: F401  (the resolvers that the files use)
 from gausim.core import Renderer
 
 CONFIGS = sorted((Path(__file__).parents[2] / "conf" / "render").glob("*.yaml"))

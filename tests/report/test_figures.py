@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from gausim.report.figures import contact_frames, contact_sheet, error_figure, picture_grid, slice_figure
-from gausim.report.frames import Timeline, error_colors, moving_line, space_time_slice, video_frame
+from gausim.report.pictures.figures import contact_frames, contact_sheet, error_figure, picture_grid, slice_figure
+from gausim.report.pictures.frames import Timeline, error_colors, moving_line, space_time_slice, video_frame
 
 CURVES = runpy.run_path(str(Path(__file__).with_name("test_summary.py")))["curves"]
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import re
-import runpy
 from pathlib import Path
 
 import pytest
+from helpers import report_runs
+from helpers.report_runs import config, evaluate, make_curves, write_run
 
 from gausim.report.write import write_report
 
-MADE = runpy.run_path(str(Path(__file__).with_name("report_runs.py")))
-config, write_run, evaluate, make_curves = (MADE[n] for n in ("config", "write_run", "evaluate", "make_curves"))
 HOSTILE = r"a_b & 100% {x} \input{/etc/passwd} $y^2 #1 ~z"
 # Commands of LaTeX itself and of the packages that the file's first line asks for.
 KNOWN = {
@@ -82,7 +81,7 @@ def width(row: str) -> int:
 
 @pytest.fixture
 def latex(tmp_path: Path) -> str:
-    root = MADE["write_sweep"](tmp_path / "sweep")
+    root = report_runs.write_sweep(tmp_path / "sweep")
     evaluate(write_run(root / "other", config(name=HOSTILE), model=None), make_curves(2.0, name=HOSTILE))
     write_report([root], tmp_path / "out", pictures=False)
     return (tmp_path / "out" / "tables.tex").read_text()

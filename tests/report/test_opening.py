@@ -6,24 +6,23 @@ import base64
 import html
 import json
 import re
-import runpy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers import report_runs
+from helpers.report_runs import config, evaluate, make_curves, write_run
 
 from gausim.io.video import read_video
-from gausim.report.frames import SEEN
+from gausim.report.gather.runs import find_runs
+from gausim.report.gather.study import make_study
 from gausim.report.opening import MOST_OPENINGS, MOST_ROWS, make_openings
-from gausim.report.runs import find_runs
-from gausim.report.study import make_study
-from gausim.report.verdict import outcome, sentences
+from gausim.report.pictures.frames import SEEN
+from gausim.report.tables.verdict import outcome, sentences
 from gausim.report.write import write_report
 
-MADE = runpy.run_path(str(Path(__file__).with_name("report_runs.py")))
-config, write_run, evaluate, make_curves = (MADE[n] for n in ("config", "write_run", "evaluate", "make_curves"))
 EVIL = "<script>alert(1)</script>&\"'|`"
 
 
@@ -119,7 +118,7 @@ def test_seeds_are_averaged_and_a_fit_that_repeats_is_no_foresight():
 def with_psnr(error: float, name: str = "toy_bunny") -> Any:
     """Curves with a PSNR that goes with their l2, and the second view held out (as their pictures have it)."""
     curves = make_curves(error, name=name)
-    psnr = MADE["ImageMetricInfo"]("psnr", "PSNR", 1.0, "dB", True)
+    psnr = report_runs.ImageMetricInfo("psnr", "PSNR", 1.0, "dB", True)
     for row in ("gausim", "static"):
         curves.values[row]["psnr"] = -10 * np.log10(curves.values[row]["l2"])
     return replace(curves, facts=replace(curves.facts, metrics=(*curves.facts.metrics, psnr)))

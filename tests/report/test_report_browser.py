@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import runpy
 import time
 from pathlib import Path
 from typing import Any
 
-MADE = runpy.run_path(str(Path(__file__).with_name("report_runs.py")))
-BROWSER = runpy.run_path(str(Path(__file__).parents[1] / "view" / "chromium.py"))
-chromium, pytestmark = BROWSER["chromium"], BROWSER["needs_chromium"]
+from helpers import chromium, report_runs
+
+chromium, pytestmark = chromium.chromium, chromium.needs_chromium
 PLAYING = "[...document.querySelectorAll('.film video')].map(v => !v.paused && v.currentTime > 0 && v.videoWidth > 0)"
 
 
@@ -20,7 +19,7 @@ def playing(page: Any) -> list[bool]:
 def test_the_page_plays_and_fits(tmp_path: Path) -> None:
     from gausim.report.write import write_report
 
-    root = MADE["write_sweep"](tmp_path / "sweep")
+    root = report_runs.write_sweep(tmp_path / "sweep")
     write_report([root], root / "report")
     with chromium(tmp_path, size=(400, 800)) as page:
         page.open((root / "report" / "report.html").as_uri())

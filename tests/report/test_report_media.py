@@ -2,24 +2,23 @@ from __future__ import annotations
 
 import base64
 import re
-import runpy
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from helpers import report_runs
+from helpers.report_runs import config, evaluate, make_curves, write_run
 
 from gausim.core import RunError
 from gausim.io.video import read_video
-from gausim.report.media import Exhibit, object_figures
-from gausim.report.pictures import load_pictures, save_pictures
-from gausim.report.runs import find_runs
-from gausim.report.study import make_study
+from gausim.report.gather.runs import find_runs
+from gausim.report.gather.study import make_study
+from gausim.report.pictures.media import Exhibit, object_figures
 from gausim.report.write import write_report
+from gausim.results.pictures import load_pictures, save_pictures
 
-MADE = runpy.run_path(str(Path(__file__).with_name("report_runs.py")))
-config, write_run, evaluate, make_curves = (MADE[n] for n in ("config", "write_run", "evaluate", "make_curves"))
-make_pictures = MADE["make_pictures"]
+make_pictures = report_runs.make_pictures
 
 
 def write_two_rows(root: Path) -> Path:

@@ -1,23 +1,21 @@
 from __future__ import annotations
 
 import json
-import runpy
 from pathlib import Path
 
 import pytest
+from helpers import report_runs
+from helpers.report_runs import config, evaluate, make_curves, write_run
 
 from gausim.core import RunError
-from gausim.report.overview import make_sheets
-from gausim.report.runs import find_runs
-from gausim.report.study import cell, make_study
-
-MADE = runpy.run_path(str(Path(__file__).with_name("report_runs.py")))
-config, write_run, evaluate, make_curves = (MADE[n] for n in ("config", "write_run", "evaluate", "make_curves"))
+from gausim.report.gather.runs import find_runs
+from gausim.report.gather.study import cell, make_study
+from gausim.report.tables.overview import make_sheets
 
 
 @pytest.fixture
 def sweep(tmp_path) -> Path:
-    return MADE["write_sweep"](tmp_path / "sweep")
+    return report_runs.write_sweep(tmp_path / "sweep")
 
 
 def states(root: Path) -> dict[str, str]:

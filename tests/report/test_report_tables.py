@@ -4,28 +4,27 @@ import csv
 import io
 import json
 import re
-import runpy
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from helpers import report_runs
+from helpers.report_runs import config, evaluate, make_curves, write_run
 
-from gausim.report.overview import make_sheets
-from gausim.report.paper import CONTRAST, TABLES, paper_object
-from gausim.report.runs import find_runs
-from gausim.report.sheets import Sheet
-from gausim.report.study import make_study
+from gausim.report.gather.paper import CONTRAST, TABLES, paper_object
+from gausim.report.gather.runs import find_runs
+from gausim.report.gather.study import make_study
+from gausim.report.tables.overview import make_sheets
+from gausim.report.tables.sheets import Sheet
 from gausim.report.text import latex_escape, markdown_escape
 from gausim.report.write import write_report
 
-MADE = runpy.run_path(str(Path(__file__).with_name("report_runs.py")))
-config, write_run, evaluate, make_curves = (MADE[n] for n in ("config", "write_run", "evaluate", "make_curves"))
 VOID = {"meta", "img", "br", "link", "hr", "input"}
 
 
 @pytest.fixture
 def sweep(tmp_path) -> Path:
-    return MADE["write_sweep"](tmp_path / "sweep")
+    return report_runs.write_sweep(tmp_path / "sweep")
 
 
 def sheets(root: Path) -> dict[str, Sheet]:

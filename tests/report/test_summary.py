@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from gausim.core import RunError
-from gausim.report.curves import ImageMetricInfo, ObjectCurves, ObjectFacts, load_curves, save_curves
-from gausim.report.summary import frame_splits, load_summary, summarise, write_summary
-from gausim.report.tables import LEGEND, markdown, object_tables
+from gausim.results.curves import ImageMetricInfo, ObjectCurves, ObjectFacts, load_curves, save_curves
+from gausim.results.summary import frame_splits, load_summary, summarise, write_summary
+from gausim.results.table import LEGEND, markdown, object_tables
 
 FRAMES = 60
 

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import csv
-import runpy
 from pathlib import Path
 
 import pytest
+from helpers.report_runs import config, evaluate, make_curves, write_run
 
-from gausim.report.overview import make_sheets
-from gausim.report.runs import find_runs
-from gausim.report.sheets import Sheet
-from gausim.report.study import make_study
+from gausim.report.gather.runs import find_runs
+from gausim.report.gather.study import make_study
+from gausim.report.tables.overview import make_sheets
+from gausim.report.tables.sheets import Sheet
 from gausim.report.write import write_report
 
-MADE = runpy.run_path(str(Path(__file__).with_name("report_runs.py")))
-config, write_run, evaluate, make_curves = (MADE[n] for n in ("config", "write_run", "evaluate", "make_curves"))
 OFF = {
     "none": {}, "no_mass": {"conserve_mass": False}, "no_momentum": {"conserve_momentum": False},
     "no_hierarchy": {"predicted_levels": [0]},

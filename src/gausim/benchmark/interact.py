@@ -11,13 +11,14 @@ from torch import Tensor
 from gausim.benchmark.harness import Options, Row, medians, torch_threads
 from gausim.benchmark.step import CLUSTERING, DEFAULT, TEMPLATE, Bound, cloud
 from gausim.core import GaussianScene, SimState
-from gausim.models.material import MaterialTemplate
-from gausim.models.simulator import GausSim
-from gausim.view.coloring import VIEW, Painter
-from gausim.view.interaction import Interaction
-from gausim.view.selections import Ball
-from gausim.view.session import Force, MadeWith
-from gausim.view.splats import Placing, pack
+from gausim.interaction.interaction import Interaction
+from gausim.interaction.selections import Ball
+from gausim.interaction.session import Force, MadeWith
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.step.simulator import GausSim
+from gausim.models.template.material import MaterialTemplate
+from gausim.viewer.coloring import VIEW, Painter
+from gausim.viewer.splats import Placing, pack
 
 SIZES = {False: (2_000, 20_000), True: (300,)}
 FPS = 24.0
@@ -56,7 +57,7 @@ def _frame(count: int, options: Options) -> list[Row]:
     scene, model = build(count)
     model.to(options.device)
     scene = scene.to(options.device)
-    initial, dynamics = SimState(scene.means, scene.means), model.dynamics(0)
+    initial, dynamics = SimState(scene.means, scene.means), SceneDynamics(model)
     units = [u.to(options.device) for u in model.units_of_kernels(0)]
     made_with = MadeWith.of(scene, model, initial)
     live = Interaction(scene, dynamics, dynamics.masses, initial, made_with=made_with, units=units)

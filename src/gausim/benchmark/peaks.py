@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from gausim.benchmark.harness import Options, medians, torch_threads
-from gausim.ops.pool import WorkerPool
+from gausim.kernels.pool import WorkerPool
 
 # Independent accumulators: enough vectors of any width to hide the latency of a fused multiply-add.
 LANES = 192

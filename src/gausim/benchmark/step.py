@@ -15,17 +15,17 @@ from torch import Tensor
 
 from gausim.benchmark.harness import Options, Row, medians, saved_bytes, torch_threads
 from gausim.core import GaussianScene, SimState
-from gausim.models.batch import SceneBatch
-from gausim.models.cuda_graph import GraphedStep
-from gausim.models.elastic import ElasticTemplate
-from gausim.models.features import network_inputs
-from gausim.models.hierarchy import build_hierarchy
-from gausim.models.material import MaterialTemplate
-from gausim.models.prepared import Prepared
-from gausim.models.recursion import Solved, Units, advance, inherit
-from gausim.models.simulator import GausSim
-from gausim.models.template import Motion, Template
-from gausim.ops.compiled import torch_only
+from gausim.kernels.compiled import torch_only
+from gausim.models.hierarchy.batch import SceneBatch
+from gausim.models.hierarchy.clusters import build_hierarchy
+from gausim.models.rollout.cuda_graph import GraphedStep
+from gausim.models.step.features import network_inputs
+from gausim.models.step.prepared import Prepared
+from gausim.models.step.recursion import Solved, Units, advance, inherit
+from gausim.models.step.simulator import GausSim
+from gausim.models.template.elastic import ElasticTemplate
+from gausim.models.template.material import MaterialTemplate
+from gausim.models.template.template import Motion, Template
 from gausim.ops.deformation import gradient_from_output
 
 CLUSTERING = "agglomerative"

@@ -15,11 +15,11 @@ from gausim.benchmark.harness import Options, Row, medians, peak_resident, torch
 from gausim.core import Rendered, Renderer
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
-from gausim.engine.comparison import Comparison
-from gausim.engine.module import GausSimModule
-from gausim.engine.rollout import States, windows
-from gausim.ops.compiled import torch_only
+from gausim.kernels.compiled import torch_only
 from gausim.render.reference import ReferenceRenderer
+from gausim.training.module import GausSimModule
+from gausim.training.rollout import States, windows
+from gausim.training.supervision.comparison import Comparison
 
 # Timed calls of what serves as reference only and takes long.
 REFERENCE_ROUNDS = 2

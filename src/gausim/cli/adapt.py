@@ -23,8 +23,8 @@ ALL_EPOCHS = {"max_minutes": None, "convergence": None}
 # What `--supervision` stands for (the defaults of these are those of conf/supervision).
 SUPERVISIONS = {
     "images": None,
-    "points": "gausim.engine.points.PointSupervision",
-    "tracks": "gausim.engine.tracks.TrackSupervision",
+    "points": "gausim.training.supervision.points.PointSupervision",
+    "tracks": "gausim.training.supervision.motion_tracks.TrackSupervision",
 }
 
 
@@ -46,7 +46,7 @@ def main(argv: list[str]) -> int:
     from omegaconf import OmegaConf
 
     from gausim.cli.train import train_run
-    from gausim.engine.run import RunDirectory
+    from gausim.runs.directory import RunDirectory
 
     source = RunDirectory(arguments.run)
     config = _config(source.config(), source.path, arguments)
@@ -139,8 +139,8 @@ def _checked(overrides: Sequence[str]) -> list[str]:
 
 def _roots(config: dict[str, Any], run: Path, stores: Sequence[str] | None) -> list[dict[str, Any]]:
     """Entries of data.root: the stores' objects that the run knows, each with the rest scene that it was trained on."""
-    from gausim.cli._config import instantiate
-    from gausim.cli._data_paths import located
+    from gausim.compose.config import instantiate
+    from gausim.compose.data_paths import located
     from gausim.core.errors import DataError
     from gausim.data.objects import ObjectData, find_objects
 

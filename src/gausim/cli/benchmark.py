@@ -111,8 +111,8 @@ def _run(name: str, options: Options, overrides: list[str], *, optional: bool) -
     case = importlib.import_module(f"gausim.benchmark.{name}")
     if name != "train":
         return list(case.run(options))
-    from gausim.cli._config import compose
-    from gausim.cli._run import build
+    from gausim.compose.build import build
+    from gausim.compose.config import compose
     from gausim.core.errors import DataError
 
     try:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gausim.report.card import CardFacts
-    from gausim.report.runs import RunRecord
+    from gausim.report.gather.runs import RunRecord
 
 HELP = "Write the card of a run: data, figures, cost, limitations, licence."
 # Groups of the configuration in which a run chooses; the rest says where and how it is shown.
@@ -52,7 +52,7 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from gausim.cli._data_paths import add_data_option
+    from gausim.compose.data_paths import add_data_option
 
     parser = argparse.ArgumentParser(
         prog="gausim card",
@@ -70,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _record(folder: Path) -> RunRecord:
     from gausim.core.errors import RunError
-    from gausim.report.runs import BROKEN, find_runs
+    from gausim.report.gather.runs import BROKEN, find_runs
 
     found = find_runs([folder])
     if [run.path for run in found] != [folder]:
@@ -81,8 +81,8 @@ def _record(folder: Path) -> RunRecord:
 
 
 def _facts(run: RunRecord, arguments: argparse.Namespace) -> CardFacts:
-    from gausim.engine.run import RunDirectory
     from gausim.report.card import CardFacts
+    from gausim.runs.directory import RunDirectory
 
     directory = RunDirectory(run.path)
     base, differences = _differences(run)
@@ -101,7 +101,7 @@ def _facts(run: RunRecord, arguments: argparse.Namespace) -> CardFacts:
 
 def _data(run: RunRecord, words: list[str]) -> dict[str, Mapping[str, Any]] | None:
     """What ``dataset.json`` of every object says; None where the data set is not on this machine."""
-    from gausim.cli._data_paths import data_option, located
+    from gausim.compose.data_paths import data_option, located
     from gausim.core.errors import DataError
     from gausim.data.objects import find_objects
     from gausim.io.transforms import read_json
@@ -140,7 +140,7 @@ def _endurance(path: Path) -> dict[str, Any]:
 
 def _about(preset: str | None) -> str:
     """The comment at the head of a model's preset."""
-    from gausim.cli._config import conf_dir
+    from gausim.compose.config import conf_dir
 
     path = conf_dir() / "model" / f"{preset}.yaml"
     if preset is None or not path.is_file():
@@ -173,9 +173,9 @@ def _differences(run: RunRecord) -> tuple[str, list[tuple[str, str, str]]]:
     from omegaconf import OmegaConf
 
     import gausim
-    from gausim.cli._config import compose
+    from gausim.compose.config import compose
     from gausim.core.errors import ConfigError
-    from gausim.report.runs import flatten
+    from gausim.report.gather.runs import flatten
 
     chosen = [f"{group}={run.choices[group]}" for group in _GROUPS if run.choices.get(group) not in (None, "None")]
     words = f"`gausim train {' '.join(chosen)}`" if chosen else "`gausim train`"

@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> int:
         ConfigError: an argument is no configuration.
     """
     if argv[:1] == ["complete"]:  # the scripts ask this way; words of any kind follow, so no parser can have them
-        from gausim.cli._completion import complete
+        from gausim.cli.completion import complete
 
         sys.stdout.writelines(f"{choice}\n" for choice in complete(argv[1:]))
         return 0
@@ -73,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _validate(arguments: argparse.Namespace) -> int:
-    from gausim.cli._validate import faults
+    from gausim.compose.validate import faults
 
     found = faults(arguments.what)
     for fault in found:
@@ -88,7 +88,7 @@ def _validate(arguments: argparse.Namespace) -> int:
 def _schema(arguments: argparse.Namespace) -> int:
     import json
 
-    from gausim.cli._schema import training_schema
+    from gausim.compose.schema import training_schema
 
     json.dump(training_schema(), sys.stdout, indent=1)
     print()

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from gausim.cli._run import LoadedRun
+    from gausim.compose.build import LoadedRun
     from gausim.data.objects import ObjectData
-    from gausim.report.curves import ObjectCurves
+    from gausim.results.curves import ObjectCurves
 
 HELP = "Measure a run on seen, unseen and held-out frames."
 WRITTEN = ("metrics.json", "metrics.npz", "pictures.npz", "table.md")
@@ -35,13 +35,13 @@ def main(argv: list[str]) -> int:
     arguments = _parser().parse_args(argv)
     if arguments.endurance is not None and arguments.endurance < 300:
         raise ConfigError(f"--endurance: expected at least 300 frames, got {arguments.endurance}.")
-    from gausim.cli._data_paths import data_option
-    from gausim.cli._end import end, told
-    from gausim.cli._foresee import state_of
-    from gausim.cli._run import load_run
-    from gausim.engine.evaluation import write_evaluation
-    from gausim.report.diagnosis import diagnosis_figure
-    from gausim.report.figures import error_figure
+    from gausim.cli.end import end, told
+    from gausim.compose.build import load_run
+    from gausim.compose.data_paths import data_option
+    from gausim.compose.predict import state_of
+    from gausim.evaluation.evaluation import write_evaluation
+    from gausim.report.pictures.diagnosis import diagnosis_figure
+    from gausim.report.pictures.figures import error_figure
 
     run = load_run(arguments.run, data=data_option(arguments.data))
     state = state_of(run)
@@ -69,7 +69,7 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from gausim.cli._data_paths import add_data_option
+    from gausim.compose.data_paths import add_data_option
 
     parser = argparse.ArgumentParser(
         prog="gausim evaluate",
@@ -93,8 +93,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _evaluate(run: LoadedRun, arguments: argparse.Namespace) -> list[ObjectCurves]:
-    from gausim.cli._foresee import TrainedPrediction, progress, run_objects, scene_of
-    from gausim.engine.evaluation import evaluate_object
+    from gausim.compose.predict import TrainedPrediction, progress, run_objects, scene_of
+    from gausim.evaluation.evaluation import evaluate_object
 
     items = run_objects(run, arguments.object)
     total = sum(len(arguments.sequences or item.data.sequences) for item in items)
@@ -118,8 +118,8 @@ def _evaluate(run: LoadedRun, arguments: argparse.Namespace) -> list[ObjectCurve
 
 def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list[str]:
     """Writes what long rollouts of each object's first sequence tell; returns the names of the files."""
-    from gausim.cli._foresee import endurance, run_objects
-    from gausim.report.endurance import endurance_figure
+    from gausim.compose.predict import endurance, run_objects
+    from gausim.report.tables.endurance import endurance_figure
 
     found = {item.data.name: endurance(run, item, arguments.endurance) for item in run_objects(run, arguments.object)}
     (folder / "endurance.json").write_text(json.dumps(found, indent=1) + "\n")
@@ -156,7 +156,7 @@ def _print_tables(summary: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from gausim.report.tables import gaps, object_tables
+    from gausim.results.table import gaps, object_tables
 
     # Rich would cut columns at 80 characters where the output goes to a file.
     console = Console(width=None if sys.stdout.isatty() else 200)

@@ -13,7 +13,7 @@ from gausim.core.errors import ConfigError, DataError
 if TYPE_CHECKING:
     import numpy as np
 
-    from gausim.cli._run import LoadedRun
+    from gausim.compose.build import LoadedRun
     from gausim.core import Cameras, GaussianScene, Renderer, Trajectory
 
 HELP = "Write a motion as PLY, OpenUSD, safetensors, viser, HTML, MP4 or GIF, and read it back."
@@ -132,7 +132,7 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from gausim.cli._data_paths import add_data_option
+    from gausim.compose.data_paths import add_data_option
 
     width = max(map(len, FORMATS))
     rows = []
@@ -217,9 +217,9 @@ def _from_trajectory(source: Path, scene_path: Path | None) -> Motion:
 
 
 def _from_run(arguments: argparse.Namespace) -> Motion:
-    from gausim.cli._data_paths import data_option
-    from gausim.cli._foresee import TrainedPrediction, head, run_objects, scene_of, state_of
-    from gausim.cli._run import load_run
+    from gausim.compose.build import load_run
+    from gausim.compose.data_paths import data_option
+    from gausim.compose.predict import TrainedPrediction, head, run_objects, scene_of, state_of
 
     run: LoadedRun = load_run(arguments.source, data=data_option(arguments.data))
     state_of(run)
@@ -299,7 +299,7 @@ def _write_usd(motion: Motion, path: Path, arguments: argparse.Namespace) -> int
 
 
 def _write_recording(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
-    from gausim.view.recording import record
+    from gausim.viewer.recording import record
 
     assert motion.trajectory is not None
     record(motion.first, motion.trajectory, path, kind=arguments.format, up=arguments.up)
@@ -329,8 +329,8 @@ _WRITERS: dict[str, Callable[[Motion, Path, argparse.Namespace], int]] = {
 def _pictures(motion: Motion, arguments: argparse.Namespace) -> Iterator[np.ndarray]:
     import torch
 
-    from gausim.cli._config import compose, instantiate
-    from gausim.cli.simulate import parse_background
+    from gausim.cli.background import parse_background
+    from gausim.compose.config import compose, instantiate
     from gausim.render.draw import draw, to_bytes
 
     background, camera = parse_background(arguments.background), _camera(motion, arguments)

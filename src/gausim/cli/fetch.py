@@ -96,7 +96,7 @@ def _print_list(registry: Registry) -> None:
 
 
 def _fetch(entry: Entry, arguments: argparse.Namespace, registry: Registry) -> None:
-    from gausim.cli._fetch import default_folder, fetch
+    from gausim.cli.bring import default_folder, fetch
     from gausim.io.registry import mirrored
 
     target = arguments.out or default_folder(entry)
@@ -116,7 +116,7 @@ def _fetch(entry: Entry, arguments: argparse.Namespace, registry: Registry) -> N
 
 
 def _pack(arguments: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
-    from gausim.cli._pack import pack_published
+    from gausim.cli.pack import pack_published
 
     if arguments.name is None:
         parser.error("--pack: expected --name NAME, by which the entry is asked for")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gausim.core.scene import GaussianScene
-    from gausim.models.hierarchy import Hierarchy
+    from gausim.models.hierarchy.clusters import Hierarchy
 
 HELP = "Print a scene's kernels and hierarchy and draw its clusters."
 
@@ -33,7 +33,7 @@ def main(argv: list[str]) -> int:
     arguments = _parser().parse_args(argv)
     from gausim.core.errors import SceneError
     from gausim.io.ply import load_scene, masks_path, save_masks
-    from gausim.models.hierarchy import build_hierarchy
+    from gausim.models.hierarchy.clusters import build_hierarchy
 
     if any(not 0 < r <= 1 for r in arguments.radii):
         raise SceneError(f"--radii {arguments.radii}: expected fractions of the diagonal in (0, 1], fine to coarse.")
@@ -131,7 +131,7 @@ def _print_hierarchy(hierarchy: Hierarchy, radii: list[float]) -> None:
 
 
 def _draw(scene: GaussianScene, hierarchy: Hierarchy, arguments: argparse.Namespace, out: Path) -> None:
-    from gausim.report.clusters import draw_clusters
+    from gausim.report.pictures.clusters import draw_clusters
 
     count = len(hierarchy.levels)
     labels = [hierarchy.ancestor(0, level).numpy() for level in range(1, count)]

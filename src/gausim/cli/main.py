@@ -46,7 +46,9 @@ COMMANDS: dict[str, Command] = {
         "gausim.cli.benchmark",
         "Measure the speed of rendering, stepping, training and clustering as ratios within one run.",
     ),
-    "simulate": Command("gausim.cli.simulate", "Roll a run forward and write videos, figures and trajectories."),
+    "simulate": Command(
+        "gausim.cli.simulate.command", "Roll a run forward and write videos, figures and trajectories."
+    ),
     "view": Command("gausim.cli.view", "Show a run or a scene in the browser and pull it about."),
     "export": Command(
         "gausim.cli.export", "Write a motion as PLY, OpenUSD, safetensors, viser, HTML, MP4 or GIF, and read it back."

@@ -26,7 +26,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from gausim.cli import _prepare_lpips
+    from gausim.cli import prepare_lpips as _prepare_lpips
 
     parser = argparse.ArgumentParser(prog="gausim prepare", description=HELP)
     parts = parser.add_subparsers(metavar="WHAT", required=True)

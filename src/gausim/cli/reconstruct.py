@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gausim.core import GaussianScene, Renderer
-    from gausim.engine.reconstruction import ReconstructionOptions
-    from gausim.engine.reconstruction_state import Partial
-    from gausim.engine.splat_start import PointCloud
-    from gausim.engine.stills import ImageSet, Material
+    from gausim.reconstruction.reconstruction import ReconstructionOptions
+    from gausim.reconstruction.splat_start import PointCloud
+    from gausim.reconstruction.state import Partial
+    from gausim.reconstruction.stills import ImageSet, Material
 
 HELP = "Fit the Gaussians of the rest scene to posed stills."
 
@@ -99,10 +99,10 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> Fitted:
     """
     import torch
 
-    from gausim.engine.reconstruction_state import Partial, identity
-    from gausim.engine.stills import measure
     from gausim.io.files import write_json
     from gausim.io.ply import save_scene
+    from gausim.reconstruction.state import Partial, identity
+    from gausim.reconstruction.stills import measure
 
     torch.set_num_threads(arguments.threads)
     options = _options(arguments)
@@ -155,7 +155,7 @@ def add_fit_options(parser: argparse.ArgumentParser) -> None:
 
 
 def _options(arguments: argparse.Namespace) -> ReconstructionOptions:
-    from gausim.engine.reconstruction import ReconstructionOptions
+    from gausim.reconstruction.reconstruction import ReconstructionOptions
 
     given = {"kernels": arguments.kernels, "anisotropy_limit": arguments.anisotropy}
     chosen = {name: value for name, value in given.items() if value is not None}
@@ -176,7 +176,7 @@ def _inputs(
     source: Path, arguments: argparse.Namespace, options: ReconstructionOptions
 ) -> tuple[str, Material, PointCloud | None]:
     from gausim.data.objects import ObjectData
-    from gausim.engine.stills import gather_object, gather_stills
+    from gausim.reconstruction.stills import gather_object, gather_stills
 
     opaque = options.extent == "scene"
     for flag, share in (("--video-share", arguments.video_share), ("--coarse", arguments.coarse)):
@@ -214,8 +214,8 @@ def _cloud(path: str | None) -> PointCloud | None:
         return None
     import torch
 
-    from gausim.engine.splat_start import PointCloud
     from gausim.io.npz import read_npz
+    from gausim.reconstruction.splat_start import PointCloud
 
     try:
         arrays = read_npz(Path(path), ["points", "colors"])
@@ -242,7 +242,7 @@ def _fit(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from gausim.engine.reconstruction import Reconstruction, reconstruct
+    from gausim.reconstruction.reconstruction import Reconstruction, reconstruct
 
     begun = partial.read()
     if begun is not None:
@@ -279,7 +279,7 @@ def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...
     import torch
 
     from gausim.data.images import composite, write_rgba
-    from gausim.engine.stills import draw_rest
+    from gausim.reconstruction.stills import draw_rest
 
     size = sets[0].cameras.width, sets[0].cameras.height
     alike = [s for s in sets if (s.cameras.width, s.cameras.height) == size]

@@ -26,7 +26,7 @@ def main(argv: list[str]) -> int:
         RunError: a directory is not there, or there is no run in it.
     """
     arguments = _parser().parse_args(argv)
-    from gausim.cli._end import end
+    from gausim.cli.end import end
     from gausim.report.page import summary_line
     from gausim.report.write import write_report
 
@@ -47,8 +47,8 @@ def main(argv: list[str]) -> int:
 
 def _next(report: Report) -> list[list[object]]:
     """What can be done with the best run; where nothing was evaluated, what makes a report of it."""
-    from gausim.cli._end import OWN_OBJECT, push
-    from gausim.report.runs import NOT_EVALUATED
+    from gausim.cli.end import OWN_OBJECT, push
+    from gausim.report.gather.runs import NOT_EVALUATED
 
     if not report.openings:
         trained = [run for run in report.study.runs if run.status == NOT_EVALUATED]

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from gausim.data.datamodule import ReadyDataModule
-    from gausim.engine.fitting import FittedModule
-    from gausim.engine.launch import Crew
-    from gausim.engine.module import GausSimModule
-    from gausim.engine.run import RunDirectory
+    from gausim.runs.directory import RunDirectory
+    from gausim.training.fitted.fitting import FittedModule
+    from gausim.training.module import GausSimModule
+    from gausim.training.ranks.launch import Crew
 
 HELP = "Learn an object's dynamics from multi-view videos."
 
@@ -67,8 +67,8 @@ def main(argv: Sequence[str]) -> int:
     if any(a in ("-h", "--help") for a in argv):
         print(USAGE)
         return 0
-    from gausim.cli._config import run_hydra
-    from gausim.engine.files import unwritable
+    from gausim.compose.config import run_hydra
+    from gausim.runs.files import unwritable
 
     try:
         return run_hydra("train", train, argv)
@@ -90,8 +90,9 @@ def train(cfg: DictConfig) -> float | None:
         BusyError: it is being trained by another process.
         DivergenceError: a number is no longer finite.
     """
-    from gausim.cli import _config, _sweep
-    from gausim.engine.run import RunDirectory
+    from gausim.cli.sweeps import grid as _sweep
+    from gausim.compose import config as _config
+    from gausim.runs.directory import RunDirectory
 
     run = RunDirectory(_config.run_dir())
     if _config.in_sweep():
@@ -143,12 +144,12 @@ def _evaluate(run: RunDirectory) -> None:
 
 
 def _train(cfg: DictConfig, run: RunDirectory) -> float | None:
-    from gausim.engine.launch import Crew
-    from gausim.engine.layout import Layout
+    from gausim.training.ranks.launch import Crew
+    from gausim.training.ranks.layout import Layout
 
     known = [field.name for field in fields(Layout)]
     layout = Layout(**{str(key): value for key, value in cfg.trainer.items() if key in known})
-    with run.noting_failure(), Crew(layout, [sys.executable, "-m", "gausim.cli._rank"]) as crew:
+    with run.noting_failure(), Crew(layout, [sys.executable, "-m", "gausim.cli.rank"]) as crew:
         if not crew.is_first:  # a scheduler has started it beside the first
             return follow(crew)
         config = _plain(cfg)
@@ -162,7 +163,7 @@ def follow(crew: Crew) -> float | None:
     """Trains as one of the other ranks: what the first one says, into nothing."""
     from omegaconf import OmegaConf
 
-    from gausim.engine.run import RunDirectory
+    from gausim.runs.directory import RunDirectory
 
     config, path, resume = crew.receive()
     cfg = OmegaConf.create(config)
@@ -172,7 +173,7 @@ def follow(crew: Crew) -> float | None:
 def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataModule]:
     from lightning.pytorch import seed_everything
 
-    from gausim.cli._run import build
+    from gausim.compose.build import build
 
     seed_everything(cfg.seed, workers=True, verbose=False)
     module, datamodule = build(cfg)
@@ -187,11 +188,11 @@ def _fit(
     parts: tuple[GausSimModule, ReadyDataModule],
     crew: Crew,
 ) -> float | None:
-    from gausim.cli import _config
-    from gausim.cli._end import end
-    from gausim.engine.convergence import Convergence
-    from gausim.engine.fitting import FittedModule
-    from gausim.engine.judge import EpochJudge
+    from gausim.cli.end import end
+    from gausim.compose import config as _config
+    from gausim.training.callbacks.convergence import Convergence
+    from gausim.training.callbacks.judge import EpochJudge
+    from gausim.training.fitted.fitting import FittedModule
 
     module, datamodule = parts
     plan = module.plan if isinstance(module, FittedModule) else None
@@ -269,8 +270,8 @@ def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None
         RunError: that run is not there, or knows another scene.
     """
     from gausim.core import ConfigError
-    from gausim.engine.fitting import FittedModule
-    from gausim.engine.transfer import load_shared, load_simulator
+    from gausim.training.fitted.fitting import FittedModule
+    from gausim.training.transfer import load_shared, load_simulator
 
     if isinstance(module, FittedModule):
         _take_over_fit(cfg, module, resumed=resumed)
@@ -290,9 +291,9 @@ def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None
 
 def _take_over_fit(cfg: DictConfig, module: FittedModule, *, resumed: bool) -> None:
     """The same for a fitted method, if it is one that takes over what another has found."""
-    from gausim.cli._run import load_run
+    from gausim.compose.build import load_run
     from gausim.core import ConfigError, TakesOver
-    from gausim.engine.fitting import FittedModule
+    from gausim.training.fitted.fitting import FittedModule
 
     method = module.method
     if cfg.init_from is None and cfg.freeze is None:
@@ -319,8 +320,8 @@ def make(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | None =
         crew: the ranks.
         epochs: instead of ``trainer.max_epochs``.
     """
-    from gausim.cli._config import instantiate
-    from gausim.cli._sweep import judges
+    from gausim.cli.sweeps.pruning import judges
+    from gausim.compose.config import instantiate
 
     callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node] + judges(cfg)
     wanted = (cfg.logger or {}).values() if crew.is_first else ()
@@ -338,7 +339,7 @@ def _introduce(
 ) -> None:
     import torch
 
-    from gausim.engine.fitting import FittedModule
+    from gausim.training.fitted.fitting import FittedModule
 
     datamodule.setup("fit")
     batches = len(datamodule.train_dataloader())

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from gausim.cli._subject import Playable
-    from gausim.view.app import Subject
+    from gausim.cli.view_subject import Playable
+    from gausim.viewer.subject import Subject
 
 HELP = "Show a run or a scene in the browser and pull it about."
 _UP = ("x", "y", "z", "-x", "-y", "-z")
@@ -36,8 +36,8 @@ def main(argv: list[str]) -> int:
     from gausim.core.errors import ConfigError
 
     try:
-        from gausim.view.app import Viewer
-        from gausim.view.guard import Door
+        from gausim.viewer.app import Viewer
+        from gausim.viewer.guard import Door
     except ModuleNotFoundError as error:
         raise ConfigError(f"the viewer needs {error.name}: pip install 'gausim[view]'.") from error
     token = os.environ.get("GAUSIM_VIEW_TOKEN")
@@ -58,8 +58,8 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from gausim.cli._data_paths import add_data_option
     from gausim.cli.inspect import add_pin_options
+    from gausim.compose.data_paths import add_data_option
 
     parser = argparse.ArgumentParser(
         prog="gausim view",
@@ -89,7 +89,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _subject(arguments: argparse.Namespace) -> Subject:
-    from gausim.cli._subject import subject_of
+    from gausim.cli.view_subject import subject_of
     from gausim.core.errors import ConfigError
 
     beside = None
@@ -110,10 +110,10 @@ def _subject(arguments: argparse.Namespace) -> Subject:
 
 
 def _of_run(path: Path, arguments: argparse.Namespace, *, name: str | None = None) -> Playable:
-    from gausim.cli._data_paths import data_option
-    from gausim.cli._foresee import state_of
-    from gausim.cli._run import load_run
-    from gausim.cli._subject import playable_run
+    from gausim.cli.view_subject import playable_run
+    from gausim.compose.build import load_run
+    from gausim.compose.data_paths import data_option
+    from gausim.compose.predict import state_of
 
     run = load_run(path, data=data_option(arguments.data))
     state_of(run)
@@ -123,8 +123,8 @@ def _of_run(path: Path, arguments: argparse.Namespace, *, name: str | None = Non
 
 
 def _of_scene(arguments: argparse.Namespace) -> Playable:
-    from gausim.cli._subject import playable_scene
     from gausim.cli.inspect import pinned_by
+    from gausim.cli.view_subject import playable_scene
     from gausim.io.ply import load_scene
 
     scene = pinned_by(load_scene(arguments.what), arguments.pin_below, arguments.pin_above)

@@ -8,6 +8,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gausim.core.scene import GaussianScene
+
 
 @dataclass(frozen=True, eq=False)
 class SimState:
@@ -61,3 +63,18 @@ class Trajectory:
         gradient = self.gradients[:, self.unit_of_kernel[kernel]]
         offset = (points - rest[kernel]).to(gradient)
         return self.positions[:, kernel] + torch.einsum("fpij,pj->fpi", gradient, offset)
+
+
+def initial_sway(scene: GaussianScene, fraction: float) -> SimState:
+    """The rest state, about to sway: every free kernel moves along x, farther from the roots faster.
+
+    Args:
+        scene: with at least one pinned kernel.
+        fraction: displacement per frame of the kernel farthest from the roots [bounding-box diagonals].
+    """
+    free = scene.simulated & ~scene.pinned
+    root = scene.means[scene.pinned].mean(0)
+    distance = torch.where(free, (scene.means - root).norm(dim=-1), torch.zeros(()))
+    shift = torch.zeros_like(scene.means)
+    shift[:, 0] = fraction * scene.diagonal * distance / distance.max().clamp_min(1e-12)
+    return SimState(scene.means, scene.means - shift)

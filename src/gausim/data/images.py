@@ -15,8 +15,8 @@ from torch import Tensor
 
 from gausim.core import DataError
 from gausim.io.pixels import decode, read_header
-from gausim.ops.compiled import fits
-from gausim.ops.jit import KERNEL
+from gausim.kernels.compiled import fits
+from gausim.kernels.jit import KERNEL
 
 # Decoding releases the interpreter lock; more threads than this only queue for the disk.
 DECODER_THREADS = 4

@@ -14,7 +14,7 @@ from gausim.doctor.clock import motion_energy
 from gausim.doctor.coverage import view_directions
 from gausim.doctor.evidence import Evidence, Tick
 from gausim.doctor.motion import swing
-from gausim.report.figures import METHOD_COLORS, save_figure
+from gausim.report.pictures.figures import METHOD_COLORS, save_figure
 
 _DPI = 110
 _COLUMNS = 3

@@ -13,10 +13,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.core import ConfigError
-from gausim.losses.fused import SSIM_C1, SSIM_C2, compare
-from gausim.ops.announce import announced
-from gausim.ops.compiled import array, fits
-from gausim.ops.pool import shared_pool
+from gausim.kernels.announce import announced
+from gausim.kernels.compiled import array, fits
+from gausim.kernels.image_loss import SSIM_C1, SSIM_C2, compare
+from gausim.kernels.pool import shared_pool
 
 # Pixels of the authors' 960 x 540 frames: sums over their pixels, restated for any image size as mean times this.
 REFERENCE_PIXELS = 518_400
@@ -32,7 +32,8 @@ class ImageLoss(nn.Module):
 
     Both are summed over channels, averaged over pixels and views and multiplied by ``pixels``, so that weights of
     other terms mean the same at every image size. float32 on the CPU goes through compiled kernels
-    (:mod:`gausim.losses.fused`); everything else, and the tests' oracle, is plain torch and never waits for a device.
+    (:mod:`gausim.kernels.image_loss`); everything else, and the tests' oracle, is plain torch and never waits for a
+    device.
 
     Attributes:
         compares_alpha: whether images have the opacity as their fourth channel.

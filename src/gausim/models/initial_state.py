@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.core import ConfigError
-from gausim.models.simulator import GausSim
+from gausim.models.step.simulator import GausSim
 
 TINY = 1e-12
 
@@ -47,7 +47,7 @@ class ModalInitialStates(nn.Module):
         """One parameter per sequence, zero at the start.
 
         Args:
-            model: its template must offer a basis (:class:`gausim.models.elastic.ElasticTemplate`).
+            model: its template must offer a basis (:class:`gausim.models.template.elastic.ElasticTemplate`).
             scene_of_sequence: which scene each sequence shows.
             in_diagonals: v_m = 1 moves the kernel that moves furthest in phi_m by one diagonal, so that one learning
                 rate means the same motion for every object and template; else v_m is an amplitude of the template's.

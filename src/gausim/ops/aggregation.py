@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gausim.ops.compiled import array, fits
-from gausim.ops.jit import KERNEL, ORDERED
+from gausim.kernels.compiled import array, fits
+from gausim.kernels.jit import KERNEL, ORDERED
 
 
 @numba.njit(fastmath=ORDERED, **KERNEL)

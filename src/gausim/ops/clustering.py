@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial import cKDTree
 
-from gausim.ops import agglomeration, kdtree
-from gausim.ops.announce import announced
+from gausim.kernels import agglomeration, kdtree
+from gausim.kernels.announce import announced
 
 # Above this the pairwise distances of complete linkage alone take more than 1.6 GB.
 MAX_COMPLETE_LINKAGE = 20_000

@@ -7,13 +7,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.ops import deformation_compiled as compiled
-from gausim.ops.compiled import array, fits
+from gausim.kernels import deformation as compiled
+from gausim.kernels.compiled import array, fits
 from gausim.ops.quaternion import quaternion_to_matrix
 
 # Bound of the logarithmic stretch (METHOD section 2).
 MAX_LOG_STRETCH = 5.0
-POLAR_ITERATIONS = 8
 
 
 def gradient_from_output(
@@ -75,9 +74,9 @@ def polar_rotation(gradient: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]
     """Rotation of the polar decomposition by Newton's iteration R <- (R + R^-T) / 2 (Higham 1986); det > 0 assumed."""
     if fits(gradient) and not gradient.requires_grad:
         found = np.empty((gradient.numel() // 9, 3, 3), np.float32)
-        compiled.polar_rotations(array(gradient).reshape(-1, 3, 3), POLAR_ITERATIONS, found)
+        compiled.polar_rotations(array(gradient).reshape(-1, 3, 3), compiled.POLAR_ITERATIONS, found)
         return torch.from_numpy(found).view(gradient.shape)
     rotation = gradient
-    for _ in range(POLAR_ITERATIONS):
+    for _ in range(compiled.POLAR_ITERATIONS):
         rotation = 0.5 * (rotation + _inverse_transpose(rotation))
     return rotation

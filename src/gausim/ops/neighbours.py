@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gausim.ops import nearest
-from gausim.ops.announce import announced
+from gausim.kernels import nearest
+from gausim.kernels.announce import announced
 
 TABLE_ELEMENTS = 1 << 24  # distances that neighbour_table holds at a time: 128 MiB of int64 keys
 

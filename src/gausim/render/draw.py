@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import Cameras, ConfigError, GaussianScene, Rendered, Renderer, Trajectory
-from gausim.ops.compiled import fits
+from gausim.kernels.compiled import fits
 from gausim.ops.covariance import covariance_from_scales, transport_covariance
 from gausim.ops.spherical_harmonics import spherical_harmonics_basis
 from gausim.render.cpu.appearance import deformed_appearance

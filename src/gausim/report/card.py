@@ -8,9 +8,9 @@ from typing import Any
 
 import yaml
 
-from gausim.report.runs import RunRecord
-from gausim.report.summary import MOTION_ENERGY
-from gausim.report.tables import GROUP_TITLES, LEGEND, NO_FORESIGHT, markdown_table, object_tables, said
+from gausim.report.gather.runs import RunRecord
+from gausim.results.summary import MOTION_ENERGY
+from gausim.results.table import GROUP_TITLES, LEGEND, NO_FORESIGHT, markdown_table, object_tables, said
 
 # Hugging Face and code hosts show a file of this name.
 CARD = "README.md"

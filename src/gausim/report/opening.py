@@ -10,14 +10,14 @@ from typing import Any
 
 from gausim.core import RunError
 from gausim.metrics.lpips import HOW_TO_GET_WEIGHTS, NO_WEIGHTS
-from gausim.report.curves import ERROR_3D, STATIC
-from gausim.report.film import Film, make_film
-from gausim.report.runs import FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
-from gausim.report.sheets import NOTHING
-from gausim.report.study import Cell, Group, Study, cell, dig, pooled
-from gausim.report.summary import MOTION_ENERGY
-from gausim.report.tables import Table
-from gausim.report.verdict import outcome, sentences
+from gausim.report.gather.runs import FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
+from gausim.report.gather.study import Cell, Group, Study, cell, dig, pooled
+from gausim.report.pictures.film import Film, make_film
+from gausim.report.tables.sheets import NOTHING
+from gausim.report.tables.verdict import outcome, sentences
+from gausim.results.curves import ERROR_3D, STATIC
+from gausim.results.summary import MOTION_ENERGY
+from gausim.results.table import Table
 
 # Videos are most of a page's size; the page of a run alone has its video.
 MOST_OPENINGS = 6

@@ -8,12 +8,12 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
-from gausim.report.frames import FORESEEN, SEEN
-from gausim.report.media import Exhibit
+from gausim.report.gather.study import Study
 from gausim.report.opening import Opening, unanswered
-from gausim.report.sheets import SECTIONS, Line, Sheet
+from gausim.report.pictures.frames import FORESEEN, SEEN
+from gausim.report.pictures.media import Exhibit
 from gausim.report.sources import Sources
-from gausim.report.study import Study
+from gausim.report.tables.sheets import SECTIONS, Line, Sheet
 
 
 def html_page(

@@ -11,8 +11,8 @@ from urllib.parse import quote
 
 import yaml
 
-from gausim.report.runs import RunRecord
-from gausim.report.sheets import Sheet
+from gausim.report.gather.runs import RunRecord
+from gausim.report.tables.sheets import Sheet
 
 _DIGITS = 12
 

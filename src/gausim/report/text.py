@@ -8,10 +8,10 @@ import itertools
 import re
 from collections.abc import Sequence
 
+from gausim.report.gather.study import Group, Study, Value, cell
 from gausim.report.opening import Opening
-from gausim.report.sheets import PAPER, Entry, Line, Sheet, metric_info
 from gausim.report.sources import Sources, commit_of, data_hashes
-from gausim.report.study import Group, Study, Value, cell
+from gausim.report.tables.sheets import PAPER, Entry, Line, Sheet, metric_info
 
 CSV_HEAD = (
     "row", "kind", "object", "split", "first_frame", "end_frame", "views", "metric", "mean", "std_sequences",

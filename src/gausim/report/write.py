@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gausim.io.files import write_durably
-from gausim.report.media import Exhibit, object_figures
+from gausim.report.gather.runs import find_runs
+from gausim.report.gather.study import Study, make_study
 from gausim.report.opening import Opening, make_openings
-from gausim.report.overview import make_sheets
 from gausim.report.page import html_page
-from gausim.report.runs import find_runs
+from gausim.report.pictures.media import Exhibit, object_figures
 from gausim.report.sources import Sources
-from gausim.report.study import Study, make_study
+from gausim.report.tables.overview import make_sheets
 from gausim.report.text import csv_numbers, latex_tables, markdown_report
 
 PAGE, MARKDOWN, LATEX, NUMBERS = "report.html", "report.md", "tables.tex", "numbers.csv"

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from gausim.baselines.mpm.config import Grid
 from gausim.core import ConfigError
-from gausim.ops.announce import announced
-from gausim.ops.jit import KERNEL
+from gausim.kernels.announce import announced
+from gausim.kernels.jit import KERNEL
 
 REACH = 3.0  # standard deviations over which a Gaussian is splatted
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from gausim.baselines.mpm.config import Grid, Material
 from gausim.baselines.mpm.particles import Particles
 from gausim.baselines.mpm.runtime import warp
-from gausim.ops.announce import announced
+from gausim.kernels.announce import announced
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gausim.ops.announce import announced
-from gausim.ops.pool import shared_pool
+from gausim.kernels.announce import announced
+from gausim.kernels.pool import shared_pool
 from gausim.render.cpu.shading import shade, shade_adjoint
 from gausim.render.cpu.simd import LANES
 

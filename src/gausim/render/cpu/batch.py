@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gausim.core.errors import DivergenceError
-from gausim.ops.pool import WorkerPool
+from gausim.kernels.pool import WorkerPool
 from gausim.render.cpu.binning import TILE_HEIGHT, TILE_WIDTH, bin_band
 from gausim.render.cpu.projection import (
     EXTENT,

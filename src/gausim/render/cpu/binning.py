@@ -7,7 +7,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from gausim.ops.jit import FINITE_MATH_OFF, HELPER, KERNEL
+from gausim.kernels.jit import FINITE_MATH_OFF, HELPER, KERNEL
 from gausim.render.cpu.projection import RECORD
 from gausim.render.cpu.simd import (
     LANES,

@@ -9,7 +9,7 @@ import math
 import numba
 import numpy as np
 
-from gausim.ops.jit import FINITE_MATH_OFF, HELPER, KERNEL
+from gausim.kernels.jit import FINITE_MATH_OFF, HELPER, KERNEL
 from gausim.render.cpu.simd import LANES, load, splat, store
 
 # Raster record, float32: integer and fractional part of the mean, x then y (so that offsets inside a tile stay exact

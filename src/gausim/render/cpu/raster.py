@@ -13,7 +13,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from gausim.ops.jit import HELPER, KERNEL
+from gausim.kernels.jit import HELPER, KERNEL
 from gausim.render.cpu.binning import TILE_HEIGHT, TILE_WIDTH
 from gausim.render.cpu.projection import RECORD
 from gausim.render.cpu.simd import (

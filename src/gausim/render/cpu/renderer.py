@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import ConfigError, Rendered
-from gausim.ops.announce import announced
-from gausim.ops.pool import shared_pool
+from gausim.kernels.announce import announced
+from gausim.kernels.pool import shared_pool
 from gausim.render.cpu.batch import Array, Batch, Images
 
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from gausim.kernels.jit import HELPER, KERNEL
 from gausim.ops import spherical_harmonics
-from gausim.ops.jit import HELPER, KERNEL
 from gausim.render.cpu.simd import LANES, load, maximum, select, splat, square_root, store
 
 P, G, Q, OUT = 0, 3 * LANES, 12 * LANES, 21 * LANES  # where in ``lanes`` the parts start

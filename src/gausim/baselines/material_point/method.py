@@ -1,0 +1,259 @@
+"""Scenes moved by the material point method with fitted velocities, and perhaps moduli: what the methods share.
+
+Units. A scene is scaled to ``side`` simulation units along its longest side, frames last 1 / fps seconds, and Young's
+modulus E and density rho are in simulation units. Nothing depends on them but sqrt(E / rho) / side, the speed of waves
+in sides per second: periods scale with side sqrt(rho / E), and a factor common to E and rho changes nothing. So E in
+PhysDreamer (side 1 / 1.8, rho 2000) equals 0.324 times as much in PhysGaussian (side 1, rho 200).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import Parameter
+
+from gausim.baselines.fitted import Fitted
+from gausim.baselines.material_point.driven import Driven
+from gausim.baselines.material_point.fields import TriPlaneField
+from gausim.baselines.mpm import (
+    Filling,
+    Grid,
+    Material,
+    MPMSolver,
+    Particles,
+    ParticleState,
+    SceneMapping,
+    TimeStep,
+    fill_interior,
+)
+from gausim.baselines.mpm.runtime import warp
+from gausim.core import ConfigError, FittedState, GaussianScene
+from gausim.ops.covariance import covariance_from_scales
+
+# Range of Young's modulus in PhysDreamer [simulation units]; outside nothing sensible is simulated.
+LEAST_MODULUS, GREATEST_MODULUS = 1e3, 5e8
+
+
+@dataclass(frozen=True)
+class Domain:
+    """How scenes are simulated.
+
+    Attributes:
+        side: longest side of the scene in the simulation [simulation units].
+        size: edge of the cubic domain, in whose middle the scene is [simulation units].
+        cells: cells per axis over the whole domain.
+        damping: rate at which the grid loses velocity [1 / s].
+        substeps: per frame; None derives them from the bound of the time step.
+        courant: c of that bound, dt < c dx / sqrt(E / rho).
+        filling: how the interior is filled; None leaves it empty.
+    """
+
+    side: float
+    size: float
+    cells: int
+    damping: float = 0.0
+    substeps: int | None = None
+    courant: float = 0.3
+    filling: Filling | None = None
+
+    @property
+    def grid(self) -> Grid:
+        """The background grid."""
+        return Grid(cells=self.cells, size=self.size, damping=self.damping)
+
+    def mapping(self, scene: GaussianScene) -> SceneMapping:
+        """From a scene to the simulation."""
+        low, high = extent(scene)
+        scale = self.side / float((high - low).amax())
+        x, y, z = (self.size / 2 - scale * (low + high) / 2).tolist()
+        return SceneMapping(scale, (x, y, z))
+
+    def filled(self, scene: GaussianScene) -> Float[Tensor, "M 3"]:
+        """Points in the interior of a scene [scene units]."""
+        if self.filling is None:
+            return scene.means.new_zeros(0, 3)
+        mapping, body = self.mapping(scene), scene.select(scene.simulated)
+        covars = mapping.scale**2 * covariance_from_scales(body.log_scales, body.quats)
+        opacities = torch.sigmoid(body.opacity_logits)
+        return mapping.to_scene(
+            fill_interior(mapping.to_simulation(body.means), covars, opacities, self.grid, self.filling)
+        )
+
+
+def extent(scene: GaussianScene) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
+    """Least and greatest corner of the simulated kernels [scene units]."""
+    x = scene.means[scene.simulated].double()
+    return x.amin(0), x.amax(0)
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One scene ready to be simulated on one device.
+
+    Attributes:
+        driven: particles and kernels [scene units].
+        mapping: to the simulation.
+        places: particles in [-1, 1]^3, where fields are looked up; the longest side of the scene has length 2.
+        solver: moves the particles.
+    """
+
+    driven: Driven
+    mapping: SceneMapping
+    places: Float[Tensor, "P 3"]
+    solver: MPMSolver
+
+
+class MaterialPoints(Fitted):
+    """A velocity field per sequence, and the material point method from there on: a base for methods.
+
+    The field gives ``velocity_scale`` times its output in longest sides per second; pinned particles have none. Before
+    anything is fitted all are at rest.
+    """
+
+    def __init__(
+        self,
+        *,
+        scenes: Sequence[GaussianScene],
+        fps: Sequence[float],
+        scene_of_sequence: Sequence[int],
+        seen: int,
+        material: Material,
+        domain: Domain,
+        velocity_resolution: int,
+        velocity_scale: float,
+    ) -> None:
+        """Places the particles.
+
+        Args:
+            scenes: the rest scenes.
+            fps: frames per second of each.
+            scene_of_sequence: the scene of each sequence.
+            seen: predicted frames that training may see.
+            material: of all particles; their E where :meth:`modulus` does not say otherwise.
+            domain: how they are simulated.
+            velocity_resolution: of the planes of the velocity fields.
+            velocity_scale: of their outputs [longest sides / s].
+
+        Raises:
+            ConfigError: Warp is not installed, or a number is out of range.
+            SceneError: too few kernels.
+        """
+        super().__init__(scenes=scenes, fps=fps, scene_of_sequence=scene_of_sequence, seen=seen)
+        if velocity_resolution < 2 or not velocity_scale > 0:
+            raise ConfigError(
+                "model.method: expected velocity_resolution >= 2 and velocity_scale > 0, got "
+                f"{velocity_resolution} and {velocity_scale}."
+            )
+        warp()  # says what to install before anything is made
+        self.material, self.domain, self.velocity_scale = material, domain, velocity_scale
+        self._bodies = [self._body(i, self.drive(scene)) for i, scene in enumerate(self.scenes)]
+        self.velocity = nn.ModuleList(TriPlaneField(velocity_resolution, outputs=3) for _ in self.scene_of_sequence)
+
+    def drive(self, scene: GaussianScene) -> Driven:
+        """Which particles carry which kernels of a scene."""
+        raise NotImplementedError
+
+    def modulus(self, scene_id: int) -> Float[Tensor, " P"]:
+        """Young's modulus of the particles [simulation units]."""
+        raise NotImplementedError
+
+    def _body(self, scene_id: int, driven: Driven) -> Body:
+        scene, domain = self.scenes[scene_id], self.domain
+        mapping, step = domain.mapping(scene), TimeStep(1 / self.fps[scene_id], domain.substeps, domain.courant)
+        particles = Particles.create(
+            mapping.to_simulation(driven.rest), grid=domain.grid, density=self.material.density, pinned=driven.pinned
+        )
+        solver = MPMSolver(particles, self.material, domain.grid, step)
+        return Body(driven, mapping, self.places(scene, driven.rest), solver)
+
+    @staticmethod
+    def places(scene: GaussianScene, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
+        """Points of a scene as fields know them: the same whatever the particles and the domain."""
+        low, high = (corner.to(points) for corner in extent(scene))
+        return (points - (low + high) / 2) / ((high - low).amax() / 2)
+
+    def body(self, scene_id: int) -> Body:
+        """A scene on the device of the parameters."""
+        found = self._bodies[scene_id]
+        if found.driven.rest.device != self._device:
+            found = self._bodies[scene_id] = self._body(scene_id, found.driven.to(self._device))
+        return found
+
+    def begin(self, sequence_id: int) -> FittedState:
+        """The rest state with the fitted velocity."""
+        body = self.body(self.scene_of_sequence[sequence_id])
+        speed = self.domain.side * self.velocity_scale
+        velocity = speed * self.velocity[sequence_id](body.places) * ~body.driven.pinned[:, None]
+        particles = ParticleState.at_rest(
+            body.mapping.to_simulation(body.driven.rest), velocity, material=self.material
+        )
+        return replace(super().begin(sequence_id), inner=particles.tensors())
+
+    def advance(self, state: FittedState) -> FittedState:
+        """One frame of substeps; differentiable.
+
+        Raises:
+            ConfigError: the configured number of substeps violates the bound of the time step.
+            DivergenceError: a particle left the domain or is not finite.
+        """
+        scene_id = self.scene_of_sequence[state.sequence_id]
+        body = self.body(scene_id)
+        particles = body.solver.advance(ParticleState(*state.inner), state.frame, young_modulus=self.modulus(scene_id))
+        x = body.mapping.to_scene(particles.positions)
+        return FittedState(
+            state.sequence_id, state.frame + 1, *self.carry(body.driven, x, particles.gradients), particles.tensors()
+        )
+
+    def carry(self, driven: Driven, x: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Positions, gradients and rotations of the kernels."""
+        return driven.carried(x, gradients)
+
+    def speed(self, scene_id: int) -> Float[Tensor, " P"]:
+        """The speed sqrt(E / rho) of waves in longest sides per frame: what a modulus means for the motion."""
+        fast = torch.sqrt(self.modulus(scene_id) / self.material.density)
+        return fast / (self.domain.side * self.fps[scene_id])
+
+    def substeps(self, scene_id: int) -> int:
+        """Substeps per frame with the present moduli."""
+        with torch.no_grad():
+            return self.body(scene_id).solver.substeps(self.modulus(scene_id))
+
+    def said(self, scene_id: int) -> str:
+        """One scene's particles, moduli and substeps in words."""
+        with torch.no_grad():
+            own, speed = self.modulus(scene_id), float(self.speed(scene_id).log().mean().exp())
+        least, mean, most = (f"{float(e):.3g}" for e in (own.amin(), own.log().mean().exp(), own.amax()))
+        spread = "" if least == most else f" ({least} to {most})"
+        return (
+            f"{self.scenes[scene_id].name}: {self._bodies[scene_id].driven.count} particles, Young's modulus "
+            f"{mean}{spread}, waves of {speed:.2g} sides per frame, {self.substeps(scene_id)} substeps per frame"
+        )
+
+    def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
+        """``velocity``, one field per sequence."""
+        return {"velocity": list(self.velocity.parameters())}
+
+    def penalties(self, sequence_id: int) -> Mapping[str, Tensor]:
+        """``velocity_variation``: of the planes of the velocity field."""
+        field = self.velocity[sequence_id]
+        assert isinstance(field, TriPlaneField)
+        return {"velocity_variation": field.planes.variation()}
+
+
+def require_modulus(value: float) -> float:
+    """``value`` if it can be Young's modulus.
+
+    Raises:
+        ConfigError: it is out of range.
+    """
+    if not (math.isfinite(value) and LEAST_MODULUS <= value <= GREATEST_MODULUS):
+        raise ConfigError(
+            f"model.method.young_modulus: expected {LEAST_MODULUS:g} .. {GREATEST_MODULUS:g} [simulation units], got "
+            f"{value:g}. Periods scale with sqrt(density / young_modulus): change the density, too, to go further."
+        )
+    return value

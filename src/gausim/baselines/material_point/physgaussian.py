@@ -1,0 +1,158 @@
+"""Forward simulation by the material point method with a given material: PhysGaussian (Xie et al., CVPR 2024).
+
+Every opaque kernel is a particle and deforms with it: S = F S_0 F^T. The material is not identified: Young's modulus is
+the configuration's, or what a run of physdreamer has found (``init_from``). Nor does the original know how a recorded
+sequence begins; here a velocity field per sequence is fitted to its first frames, or taken over from that run, or left
+at zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gausim.baselines.material_point.driven import Driven, opaque
+from gausim.baselines.material_point.method import Domain, MaterialPoints, require_modulus
+from gausim.baselines.material_point.physdreamer import PhysDreamer
+from gausim.baselines.mpm import Filling, Material, MaterialKind
+from gausim.core import ConfigError, GaussianScene
+
+# What the original takes: the scene's longest side is 1, 50 cells over a domain of edge 2, 100 substeps per frame.
+SIDE, SIZE, CELLS, SUBSTEPS = 1.0, 2.0, 50, 100
+OPACITY = 0.02  # kernels below it are no particles
+
+
+class PhysGaussian(MaterialPoints):
+    """All opaque simulated kernels as particles of a given material; transparent ones follow the nearest."""
+
+    name = "physgaussian"
+
+    def __init__(
+        self,
+        *,
+        scenes: Sequence[GaussianScene],
+        fps: Sequence[float],
+        scene_of_sequence: Sequence[int],
+        seen: int,
+        material: str = "fixed_corotated",
+        young_modulus: float = 1e5,
+        poisson_ratio: float = 0.4,
+        density: float = 200.0,
+        yield_stress: float = 1e3,
+        cells: int = CELLS,
+        damping: float = 0.0,
+        substeps: int | None = None,
+        courant: float = 0.5,
+        filling: Filling | None = None,
+        opacity: float = OPACITY,
+        velocity_resolution: int = 24,
+        velocity_scale: float = 0.18,
+    ) -> None:
+        """Places the particles.
+
+        Args:
+            scenes: the rest scenes.
+            fps: frames per second of each.
+            scene_of_sequence: the scene of each sequence.
+            seen: predicted frames that training may see.
+            material: fixed_corotated, von_mises, drucker_prager, viscoplastic or plasticine.
+            young_modulus: E [simulation units].
+            poisson_ratio: nu.
+            density: rho [simulation units].
+            yield_stress: of what flows [as E].
+            cells: per axis of the domain, whose edge is twice the longest side.
+            damping: rate at which the grid loses velocity [1 / s].
+            substeps: per frame; None derives them from the bound of the time step.
+            courant: c of that bound; measured, 0.5 is stable up to nu = 0.4.
+            filling: how the interior is filled; None leaves it empty.
+            opacity: above which a kernel is a particle.
+            velocity_resolution: of the planes of the velocity fields.
+            velocity_scale: of their outputs [longest sides / s].
+
+        Raises:
+            ConfigError: a number out of range, an unknown material, or Warp is not installed.
+            SceneError: no kernel is opaque enough.
+        """
+        kinds = {kind.name.lower(): kind for kind in MaterialKind}
+        if material not in kinds:
+            raise ConfigError(f"model.method.material: expected {', '.join(kinds)}, got '{material}'.")
+        self.opacity = opacity
+        matter = Material(
+            kind=kinds[material],
+            young_modulus=require_modulus(young_modulus),
+            poisson_ratio=poisson_ratio,
+            density=density,
+            yield_stress=yield_stress,
+        )
+        super().__init__(
+            scenes=scenes,
+            fps=fps,
+            scene_of_sequence=scene_of_sequence,
+            seen=seen,
+            material=matter,
+            domain=Domain(SIDE, SIZE, cells, damping, substeps, courant, filling),
+            velocity_resolution=velocity_resolution,
+            velocity_scale=velocity_scale,
+        )
+        for scene_id in range(len(self.scenes)):
+            moduli = torch.full((self.body(scene_id).driven.count,), float(young_modulus))
+            self.register_buffer(f"young_{scene_id}", moduli)
+
+    def drive(self, scene: GaussianScene) -> Driven:
+        """Every opaque kernel, and filled points."""
+        return opaque(scene, self.domain.filled(scene), self.opacity)
+
+    def modulus(self, scene_id: int) -> Float[Tensor, " P"]:
+        """Young's modulus of the particles [simulation units]."""
+        return self.get_buffer(f"young_{scene_id}")
+
+    @torch.no_grad()
+    def take_over(self, other: object) -> None:
+        """The moduli and velocities that PhysDreamer has found for the same scenes and sequences.
+
+        Raises:
+            ConfigError: it is another method, of other scenes or sequences, or its velocity fields differ in shape.
+        """
+        if not isinstance(other, PhysDreamer):
+            raise ConfigError(
+                "init_from: physgaussian takes over what physdreamer has found, but that run is of "
+                f"{getattr(other, 'name', 'a simulator')}. Name a run of model=physdreamer."
+            )
+        self._require_alike(other)
+        self.velocity.load_state_dict(other.velocity.state_dict())
+        for scene_id in range(len(self.scenes)):
+            found = other.modulus_at(scene_id, self.body(scene_id).places)
+            stretched = self.domain.side / other.domain.side
+            self.modulus(scene_id).copy_(found * stretched**2 * self.material.density / other.material.density)
+
+    def _require_alike(self, other: PhysDreamer) -> None:
+        """Raises ConfigError where the velocities of ``other`` do not belong to the same scenes and sequences."""
+        own, its = (
+            ([s.name for s in m.scenes], m.scene_of_sequence, m.velocity_scale, _shapes(m.velocity))
+            for m in (self, other)
+        )
+        same = own == its and all(
+            a.count == b.count and torch.equal(a.means, b.means) for a, b in zip(self.scenes, other.scenes, strict=True)
+        )
+        if not same:
+            raise ConfigError(
+                "init_from: expected a run on the same scenes and sequences with the same velocity_resolution and "
+                f"velocity_scale, got {its[0]} with {len(its[1])} sequences (here {own[0]} with {len(own[1])}). "
+                "Train both with the same data and model.method.velocity_*."
+            )
+
+    def notes(self) -> tuple[str, ...]:
+        """That nothing of the material is identified."""
+        kind = self.material.kind.name.lower().replace("_", " ")
+        return (
+            f"PhysGaussian ({kind}) with a given modulus, which it does not identify; the original does not fit how a "
+            f"sequence begins either, and takes {CELLS} cells (here {self.domain.cells}) and {SUBSTEPS} substeps.",
+            *(f"{self.said(i)}." for i in range(len(self.scenes))),
+        )
+
+
+def _shapes(module: nn.Module) -> list[tuple[int, ...]]:
+    return [tuple(p.shape) for p in module.parameters()]

@@ -1,0 +1,251 @@
+"""A net of springs fitted to videos: Spring-Gaus (Zhong et al., ECCV 2024), for objects that are held somewhere.
+
+Anchors on a grid are joined by springs; kernels follow their nearest anchors. Fitted are an initial velocity per anchor
+and sequence, and of every object a stiffness per anchor and one number that attenuates far springs. Sequences of one
+object share what is the object's, which the original (one sequence, one object) leaves open.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import eigsh
+from torch import Tensor, nn
+from torch.nn import Parameter
+
+from gausim.baselines.fitted import Fitted
+from gausim.baselines.spring_gaus.anchors import Anchors
+from gausim.baselines.spring_gaus.springs import Net, move
+from gausim.core import ConfigError, DivergenceError, FittedState, GaussianScene
+
+# What the original takes.
+ANCHORS, NEIGHBOURS, SUBSTEPS, DAMPING = 2048, 256, 100, 0.1
+# Beyond so many times the substeps that were asked for, a fit has made its springs absurdly stiff.
+MOST_SUBSTEPS = 16
+
+
+class AnchoredMotion(Fitted):
+    """Kernels that follow anchors, and a velocity per anchor and sequence: a base for what moves anchors.
+
+    A velocity is in diagonals of the scene per frame; anchors of pinned kernels have none.
+    """
+
+    def __init__(
+        self,
+        *,
+        scenes: Sequence[GaussianScene],
+        fps: Sequence[float],
+        scene_of_sequence: Sequence[int],
+        seen: int,
+        anchors: int,
+        gradients: bool = True,
+    ) -> None:
+        """Places the anchors.
+
+        Args:
+            scenes: the rest scenes.
+            fps: frames per second of each.
+            scene_of_sequence: the scene of each sequence.
+            seen: predicted frames that training may see.
+            anchors: at most so many per scene.
+            gradients: kernels turn and stretch with their anchors; else they keep their shape (the original).
+
+        Raises:
+            ConfigError: fewer than four anchors are allowed.
+            SceneError: the kernels of a scene occupy fewer than four grid cells.
+        """
+        super().__init__(scenes=scenes, fps=fps, scene_of_sequence=scene_of_sequence, seen=seen)
+        if anchors < 4:
+            raise ConfigError(f"model.method.anchors: expected at least 4, got {anchors}.")
+        self.most, self.gradients = anchors, gradients
+        self._anchors = [Anchors.of(scene, anchors) for scene in self.scenes]
+        self.velocity = nn.ParameterList(torch.zeros(self._anchors[i].count, 3) for i in self.scene_of_sequence)
+
+    def anchors(self, sequence_id: int) -> Anchors:
+        """The anchors of a sequence's scene."""
+        scene_id = self.scene_of_sequence[sequence_id]
+        if self._anchors[scene_id].rest.device != self._device:
+            self._anchors[scene_id] = self._anchors[scene_id].to(self._device)
+        return self._anchors[scene_id]
+
+    def begin(self, sequence_id: int) -> FittedState:
+        """The rest state and the fitted velocity."""
+        anchors = self.anchors(sequence_id)
+        return self.state(sequence_id, 0, anchors.rest, self.velocity[sequence_id] * anchors.free)
+
+    def state(self, sequence_id: int, frame: int, x: Float[Tensor, "A 3"], v: Float[Tensor, "A 3"]) -> FittedState:
+        """The kernels that follow anchors at ``x``."""
+        anchors = self.anchors(sequence_id)
+        displacement = x - anchors.rest
+        if self.gradients:
+            gradients, rotations = anchors.gradients(displacement)
+        else:
+            gradients = rotations = torch.eye(3).to(x).expand(len(anchors.means), 3, 3)
+        return FittedState(sequence_id, frame, anchors.positions(displacement), gradients, rotations, (x, v))
+
+    def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
+        """``velocity``, one per sequence."""
+        return {"velocity": list(self.velocity)}
+
+
+class ConstantVelocity(AnchoredMotion):
+    """Every anchor keeps the velocity that the first frames show; no forces, nothing to foresee with."""
+
+    name = "constant_velocity"
+
+    def notes(self) -> tuple[str, ...]:
+        """Which velocity."""
+        return ("Keeps for ever the velocity per anchor that was fitted to the frames of its one stage.",)
+
+    def advance(self, state: FittedState) -> FittedState:
+        """One frame further on the same straight line."""
+        x, v = state.inner
+        return self.state(state.sequence_id, state.frame + 1, x + v, v)
+
+
+class SpringMass(AnchoredMotion):
+    """Spring-Gaus: anchors of mass 1 joined by springs, without gravity, held where the object is.
+
+    A spring between a and b has kappa = att 10^((k_a + k_b) / 2) / L_0 and drag att damping / L_0 (lengths in
+    diagonals of the scene, times in seconds); the law and att
+    are those of :mod:`gausim.baselines.spring_gaus.springs`.
+    """
+
+    name = "spring_mass"
+
+    def __init__(
+        self,
+        *,
+        scenes: Sequence[GaussianScene],
+        fps: Sequence[float],
+        scene_of_sequence: Sequence[int],
+        seen: int,
+        anchors: int = ANCHORS,
+        neighbours: int = NEIGHBOURS,
+        substeps: int = SUBSTEPS,
+        damping: float = DAMPING,
+        stiffness: float | None = None,
+        period: float = 8.0,
+        gradients: bool = True,
+    ) -> None:
+        """Places anchors and springs.
+
+        Args:
+            scenes: the rest scenes.
+            fps: frames per second of each.
+            scene_of_sequence: the scene of each sequence.
+            seen: predicted frames that training may see.
+            anchors: at most so many per scene.
+            neighbours: springs from an anchor to so many of its nearest.
+            substeps: per frame, at least; stiff springs get more.
+            damping: of the closing speed of a spring's ends, times its rest length [diagonals / s].
+            stiffness: k at the start; None derives it from ``period``.
+            period: of the slowest vibration at the start [frames].
+            gradients: kernels turn and stretch with their anchors; else they keep their shape (the original).
+
+        Raises:
+            ConfigError: a number out of range.
+            SceneError: too few anchors.
+        """
+        super().__init__(
+            scenes=scenes, fps=fps, scene_of_sequence=scene_of_sequence, seen=seen, anchors=anchors, gradients=gradients
+        )
+        if min(neighbours, substeps) < 1 or damping <= 0 or period <= 0:
+            raise ConfigError(
+                "model.method: expected neighbours, substeps >= 1 and damping, period > 0, got "
+                f"{neighbours}, {substeps}, {damping} and {period}."
+            )
+        self.neighbours, self.substeps = neighbours, substeps
+        self._nets = [Net.of(a.rest, a.pinned, neighbours) for a in self._anchors]
+        self.attenuation = nn.ParameterList(torch.zeros(()) for _ in self.scenes)
+        self.damping = nn.ParameterList(torch.tensor(math.log10(damping)) for _ in self.scenes)
+        self.stiffness = nn.ParameterList(torch.zeros(a.count) for a in self._anchors)
+        for scene_id, own in enumerate(self.stiffness):
+            nn.init.constant_(own, self._matching(scene_id, period) if stiffness is None else stiffness)
+
+    def _matching(self, scene_id: int, period: float) -> float:
+        """The k with which the slowest vibration has a period [frames]."""
+        kappa = self.springs(scene_id)[0].detach()
+        slowest = slowest_vibration(self._nets[scene_id], self._anchors[scene_id], kappa)
+        return math.log10((2 * math.pi / period) ** 2 / slowest)
+
+    def notes(self) -> tuple[str, ...]:
+        """Where it is smaller than the original."""
+        smaller = [
+            f"{own} {what} instead of {full}"
+            for own, full, what in ((self.most, ANCHORS, "anchors"), (self.neighbours, NEIGHBOURS, "neighbours"))
+            if own < full
+        ]
+        return (f"Spring-Gaus with at most {', '.join(smaller)}.",) if smaller else ()
+
+    def springs(self, scene_id: int) -> tuple[Float[Tensor, " E"], Float[Tensor, " E"]]:
+        """Stiffness kappa [1 / frames^2] and drag [1 / frames] of every spring of a scene."""
+        if self._nets[scene_id].length.device != self._device:
+            self._nets[scene_id] = self._nets[scene_id].to(self._device)
+        net = self._nets[scene_id]
+        k, fps = self.stiffness[scene_id], self.fps[scene_id]
+        firm = net.attenuation(self.attenuation[scene_id]) / net.length
+        both = 0.5 * (k.index_select(0, net.first) + k.index_select(0, net.second))
+        ten = math.log(10)
+        return firm * torch.exp(ten * both) / fps**2, firm * torch.exp(ten * self.damping[scene_id]) / fps
+
+    def advance(self, state: FittedState) -> FittedState:
+        """One frame of semi-implicit Euler.
+
+        Raises:
+            DivergenceError: the springs have become too stiff for any sensible number of substeps.
+        """
+        scene_id = self.scene_of_sequence[state.sequence_id]
+        kappa, drag = self.springs(scene_id)
+        x, v = state.inner
+        free, net = self.anchors(state.sequence_id).free, self._nets[scene_id]
+        x, v = move(net, x, v, kappa, drag, free, self._count(scene_id, kappa.detach(), drag.detach()))
+        return self.state(state.sequence_id, state.frame + 1, x, v)
+
+    def _count(self, scene_id: int, kappa: Tensor, drag: Tensor) -> int:
+        """Substeps per frame: semi-implicit Euler needs omega dt < 2 (half of it is taken), and drag dt < 1."""
+        net = self._nets[scene_id]
+        needed = max(math.sqrt(net.stiffest(kappa)), 2 * net.stiffest(drag))
+        if not needed <= MOST_SUBSTEPS * self.substeps:
+            raise DivergenceError(
+                f"{self.name}, '{self.scenes[scene_id].name}': the springs would need {needed:.0f} substeps per frame, "
+                f"expected at most {MOST_SUBSTEPS * self.substeps}. Lower the stage's rate of stiffness, or raise "
+                "model.method.substeps."
+            )
+        return max(self.substeps, math.ceil(needed))
+
+    def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
+        """``velocity`` per sequence; ``stiffness``, ``attenuation`` and ``damping`` per object."""
+        return {
+            **super().parameter_groups(),
+            "stiffness": list(self.stiffness),
+            "attenuation": list(self.attenuation),
+            "damping": list(self.damping),
+        }
+
+
+def slowest_vibration(net: Net, anchors: Anchors, kappa: Float[Tensor, " E"]) -> float:
+    """Squared angular frequency of the slowest vibration about rest [1 / frames^2], rigid motions left out."""
+    d = ((anchors.rest[net.second] - anchors.rest[net.first]) / net.length[:, None]).double()
+    blocks = (kappa.double()[:, None, None] * d[:, :, None] * d[:, None, :]).numpy()
+    rows, columns, values = [], [], []
+    axes, ends = np.arange(3), (net.first.numpy(), net.second.numpy())
+    for a, b in ((0, 0), (1, 1), (0, 1), (1, 0)):
+        row, column = 3 * ends[a][:, None, None] + axes[:, None], 3 * ends[b][:, None, None] + axes
+        rows.append(np.broadcast_to(row, blocks.shape).ravel())
+        columns.append(np.broadcast_to(column, blocks.shape).ravel())
+        values.append((blocks if a == b else -blocks).ravel())
+    size = 3 * anchors.count
+    whole = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)).tocsc()
+    free = np.repeat(~anchors.pinned.numpy(), 3)
+    stiff = whole[free][:, free]
+    largest = float(abs(stiff).sum(0).max())
+    wanted = min(7, stiff.shape[0] - 1)  # six of them may be rigid
+    start = np.ones(stiff.shape[0])  # a random one would make runs differ
+    found = np.sort(eigsh(stiff, k=wanted, sigma=-1e-9 * largest, v0=start, return_eigenvectors=False))
+    return float(next((value for value in found if value > 1e-7 * largest), largest))

@@ -1,0 +1,50 @@
+"""How a command ends on the terminal: sentences of result, one address, the next commands. No lists of files."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+# Of several objects so many are told of; the page or the table has them all.
+MOST_SENTENCES = 3
+PUSH = "--force on=tip weights=3 direction=x"
+OWN_OBJECT = ("train", "data=object", "data.root=ROOT", "name=mine")
+
+
+def end(sentences: Sequence[str], kind: str, address: Path, *commands: Sequence[object]) -> None:
+    """Prints the end of a command, at most three lines, one, and one per next command.
+
+    Args:
+        sentences: the result, one line each; of more than three, the number of the others is told.
+        kind: what lies at the address: ``page``, ``tables``, ``videos``, ``run``.
+        address: file or directory.
+        commands: the next ones: arguments of gausim.
+    """
+    lines = list(sentences[:MOST_SENTENCES])
+    left = len(sentences) - len(lines)
+    lines.append(f"{kind}: {address.resolve().as_uri()}" + (f" ({left} more objects)" if left else ""))
+    shown = [" ".join([program(), *(shlex.quote(str(word)) for word in words)]) for words in commands]
+    lines += [f"{'next:' if i == 0 else '     '} {command}" for i, command in enumerate(shown)]
+    print("\n".join(lines), flush=True)
+
+
+def program() -> str:
+    """What gausim is called here: by its name where the shell finds it, else by the path it was called by."""
+    called = Path(sys.argv[0])
+    return shlex.quote(str(called)) if called.name == "gausim" and shutil.which("gausim") is None else "gausim"
+
+
+def push(run: Path | str, name: str | None = None) -> list[object]:
+    """The command that pushes an object of a run."""
+    return ["simulate", run, *(["--object", name] if name else []), *PUSH.split()]
+
+
+def told(entries: Mapping[str, dict[str, Any]]) -> list[str]:
+    """One sentence per object of ``metrics.json``: how far off its first method is in frames never seen."""
+    from gausim.report.tables.verdict import outcome, sentences
+
+    return [f"{name}: {sentences(outcome([entry], str(entry['methods'][0])))[0]}" for name, entry in entries.items()]

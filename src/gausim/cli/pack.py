@@ -1,0 +1,117 @@
+"""How a finished run or a data set becomes an archive that others fetch, and the entry that a registry needs of it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gausim.compose.data_paths import SCENES, outside_files
+from gausim.core.errors import FetchError, RunError
+from gausim.data.objects import find_objects
+from gausim.io.archive import files_below, pack
+from gausim.io.files import sha256
+from gausim.io.registry import Entry, check_names, entry_text
+from gausim.io.transforms import read_json
+from gausim.report.card import CARD
+from gausim.runs.checkpoint import LAST_CHECKPOINT, read_checkpoint
+from gausim.runs.directory import CONFIG, FETCHED, FINISHED, RunDirectory
+from gausim.runs.names import EPOCHS, MOTION
+
+# What of a run others need; logs, panels and films stay: they say on which machine and by whom it was made.
+_OF_A_RUN = (CONFIG, LAST_CHECKPOINT, FINISHED, EPOCHS, MOTION, CARD)
+_LICENCES = ("licence", "license")
+
+
+def pack_published(source: Path, out: Path, *, name: str, title: str | None, licence: str | None, data: str) -> str:
+    """Packs a finished run or a data set into ``out/NAME.tar``, its card beside it.
+
+    Args:
+        source: a run directory, or a directory of an object or of several.
+        out: where the archive goes.
+        name: of the entry.
+        title: what it is; made from its objects when None.
+        licence: of the archive's content; what ``dataset.json`` says when None.
+        data: of a run, the entry of its data set; empty without one.
+
+    Returns:
+        The entry of a registry, its addresses left to fill in.
+
+    Raises:
+        FetchError: the name cannot be one, or no licence is known.
+        RunError: the run is not finished or its checkpoint damaged.
+        DataError: there is no data set, or a link in it.
+    """
+    archive = out / f"{name}.tar"
+    check_names(name, archive.name)
+    is_run = (source / CONFIG).is_file()
+    files, objects = _of_run(source) if is_run else _of_data(source)
+    known = licence or (None if is_run else _licence_of(source))
+    if not known:
+        raise FetchError(
+            f"{source}: under which licence may others use it? Give --licence ID, e.g. CC-BY-4.0"
+            f"{'' if is_run else ', or write it into dataset.json (licence)'}."
+        )
+    unpacked = pack(archive, {f"{name}/{path}": file for path, file in files.items()})
+    card = files.get(CARD)
+    if card is not None:
+        shutil.copyfile(card, out / f"{name}.md")
+    _say_what(source, archive, len(files), is_run=is_run, has_card=card is not None)
+    entry = Entry(
+        name=name, kind="run" if is_run else "data", file=archive.name, sha256=sha256(archive),
+        title=title or f"{'trained on ' if is_run else ''}{', '.join(objects)}", size=archive.stat().st_size,
+        unpacked=unpacked, licence=known, card=f"{name}.md" if card is not None else "", data=data,
+    )  # fmt: skip
+    return f"# addresses: where {archive.name} will lie, URLs or paths relative to the registry.\n{entry_text(entry)}"
+
+
+def _of_run(source: Path) -> tuple[dict[str, Path], list[str]]:
+    run = RunDirectory(source)
+    if not run.is_finished:
+        raise RunError(f"{source}: expected a finished run, found none ({FINISHED} is missing). Train it to its end.")
+    checkpoint = read_checkpoint(run.checkpoint)
+    own = {name: source / name for name in _OF_A_RUN if (source / name).is_file()}
+    evaluation = source / "evaluation"
+    if evaluation.is_dir():
+        own |= {str(file.relative_to(source).as_posix()): file for file in files_below(evaluation)}
+    return own | _scenes(source, run.config()["data"]), [str(s["name"]) for s in checkpoint["gausim"]["scenes"]]
+
+
+def _scenes(source: Path, data: Mapping[str, Any]) -> dict[str, Path]:
+    """Rest scenes and masks that the configuration names apart from the data set; they travel with the run."""
+    found: dict[str, Path] = {}
+    for path in outside_files(source, data):
+        name = f"{SCENES}/{path.name}"
+        if found.setdefault(name, path) != path:
+            raise RunError(f"{source}/{CONFIG}: names two scenes {path.name}. Rename one and train again.")
+    return found
+
+
+def _of_data(source: Path) -> tuple[dict[str, Path], list[str]]:
+    roots = find_objects(source)
+    files = {file.relative_to(source).as_posix(): file for file in files_below(source)}
+    files.pop(FETCHED, None)
+    return files, [str(read_json(root / "dataset.json").get("name", root.name)) for root in roots]
+
+
+def _licence_of(source: Path) -> str | None:
+    """What every ``dataset.json`` of a set says, if all say the same."""
+    said = set()
+    for root in find_objects(source):
+        facts = read_json(root / "dataset.json")
+        said.add(next((facts[key] for key in _LICENCES if isinstance(facts.get(key), str)), None))
+    return said.pop() if len(said) == 1 else None
+
+
+def _say_what(source: Path, archive: Path, count: int, *, is_run: bool, has_card: bool) -> None:
+    """What the packing person should know, on the standard error: the entry alone goes to the standard output."""
+    print(f"wrote {archive} ({archive.stat().st_size / 1e6:,.1f} MB, {count} files)", file=sys.stderr)
+    if not is_run:
+        return
+    root = json.dumps(RunDirectory(source).config()["data"].get("root"))
+    print(f"note: {CONFIG} in it says where your data lies: {root}", file=sys.stderr)
+    if not has_card:
+        print(f"note: it has no card. Write one with `gausim card {source}` and pack again.", file=sys.stderr)

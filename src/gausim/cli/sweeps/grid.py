@@ -1,0 +1,210 @@
+"""Sweeps: what a job does about a run that is there already, grids of jobs, and the summary at the end."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobReturn
+from hydra.types import HydraContext, TaskFunction
+from omegaconf import DictConfig, OmegaConf
+
+from gausim.core.errors import BusyError, ConfigError, GausSimError, RunError
+from gausim.runs.directory import RunDirectory, one_line
+
+log = logging.getLogger(__name__)
+
+# What became of a job.
+TRAINED, PRUNED, FINISHED_BEFORE, BUSY = "trained", "pruned", "finished before", "trained by another process"
+FAILED, FAILED_BEFORE = "failed", "failed before"
+# The metric that searches minimise: the last epoch's loss above the floor, as a fraction of the static prediction's.
+OBJECTIVE = "excess_static"
+
+
+class JobResult(float):
+    """The objective of a job, which any sweeper can read (nan where there is none), and what became of the job.
+
+    Attributes:
+        state: one of the constants of this module.
+        directory: its run directory.
+        detail: the error, of one that failed.
+    """
+
+    state: str
+    directory: str
+    detail: str
+
+    @classmethod
+    def of(cls, objective: float | None, state: str, run: RunDirectory, detail: str = "") -> JobResult:
+        """Puts the two together."""
+        result = cls(math.nan if objective is None else objective)
+        result.state, result.directory, result.detail = state, str(run.path), detail
+        return result
+
+
+def do_job(cfg: DictConfig, run: RunDirectory, train: Callable[[DictConfig, RunDirectory], Any]) -> JobResult:
+    """Does one job of a sweep, unless its run is finished, has failed, or is another process's.
+
+    Args:
+        cfg: the job's configuration.
+        run: its directory.
+        train: trains the run to its end, from its last checkpoint where there is one, and evaluates it if asked to.
+
+    Returns:
+        What became of it. No error is raised, so that the other jobs go on.
+    """
+    try:
+        with run.writing():
+            left_out = _left_out(cfg, run)
+            if left_out is not None:
+                return left_out
+            objective = train(cfg, run)
+            # Of several ranks that a scheduler started, only the first has surely written the marker by now.
+            return _finished(run, TRAINED) if run.is_finished else JobResult.of(objective, TRAINED, run)
+    except BusyError as error:
+        print(f"left out, {error}", flush=True)
+        return JobResult.of(None, BUSY, run)
+    except Exception as error:
+        # The traceback of a defect goes to the job's log; an error meant for people explains itself.
+        log.error("%s: %s", run.path, one_line(error), exc_info=not isinstance(error, GausSimError))
+        return JobResult.of(None, FAILED, run, one_line(error))
+
+
+def _left_out(cfg: DictConfig, run: RunDirectory) -> JobResult | None:
+    """The result of a run that is not to be trained (again)."""
+    if cfg.trainer.overwrite:
+        return None
+    if run.is_finished:
+        config = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+        run.check_unchanged(config)
+        if cfg.evaluate and run.awaits_evaluation(config):
+            return None
+        print(f"left out, finished before: {run.path}", flush=True)
+        return _finished(run, FINISHED_BEFORE)
+    if run.has_failed and not cfg.sweep.retry_failed:
+        print(f"left out, failed before (sweep.retry_failed=true tries again): {run.path}", flush=True)
+        return JobResult.of(None, FAILED_BEFORE, run, run.failure())
+    return None
+
+
+def _finished(run: RunDirectory, state: str) -> JobResult:
+    facts = run.facts()
+    return JobResult.of(facts["last_epoch"].get(OBJECTIVE), PRUNED if facts.get("pruned") else state, run)
+
+
+class Sweep:
+    """What every sweeper needs: overrides taken apart, jobs started and collected, the summary.
+
+    Attributes:
+        config: the composed configuration of the sweep, Hydra's own included.
+        folder: where the sweep lies.
+        results: of the jobs so far.
+    """
+
+    def __init__(self, config: DictConfig, context: HydraContext, task: TaskFunction) -> None:
+        """Builds the launcher."""
+        self.config, self._context = config, context
+        self.folder = Path(str(config.hydra.sweep.dir))
+        self.results: list[JobResult] = []
+        self._launcher = Plugins.instance().instantiate_launcher(context, task, config)
+
+    def begin(self) -> None:
+        """Makes the directory and writes down what the sweep was asked."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(self.config, self.folder / "multirun.yaml")
+
+    def overrides(self, params: Mapping[str, Any] | None, arguments: Sequence[str]) -> list[Override]:
+        """The parsed overrides of a sweep, each key once: those of the command line win over the configuration's."""
+        parser = OverridesParser.create(config_loader=self._context.config_loader)
+        parsed = parser.parse_overrides([*(f"{k}={v}" for k, v in (params or {}).items()), *arguments])
+        return list({override.get_key_element(): override for override in parsed}.values())
+
+    def launch(self, jobs: Sequence[Sequence[str]]) -> list[JobResult]:
+        """Starts jobs, waits for them, and returns what became of each.
+
+        Raises:
+            ConfigError: a job cannot be composed; none was started.
+            RunError: the launcher lost a process.
+        """
+        for overrides in jobs:  # all at first: a misspelt value must not show after hours
+            self._context.config_loader.load_sweep_config(self.config, list(overrides))
+        try:
+            returned = self._launcher.launch(jobs, initial_job_idx=len(self.results))
+        except Exception as error:
+            raise RunError(
+                f"{self.folder}: the launcher stopped ({one_line(error)}). Jobs that it started may still be running. "
+                "The same command goes on with what is not finished."
+            ) from error
+        results = [_result(one) for one in returned]
+        self.results += results
+        return results
+
+    def conclude(self) -> None:
+        """Prints the summary.
+
+        Raises:
+            RunError: a job failed, now or before.
+        """
+        counts = Counter(result.state for result in self.results)
+        told = ", ".join(f"{counts[s]} {s}" for s in (TRAINED, PRUNED, FINISHED_BEFORE, BUSY) if counts[s])
+        failed = {r.directory: r for r in self.results if r.state in (FAILED, FAILED_BEFORE)}
+        told = ", ".join(part for part in (told, f"{len(failed)} failed" if failed else "") if part)
+        print(
+            f"\nsweep of {len(self.results)} jobs: {told or 'nothing left to do'}\nnext: gausim report {self.folder}",
+            flush=True,
+        )
+        if failed:
+            lines = [f"\n  {r.directory}: {r.detail}" for r in failed.values()]
+            raise RunError(
+                f"{len(failed)} of {len(self.results)} jobs failed:{''.join(lines)}\n"
+                "The same command with sweep.retry_failed=true tries these again, from their last checkpoints."
+            )
+
+
+def _result(returned: JobReturn) -> JobResult:
+    value = returned.return_value  # raises what ended the job outside our hands
+    if isinstance(value, JobResult):
+        return value
+    assert returned.hydra_cfg is not None
+    return JobResult.of(value, TRAINED, RunDirectory(returned.hydra_cfg.hydra.runtime.output_dir))
+
+
+def run_grid(sweep: Sweep, arguments: Sequence[str], params: Mapping[str, Any] | None, batch: int | None) -> None:
+    """Trains every combination of the values.
+
+    Args:
+        sweep: launcher and directory.
+        arguments: overrides of the command line.
+        params: overrides of the configuration, key to text.
+        batch: most jobs that are handed to the launcher at a time; None hands over all.
+
+    Raises:
+        ConfigError: an override gives no value, or an interval.
+        RunError: a job failed.
+    """
+    jobs = [list(job) for job in itertools.product(*(_values(o) for o in sweep.overrides(params, arguments)))]
+    sweep.begin()
+    size = batch if batch and batch > 0 else max(1, len(jobs))
+    for start in range(0, len(jobs), size):
+        sweep.launch(jobs[start : start + size])
+    sweep.conclude()
+
+
+def _values(override: Override) -> list[str]:
+    key = override.get_key_element()
+    if not override.is_sweep_override():
+        return [f"{key}={override.get_value_element_as_str()}"]
+    if not override.is_discrete_sweep():
+        raise ConfigError(f"{override.input_line}: a grid needs single values. Intervals: hydra/sweeper=optuna.")
+    values = [f"{key}={value}" for value in override.sweep_string_iterator()]
+    if not values:
+        raise ConfigError(f"{override.input_line}: expected at least one value, got none, so there is nothing to run.")
+    return values

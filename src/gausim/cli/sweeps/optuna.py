@@ -1,0 +1,317 @@
+"""Searches by Optuna: trials are asked for, trained by Hydra's launcher and told; all of it can be killed."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Override
+from hydra.utils import get_object
+from omegaconf import DictConfig
+
+from gausim.cli.sweeps.grid import BUSY, FAILED_BEFORE, OBJECTIVE, PRUNED, JobResult, Sweep
+from gausim.compose.config import check_targets, instantiate
+from gausim.core.errors import ConfigError
+from gausim.io.files import write_durably
+from gausim.runs.directory import FREE_KEYS, RunDirectory
+from gausim.runs.files import sole_writer
+from gausim.training.callbacks.judge import EpochJudge
+
+try:
+    import optuna
+    from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+    from optuna.trial import FrozenTrial, Trial, TrialState
+except ImportError as error:
+    raise ConfigError("hydra/sweeper=optuna: needs Optuna, which comes with `pip install 'gausim[sweep]'`.") from error
+
+RESULTS, LOCK = "optimization_results.yaml", ".search.lock"
+RETRY_OF = "retry_of"
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """The node `hydra.sweeper` of a search.
+
+    Attributes:
+        n_trials: trials in all, those of earlier starts included and repeated ones counted once.
+        n_jobs: trials that are chosen and given to the launcher at a time.
+        direction: `minimize` or `maximize`.
+        params: what is searched, key to Hydra's notation of a choice, range or interval.
+        study_name: of the study in the storage.
+        storage: Optuna's address of a data base.
+        seed: of the sampler.
+        sampler: node with the `_target_` of one of `optuna.samplers`.
+        pruner: node with the `_target_` of one of `optuna.pruners`; None lets every trial come to its end.
+        trial: number of the trial, of a job.
+    """
+
+    n_trials: int
+    n_jobs: int
+    direction: str
+    params: Mapping[str, str] | None
+    study_name: str
+    storage: str
+    seed: int
+    sampler: DictConfig
+    pruner: DictConfig | None
+    trial: int | None
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        if self.n_trials < 1 or self.n_jobs < 1 or self.direction not in ("minimize", "maximize"):
+            raise ConfigError(
+                "hydra.sweeper: expected n_trials >= 1, n_jobs >= 1 and direction minimize or maximize, got "
+                f"{self.n_trials}, {self.n_jobs} and {self.direction!r}."
+            )
+
+
+class Search:
+    """One study: its trials and how they are trained."""
+
+    def __init__(self, sweep: Sweep, settings: SearchSettings) -> None:
+        """Keeps both; :meth:`run` does everything."""
+        self._sweep, self._settings = sweep, settings
+
+    def run(self, arguments: Sequence[str]) -> None:
+        """Trains trials until there are enough, then prints and writes the best.
+
+        Args:
+            arguments: overrides of the command line.
+
+        Raises:
+            ConfigError: nothing is searched, or the study in the storage is another one.
+            BusyError: another process works on the study.
+            RunError: a trial failed.
+        """
+        overrides = self._sweep.overrides(self._settings.params, arguments)
+        space = {o.get_key_element(): distribution(o) for o in overrides if o.is_sweep_override()}
+        fixed = [
+            f"{o.get_key_element()}={o.get_value_element_as_str()}" for o in overrides if not o.is_sweep_override()
+        ]
+        if not space:
+            raise ConfigError(
+                "hydra/sweeper=optuna: nothing to search. Name keys as in 'optimizer.network_lr=interval(1e-4,1e-2)', "
+                "in hydra.sweeper.params, or choose a file of sweep/."
+            )
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self._sweep.begin()
+        with sole_writer(self._sweep.folder / LOCK):
+            study = self._open(space, fixed)
+            failed = _failed(study)
+            if self._sweep.config.sweep.retry_failed:
+                for one in failed:
+                    study.enqueue_trial(one.params, user_attrs={RETRY_OF: one.number})
+            else:
+                self._sweep.results += [_failed_before(one) for one in failed]
+            while batch := self._next(study, space):
+                if not self._do(study, batch, fixed):
+                    break
+            self._report(study)
+        self._sweep.conclude()
+
+    def _open(self, space: Mapping[str, BaseDistribution], fixed: Sequence[str]) -> optuna.Study:
+        """The study, new or as it was left; another one under the same name is refused."""
+        wanted = self._settings
+        direction = optuna.study.StudyDirection[wanted.direction.upper()]
+        study = optuna.create_study(
+            storage=wanted.storage, study_name=wanted.study_name, direction=direction, load_if_exists=True
+        )
+        asked: dict[str, Any] = {name: json.loads(optuna.distributions.distribution_to_json(space[name]))
+                                 for name in sorted(space)}  # fmt: skip
+        asked |= {"direction": wanted.direction, "fixed": sorted(o for o in fixed if not _is_free(o))}
+        known = study.user_attrs.get("asked")
+        if known is None:
+            study.set_user_attr("asked", asked)
+        elif known != asked:
+            changed = sorted(k for k in {*known, *asked} if known.get(k) != asked.get(k))
+            raise ConfigError(
+                f"{wanted.storage}: the study {wanted.study_name!r} there is another search; changed: "
+                f"{', '.join(changed)}. Restore these, or give hydra.sweeper.study_name or name another value."
+            )
+        return study
+
+    def _next(self, study: optuna.Study, space: Mapping[str, BaseDistribution]) -> list[Trial]:
+        """The next trials: those that were under way when the search was killed, then new ones.
+
+        New ones come in full batches of n_jobs, whenever it was killed, so that they are chosen knowing the same.
+        """
+        known = study.get_trials(deepcopy=False)
+        batch = [self._ready(study, space, t) for t in known if t.state == TrialState.RUNNING]
+        waiting = sum(t.state == TrialState.WAITING for t in known)
+        count = sum(RETRY_OF not in t.user_attrs for t in known)
+        total, size = self._settings.n_trials, self._settings.n_jobs
+        while len(batch) < size and (waiting or (count < total and (not batch or count % size))):
+            count, waiting = (count, waiting - 1) if waiting else (count + 1, 0)
+            batch.append(self._ready(study, space))
+        return batch
+
+    def _ready(
+        self, study: optuna.Study, space: Mapping[str, BaseDistribution], known: FrozenTrial | None = None
+    ) -> Trial:
+        """A trial with a value for every parameter: a new one, or one that was asked for before.
+
+        The sampler is made anew for every trial, from the seed and its number: a search that was killed goes on with
+        what it would have tried undisturbed.
+        """
+        number = len(study.get_trials(deepcopy=False)) if known is None else known.number
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            study.sampler = self._sampler(self._settings.seed + number)
+            trial = study.ask() if known is None else Trial(study, known._trial_id)
+            for name, one in space.items():
+                _suggest(trial, name, one)
+        return trial
+
+    def _sampler(self, seed: int) -> optuna.samplers.BaseSampler:
+        node = self._settings.sampler
+        check_targets(node)
+        takes_seed = "seed" in inspect.signature(get_object(node._target_)).parameters
+        return instantiate(node, **({"seed": seed} if takes_seed and "seed" not in node else {}))
+
+    def _do(self, study: optuna.Study, batch: Sequence[Trial], fixed: Sequence[str]) -> bool:
+        """Trains trials and tells what came out; False if none of them could be done."""
+        jobs: dict[tuple[str, ...], list[Trial]] = {}
+        for trial in batch:  # two that try the same are one job
+            jobs.setdefault(tuple(f"{k}={_text(v)}" for k, v in trial.params.items()), []).append(trial)
+        orders = [[*fixed, *values, f"hydra.sweeper.trial={same[0].number}"] for values, same in jobs.items()]
+        results = self._sweep.launch(orders)
+        for (values, same), result in zip(jobs.items(), results, strict=True):
+            for trial in same:
+                _tell(study, trial, result)
+                print(f"trial {trial.number}: {result.state}, {float(result):.4g}  {' '.join(values)}", flush=True)
+        self._write(study)
+        return any(result.state != BUSY for result in results)
+
+    def _write(self, study: optuna.Study) -> FrozenTrial | None:
+        """Writes what is known so far; returns the best trial."""
+        trials = study.get_trials(deepcopy=False)
+        done = [t for t in trials if t.state == TrialState.COMPLETE]
+        sign = 1 if self._settings.direction == "minimize" else -1
+        best = min(done, key=lambda t: sign * (t.value if t.value is not None else math.inf), default=None)
+        facts = {
+            "name": "optuna",
+            "study": self._settings.study_name,
+            "objective": OBJECTIVE,
+            "direction": self._settings.direction,
+            "best_trial": best.number if best else None,
+            "best_value": best.value if best else None,
+            "best_params": dict(best.params) if best else None,
+            "best_directory": best.user_attrs.get("directory") if best else None,
+            "trials": [_row(t) for t in trials],
+        }
+        write_durably(self._sweep.folder / RESULTS, yaml.safe_dump(facts, sort_keys=False).encode())
+        return best
+
+    def _report(self, study: optuna.Study) -> None:
+        best = self._write(study)
+        states = [t.state for t in study.get_trials(deepcopy=False)]
+        counts = {s.name.lower(): states.count(s) for s in TrialState if states.count(s)}
+        print(f"\nstudy {self._settings.study_name}: " + ", ".join(f"{n} {name}" for name, n in counts.items()))
+        if best:
+            print(f"best: trial {best.number}, {OBJECTIVE} {best.value:.6g}, {best.user_attrs.get('directory')}")
+            print("  " + " ".join(f"{k}={_text(v)}" for k, v in best.params.items()))
+        print(f"wrote {self._sweep.folder / RESULTS}", flush=True)
+
+
+def _is_free(override: str) -> bool:
+    """Whether an override changes nothing that is learned."""
+    key = override.lstrip("+~").split("=")[0]
+    return any(key == free or key.startswith(f"{free}.") for free in FREE_KEYS)
+
+
+def distribution(override: Override) -> BaseDistribution:
+    """Optuna's distribution of an override: a choice, `range` or `interval` of Hydra, `tag(log, …)` for logarithmic.
+
+    A range ends before its stop, as everywhere in Hydra; an interval has whole numbers as `int(interval(…))`.
+
+    Raises:
+        ConfigError: it is empty.
+    """
+    value: Any = override.value()
+    log_scale = "log" in getattr(value, "tags", ())
+    if override.is_interval_sweep():
+        kind = IntDistribution if isinstance(value.start, int) and isinstance(value.end, int) else FloatDistribution
+        return kind(value.start, value.end, log=log_scale)
+    texts = list(override.sweep_string_iterator())
+    if not texts:
+        raise ConfigError(f"{override.input_line}: expected at least one value, got none.")
+    if override.is_range_sweep() and not log_scale:
+        numbers = list(value.range())
+        if all(isinstance(n, int) for n in numbers):
+            return IntDistribution(min(numbers), max(numbers), step=abs(value.step))
+        return FloatDistribution(min(numbers), max(numbers), step=abs(value.step))
+    return CategoricalDistribution(texts)
+
+
+def _suggest(trial: Trial, name: str, one: BaseDistribution) -> None:
+    if isinstance(one, FloatDistribution):
+        trial.suggest_float(name, one.low, one.high, step=one.step, log=one.log)
+    elif isinstance(one, IntDistribution):
+        trial.suggest_int(name, one.low, one.high, step=one.step, log=one.log)
+    elif isinstance(one, CategoricalDistribution):
+        trial.suggest_categorical(name, one.choices)
+
+
+def _text(value: Any) -> str:
+    """A parameter as the value of an override; floats to the last digit."""
+    return repr(value) if isinstance(value, float) else str(value)
+
+
+def _tell(study: optuna.Study, trial: Trial, result: JobResult) -> None:
+    if result.state == BUSY:
+        return  # it stays under way; a later start learns what came of it
+    trial.set_user_attr("directory", result.directory)
+    if result.state == PRUNED:
+        study.tell(trial.number, state=TrialState.PRUNED)
+    elif math.isfinite(result):
+        study.tell(trial.number, float(result))
+    else:
+        study.tell(trial.number, state=TrialState.FAIL)
+
+
+def _failed(study: optuna.Study) -> list[FrozenTrial]:
+    """Trials that failed and were not tried again."""
+    trials = study.get_trials(deepcopy=False)
+    again = {t.user_attrs.get(RETRY_OF) for t in trials}
+    return [t for t in trials if t.state == TrialState.FAIL and t.number not in again]
+
+
+def _failed_before(trial: FrozenTrial) -> JobResult:
+    run = RunDirectory(trial.user_attrs.get("directory", "?"))
+    return JobResult.of(None, FAILED_BEFORE, run, run.failure() if run.has_failed else f"trial {trial.number}")
+
+
+def _row(trial: FrozenTrial) -> dict[str, Any]:
+    return {
+        "number": trial.number,
+        "state": trial.state.name.lower(),
+        "value": trial.value,
+        "params": dict(trial.params),
+        "directory": trial.user_attrs.get("directory"),
+    }
+
+
+def pruning_judge() -> EpochJudge:
+    """What ends the running job, a trial of a search that prunes, when the pruner thinks so."""
+    sweeper = HydraConfig.get().sweeper
+    study = optuna.load_study(
+        storage=sweeper.storage,
+        study_name=sweeper.study_name,
+        sampler=optuna.samplers.RandomSampler(seed=0),  # asked for nothing
+        pruner=instantiate(sweeper.pruner),
+    )
+    (known,) = (t for t in study.get_trials(deepcopy=False) if t.number == sweeper.trial)
+    trial = Trial(study, known._trial_id)
+
+    def judge(epoch: int, value: float) -> bool:
+        trial.report(value, epoch)  # of an epoch that is done again, Optuna keeps what it has
+        return trial.should_prune()
+
+    return EpochJudge(judge=judge, metric=OBJECTIVE)

@@ -1,0 +1,141 @@
+"""From a configuration to a training module, and from a run directory back to its trained module."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from gausim.compose.config import instantiate
+from gausim.compose.data_paths import located
+from gausim.core import ConfigError, Renderer
+from gausim.data.datamodule import ReadyDataModule
+from gausim.data.objects import ObjectData
+from gausim.runs.checkpoint import check_scenes, load_weights, read_checkpoint
+from gausim.runs.directory import RunDirectory
+from gausim.training.fitted.fitting import FittedModule
+from gausim.training.fitted.stages import StagedCurriculum
+from gausim.training.module import GausSimModule
+from gausim.training.supervision.images import Sources, Supervision
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedRun:
+    """A trained run, ready to be measured or played.
+
+    Attributes:
+        config: its resolved configuration.
+        module: in evaluation mode with the run's weights (the averaged ones where it averaged).
+        objects: its objects; their index is the ``scene_id`` of the module's scenes.
+        datamodule: its data.
+        renderer: what it was trained with.
+        run_dir: where it lies.
+    """
+
+    config: dict[str, Any]
+    module: GausSimModule
+    objects: list[ObjectData]
+    datamodule: ReadyDataModule
+    renderer: Renderer
+    run_dir: Path
+
+
+def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyDataModule]:
+    """Builds the module and the data of a training configuration.
+
+    Raises:
+        ConfigError: a node is wrong, or the model cannot be trained by `gausim train`.
+        DataError: the data set is missing or broken.
+        SceneError: a rest scene is missing or broken.
+    """
+    config = cfg if isinstance(cfg, DictConfig) else OmegaConf.create(dict(cfg))
+    if "method" in config.model:
+        return _build_fit(config)
+    if "simulator" not in config.model or "initial_states" not in config.model:
+        raise ConfigError(
+            "model: expected the entries 'simulator' and 'initial_states' of a model that learns (gausim, "
+            "gausim_paper), or 'method' and 'plan' of one that is fitted (spring_mass, ...), got "
+            f"{sorted(str(k) for k in config.model)}."
+        )
+    datamodule = instantiate(config.data)
+    objects = datamodule.objects
+    scenes = [item.scene() for item in objects]
+    model = instantiate(config.model.simulator, scenes=scenes, fps=[item.fps for item in objects])()
+    scene_of_sequence = [scene_id for scene_id, _ in datamodule.index.entries]
+    renderer, objective = instantiate(config.render), instantiate(config.loss)
+    sources = Sources(scenes, datamodule.index.ground_truth, model.smooth_motions, renderer, objective.image)
+    states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
+    module = GausSimModule(
+        model=model,
+        initial_states=states,
+        scene_of_sequence=scene_of_sequence,
+        renderer=renderer,
+        objective=objective,
+        optimizer=instantiate(config.optimizer),
+        supervision=_supervision(config, sources),
+        seed=int(config.seed),
+    )
+    return module, datamodule
+
+
+def _supervision(config: DictConfig, sources: Sources) -> Supervision | None:
+    if not config.get("supervision"):
+        return None
+    made: Supervision | None = instantiate(config.supervision)(sources)
+    return made
+
+
+def _build_fit(config: DictConfig) -> tuple[FittedModule, ReadyDataModule]:
+    """The module and the data of a method that is fitted in stages; T and shows per epoch are those of its plan."""
+    plan = instantiate(config.model.plan)
+    seen = int(config.data.curriculum.t_max)
+    curriculum = StagedCurriculum(t_start=1, t_max=seen, plan=plan)
+    alone = config.data.batch_size or 1  # the fits of the sequences do not see each other
+    datamodule = instantiate(config.data, curriculum=curriculum, repeats=plan.shows, batch_size=alone)
+    objects = datamodule.objects
+    scenes = [item.scene() for item in objects]
+    method = instantiate(
+        config.model.method,
+        scenes=scenes,
+        fps=[item.fps for item in objects],
+        scene_of_sequence=[scene_id for scene_id, _ in datamodule.index.entries],
+        seen=seen,
+    )()
+    renderer, image_loss = instantiate(config.render), instantiate(config.loss).image
+    sources = Sources(scenes, datamodule.index.ground_truth, lambda scene_id: None, renderer, image_loss)
+    module = FittedModule(
+        method=method,
+        plan=plan,
+        renderer=renderer,
+        explosion=float(config.loss.explosion),
+        supervision=_supervision(config, sources),
+        seed=int(config.seed),
+    )
+    return module, datamodule
+
+
+def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mapping[str, Any] | None = None) -> LoadedRun:
+    """Loads a run.
+
+    Args:
+        run_dir: its directory.
+        checkpoint: file in it.
+        data: keys of the data configuration to replace, e.g. ``{"root": "/elsewhere"}``.
+
+    Raises:
+        RunError: there is no run or checkpoint, or the data holds another scene than it was trained on.
+        DataError: the data set or scene of the configuration is not on this machine, and no other is given.
+    """
+    directory = RunDirectory(run_dir)
+    config = directory.config()
+    loaded = read_checkpoint(directory.path / checkpoint)
+    config["data"] = located(directory.path, config.get("data", {}), data or {})
+    module, datamodule = build(config)
+    check_scenes(loaded, module.simulator.scenes, str(directory.path / checkpoint))
+    load_weights(module, loaded)
+    module.take_notes(loaded)
+    module.eval()
+    return LoadedRun(config, module, datamodule.objects, datamodule, module.renderer, directory.path)

@@ -1,0 +1,264 @@
+"""Hydra at one place: where the configurations lie, how they are composed, run and turned into objects."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, InstantiationException
+from hydra.types import RunMode
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gausim.compose.root import HYDRA_VERSION_BASE, conf_dir
+from gausim.compose.targets import check_hydra, check_targets
+from gausim.core.errors import ConfigError, GausSimError
+
+_UNKNOWN_KEY = r"Could not override '([^']+)'|Key '([^']+)' (?:is )?not in"
+
+
+def compose(config_name: str, overrides: Sequence[str] = ()) -> DictConfig:
+    """Composes a configuration without running anything.
+
+    Args:
+        config_name: file in conf/, without its suffix.
+        overrides: as on the command line, e.g. `("model=gausim_paper", "seed=3")`.
+
+    Returns:
+        The composed configuration; unknown keys cannot be set on it.
+
+    Raises:
+        ConfigError: an unknown key, group or option.
+    """
+    with _readable_errors(config_name):
+        return _compose(config_name, overrides)
+
+
+def compose_leniently(config_name: str, overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
+    """Composes what can be composed of the overrides, and says of every other what is wrong with it.
+
+    Args:
+        config_name: file in conf/, without its suffix.
+        overrides: as on the command line.
+
+    Returns:
+        The configuration without the wrong overrides, and a sentence for each of these.
+
+    Raises:
+        ConfigError: the file in conf/ is broken by itself.
+    """
+    try:
+        return _compose(config_name, overrides), []
+    except (HydraException, OmegaConfBaseException):
+        pass  # now one by one, groups first: they decide which keys there are
+    taken: list[str] = []
+    faults: list[str] = []
+    for override in sorted(overrides, key=_turn):
+        try:
+            _compose(config_name, [*taken, override])
+            taken.append(override)
+        except (HydraException, OmegaConfBaseException) as error:
+            faults.append(_fault(config_name, taken, override, error))
+    return compose(config_name, taken), faults
+
+
+def _turn(override: str) -> int:
+    """When an override is tried: where files are searched, then groups, then keys."""
+    key = override.lstrip("+~").split("=")[0]
+    return 0 if key == "hydra.searchpath" else 1 if (conf_dir() / key).is_dir() else 2
+
+
+def _fault(config_name: str, taken: Sequence[str], override: str, error: Exception) -> str:
+    """What is wrong with one override beside those that are right."""
+    unknown = re.search(_UNKNOWN_KEY, str(error))
+    if unknown is None:
+        why = f"{error.__cause__ or error}".partition("Config search path")[0]
+        return f"{override}: {' '.join(why.split())}"
+    key = override.lstrip("+~").split("=")[0]
+    matches = difflib.get_close_matches(key, list(_keys(_compose(config_name, taken))), n=1, cutoff=0.6)
+    return f"{key}: unknown key." + (f" Did you mean '{matches[0]}'?" if matches else "")
+
+
+def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    with hydra.initialize_config_dir(str(conf_dir()), version_base=HYDRA_VERSION_BASE):
+        return hydra.compose(config_name, overrides=list(overrides))
+
+
+class Job:
+    """What Hydra calls for every job. Of this module, so that a process that is sent one has our resolvers too."""
+
+    def __init__(self, task: Callable[[DictConfig], float | None]) -> None:
+        """Keeps the function that does the work."""
+        self._task = task
+
+    def __call__(self, config: DictConfig) -> float | None:
+        """Does it."""
+        return self._task(config)
+
+
+def run_hydra(config_name: str, task: Callable[[DictConfig], float | None], argv: Sequence[str]) -> int:
+    """Runs a task under Hydra: overrides, `-m`, `--cfg job`, `--help` and the rest of Hydra's own options.
+
+    Args:
+        config_name: file in conf/, without its suffix.
+        task: what to do with the composed configuration; its return value is a sweeper's objective.
+        argv: the arguments after the command's name.
+
+    Returns:
+        The exit status.
+
+    Raises:
+        ConfigError: an unknown key, group or option, or a value missing.
+        GausSimError: whatever the task raises on purpose.
+    """
+    runner = hydra.main(version_base=HYDRA_VERSION_BASE, config_path=str(conf_dir()), config_name=config_name)(
+        Job(task)
+    )
+    saved_argv, saved_flag = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
+    # Hydra reads sys.argv; with its full errors on it raises them, which are then told in our way, instead of exiting.
+    sys.argv = [saved_argv[0], *argv]
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    try:
+        with _readable_errors(config_name), _guarded():
+            runner()
+    finally:
+        sys.argv = saved_argv
+        if saved_flag is None:
+            del os.environ["HYDRA_FULL_ERROR"]
+        else:
+            os.environ["HYDRA_FULL_ERROR"] = saved_flag
+    return 0
+
+
+def run_dir() -> Path:
+    """Returns the directory of the running job (inside `run_hydra` only; of a sweep, the job's own)."""
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+def in_sweep() -> bool:
+    """Returns whether the running job is one of a sweep (`-m`)."""
+    return HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+@contextmanager
+def _guarded() -> Iterator[None]:
+    """Has the node `hydra` of a configuration checked before Hydra builds its logging, callbacks and launcher of it."""
+    load = ConfigLoaderImpl.load_configuration
+
+    def checked(self: ConfigLoaderImpl, *args: Any, **kwargs: Any) -> DictConfig:
+        config = load(self, *args, **kwargs)
+        check_hydra(config.hydra)
+        return config
+
+    ConfigLoaderImpl.load_configuration = checked  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        ConfigLoaderImpl.load_configuration = load  # type: ignore[method-assign]
+
+
+@contextmanager
+def _readable_errors(config_name: str) -> Iterator[None]:
+    """Turns Hydra's and OmegaConf's complaints into ConfigError, with the keys that were perhaps meant."""
+    try:
+        yield
+    except InstantiationException:
+        raise  # `instantiate` has already told those that are the configuration's fault
+    except (HydraException, OmegaConfBaseException) as error:
+        message = str(error).strip()
+        cause = str(error.__cause__).strip() if error.__cause__ else ""
+        if cause and cause not in message:
+            message = f"{message}\n{cause}"
+        if "hydra/launcher/" in message:
+            message += "\njoblib, submitit_local and submitit_slurm come with `pip install 'gausim[sweep]'`."
+        raise ConfigError(f"{config_name}.yaml: {message}{_close_keys(config_name, message)}") from error
+
+
+def _close_keys(config_name: str, message: str) -> str:
+    found = re.search(_UNKNOWN_KEY, message)
+    if found is None:
+        return ""
+    key = str(found.group(1) or found.group(2)).split("@")[0]
+    try:
+        known = list(_keys(_compose(config_name, ())))
+    except (HydraException, OmegaConfBaseException):
+        return ""  # the configuration is broken without the override as well; the message at hand says how
+    matches = difflib.get_close_matches(key, known, n=3, cutoff=0.6)
+    return f"\nDid you mean {' or '.join(matches)}?" if matches else f"\n`--cfg job` shows every key of {config_name}."
+
+
+def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
+    for key in map(str, node):
+        yield f"{prefix}{key}"
+        if not OmegaConf.is_missing(node, key) and not OmegaConf.is_interpolation(node, key):
+            child = node[key]
+            if isinstance(child, DictConfig):
+                yield from _keys(child, f"{prefix}{key}.")
+
+
+def instantiate(node: DictConfig | ListConfig | Mapping[str, Any], **kwargs: Any) -> Any:
+    """Builds the objects that a configuration names in `_target_`; nothing else in gausim does.
+
+    Objects in `kwargs` reach the constructor as they are (Hydra itself would copy them).
+
+    Args:
+        node: a node with `_target_`, or a dict or list of such nodes (then without `kwargs`).
+        **kwargs: further constructor arguments; they win over the node's.
+
+    Returns:
+        The object; a `functools.partial` where the node says `_partial_: true`; a dict or list for a dict or list.
+
+    Raises:
+        ConfigError: a target outside the allow-list, one that does not exist, or arguments it does not take.
+        GausSimError: whatever the constructor raises on purpose.
+    """
+    config = node if isinstance(node, DictConfig | ListConfig) else OmegaConf.create(dict(node))
+    target = config.get("_target_") if isinstance(config, DictConfig) else None
+    if kwargs and target is None:
+        raise ConfigError(f"expected a node with `_target_` for the arguments {sorted(kwargs)}, got {config!r}.")
+    check_targets(config)
+    where = str(config._get_full_key(None) or "configuration")
+    try:
+        if not isinstance(config, DictConfig) or target is None:
+            return hydra.utils.instantiate(config, _convert_="all")
+        wants_partial = bool(config.get("_partial_", False))
+        factory = hydra.utils.instantiate(config, _convert_="all", _partial_=True)
+        return partial(factory, **kwargs) if wants_partial else factory(**kwargs)
+    except InstantiationException as error:
+        raise _blame(error, where) from error
+    except TypeError as error:
+        if not _is_wrong_call(error):
+            raise  # from inside the constructor: a defect there, not a wrong configuration
+        raise ConfigError(f"{where}: {error}. Compare the keys with {target}.") from error
+
+
+def _is_wrong_call(error: TypeError) -> bool:
+    """Tells arguments that the target does not take from a TypeError inside its body, by where it was raised."""
+    frame = error.__traceback__
+    while frame is not None and frame.tb_next is not None:
+        frame = frame.tb_next
+    raised_in = Path(frame.tb_frame.f_code.co_filename).resolve() if frame else Path()
+    hydra_home = Path(hydra.__file__).resolve().parent
+    return "argument" in str(error) and (raised_in == Path(__file__).resolve() or hydra_home in raised_in.parents)
+
+
+def _blame(error: InstantiationException, where: str) -> Exception:
+    """Finds what Hydra wrapped: our own error, a wrong argument or name (the configuration's fault), or a defect."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, GausSimError):
+            return cause
+        last, cause = cause, cause.__cause__
+    if isinstance(last, InstantiationException) or (isinstance(last, TypeError) and _is_wrong_call(last)):
+        return ConfigError(f"{where}: {str(error).strip()}")
+    return error

@@ -1,0 +1,145 @@
+"""Where the data of a run lies on this machine: what its configuration says, and what replaces that."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gausim.core.errors import ConfigError, DataError
+
+# Rest scenes that a packed run brings along, if they lay apart from its data set.
+SCENES = "scenes"
+_KEYS = ("root", "scene", "masks")
+_FILES = ("scene", "masks")
+
+
+def add_data_option(parser: argparse.ArgumentParser) -> None:
+    """Adds ``--data``, which :func:`data_option` reads."""
+    parser.add_argument(
+        "--data", action="append", default=[], metavar="DIR|scene=FILE",
+        help="where the run's data set lies now, and scene=FILE or masks=FILE where its configuration names such; of "
+        "several sets give each, in the configuration's order (default: where it was trained)",
+    )  # fmt: skip
+
+
+def data_option(words: Sequence[str]) -> dict[str, Any]:
+    """What ``--data`` says, as keys of the data configuration.
+
+    Raises:
+        ConfigError: a key is given twice.
+    """
+    given: dict[str, Any] = {}
+    roots = []
+    for word in words:
+        key, _, value = word.partition("=")
+        if key not in _KEYS or not value:
+            roots.append(word)
+        elif key == "root":
+            roots.append(value)
+        elif key in given:
+            raise ConfigError(f"--data {word}: {key} is given twice.")
+        else:
+            given[key] = value
+    return {**given, **({"root": roots[0] if len(roots) == 1 else roots} if roots else {})}
+
+
+def located(run_dir: Path, data: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """The data configuration of a run, with every path that this machine has.
+
+    A scene or masks that are not where the configuration says are looked for in ``RUN/scenes``, which a packed run
+    brings along. The checkpoint knows its scenes, so that a wrong file is refused later.
+
+    Args:
+        run_dir: the run.
+        data: its data configuration.
+        given: keys that replace its own.
+
+    Raises:
+        DataError: a path is not there; what to give instead is told.
+    """
+    merged = {**data, **given, "root": _roots(data.get("root"), given.get("root"))}
+    if isinstance(merged["root"], list):
+        merged["root"] = [
+            _placed(run_dir, entry, f"data.root[{i}]") if isinstance(entry, Mapping) else entry
+            for i, entry in enumerate(merged["root"])
+        ]
+    merged = _placed(run_dir, merged, "data")
+    for root in merged["root"] if isinstance(merged["root"], list) else [merged["root"]]:
+        path = root.get("root") if isinstance(root, Mapping) else root
+        if path is not None and not Path(path).is_dir():
+            raise DataError(_missing(run_dir, "data.root", path, "--data DIR", "a directory"))
+    return merged
+
+
+def outside_files(run_dir: Path, data: Mapping[str, Any]) -> list[Path]:
+    """Scenes and masks that a data configuration names apart from the data set, masks beside their scene included.
+
+    Raises:
+        DataError: one is not there.
+    """
+    data = located(run_dir, data, {})
+    entries = [entry for entry in _listed(data["root"]) if isinstance(entry, Mapping)]
+    found = []
+    for entry in [data, *entries]:
+        scene, masks = entry.get("scene"), entry.get("masks")
+        beside = Path(scene).with_suffix(".masks.npz") if scene and not masks else None
+        found += [Path(path) for path in (scene, masks) if path]
+        found += [beside] if beside is not None and beside.is_file() else []
+    return found
+
+
+def _listed(root: Any) -> list[Any]:
+    return list(root) if isinstance(root, list) else [root]
+
+
+def _roots(own: Any, given: Any) -> Any:
+    """The given directories; of as many entries as the configuration has, each keeps what else it says."""
+    if given is None:
+        return own
+    entries, replaced = _listed(own), _listed(given)
+    if len(entries) != len(replaced) or not any(isinstance(entry, Mapping) for entry in entries):
+        return given
+    return [
+        {**old, "root": new} if isinstance(old, Mapping) else new for old, new in zip(entries, replaced, strict=True)
+    ]
+
+
+def _placed(run_dir: Path, entry: Mapping[str, Any], field: str) -> dict[str, Any]:
+    placed = dict(entry)
+    for key in _FILES:
+        path = entry.get(key)
+        if path is None or Path(path).is_file():
+            continue
+        packed = run_dir / SCENES / Path(path).name
+        if not packed.is_file():
+            raise DataError(_missing(run_dir, f"{field}.{key}", path, f"--data {key}=FILE", "a file"))
+        placed[key] = str(packed)
+    return placed
+
+
+def _missing(run_dir: Path, field: str, path: Any, option: str, kind: str) -> str:
+    from gausim.runs.directory import CONFIG
+
+    fetched = _fetched_with(run_dir)
+    first = f" `gausim fetch {fetched}` fetches the data set that it was trained on." if fetched else ""
+    key, value = option.removeprefix("--data ").partition("=")[::2]
+    setting = f"data.{key}={value}" if value else "data.root=DIR"
+    return (
+        f"{run_dir / CONFIG}: field {field} names {path}, expected {kind}, found none on this machine.{first} Give it "
+        f"with {option} (evaluate, simulate, export, view), as {setting} to a training by this configuration, or write "
+        "its path into that field."
+    )
+
+
+def _fetched_with(run_dir: Path) -> str | None:
+    """The data set that a fetched run's registry names."""
+    from gausim.runs.directory import FETCHED
+
+    try:
+        said = json.loads((run_dir / FETCHED).read_text())["data"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return said if isinstance(said, str) and said.isprintable() and said else None

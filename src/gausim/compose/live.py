@@ -1,0 +1,135 @@
+"""From a run to an object that can be pushed about: what `simulate`, `view` and the Python interface share."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from gausim.core.errors import ConfigError, DataError
+from gausim.models.rollout.dynamics import SceneDynamics
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gausim.compose.build import LoadedRun
+    from gausim.compose.predict import RunObject
+    from gausim.core import GaussianScene, SimState, Steppable
+    from gausim.interaction.interaction import Interaction
+
+REST = "rest"
+# Forces may give an object so many times the energy with which recorded motions begin; far beyond, nothing was learned.
+ENERGY_ROOM = 2.0
+# Where recorded motions are slower than this, a sway of this speed counts [diagonals per frame of the farthest kernel].
+_LEAST_SWAY = 0.02
+
+
+def open_interaction(
+    run: LoadedRun,
+    *,
+    name: str | None = None,
+    sequence: str = REST,
+    gravity: float | None = None,
+    most_force: float | None = None,
+    seed: int = 0,
+    keep: int | None = 0,
+) -> Interaction:
+    """An object of a run, ready to be pushed.
+
+    Args:
+        run: the loaded run.
+        name: of the object; the first one when None.
+        sequence: whose beginning is the initial state, or ``rest``.
+        gravity: acceleration that makes a weight of a mass [scene units / s^2]; 9.81 when None.
+        most_force: the largest force [weights]; the interaction's own limit when None.
+        seed: of the gusts of wind.
+        keep: so many of the latest frames are kept; None keeps all.
+
+    Raises:
+        DataError: there is no such object or sequence.
+        ConfigError: the model cannot be simulated on its own.
+    """
+    from gausim.compose.predict import TrainedPrediction, run_objects, scene_of
+    from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
+    from gausim.interaction.session import MadeWith
+
+    item = run_objects(run, None if name is None else [name])[0]
+    scene = scene_of(run, item)
+    initial, dynamics, masses, ceiling = _method(run, item, scene, sequence)
+    settings = json.dumps([run.config.get("model"), ceiling], sort_keys=True, default=str)
+    made_with = MadeWith.of(
+        scene, run.module.model, initial, settings=settings, name=sequence, run=_name(Path(run.run_dir))
+    )
+    return Interaction(
+        scene,
+        dynamics,
+        masses,
+        initial,
+        made_with=made_with,
+        units=TrainedPrediction(run, item).units,
+        gravity=STANDARD_GRAVITY if gravity is None else gravity,
+        most_force=MOST_FORCE if most_force is None else most_force,
+        seed=seed,
+        keep=keep,
+    )
+
+
+def energy_ceiling(model: object, scene_id: int, previous: Sequence[Tensor]) -> float | None:
+    """The energy that forces may give a scene: :data:`ENERGY_ROOM` times that of its liveliest beginning.
+
+    Args:
+        model: the simulator.
+        scene_id: of the scene.
+        previous: positions one frame before rest of every recorded sequence; may be empty.
+
+    Returns:
+        The energy; None for models that know none.
+    """
+    import torch
+
+    from gausim.core import SimState
+    from gausim.core.state import initial_sway
+    from gausim.training.contracts import Energetic
+
+    if not isinstance(model, Energetic) or not model.knows_energy:
+        return None
+    simulator = cast(Any, model)
+    scene, batch = simulator.scenes[scene_id], simulator.batch((scene_id,))
+    rest = batch.rest
+    states = [initial_sway(scene, _LEAST_SWAY).previous, *previous]
+    with torch.no_grad():
+        energies = [float(simulator.energy(batch, SimState(rest, x.to(rest)))) for x in states]
+    return ENERGY_ROOM * max(energies)
+
+
+def _method(
+    run: LoadedRun, item: RunObject, scene: GaussianScene, sequence: str
+) -> tuple[SimState, Steppable, Tensor, float | None]:
+    """Initial state, dynamics, masses and the ceiling of the energy."""
+    from gausim.core import FittedDynamics, SimState
+    from gausim.models.step.simulator import GausSim
+    from gausim.ops.covariance import kernel_volumes
+    from gausim.training.fitted.fitting import FittedModule
+
+    module, names = run.module, [record.name for record in item.data.sequences]
+    if sequence != REST and sequence not in names:
+        raise DataError(f"{item.data.root}: has no sequence '{sequence}'; expected '{REST}' or one of {names}.")
+    number = item.first_sequence + (names.index(sequence) if sequence != REST else 0)
+    if isinstance(module, FittedModule):
+        volumes = kernel_volumes(scene.log_scales, scene.volume_scale) * scene.simulated
+        return SimState(scene.means, scene.means), FittedDynamics(module.method, number), volumes, None
+    if not isinstance(module.model, GausSim):
+        raise ConfigError(f"{run.run_dir}: {module.method_name} cannot be simulated by itself. Take a run of gausim.")
+    states = cast(Any, module.initial_states)
+    numbers = range(item.first_sequence, item.first_sequence + len(names))
+    before = [states.previous(i).detach().to(scene.means) for i in numbers]
+    ceiling = energy_ceiling(module.model, item.scene_id, before)
+    dynamics = SceneDynamics(module.model, item.scene_id, energy_ceiling=ceiling)
+    previous = scene.means if sequence == REST else before[names.index(sequence)]
+    return SimState(scene.means, previous), dynamics, dynamics.masses, ceiling
+
+
+def _name(path: Path) -> str:
+    """A run by its last folders: the last one is often a seed only."""
+    return "/".join(path.resolve().parts[-2:])

@@ -1,0 +1,96 @@
+"""What conf/ sets, where, and what it says about it: the keys of all its files, their targets and their comments."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+
+from gausim.compose.root import conf_dir
+
+ROOT_FILE, GLOBAL_PACKAGE = "train", "# @package _global_"
+# The defaults list composes; the node `hydra` is Hydra's own.
+_NOT_OURS = ("defaults", "hydra")
+
+
+@dataclass
+class Place:
+    """One key of the configuration, over all files that set it.
+
+    Attributes:
+        targets: what is built there, by any of the files.
+        children: the keys below.
+        comment: what stands behind the key, in the first file that comments on it.
+    """
+
+    targets: list[str] = field(default_factory=list)
+    children: dict[str, Place] = field(default_factory=dict)
+    comment: str = ""
+
+    def merged(self) -> Place:
+        """All children as one, where their names are free."""
+        whole = Place()
+        for child in self.children.values():
+            whole.take(child)
+        return whole
+
+    def take(self, other: Place) -> None:
+        """Adds what another place knows."""
+        self.targets += [target for target in other.targets if target not in self.targets]
+        self.comment = self.comment or other.comment
+        for name, child in other.children.items():
+            self.children.setdefault(name, Place()).take(child)
+
+
+def choices() -> dict[str, list[str]]:
+    """The groups of conf/ and the names of their files, e.g. `{"model": ["gausim", ...], "hydra/sweeper": [...]}`."""
+    found: dict[str, list[str]] = {}
+    for path in _files():
+        if path.parent != conf_dir():
+            found.setdefault(path.parent.relative_to(conf_dir()).as_posix(), []).append(path.stem)
+    return found
+
+
+def read_places() -> Place:
+    """The root of all places that conf/ knows.
+
+    Raises:
+        ConfigError: there is no conf/.
+    """
+    root = Place()
+    for path in _files():
+        text = path.read_text()
+        folder = path.parent.relative_to(conf_dir()).parts
+        is_global = not folder or GLOBAL_PACKAGE in text.splitlines()
+        if not is_global and folder[0] in _NOT_OURS:
+            continue
+        place = root if is_global else root.children.setdefault(folder[0], Place())
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        if isinstance(node, yaml.MappingNode):
+            _read(node, place, text.splitlines())
+    return root
+
+
+def _files() -> Iterator[Path]:
+    yield from sorted(conf_dir().rglob("*.yaml"))
+
+
+def _read(node: yaml.MappingNode, place: Place, lines: list[str]) -> None:
+    for key, value in node.value:
+        if key.value == "_target_":
+            place.take(Place([value.value]))
+        elif key.value not in _NOT_OURS and not key.value.startswith("_"):
+            child = place.children.setdefault(key.value, Place())
+            child.comment = child.comment or _comment(key, value, lines)
+            if isinstance(value, yaml.MappingNode):
+                _read(value, child, lines)
+
+
+def _comment(key: yaml.Node, value: yaml.Node, lines: list[str]) -> str:
+    """The comment behind a value on one line, or behind the key of a longer one."""
+    end = value.end_mark if value.end_mark.line == key.start_mark.line else key.end_mark
+    found = re.match(r":?\s*#\s*(.*)", lines[end.line][end.column :])
+    return found.group(1).strip() if found else ""

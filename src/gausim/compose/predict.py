@@ -1,0 +1,185 @@
+"""What `evaluate` and `simulate` share: predictions of a trained run, its facts, choices of objects and views."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
+
+from gausim.core.errors import DataError
+from gausim.models.rollout.dynamics import SceneDynamics
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gausim.compose.build import LoadedRun
+    from gausim.core import GaussianScene, Trajectory
+    from gausim.data.objects import ObjectData
+    from gausim.data.records import SequenceRecord
+
+# Random pushes of `gausim evaluate --endurance` go on for so many frames.
+PUSHED_FRAMES = 240
+
+
+@dataclass(frozen=True)
+class RunObject:
+    """One object of a run.
+
+    Attributes:
+        scene_id: its index in the run.
+        data: its sequences.
+        first_sequence: running number of its first sequence over all objects.
+    """
+
+    scene_id: int
+    data: ObjectData
+    first_sequence: int
+
+
+def run_objects(run: LoadedRun, names: list[str] | None = None) -> list[RunObject]:
+    """The run's objects, or those of these names.
+
+    Raises:
+        DataError: the run has no object of a name.
+    """
+    found, first = [], 0
+    for scene_id, data in enumerate(run.objects):
+        found.append(RunObject(scene_id, data, first))
+        first += len(data.sequences)
+    have = [item.data.name for item in found]
+    unknown = [name for name in names or () if name not in have]
+    if unknown:
+        raise DataError(f"{run.run_dir}: has no object {unknown}; it has {have}.")
+    return [item for item in found if names is None or item.data.name in names]
+
+
+def scene_of(run: LoadedRun, item: RunObject) -> GaussianScene:
+    """The rest scene that the run was trained on."""
+    return run.module.simulator.scenes[item.scene_id]
+
+
+def state_of(run: LoadedRun) -> dict[str, Any]:
+    """How far the run has come: ``finished``, ``epoch`` and ``updates`` of the checkpoint in use.
+
+    An unfinished run is said to be so on the standard error.
+    """
+    from gausim.runs.checkpoint import read_checkpoint
+    from gausim.runs.directory import RunDirectory
+
+    directory = RunDirectory(run.run_dir)
+    if not directory.is_finished:
+        print(f"warning: {run.run_dir} is not finished; its latest checkpoint is used.", file=sys.stderr)
+    checkpoint = read_checkpoint(directory.checkpoint)
+    return {
+        "finished": directory.is_finished,
+        "epoch": checkpoint.get("epoch"),
+        "updates": checkpoint.get("global_step"),
+    }
+
+
+class TrainedPrediction:
+    """Predicts sequences of one object with the trained model, each once.
+
+    Args:
+        run: the loaded run.
+        item: the object.
+        frames: frames to predict at least, also where the recording is shorter.
+    """
+
+    def __init__(self, run: LoadedRun, item: RunObject, *, frames: int = 0) -> None:
+        self._run, self._item, self._frames = run, item, frames
+        names = [record.name for record in item.data.sequences]
+        self._ids = {name: item.first_sequence + i for i, name in enumerate(names)}
+        self._known: dict[str, Trajectory] = {}
+
+    @property
+    def levels(self) -> dict[str, Any] | None:
+        """Units per level of the hierarchy, those predicted, N_F and N_K; None for a model without a hierarchy."""
+        model: Any = self._run.module.model
+        hierarchies = getattr(model, "hierarchies", None)
+        if hierarchies is None:
+            return None
+        hierarchy, predicted = hierarchies[self._item.scene_id], list(model.predicted_levels)
+        counts = [level.count for level in hierarchy.levels]
+        predictions = hierarchy.predictions(predicted)
+        return {"counts": counts, "predicted": predicted, "predictions": predictions, "kernels": counts[0]}
+
+    @property
+    def units(self) -> tuple[Tensor, ...]:
+        """The unit of every kernel at each level, the small ones first; nothing for a model without a hierarchy."""
+        from gausim.training.contracts import Hierarchical
+
+        model = self._run.module.model
+        return tuple(model.units_of_kernels(self._item.scene_id)) if isinstance(model, Hierarchical) else ()
+
+    @property
+    def footnotes(self) -> dict[str, Any] | None:
+        """What the method says of itself (see :attr:`GausSimModule.footnotes`), and whether small motions grow."""
+        from gausim.evaluation.stability import largest_eigenvalue
+        from gausim.models.step.simulator import GausSim
+
+        said, model = self._run.module.footnotes, self._run.module.model
+        if not isinstance(model, GausSim):
+            return said
+        largest = largest_eigenvalue(model, self._item.scene_id)
+        note = f"Largest eigenvalue of the step, linearised at rest: {largest:.4f}; small motions grow above 1."
+        return {**said, "largest_eigenvalue": largest, "notes": [*said["notes"], note]}
+
+    def full(self, record: SequenceRecord) -> Trajectory:
+        """All predicted frames of a sequence, the recorded ones and those asked for beyond."""
+        if record.name not in self._known:
+            steps = max(record.count, self._frames) - 1
+            self._known[record.name] = self._run.module.foresee(self._ids[record.name], steps)
+        return self._known[record.name]
+
+    def __call__(self, record: SequenceRecord) -> Trajectory:
+        """Exactly the recorded frames of a sequence."""
+        return head(self.full(record), record.count)
+
+
+def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
+    """How the first sequence of an object goes on for so many frames: free, and under random pushes from rest."""
+    from gausim.core import ConfigError, SimState
+    from gausim.evaluation.endurance import RandomPushes, endure
+    from gausim.models.step.simulator import GausSim
+
+    if not isinstance(run.module.model, GausSim):
+        raise ConfigError(
+            f"--endurance: {run.module.method_name} takes no forces. Leave the option out, or evaluate a simulator."
+        )
+    scene, model, states = scene_of(run, item), cast(Any, run.module.model), cast(Any, run.module.initial_states)
+    dynamics = SceneDynamics(model, item.scene_id)
+    previous = states.previous(item.first_sequence).detach().to(scene.means)
+    free = scene.simulated & ~scene.pinned
+    pushes = RandomPushes(scene.means, dynamics.masses, free, scene.diagonal, item.data.fps, PUSHED_FRAMES)
+    still = SimState(scene.means, scene.means)
+    return {
+        "free": endure(dynamics, SimState(scene.means, previous), scene.means, scene.diagonal, frames),
+        "pushed": endure(dynamics, still, scene.means, scene.diagonal, frames, pushes=pushes),
+    }
+
+
+def head(trajectory: Trajectory, frames: int) -> Trajectory:
+    """The first frames of a trajectory."""
+    return replace(
+        trajectory,
+        positions=trajectory.positions[:frames],
+        gradients=trajectory.gradients[:frames],
+        rotations=trajectory.rotations[:frames],
+    )
+
+
+def progress(total: int, title: str) -> tuple[Any, Callable[[str], None]]:
+    """A progress bar (a context manager, on the standard error) and what advances it by one named item."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
+    task = bar.add_task(title, total=total)
+
+    def advance(name: str) -> None:
+        bar.update(task, advance=1, description=f"{title}: {name}")
+
+    return bar, advance

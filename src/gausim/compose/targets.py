@@ -1,0 +1,157 @@
+"""What a configuration may build: it may come from other people with their runs, and must not call what it likes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from gausim.core.errors import ConfigError
+
+# Whole packages will not do: torch alone runs programs (torch.distributed.run), text (torch.fx) and pickles.
+ALLOWED_PACKAGES = (
+    "gausim",
+    "torch.nn",
+    "torch.optim",
+    "lightning.pytorch.callbacks",
+    "lightning.pytorch.loggers",
+    "lightning.pytorch.plugins",
+    "lightning.pytorch.profilers",
+    "lightning.pytorch.strategies",
+    "lightning.fabric.plugins",
+    "torchmetrics.aggregation",
+    "torchmetrics.image",
+    "torchmetrics.regression",
+    "kornia.losses",
+    "kornia.metrics",
+    "optuna.pruners",
+    "optuna.samplers",
+)
+ALLOWED_TARGETS = ("builtins.dict", "builtins.list")
+# Inside the allowed packages these start programs or write files.
+REFUSED_MODULES = (
+    "gausim.benchmark",
+    "gausim.cli",
+    "gausim.data.images",
+    "gausim.runs.checkpoint",
+    "gausim.runs.files",
+    "gausim.runs.provenance",
+    "gausim.io",
+    "gausim.report",
+    "lightning.pytorch.strategies.launchers",
+)
+# What the node `hydra` may name: launchers, sweepers, what these search by, and callbacks.
+HYDRA_PACKAGES = ("hydra._internal.core_plugins", "hydra_plugins", "gausim", "optuna.pruners", "optuna.samplers")
+_LOGGING_CLASS = re.compile(r"(logging|logging\.handlers|colorlog)\.[A-Z]\w*")
+_STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
+
+
+def check_targets(node: DictConfig | ListConfig) -> None:
+    """Refuses every `_target_` outside the allow-list, however deep, before anything is built.
+
+    A name is judged by where its object really lives: `torch.nn.modules.module.torch.load` begins well, but is not of
+    torch.nn. Methods are refused: a configuration names classes and functions.
+
+    Args:
+        node: the configuration to look through.
+
+    Raises:
+        ConfigError: naming the key and the target.
+    """
+    for fault in target_faults(OmegaConf.to_container(node, resolve=True), str(node._get_full_key(None) or "")):
+        raise ConfigError(fault)
+
+
+def target_faults(config: Any, root: str = "") -> Iterator[str]:
+    """Every `_target_` of a configuration that may not be built or does not exist, in words.
+
+    Args:
+        config: plain containers, interpolations resolved.
+        root: key of the node that they are.
+    """
+    for key, target in _targets(config, root):
+        try:
+            allowed = target in ALLOWED_TARGETS or _is_allowed(target, ALLOWED_PACKAGES, REFUSED_MODULES)
+        except ConfigError as error:  # it does not exist
+            yield f"{key}: {error}"
+            continue
+        if not allowed:
+            yield (
+                f"{key}._target_: expected a class or function of {', '.join(ALLOWED_PACKAGES)} or one of "
+                f"{', '.join(ALLOWED_TARGETS)}, got {target!r}. Only these may be built from a configuration."
+            )
+
+
+def check_hydra(node: DictConfig) -> None:
+    """Refuses a node `hydra` that would make Hydra itself call something before the configuration is looked at.
+
+    Its launcher, sweeper and callbacks must be of Hydra, its plugins or gausim, its logging of the module logging, and
+    it may not set environment variables, which choose the programs that are started later.
+
+    Args:
+        node: the node `hydra` of a composed configuration.
+
+    Raises:
+        ConfigError: naming the key and its value.
+    """
+    content = OmegaConf.to_container(node, resolve=False)
+    assert isinstance(content, dict)
+    for key, target in _targets(content, "hydra"):
+        if not _is_allowed(target, HYDRA_PACKAGES, REFUSED_MODULES):
+            raise ConfigError(f"{key}._target_: expected something from {', '.join(HYDRA_PACKAGES)}, got {target!r}.")
+    if content["job"]["env_set"]:
+        raise ConfigError(
+            f"hydra.job.env_set: expected nothing, got {content['job']['env_set']}. Set environment variables in the "
+            "shell instead."
+        )
+    for name in ("hydra_logging", "job_logging"):
+        for key, text in _leaves(content[name], f"hydra.{name}"):
+            _check_logging(key, text)
+
+
+def _check_logging(key: str, text: Any) -> None:
+    """Refuses factories, classes outside of logging and any object but the standard streams."""
+    names_code = key.endswith((".()", ".class")) and not _LOGGING_CLASS.fullmatch(str(text))
+    protocol = isinstance(text, str) and text.startswith("ext://") and text not in _STREAMS
+    if names_code or protocol:
+        raise ConfigError(f"{key}: expected a class of logging, or {' or '.join(_STREAMS)}, got {text!r}.")
+
+
+def _targets(value: Any, key: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        if "_target_" in value:
+            yield key or "configuration", value["_target_"]
+        for name, child in value.items():
+            yield from _targets(child, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, list):
+        for index, child in enumerate(value):
+            yield from _targets(child, f"{key}[{index}]")
+
+
+def _leaves(value: Any, key: str) -> Iterator[tuple[str, Any]]:
+    if isinstance(value, dict):
+        for name, child in value.items():
+            yield from _leaves(child, f"{key}.{name}")
+    elif isinstance(value, list):
+        for index, child in enumerate(value):
+            yield from _leaves(child, f"{key}[{index}]")
+    else:
+        yield key, value
+
+
+def _within(name: str, packages: Sequence[str]) -> bool:
+    return any(name == package or name.startswith(f"{package}.") for package in packages)
+
+
+def _is_allowed(target: Any, packages: Sequence[str], refused: Sequence[str]) -> bool:
+    if not isinstance(target, str) or not _within(target, packages) or _within(target, refused):
+        return False
+    try:
+        found = hydra.utils.get_object(target)
+    except Exception as error:  # importing the target may fail in any way; the name is what the reader can mend
+        raise ConfigError(f"_target_ {target!r} cannot be found: {error}. Check its spelling.") from error
+    home, name = getattr(found, "__module__", None), getattr(found, "__qualname__", ".")
+    return isinstance(home, str) and "." not in name and _within(home, packages) and not _within(home, refused)

@@ -1,0 +1,181 @@
+"""Checks a training configuration without training: every wrong key by its name, with the nearest right one."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from jsonschema import Draft7Validator, ValidationError
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gausim.compose.config import compose_leniently, instantiate
+from gausim.compose.places import GLOBAL_PACKAGE, ROOT_FILE, choices
+from gausim.compose.root import conf_dir
+from gausim.compose.schema import required_keys, training_schema
+from gausim.compose.targets import target_faults
+from gausim.core.errors import ConfigError, GausSimError
+
+RUN_CONFIG = "config.yaml"
+# Built as a training does, for what only their constructors know; none of these reads data or writes files.
+_BUILT = ("data", "supervision", "loss", "optimizer", "render")
+
+
+def faults(arguments: Sequence[str]) -> list[str]:
+    """What is wrong with a configuration, key by key.
+
+    Args:
+        arguments: one saved configuration (a YAML file, or a run directory); or what `gausim train` would be given:
+            overrides, names of experiments, and files of conf/ or of a folder like it (`MINE/experiment/NAME.yaml`).
+
+    Returns:
+        A sentence for every fault; none if it can be trained, its data aside.
+
+    Raises:
+        ConfigError: an argument is no configuration, or a file is beside other arguments.
+    """
+    saved = [path for path in map(_saved, arguments) if path is not None]
+    if saved and len(arguments) > 1:
+        raise ConfigError(f"{saved[0]}: expected a saved configuration alone, got {len(arguments)} arguments.")
+    if saved:
+        whole = _read(saved[0])
+        missing = [f"{key}: missing. Every configuration that is trained has it." for key in required_keys()]
+        return [fault for fault in missing if fault.split(":")[0] not in whole] + check(whole)
+    overrides = _search_path(arguments) + [said for argument in arguments if (said := _override(argument))]
+    config, found = compose_leniently(ROOT_FILE, overrides)
+    try:
+        return found + check(OmegaConf.to_container(config, resolve=True))
+    except OmegaConfBaseException as error:
+        return [*found, f"{getattr(error, 'full_key', None) or 'configuration'}: {str(error).splitlines()[0]}"]
+
+
+def check(config: Any) -> list[str]:
+    """The faults of a whole configuration in plain containers, its interpolations resolved."""
+    found = list(target_faults(config))
+    if found:
+        return found  # of what cannot be built no arguments are known
+    schema = training_schema()
+    found = sorted({told for error in Draft7Validator(schema).iter_errors(config) for told in _told(error, schema)})
+    return found or list(_contradictions(config))
+
+
+def _saved(argument: str) -> Path | None:
+    """The file of a saved configuration, if the argument names one: a run's directory, or a file of no group."""
+    path = Path(argument)
+    path = path / RUN_CONFIG if (path / RUN_CONFIG).is_file() else path
+    is_file = path.suffix in (".yaml", ".yml") and path.is_file()
+    return path if is_file and _group(path) is None else None
+
+
+def _group(path: Path) -> str | None:
+    """The group whose choice a file is, by its folder in conf/ or its folder's name elsewhere; "" of conf/ itself."""
+    folder = path.resolve().parent
+    if folder.is_relative_to(conf_dir()):
+        return folder.relative_to(conf_dir()).as_posix().removeprefix(".")
+    return folder.name if folder.name in choices() else None
+
+
+def _search_path(arguments: Sequence[str]) -> list[str]:
+    """What `--config-dir` is to `gausim train`: where the groups of files outside of conf/ lie."""
+    files = [Path(argument).resolve() for argument in arguments if Path(argument).is_file()]
+    roots = sorted({f"'file://{file.parent.parent}'" for file in files if not file.is_relative_to(conf_dir())})
+    return [f"hydra.searchpath=[{','.join(roots)}]"] if roots else []
+
+
+def _override(argument: str) -> str:
+    """What an argument is on the command line of `gausim train`; nothing, if it is conf/train.yaml itself.
+
+    Raises:
+        ConfigError: it is neither an override, an experiment nor a file.
+    """
+    path, experiments = Path(argument), choices()["experiment"]
+    if path.is_file() and (group := _group(path)) is not None:
+        return f"{group}={path.stem}" if group else ""
+    if "=" in argument or argument.startswith("~"):
+        return argument
+    if argument in experiments:
+        return f"experiment={argument}"
+    if "/" in argument or path.suffix:
+        raise ConfigError(f"{argument}: expected a YAML file or a run directory with {RUN_CONFIG}, found neither.")
+    raise ConfigError(
+        f"'{argument}': expected KEY=VALUE, a file, a run or an experiment.{_nearest(argument, experiments)}"
+    )
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text()
+        loaded = yaml.safe_load(text)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: cannot be read as YAML ({error}).") from error
+    if not isinstance(loaded, dict):
+        raise ConfigError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
+    if "defaults" in loaded or GLOBAL_PACKAGE in text.splitlines():
+        raise ConfigError(f"{path}: is composed with others. Put it into a folder named experiment (or ablation, ...).")
+    return loaded
+
+
+def _contradictions(config: dict[str, Any]) -> Iterator[str]:
+    """What the constructors say themselves."""
+    for key in _BUILT:
+        if isinstance(config.get(key), dict) and "_target_" in config[key]:
+            try:
+                instantiate(OmegaConf.create(config)[key])
+            except (GausSimError, ValueError) as error:
+                yield f"{key}: {error}"
+
+
+def _told(error: ValidationError, whole: Mapping[str, Any]) -> Iterator[str]:
+    """One violation of the schema, in words."""
+    path = ".".join(map(str, error.absolute_path))
+    schema, instance = error.schema, error.instance
+    assert isinstance(schema, dict)
+    if error.validator == "additionalProperties":
+        known = list(schema.get("properties", {}))
+        target = instance.get("_target_")
+        for key in sorted(set(map(str, instance)) - set(known)):
+            where = f"{path}.{key}" if path else key
+            yield f"{where}: unknown key{f' of {target}' if target else ''}.{_nearest(key, known)}"
+    elif error.validator == "required":
+        *parent, key = map(str, error.absolute_path)
+        siblings = whole["definitions"].get(".".join(parent), {}).get("properties", {})
+        near = _nearest(key, [name for name in siblings if name != key])
+        yield f"{path}: expected a node with `_target_`, which says what to build.{near}"
+    else:
+        yield f"{path or 'configuration'}: expected {_expected(schema)}, got {_short(instance)}."
+
+
+def _expected(schema: Any) -> str:
+    """A schema in words."""
+    schema = schema.get("else", schema)  # where an interpolation may stand for it
+    if "enum" in schema:
+        return f"one of {', '.join(map(str, schema['enum']))}"
+    if "anyOf" in schema:
+        return " or ".join(_expected(option) for option in schema["anyOf"])
+    kinds = [schema["type"]] if isinstance(schema.get("type"), str) else list(schema.get("type", ["another value"]))
+    words = " or ".join(_WORDS.get(kind, kind) for kind in kinds)
+    count = schema.get("minItems")
+    return f"{words} of {count}" if count else words
+
+
+_WORDS = {
+    "object": "a mapping",
+    "array": "a list",
+    "string": "a text",
+    "number": "a number",
+    "integer": "a whole number",
+    "boolean": "true or false",
+}
+
+
+def _short(value: Any) -> str:
+    text = "null" if value is None else repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _nearest(key: str, known: Sequence[str]) -> str:
+    matches = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+    return f" Did you mean '{matches[0]}'?" if matches else f" Known: {', '.join(sorted(known))}." if known else ""

@@ -1,0 +1,342 @@
+"""Measures predictions of a whole object against its videos and, where known, its true 3D motion.
+
+Needs no run: any callable that gives a :class:`Trajectory` for a sequence can be measured beside the references
+(the static prediction, linear AR(2) on the true states). Frames stream through in chunks; per-frame figures remain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gausim.baselines.linear_ar import LinearAR2, fit_linear_ar2
+from gausim.baselines.static import StaticDynamics
+from gausim.core import Cameras, DataError, GaussianScene, Rendered, Renderer, RunError, SimState, Trajectory
+from gausim.data.images import composite
+from gausim.data.objects import ObjectData
+from gausim.data.records import GroundTruth, SequenceRecord
+from gausim.evaluation.recorder import PictureRecorder
+from gausim.metrics import (
+    FLIP,
+    L2,
+    LPIPS,
+    PSNR,
+    SSIM,
+    ForegroundL2,
+    ForegroundPSNR,
+    ImageMetric,
+    motion_energy,
+    point_error,
+)
+from gausim.metrics.lpips import NO_WEIGHTS, SMALLEST, TOO_SMALL, weights_path
+from gausim.render.draw import SceneAppearance, draw
+from gausim.results.curves import (
+    ERROR_3D,
+    IMAGE_ENERGY,
+    POINT_ENERGY,
+    STATIC,
+    TRUTH,
+    ImageMetricInfo,
+    ObjectCurves,
+    ObjectFacts,
+    save_curves,
+)
+from gausim.results.diagnosis import Diagnosis
+from gausim.results.pictures import save_pictures
+from gausim.results.summary import write_summary
+from gausim.results.table import markdown
+from gausim.runs.cost import CostMeter
+from gausim.runs.provenance import code_provenance, data_provenance
+from gausim.training.supervision.points import attach_points
+
+# Predicts every frame of a sequence (count frames, frame 0 first) for all kernels of the scene. One that carries an
+# attribute ``levels`` (plain data: counts, predicted, predictions, kernels) or ``footnotes`` (extrapolates, notes) has
+# it stored in the summary; one that carries ``units`` (the unit of every kernel, level by level) has its error told by
+# level.
+Predict = Callable[[SequenceRecord], Trajectory]
+Rows = dict[str, dict[str, np.ndarray]]
+
+# Modes of the linear references: few, which are robust, and more, which follow finer motion.
+AR_MODES = (8, 24)
+# Pixels that are rendered and compared at once: about 100 MB of float images and their filters.
+PIXELS_AT_ONCE = 1 << 20
+
+
+def default_metrics(side: int = SMALLEST) -> list[ImageMetric]:
+    """The image metrics of every table; of images of ``side`` pixels LPIPS where :func:`no_lpips` has no objection."""
+    perceptual = [] if no_lpips(side) else [LPIPS()]
+    return [L2(), ForegroundL2(), PSNR(), ForegroundPSNR(), SSIM(), FLIP(), *perceptual]
+
+
+def no_lpips(side: int) -> str:
+    """Why LPIPS cannot be measured on images of ``side`` pixels; empty where it can."""
+    if side < SMALLEST:
+        return TOO_SMALL
+    return "" if weights_path().is_file() else NO_WEIGHTS
+
+
+def evaluate_object(
+    data: ObjectData,
+    scene: GaussianScene,
+    methods: Mapping[str, Predict],
+    renderer: Renderer,
+    *,
+    sequences: Sequence[str] | None = None,
+    views: Sequence[str] | None = None,
+    metrics: Sequence[ImageMetric] | None = None,
+    advance: Callable[[str], None] | None = None,
+) -> ObjectCurves:
+    """Per-frame figures of every method and reference on every sequence of an object.
+
+    Args:
+        data: the object.
+        scene: its rest scene, with all kernels that the trajectories move.
+        methods: row name -> prediction.
+        renderer: draws both predictions and the static reference.
+        sequences: names of the sequences to measure; all when None.
+        views: names of the cameras to measure in; all when None.
+        metrics: image metrics; :func:`default_metrics` when None.
+        advance: called with a sequence's name when it is done.
+
+    Raises:
+        DataError: an unknown sequence, or broken data.
+        RunError: a prediction has another number of frames or kernels than asked for, or is not finite.
+    """
+    measure = _ObjectMeasure(data, scene, renderer, views, metrics)
+    records = _chosen(data, sequences)
+    references = _linear_references(data)
+    results: list[Rows] = []
+    pictures = PictureRecorder(data, records[0].name, measure.views)
+    for record in records:
+        # A record of our own: its decoded frames are let go with it instead of filling the memory.
+        fresh = SequenceRecord(record.root, views=record.views, fps=record.fps)
+        results.append(measure.sequence(fresh, methods, references, pictures if record is records[0] else None))
+        if advance is not None:
+            advance(record.name)
+    facts = ObjectFacts(
+        name=data.name,
+        fps=data.fps,
+        sequences=tuple(r.name for r in records),
+        frames=tuple(r.count for r in records),
+        views=tuple(measure.views),
+        train_views=tuple(v for v in measure.views if v in data.train_views),
+        first_unseen=data.train_frames.stop,
+        methods=tuple(methods),
+        metrics=tuple(
+            ImageMetricInfo(m.key, m.label, m.scale, m.unit, bool(m.higher_is_better)) for m in measure.metrics
+        ),
+        mean_color=measure.mean_color,
+        max_l2=measure.max_l2,
+    )
+    return ObjectCurves(facts, _stack(results), measure.record(methods), pictures.finish())
+
+
+def write_evaluation(folder: Path, objects: list[ObjectCurves], run: dict[str, Any]) -> dict[str, Any]:
+    """Writes metrics.json, metrics.npz, pictures.npz and table.md into ``folder``; returns what metrics.json holds."""
+    folder.mkdir(parents=True, exist_ok=True)
+    save_curves(folder / "metrics.npz", objects)
+    save_pictures(folder / "pictures.npz", [c.pictures for c in objects if c.pictures is not None])
+    summary = write_summary(folder / "metrics.json", objects, run, provenance=code_provenance())
+    (folder / "table.md").write_text(markdown(summary))
+    return summary
+
+
+def _chosen(data: ObjectData, names: Sequence[str] | None) -> list[SequenceRecord]:
+    known = {r.name: r for r in data.sequences}
+    unknown = [n for n in names or () if n not in known]
+    if unknown:
+        raise DataError(f"{data.root}: has no sequence {unknown}; it has {list(known)}.")
+    return data.sequences if names is None else [known[n] for n in names]
+
+
+def _linear_references(data: ObjectData) -> dict[str, LinearAR2]:
+    """Linear AR(2) fitted to the seen frames of every sequence whose truth is known."""
+    truths = [t for t in (data.ground_truth(s) for s in data.sequences) if t is not None]
+    seen = [(t.positions - t.rest)[: data.train_frames.stop] for t in truths]
+    if not seen or min(len(d) for d in seen) < 3:
+        return {}
+    return {f"linear AR(2) on true states, {m} modes": fit_linear_ar2(seen, m) for m in AR_MODES}
+
+
+class _ObjectMeasure:
+    """Measures one object's sequences; keeps what is summed over all of them (mean colour, largest l2, costs)."""
+
+    def __init__(
+        self,
+        data: ObjectData,
+        scene: GaussianScene,
+        renderer: Renderer,
+        views: Sequence[str] | None,
+        metrics: Sequence[ImageMetric] | None,
+    ) -> None:
+        self.data, self.scene, self.renderer = data, scene, renderer
+        self.views = list(data.views if views is None else views)
+        side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
+        self.metrics = list(default_metrics(side) if metrics is None else metrics)
+        measured = any(m.key == LPIPS.key for m in self.metrics)
+        self._absent = {} if measured else {LPIPS.key: no_lpips(side) or NO_WEIGHTS}
+        self.static = StaticDynamics(scene, fps=data.fps)
+        self.look = SceneAppearance.of(scene, scene.foreground)
+        points = data.rest_points
+        self.attached = None if points is None else attach_points(scene, points)
+        self.max_l2 = 0.0
+        self._color = torch.zeros(4, dtype=torch.float64)
+        self._costs: dict[str, CostMeter] = {}
+        self._diagnosis = Diagnosis(data.fps)
+
+    def record(self, methods: Mapping[str, Predict]) -> dict[str, Any]:
+        """What is known beside the figures: costs of every method, hashes of the data, what is absent, diagnosis."""
+        levels = {name: getattr(predict, "levels", None) for name, predict in methods.items()}
+        costs = {name: {**meter.summary(), "levels": levels[name]} for name, meter in self._costs.items()}
+        footnotes = {name: found for name, p in methods.items() if (found := getattr(p, "footnotes", None)) is not None}
+        sources = data_provenance(self.data)
+        facts = {"efficiency": costs, "sources": sources, "absent": self._absent, "footnotes": footnotes}
+        diagnosis = self._diagnosis.summary()
+        return facts if diagnosis is None else {**facts, "diagnosis": diagnosis}
+
+    @property
+    def mean_color(self) -> tuple[float, float, float]:
+        """Mean colour of the true foreground pixels so far; black where there was none."""
+        r, g, b = (self._color[:3] / self._color[3].clamp_min(1)).tolist()
+        return r, g, b
+
+    @torch.no_grad()
+    def sequence(
+        self,
+        record: SequenceRecord,
+        methods: Mapping[str, Predict],
+        references: Mapping[str, LinearAR2],
+        pictures: PictureRecorder | None = None,
+    ) -> Rows:
+        """Figures of one sequence, (F, V) and (F,) per row and metric; frames go to ``pictures``, too."""
+        trajectories = {}
+        for name, predict in methods.items():
+            meter = self._costs.setdefault(name, CostMeter())
+            made = meter.predict(partial(predict, record), record.count - 1)
+            trajectories[name] = self._checked(name, record, made)
+        rows = self._images(record, trajectories, pictures)
+        truth = self.data.ground_truth(record)
+        if truth is not None:
+            units = {name: found for name, predict in methods.items() if (found := getattr(predict, "units", None))}
+            self._points(rows, trajectories, references, truth, units)
+        return rows
+
+    def _checked(self, name: str, record: SequenceRecord, trajectory: Trajectory) -> Trajectory:
+        expected, actual = (record.count, self.scene.count), tuple(trajectory.positions.shape[:2])
+        if actual != expected:
+            raise RunError(f"{name}, {record.name}: predicted (frames, kernels) = {actual}, expected {expected}.")
+        broken = ~torch.isfinite(trajectory.positions).flatten(1).all(1)
+        if broken.any():
+            raise RunError(
+                f"{name}, {record.name}: the prediction is not finite from frame {int(broken.nonzero()[0])} on. "
+                "Evaluate an earlier checkpoint, or train again with a smaller learning rate."
+            )
+        return trajectory
+
+    def _images(
+        self, record: SequenceRecord, trajectories: Mapping[str, Trajectory], pictures: PictureRecorder | None
+    ) -> Rows:
+        cameras = record.cameras_of(self.views).to(self.scene.means.device)
+        still = SimState(self.scene.means, self.scene.means)
+        rest = self._draw(self.static.rollout(still, 0), range(1), cameras).rgb
+        parts: dict[str, dict[str, list[Tensor]]] = {}
+        before: dict[str, Tensor] = {}
+        for frames in _chunks(record, len(self.views)):
+            recorded = record.frames(frames, self.views)
+            target, alpha = composite(recorded)
+            target, mask = target.to(rest), (alpha > 0).to(rest.device)
+            self._count_color(target, mask)
+            images_of = {name: self._timed(name, t, frames, cameras) for name, t in trajectories.items()}
+            if pictures is not None:
+                pictures.add(recorded, images_of)
+            drawn = {name: images.rgb for name, images in images_of.items()} | {STATIC: rest.expand_as(target)}
+            for i, (name, images) in enumerate(drawn.items()):
+                if i == 0:
+                    self.max_l2 = max(self.max_l2, float((images - target).norm(dim=-1).max()))
+                for metric in self.metrics:
+                    flat = (x.flatten(0, 1) for x in (images, target, mask))
+                    values = metric.per_image(*flat).reshape(mask.shape[:2])
+                    parts.setdefault(name, {}).setdefault(metric.key, []).append(values)
+            for name, images in {**drawn, TRUTH: target}.items():
+                parts.setdefault(name, {}).setdefault(IMAGE_ENERGY, []).append(_energy(images, before.get(name)))
+                before[name] = images[-1:]
+        return {row: {m: torch.cat(v).cpu().numpy() for m, v in ms.items()} for row, ms in parts.items()}
+
+    def _timed(self, name: str, trajectory: Trajectory, frames: range, cameras: Cameras) -> Rendered:
+        return self._costs[name].draw(
+            partial(self._draw, trajectory, frames, cameras), len(frames) * len(cameras.viewmats)
+        )
+
+    def _draw(self, trajectory: Trajectory, frames: range, cameras: Cameras) -> Rendered:
+        """Foreground on black; colours beyond [0, 1] are cut, as in every image file."""
+        part = slice(frames.start, frames.stop)
+        state = trajectory.positions[part], trajectory.gradients[part], trajectory.rotations[part]
+        images = draw(self.renderer, self.look, *state, trajectory.unit_of_kernel, cameras)
+        return Rendered(images.rgb.clamp(0, 1), images.alpha)
+
+    def _count_color(self, target: Float[Tensor, "F V H W 3"], mask: Bool[Tensor, "F V H W"]) -> None:
+        total = target[mask].sum(0, dtype=torch.float64)
+        self._color += torch.cat((total, mask.sum()[None].double())).cpu()
+
+    def _points(
+        self,
+        rows: Rows,
+        trajectories: Mapping[str, Trajectory],
+        references: Mapping[str, LinearAR2],
+        truth: GroundTruth,
+        units: Mapping[str, Sequence[Tensor]],
+    ) -> None:
+        """Adds 3D errors and energies to the rows."""
+        assert self.attached is not None
+        frames = len(truth.positions)
+        predicted = {
+            name: t.carry(truth.rest.to(t.positions), self.attached, self.scene.means).to(truth.positions)
+            for name, t in trajectories.items()
+        }
+        predicted[STATIC] = truth.rest.expand_as(truth.positions)
+        displacement = truth.positions - truth.rest
+        for name, linear in references.items():
+            predicted[name] = truth.rest + linear.rollout(displacement[:2], frames - 1)
+        moving = {name: points for name, points in predicted.items() if name != STATIC}
+        parts = {name: [unit[self.attached] for unit in levels] for name, levels in units.items()}
+        self._diagnosis.add(truth.positions, truth.rest, moving, parts)
+        spread = truth.rest.amax(0) - truth.rest.amin(0)
+        diagonal = self.data.diagonal or float(spread.norm())
+        for name, points in {**predicted, TRUTH: truth.positions}.items():
+            row = rows.setdefault(name, {})
+            if name != TRUTH:
+                row[ERROR_3D] = point_error(points, truth.positions, diagonal).cpu().numpy()
+            row[POINT_ENERGY] = np.concatenate(([np.nan], motion_energy(points).cpu().numpy()))
+
+
+def _chunks(record: SequenceRecord, views: int) -> Iterator[range]:
+    size = max(1, PIXELS_AT_ONCE // (views * record.cameras.width * record.cameras.height))
+    for start in range(0, record.count, size):
+        yield range(start, min(start + size, record.count))
+
+
+def _energy(images: Float[Tensor, "F V H W 3"], before: Tensor | None) -> Float[Tensor, "F V"]:
+    """Image energy of the step into every frame and view; NaN for the very first frame."""
+    first = torch.full_like(images[:1], torch.nan) if before is None else before
+    return torch.cat((first, images)).diff(dim=0).square().sum((2, 3, 4))
+
+
+def _stack(results: list[Rows]) -> Rows:
+    """Joins sequences along a new first axis; NaN fills shorter sequences and those whose truth is unknown."""
+    stacked: Rows = {}
+    for row, metric in dict.fromkeys((row, m) for r in results for row, ms in r.items() for m in ms):
+        arrays = [r.get(row, {}).get(metric) for r in results]
+        shape = max(a.shape for a in arrays if a is not None)
+        joined = np.full((len(results), *shape), np.nan)
+        for target, array in zip(joined, arrays, strict=True):
+            if array is not None:
+                target[: len(array)] = array
+        stacked.setdefault(row, {})[metric] = joined
+    return stacked

@@ -1,0 +1,84 @@
+"""Whether small motions grow: eigenvalues of a simulator's step, linearised at rest."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
+from torch import Tensor
+
+from gausim.core import SimState
+from gausim.nn.mode import evaluating
+
+if TYPE_CHECKING:
+    from gausim.models.step.simulator import GausSim
+
+# Rows of the Jacobian that one backward pass gives, each in a copy of the scene.
+COPIES = 24
+# Up to so many unknowns per state the Jacobian is written out; beyond, ARPACK asks for its products.
+DENSE = 1500
+
+
+def largest_eigenvalue(model: GausSim, scene_id: int) -> float:
+    """The largest absolute eigenvalue of the step at rest: small motions grow where it is above 1.
+
+    The step takes displacements (u_t, u_{t-1}) of the finest predicted units, their kernels with them, to
+    (u_{t+1}, u_t); its Jacobian [[A, B], [I, 0]] is taken by automatic differentiation, units that are pinned left out.
+    The energy guard of rollouts takes no part.
+
+    Args:
+        model: the simulator.
+        scene_id: of the scene.
+    """
+    step = _LinearStep(model, scene_id)
+    count = step.count
+    if count <= DENSE:
+        blocks = step.rows()
+        jacobian = np.block([[blocks[:, :count], blocks[:, count:]], [np.eye(count), np.zeros((count, count))]])
+        return float(np.abs(np.linalg.eigvals(jacobian)).max())
+    operator = LinearOperator((2 * count, 2 * count), matvec=step.transposed, dtype=np.float64)
+    try:
+        values = eigs(operator, 6, which="LM", tol=1e-5, v0=np.ones(2 * count), return_eigenvectors=False)
+    except ArpackNoConvergence as unfinished:
+        values = unfinished.eigenvalues
+    return float(np.abs(values).max()) if len(values) else float("nan")
+
+
+class _LinearStep:
+    """Products with the Jacobian of the free units' step at rest."""
+
+    def __init__(self, model: GausSim, scene_id: int) -> None:
+        self._model, self._scene_id = model, scene_id
+        level = model.batch((scene_id,)).levels[-1]
+        self._free = level.free[:, 0].bool()
+        self.count = 3 * int(self._free.sum())
+
+    def _pull(self, weights: Tensor) -> np.ndarray:
+        """weights^T [A, B] for every row of ``weights`` (copies, count)."""
+        model = self._model
+        with evaluating(model), torch.enable_grad():
+            batch = model.batch((self._scene_id,) * len(weights))
+            prepared = model.prepare(batch)
+            free = self._free.repeat(len(weights))
+            shifts = batch.rest.new_zeros(2, len(free), 3, requires_grad=True)
+            kernels = (shifts * free[:, None]).index_select(1, batch.finest)
+            state = SimState(batch.rest + kernels[0], batch.rest + kernels[1])
+            after = prepared.aggregate(model.step(batch, state, prepared=prepared).positions)[-1]
+            (pulled,) = torch.autograd.grad((after[free] * weights.view(-1, 3)).sum(), shifts)
+        rows = pulled[:, free].view(2, len(weights), self.count)
+        return torch.cat((rows[0], rows[1]), 1).double().cpu().numpy()
+
+    def rows(self) -> np.ndarray:
+        """[A, B] (count, 2 count)."""
+        identity = torch.eye(self.count, device=self._free.device)
+        return np.concatenate([self._pull(part) for part in identity.split(COPIES)])
+
+    def transposed(self, vector: np.ndarray) -> np.ndarray:
+        """J^T v, whose eigenvalues are those of J."""
+        first, second = vector.ravel()[: self.count], vector.ravel()[self.count :]
+        weights = torch.from_numpy(first.astype(np.float32))[None].to(self._free.device)
+        pulled = self._pull(weights)[0]
+        pulled[: self.count] += second
+        return pulled

@@ -1,0 +1,74 @@
+"""Forces as arrows: where they act, and drawn into pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.interaction.interaction import Interaction
+
+_COLOR, _OUTLINE = (255, 170, 40), (20, 20, 20)
+# Length of an arrow [diagonals]: of the smallest force, and of the largest that is allowed.
+_SHORT, _LONG = 0.08, 0.35
+
+
+@dataclass(frozen=True, eq=False)
+class Arrow:
+    """A force as an arrow.
+
+    Attributes:
+        start: where it acts: the middle of its kernels [scene units].
+        end: its tip.
+        label: its size in words.
+    """
+
+    start: Float[Tensor, " 3"]
+    end: Float[Tensor, " 3"]
+    label: str
+
+
+def arrows_of(live: Interaction) -> list[Arrow]:
+    """The forces that act before the next step, longer the stronger they are."""
+    found = []
+    for mask, acceleration, name in live.pushes():
+        vector = torch.tensor(acceleration)
+        size = float(vector.norm()) / live.gravity
+        if size == 0:
+            continue
+        start = live.frame.positions[mask].mean(0).cpu()
+        length = (_SHORT + (_LONG - _SHORT) * min(1.0, size / live.most_force)) * live.scene.diagonal
+        found.append(Arrow(start, start + vector / vector.norm() * length, f"{name} {size:.2g} weights"))
+    return found
+
+
+def draw_arrows(
+    image: np.ndarray,
+    arrows: Sequence[Arrow],
+    viewmat: Float[Tensor, "4 4"],
+    K: Float[Tensor, "3 3"],
+) -> np.ndarray:
+    """A copy of a (H, W, 3) uint8 picture of one camera with arrows over it.
+
+    Args:
+        image: the picture.
+        arrows: what is drawn; those behind the camera are left out.
+        viewmat: world to camera.
+        K: intrinsics of the picture [pixels].
+    """
+    drawn = np.ascontiguousarray(image).copy()
+    for arrow in arrows:
+        ends = torch.stack((arrow.start, arrow.end)).double() @ viewmat[:3, :3].double().T + viewmat[:3, 3].double()
+        if float(ends[:, 2].min()) <= 1e-6:
+            continue
+        pixels = (ends / ends[:, 2:]) @ K.double().T
+        # OpenCV takes 32-bit coordinates; nothing so far outside is seen.
+        a, b = ([int(v) for v in p[:2].clamp(-1e4, 1e4)] for p in pixels)
+        for color, width in ((_OUTLINE, 5), (_COLOR, 2)):
+            drawn = cv2.arrowedLine(drawn, a, b, color, width, cv2.LINE_AA, tipLength=0.3)
+    return drawn

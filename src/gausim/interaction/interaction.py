@@ -1,0 +1,394 @@
+"""A live simulation: forces, wind, gravity and pins on an object, step by step, and the session that they make."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gausim.core import (
+    ConfigError,
+    DataError,
+    DivergenceError,
+    GaussianScene,
+    SimState,
+    Steppable,
+    SteppedFrame,
+    Trajectory,
+    trajectory_of,
+)
+from gausim.interaction.pushes import Push, exposure, scaled
+from gausim.interaction.selections import Selected
+from gausim.interaction.session import (
+    MOST_EVENTS,
+    MOST_STEPS,
+    Entry,
+    Event,
+    Force,
+    ForceSession,
+    Gravity,
+    Impulse,
+    MadeWith,
+    Pin,
+    Release,
+    Reset,
+    Unpin,
+    Wind,
+)
+from gausim.ops.deformation import determinant
+
+# One metre is one scene unit, unless it is said otherwise.
+STANDARD_GRAVITY = 9.81
+# The largest force, and the largest sum of forces on a kernel [weights].
+MOST_FORCE = 10.0
+# A kernel this far from rest has left [diagonals].
+FARTHEST = 10.0
+# |det G| / |G|^3 (Frobenius) of a flattened unit; 0.19 is none, and below this G S G^T is singular in float32.
+FLATTEST = 1e-6
+# Gusts are a sum of waves of these frequencies [Hz].
+_GUSTS = (0.35, 0.8, 1.7)
+# A trajectory that takes more memory is not built [bytes].
+_MOST_BYTES = 8 << 30
+
+
+class Interaction:
+    """One object that is pushed about. Not for several threads at once.
+
+    Attributes:
+        scene: the rest scene.
+        tick: steps since the session began; events are recorded at it.
+        frame_number: steps since the last reset.
+        frame: the latest frame.
+        held: kernels that are pinned by hand.
+        gravity: acceleration that makes a weight of a mass [scene units / s^2].
+        most_force: the largest force, and the largest sum of them on a kernel [weights].
+        broken: why the simulation stopped; None while it goes on.
+    """
+
+    def __init__(
+        self,
+        scene: GaussianScene,
+        dynamics: Steppable,
+        masses: Float[Tensor, " K"],
+        initial: SimState,
+        *,
+        made_with: MadeWith,
+        units: Sequence[Int[Tensor, " K"]] = (),
+        gravity: float = STANDARD_GRAVITY,
+        most_force: float = MOST_FORCE,
+        farthest: float = FARTHEST,
+        seed: int = 0,
+        keep: int | None = 0,
+    ) -> None:
+        """Begins at ``initial`` with nothing acting.
+
+        Args:
+            scene: the rest scene.
+            dynamics: moves it.
+            masses: of the kernels, up to a common factor, as the dynamics know them.
+            initial: where it starts, and where a reset leads.
+            made_with: what sessions say of all this.
+            units: the unit of every kernel at levels 1, 2, ... of the hierarchy; -1 for kernels of none.
+            gravity: acceleration that makes a weight of a mass [scene units / s^2].
+            most_force: the largest force, and the largest sum of them on a kernel [weights].
+            farthest: a kernel this far from rest stops the simulation [diagonals].
+            seed: of the gusts of wind.
+            keep: so many of the latest frames are kept for :meth:`trajectory`; None keeps all.
+
+        Raises:
+            ConfigError: a number is not positive and finite.
+        """
+        for name, value in (("gravity", gravity), ("most_force", most_force), ("farthest", farthest)):
+            if not (math.isfinite(value) and value > 0):
+                raise ConfigError(f"interaction: {name}: expected a number > 0, got {value}.")
+        self.scene, self.made_with, self.units = scene, made_with, tuple(units)
+        self.gravity, self.most_force, self.seed = gravity, most_force, seed
+        self._dynamics, self._initial, self._farthest = dynamics, initial, farthest
+        self._masses = masses.to(initial.positions)
+        self._rest = scene.means.to(initial.positions)
+        self._free = (scene.simulated & ~scene.pinned).to(self._rest.device)
+        self._diagonal = scene.diagonal
+        self._exposure = exposure(scene, self._masses, self._free)
+        self._frames: deque[SteppedFrame] = deque(maxlen=keep)
+        self.restart()
+
+    # ---------------------------------------------------------------------------------------------------- running
+
+    def restart(self) -> None:
+        """A new session from the initial state; what was recorded is forgotten."""
+        self.tick, self._entries = 0, list[Entry]()
+        phases = random.Random(self.seed)
+        self._phases = [phases.uniform(0, 2 * math.pi) for _ in _GUSTS]
+        self._rest_all()
+        self._frames.clear()
+        self._frames.append(self.frame)
+
+    def reset(self) -> None:
+        """Back to the initial state, with no force, wind, gravity or pin; the session goes on."""
+        self.act(Reset())
+
+    def _rest_all(self) -> None:
+        self._stepper = self._dynamics.stepper(self._initial)
+        self._limited_at: int | None = None
+        self.frame: SteppedFrame = self._stepper.frame
+        self.frame_number = 0
+        self.broken: str | None = None
+        self.held: Bool[Tensor, " K"] = torch.zeros_like(self._free)
+        self._forces: dict[str, Push] = {}
+        self._impulses: list[Push] = []
+        self._steady: Gravity | None = None
+        self._wind: Wind | None = None
+
+    def step(self) -> SteppedFrame:
+        """The next frame.
+
+        Raises:
+            DivergenceError: a position is not finite, a covariance no longer positive definite, or a kernel too far
+                away; names the kernel and the frame. The simulation stands until :meth:`reset`.
+            ConfigError: the session has become too long.
+        """
+        if self.broken is not None:
+            raise DivergenceError(self.broken)
+        if self.tick >= MOST_STEPS:
+            raise ConfigError(f"session: expected at most {MOST_STEPS} steps. Save it and begin another.")
+        held = self.held if bool(self.held.any()) else None
+        try:
+            before = self._stepper.limited
+            frame = self._stepper.step(self._force(), held=held)
+            self._check(frame)
+        except DivergenceError as error:
+            self.broken = str(error)
+            raise
+        self.tick, self.frame_number, self.frame = self.tick + 1, self.frame_number + 1, frame
+        if self._stepper.limited > before:
+            self._limited_at = self.frame_number
+        self._frames.append(frame)
+        self._impulses.clear()
+        for name, push in list(self._forces.items()):
+            if push.left is not None:
+                push.left -= 1
+                if push.left == 0:
+                    del self._forces[name]
+        return frame
+
+    @property
+    def state(self) -> SimState:
+        """The two latest positions of all kernels [scene units]."""
+        return self._stepper.state
+
+    @property
+    def unit_of_kernel(self) -> Int[Tensor, " K"]:
+        """The unit of each kernel, a row of the frames' gradients and rotations."""
+        return self._stepper.unit_of_kernel
+
+    @property
+    def masses(self) -> Float[Tensor, " K"]:
+        """Masses of the kernels, up to a common factor."""
+        return self._masses
+
+    @property
+    def fps(self) -> float:
+        """Frames per second."""
+        return self._stepper.fps
+
+    @property
+    def limited(self) -> int:
+        """Frames since the last reset in which forces acted in part only (:attr:`gausim.core.Stepper.limited`)."""
+        return self._stepper.limited
+
+    @property
+    def resisting(self) -> bool:
+        """Whether one of them was within the last second."""
+        return self._limited_at is not None and self.frame_number - self._limited_at < self.fps
+
+    def trajectory(self) -> Trajectory:
+        """The frames that were kept, the initial one first if no newer ones have displaced it."""
+        return trajectory_of(self._frames or [self.frame], self._stepper)
+
+    def session(self) -> ForceSession:
+        """What was done so far."""
+        return ForceSession(self.made_with, self.fps, self.tick, tuple(self._entries), self.gravity, self.seed)
+
+    # ----------------------------------------------------------------------------------------------------- acting
+
+    @property
+    def acting(self) -> tuple[str, ...]:
+        """Names of the forces that act."""
+        return tuple(self._forces)
+
+    def pushes(self) -> list[tuple[Bool[Tensor, " K"], tuple[float, float, float], str]]:
+        """What acts before the next step: kernels, acceleration [scene units / s^2] and kind."""
+        found = [(push.mask, push.acceleration, "force") for push in self._forces.values()]
+        found += [(push.mask, push.acceleration, "impulse") for push in self._impulses]
+        if self._wind is not None:
+            found.append((self._free, scaled(self._wind.direction, self._wind_strength() * self.gravity), "wind"))
+        if self._steady is not None:
+            steady = scaled(self._steady.direction, self._steady.weights * self.gravity)
+            found.append((self._free, steady, "gravity"))
+        return found
+
+    def act(self, event: Event) -> None:
+        """Does something before the next step, and records it.
+
+        Raises:
+            ConfigError: it selects nothing that can move, is too strong, or the method takes no forces.
+        """
+        if len(self._entries) >= MOST_EVENTS:
+            raise ConfigError(f"session: expected at most {MOST_EVENTS} events. Save it and begin another.")
+        if not isinstance(event, Reset | Release) and not self._stepper.takes_forces:
+            raise ConfigError(
+                f"{self.made_with.run or 'this method'}: takes no forces, only a reset. Play a run of gausim instead."
+            )
+        self._do(event)
+        self._entries.append(Entry(self.tick, event))
+
+    def _do(self, event: Event) -> None:
+        match event:
+            case Force():
+                push = self._push(event.on, event.direction, self._allowed("weights", event.weights), event.frames)
+                self._forces[event.name] = push
+            case Impulse():
+                weights = self._allowed("weight_seconds", event.weight_seconds, per=self.fps)
+                self._impulses.append(self._push(event.on, event.direction, weights, 1))
+            case Release():
+                for name in [event.name] if event.name is not None else list(self._forces):
+                    self._forces.pop(name, None)
+            case Gravity():
+                self._allowed("weights", event.weights)
+                self._steady = event if event.weights > 0 else None
+            case Wind():
+                self._allowed("weights", event.weights)
+                self._wind = event if event.weights > 0 else None
+            case Pin():
+                self.held = self.held | self._movable(event.on)
+            case Unpin():
+                self.held = self.held & ~event.on.mask(self.scene, self.units).to(self.held.device)
+            case Reset():
+                self._rest_all()
+
+    def _allowed(self, name: str, amount: float, *, per: float = 1.0) -> float:
+        """A force in weights, from an amount that is so many weights ``per`` ..."""
+        if not amount * per <= self.most_force:
+            raise ConfigError(
+                f"field '{name}': expected at most {self.most_force / per:g} (a force of {self.most_force:g} weights), "
+                f"got {amount:g}."
+            )
+        return amount * per
+
+    def _movable(self, on: Selected) -> Bool[Tensor, " K"]:
+        mask = on.mask(self.scene, self.units).to(self._free.device) & self._free
+        if not bool(mask.any()):
+            raise ConfigError(f"selection {on.to_json()}: expected kernels that can move, got only pinned ones.")
+        return mask
+
+    def _push(self, on: Selected, direction: tuple[float, float, float], weights: float, frames: int | None) -> Push:
+        return Push(self._movable(on), scaled(direction, weights * self.gravity), frames)
+
+    # ----------------------------------------------------------------------------------------------------- forces
+
+    def _force(self) -> Float[Tensor, "K 3"] | None:
+        """Sum of all that acts on every kernel [mass scene units / s^2]; None if nothing does."""
+        if not (self._forces or self._impulses or self._steady or self._wind):
+            return None
+        acceleration = torch.zeros_like(self._rest)
+        for push in (*self._forces.values(), *self._impulses):
+            acceleration += push.mask[:, None] * acceleration.new_tensor(push.acceleration)
+        if self._steady is not None:
+            acceleration += acceleration.new_tensor(scaled(self._steady.direction, self._steady.weights * self.gravity))
+        if self._wind is not None:
+            blown = acceleration.new_tensor(scaled(self._wind.direction, self._wind_strength() * self.gravity))
+            acceleration += self._exposure[:, None] * blown
+        most = self.most_force * self.gravity
+        acceleration *= (most / acceleration.norm(dim=-1, keepdim=True).clamp_min(most)).clamp_max(1.0)
+        return acceleration * (self._masses * (self._free & ~self.held))[:, None]
+
+    def _wind_strength(self) -> float:
+        """Of the wind now, gusts included [weights]."""
+        if self._wind is None:
+            return 0.0
+        seconds = self.tick / self.fps
+        waves = (math.sin(2 * math.pi * f * seconds + p) for f, p in zip(_GUSTS, self._phases, strict=True))
+        return self._wind.weights * (1 + self._wind.gusts * sum(waves) / len(_GUSTS))
+
+    # ----------------------------------------------------------------------------------------------------- sanity
+
+    def _check(self, frame: SteppedFrame) -> None:
+        number = self.frame_number + 1
+        away = (frame.positions - self._rest).norm(dim=-1) / self._diagonal
+        gone = ~(away <= self._farthest)  # also NaN
+        if bool(gone.any()):
+            kernel = int(gone.nonzero()[0])
+            raise DivergenceError(
+                f"{self.scene.name}: kernel {kernel} is {float(away[kernel]):.3g} diagonals from rest at frame "
+                f"{number}, expected at most {self._farthest:g}. Reset, and use smaller forces."
+            )
+        g = frame.gradients.double()
+        volume = determinant(g).abs() / g.square().sum((-2, -1)).pow(1.5)
+        flat = ~(volume >= FLATTEST)
+        if bool(flat.any()):
+            unit = int(flat.nonzero()[0])
+            carried = (self.unit_of_kernel == unit).nonzero()
+            if len(carried):
+                raise DivergenceError(
+                    f"{self.scene.name}: the covariance of kernel {int(carried[0])} is no longer positive definite at "
+                    f"frame {number} (its unit {unit} is flattened). Reset, and use smaller forces."
+                )
+
+
+def replay(
+    interaction: Interaction,
+    session: ForceSession,
+    *,
+    other_model: bool = False,
+    watch: Callable[[Interaction], None] | None = None,
+) -> Trajectory:
+    """Does what a session says, from the initial state; the result has all its frames, bit for bit those recorded.
+
+    Args:
+        interaction: begins anew.
+        session: what to do.
+        other_model: the method or the initial state may differ from the recorded ones; then so do the numbers.
+        watch: is shown the interaction before every step, with what acts in it, and after the last.
+
+    Raises:
+        DataError: the session is of another scene, frame rate, method or initial state, or too long for the memory.
+        ConfigError: an event cannot be done.
+        DivergenceError: the simulation went wrong where the recorded one did not.
+    """
+    wrong = differences(interaction, session)
+    if wrong and not (other_model and all(allowed for _, allowed in wrong)):
+        raise DataError("session: " + "; ".join(text for text, _ in wrong) + ". Replay it with what it was made with.")
+    size = session.steps * 4 * (interaction.frame.positions.numel() + 2 * interaction.frame.gradients.numel())
+    if size > _MOST_BYTES:
+        raise DataError(f"session: its {session.steps} frames take {size >> 30} GiB, expected at most 8. Shorten it.")
+    interaction.gravity, interaction.seed = session.gravity, session.seed
+    interaction.restart()
+    frames, pending = [interaction.frame], deque(session.entries)
+    for tick in range(session.steps + 1):
+        while pending and pending[0].at == tick:
+            interaction.act(pending.popleft().event)
+        if watch is not None:
+            watch(interaction)
+        if tick < session.steps:
+            frames.append(interaction.step())
+    return trajectory_of(frames, interaction._stepper)
+
+
+def differences(interaction: Interaction, session: ForceSession) -> list[tuple[str, bool]]:
+    """What a session was made with and this is not, in words; and whether it can be replayed all the same."""
+    made, here = session.made_with, interaction.made_with
+    found = []
+    if made.scene_hash != here.scene_hash:
+        found.append((f"it is of another scene, '{made.scene}' and not '{here.scene}'", False))
+    if session.fps != interaction.fps:
+        found.append((f"it has {session.fps:g} frames per second and not {interaction.fps:g}", False))
+    if made.model_hash != here.model_hash:
+        found.append((f"it was made with another method or training (run '{made.run}')", True))
+    if made.initial_hash != here.initial_hash:
+        found.append((f"it begins at another state, '{made.initial}' and not '{here.initial}'", True))
+    return found

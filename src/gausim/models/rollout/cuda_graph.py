@@ -1,0 +1,117 @@
+"""A step of one batch as a CUDA graph: its thousands of kernels are launched at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import ConfigError, SimState, SteppedFrame
+
+WARM_UP = 3  # steps before a capture: lazy initialisation and autotuning must be over (PyTorch's notes on CUDA graphs)
+
+
+@runtime_checkable
+class Predicted(Protocol):
+    """What a rollout keeps of a step; :class:`gausim.models.step.simulator.Step` is one."""
+
+    @property
+    def positions(self) -> Tensor:
+        """x_{t+1} of all kernels, (K, 3) [scene units]."""
+
+    @property
+    def gradients(self) -> Tensor:
+        """Accumulated deformation gradients of the units, (N, 3, 3)."""
+
+    @property
+    def rotations(self) -> Tensor:
+        """Their rotations, (N, 3, 3)."""
+
+
+StepFunction = Callable[[SimState, Tensor | None], Predicted]
+
+
+class GraphedStep:
+    """A step without gradients that is captured at its first call and replayed at the others.
+
+    Its inputs are copied into fixed buffers and its results out of them, so that a call is used like the step itself.
+    Steps with and without forces are captured apart. What the step reads besides its arguments (weights, constants of
+    the batch, evaluation mode, autocast) is read where it lay at the capture: it may change in place, but not move.
+    Make a new one for every rollout; the capture costs about four steps.
+    """
+
+    def __init__(self, step: StepFunction, rest: Float[Tensor, "K 3"], *, capture: bool = True) -> None:
+        """Makes the buffers.
+
+        Args:
+            step: from state and forces to the next frame; no shape and no branch in it may depend on values.
+            rest: rest positions of all kernels; the state has their shape, type and device.
+            capture: False computes the same between the same buffers, kernel by kernel, on any device.
+
+        Raises:
+            ConfigError: a capture on a device without CUDA graphs.
+        """
+        if capture and rest.device.type != "cuda":
+            raise ConfigError(
+                f"model.simulator.cuda_graph: expected the model on a CUDA device, got {rest.device}. Set it to false."
+            )
+        self._step, self._capture = step, capture
+        self._state = SimState(torch.zeros_like(rest), torch.zeros_like(rest))
+        self._force = torch.zeros_like(rest)
+        self._graphs: dict[bool, tuple[torch.cuda.CUDAGraph, SteppedFrame]] = {}
+
+    @torch.no_grad()
+    def __call__(self, state: SimState, force: Float[Tensor, "K 3"] | None = None) -> SteppedFrame:
+        """Predicts the next frame; the result is a copy of its own.
+
+        Args:
+            state: positions and previous positions [scene units].
+            force: force per kernel [mass scene units / s^2].
+
+        Raises:
+            ConfigError: the step cannot be captured, because something in it waits for the device.
+        """
+        self._state.positions.copy_(state.positions)
+        self._state.previous.copy_(state.previous)
+        pushed = force is not None
+        if force is not None:
+            self._force.copy_(force)
+        if not self._capture:
+            return _copy(self._compute(pushed))
+        if pushed not in self._graphs:
+            self._graphs[pushed] = self._record(pushed)
+        graph, result = self._graphs[pushed]
+        graph.replay()
+        return _copy(result)
+
+    def _compute(self, pushed: bool) -> SteppedFrame:
+        """What is captured."""
+        made = self._step(self._state, self._force if pushed else None)
+        return SteppedFrame(made.positions, made.gradients, made.rotations)
+
+    def _record(self, pushed: bool) -> tuple[torch.cuda.CUDAGraph, SteppedFrame]:
+        device = self._force.device
+        aside = torch.cuda.Stream(device)
+        aside.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(aside):
+            for _ in range(WARM_UP):
+                self._compute(pushed)
+        torch.cuda.current_stream(device).wait_stream(aside)
+        graph = torch.cuda.CUDAGraph()
+        try:
+            # thread_local: the thread that pins memory for a data loader may call CUDA meanwhile.
+            with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
+                result = self._compute(pushed)
+        except RuntimeError as error:
+            raise ConfigError(
+                f"model.simulator.cuda_graph: the step cannot be captured ({str(error).splitlines()[0]}). Something in "
+                "it waits for the device or has a shape that depends on values; set it to false."
+            ) from error
+        return graph, result
+
+
+def _copy(frame: SteppedFrame) -> SteppedFrame:
+    return SteppedFrame(frame.positions.clone(), frame.gradients.clone(), frame.rotations.clone())

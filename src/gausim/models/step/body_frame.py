@@ -1,0 +1,80 @@
+"""A body's own axes: what is computed in them turns with the scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import GaussianScene
+from gausim.models.hierarchy.batch import SceneBatch
+from gausim.models.step.recursion import Solved
+from gausim.ops.selection import require_pinned
+
+# An axis is told by the pins where the body's centre is further than this from theirs [diagonals].
+CLEAR = 1e-2
+
+
+def body_axes(scene: GaussianScene) -> np.ndarray:
+    """Axes of a scene's body (3, 3), as rows: a rotation that only the body's shape and its pins determine.
+
+    The first points from the pinned kernels to the free ones, or along the body where these coincide; the second is the
+    widest direction across it, its sign that of the third moment. A body of perfect symmetry about the first has none.
+    """
+    require_pinned(scene)
+    rest = scene.means[scene.simulated].double().cpu().numpy()
+    pinned = scene.pinned[scene.simulated].cpu().numpy()
+    centre = rest[~pinned].mean(0)
+    offset = rest - centre
+    first = centre - rest[pinned].mean(0)
+    if np.linalg.norm(first) < CLEAR * scene.diagonal:
+        first = _signed(np.linalg.eigh(offset.T @ offset)[1][:, -1], offset)
+    first = first / np.linalg.norm(first)
+    across = offset - (offset @ first)[:, None] * first
+    second = _signed(np.linalg.eigh(across.T @ across)[1][:, -1], across)
+    second = second - (second @ first) * first
+    second /= np.linalg.norm(second)
+    return np.stack((first, second, np.cross(first, second)))
+
+
+def _signed(axis: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    third = float(((offset @ axis) ** 3).sum())
+    return -axis if third < 0 else axis
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Axes and origins of the scenes of a batch, for every unit of every predicted level and for every root.
+
+    Attributes:
+        axes: (N, 3, 3) per level, coarse to fine; rows are the body's axes in scene coordinates.
+        origins: (N, 3) per level [scene units].
+    """
+
+    axes: tuple[Float[Tensor, "_ 3 3"], ...]
+    origins: tuple[Float[Tensor, "_ 3"], ...]
+
+    @classmethod
+    def of(cls, batch: SceneBatch, axes: Float[Tensor, "S 3 3"], origins: Float[Tensor, "S 3"]) -> Frames:
+        """The frames of a batch from those of all scenes."""
+        scenes = torch.tensor(batch.scene_ids, device=axes.device)
+        rows = [scenes.index_select(0, level.member) for level in batch.levels]
+        return cls(tuple(axes[r] for r in rows), tuple(origins[r] for r in rows))
+
+    def into(self, level: int, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Positions of the units of a level (counted coarse to fine) in the body's axes."""
+        return (self.axes[level] @ (positions - self.origins[level])[..., None])[..., 0]
+
+    def turned_back(self, level: int, matrices: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 3 3"]:
+        """Matrices of the units of a level in scene coordinates."""
+        return self.axes[level].mT @ matrices @ self.axes[level]
+
+    def back(self, solved: Solved, rest: Float[Tensor, "N 3"]) -> Solved:
+        """What the recursion hands to the kernels, in scene coordinates."""
+        last = len(self.axes) - 1
+        after = (self.axes[last].mT @ solved.after[..., None])[..., 0] + self.origins[last]
+        gradient, rotation = self.turned_back(last, solved.gradient), self.turned_back(last, solved.rotation)
+        return replace(solved, rest=rest, after=after, gradient=gradient, rotation=rotation)

@@ -1,0 +1,202 @@
+"""What the network sees (METHOD section 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gausim.core import ConfigError
+from gausim.kernels.compiled import fits
+from gausim.kernels.features import NetworkInputs
+from gausim.models.step.recursion import Solved, Units
+
+# Lengths are divided by the diagonal of the scene before they get here: 1e-6 of it is nothing.
+TINY = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class UnitState:
+    """Aggregated state of the N units of one level (or of their parents), in diagonals of the scene.
+
+    Attributes:
+        rest: X.
+        now: x_t.
+        before: x_{t-1}.
+        after: the predicted position at t+1 where it is known (parents), else the coarse prediction.
+    """
+
+    rest: Float[Tensor, "N 3"]
+    now: Float[Tensor, "N 3"]
+    before: Float[Tensor, "N 3"]
+    after: Float[Tensor, "N 3"]
+
+
+@dataclass(frozen=True)
+class FeatureOptions:
+    """Choices among the readings of the paper.
+
+    Attributes:
+        angle: ``cos_sin`` of the difference of the two angles (scale-free), or ``inner``, the difference of products.
+        rest_inputs: also give displacements, rest-space edge vectors and the template's prediction.
+        coarse_inputs: below the top level read positions from the coarse prediction instead of the current state.
+        velocities: give velocities and accelerations; without them levers X_i - X_p, displacements and what the parent
+            did to the template take their place.
+    """
+
+    angle: str = "cos_sin"
+    rest_inputs: bool = False
+    coarse_inputs: bool = False
+    velocities: bool = True
+
+    def __post_init__(self) -> None:
+        """Checks that something is left to see."""
+        if not (self.velocities or self.rest_inputs):
+            raise ConfigError(
+                "model.simulator.velocity_inputs=false needs rest_inputs=true: the network would see nothing."
+            )
+
+    @property
+    def node_normalised(self) -> int:
+        """How many leading node features are normalised."""
+        if not self.velocities:
+            return 9
+        return 12 if self.rest_inputs else 6
+
+    @property
+    def edge_normalised(self) -> int:
+        """How many leading edge features are normalised."""
+        return (13 if self.rest_inputs else 7) - (0 if self.velocities else 3)
+
+    @property
+    def edge_size(self) -> int:
+        """Number of edge features."""
+        return self.edge_normalised + (2 if self.angle == "cos_sin" else 1)
+
+
+def safe_norm(x: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 1"]:
+    """Length, with a finite gradient at zero."""
+    return (x * x).sum(-1, keepdim=True).add(TINY**2).sqrt()
+
+
+def network_inputs(
+    unit: Units,
+    target: Float[Tensor, "N 3"],
+    above: Solved,
+    edge_index: Int[Tensor, "2 E"],
+    size: Float[Tensor, "N 1"],
+    dt: Float[Tensor, "N 1"],
+    gravity: Float[Tensor, " 3"],
+    options: FeatureOptions,
+    *,
+    coarse: bool = False,
+) -> tuple[Float[Tensor, "N Cn"], Float[Tensor, "E Ce"]]:
+    """Node and edge features of the units of one level.
+
+    Args:
+        unit: the units.
+        target: their template positions [scene units].
+        above: their solved parents.
+        edge_index: source and destination.
+        size: diagonal of each unit's scene [scene units].
+        dt: frame interval [s].
+        gravity: acceleration [scene units / s^2].
+        options: among the readings of the paper.
+        coarse: whether positions are those of the coarse prediction.
+    """
+    moving = unit.rest, unit.now, unit.before, target
+    parents = above.rest, above.now, above.before, above.after, above.template, above.gradient
+    if fits(*moving, *parents, unit.log_density, unit.attributes, size, dt, gravity):
+        choices = options.rest_inputs, coarse, options.angle == "cos_sin"
+        constants = above.index, edge_index, size.view(-1), dt.view(-1), gravity
+        made = NetworkInputs.apply(*moving, unit.log_density, unit.attributes, *parents, *constants, choices)
+        return made if options.velocities else _positions_only(made[0], made[1], unit, target, above, size)
+    own = UnitState(unit.rest / size, unit.now / size, unit.before / size, above.carry(target) / size)
+    parent = UnitState(*(x.index_select(0, above.index) / size for x in parents[:4]))
+    nodes = node_features(
+        own, parent, dt, gravity / size, unit.log_density, unit.attributes, options, coarse=coarse
+    )  # fmt: skip
+    edges = edge_features(own, parent, edge_index, dt, options, coarse=coarse)
+    return (nodes, edges) if options.velocities else _positions_only(nodes, edges, unit, target, above, size)
+
+
+def _positions_only(
+    nodes: Tensor, edges: Tensor, unit: Units, target: Tensor, above: Solved, size: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Inputs without any velocity: lever, displacement and what the parent did to the template [diagonals]."""
+    lever = (unit.rest - above.rest.index_select(0, above.index)) / size
+    done = (above.carry(target) - target) / size
+    nodes = torch.cat((lever, nodes[:, 6:9], done, nodes[:, 12:]), -1)
+    return nodes, torch.cat((edges[:, :4], edges[:, 7:]), -1)
+
+
+def node_features(
+    unit: UnitState,
+    parent: UnitState,
+    dt: Float[Tensor, "N 1"],
+    gravity: Float[Tensor, "N 3"],
+    log_density: Float[Tensor, " N"],
+    attributes: Float[Tensor, "N A"],
+    options: FeatureOptions,
+    *,
+    coarse: bool = False,
+) -> Float[Tensor, "N C"]:
+    """Inertial acceleration of the parent's frame plus gravity, local velocity, log density and attributes.
+
+    With ``coarse`` the velocity reads the coarse prediction and the parent's new position instead of x_t.
+    """
+    inertial = gravity - (parent.after - 2 * parent.now + parent.before) / dt**2
+    local = unit.after - parent.after if coarse else unit.now - parent.now
+    velocity = (local - (unit.before - parent.before)) / dt
+    columns = [inertial, velocity]
+    if options.rest_inputs:
+        columns += [unit.now - unit.rest, (unit.after - unit.now) / dt]
+    return torch.cat([*columns, log_density[:, None], attributes], -1)
+
+
+def edge_features(
+    unit: UnitState,
+    barycentre: UnitState,
+    edge_index: Int[Tensor, "2 E"],
+    dt: Float[Tensor, "N 1"],
+    options: FeatureOptions,
+    *,
+    coarse: bool = False,
+) -> Float[Tensor, "E C"]:
+    """Stretch ratio, direction, relative velocity and relative angle seen from the destination's barycentre.
+
+    With ``coarse`` all of them read the coarse prediction and the parent's new position instead of x_t.
+    """
+    s, d = edge_index
+    current, centre = (unit.after, barycentre.after) if coarse else (unit.now, barycentre.now)
+    now = current.index_select(0, d) - current.index_select(0, s)
+    rest = unit.rest.index_select(0, d) - unit.rest.index_select(0, s)
+    before = unit.before.index_select(0, d) - unit.before.index_select(0, s)
+    length = safe_norm(now)
+    columns = [length / safe_norm(rest), now / length, (now - before) / dt.index_select(0, d)]
+    if options.rest_inputs:
+        columns += [rest, now - rest]
+    columns.append(_angle(current, centre, unit.rest, barycentre.rest, edge_index, options.angle))
+    return torch.cat(columns, -1)
+
+
+def _angle(now: Tensor, centre: Tensor, rest: Tensor, rest_centre: Tensor, edge_index: Tensor, kind: str) -> Tensor:
+    s, d = edge_index
+    products = []
+    for x, c in ((now, centre), (rest, rest_centre)):
+        c = c.index_select(0, d)
+        a, b = x.index_select(0, d) - c, x.index_select(0, s) - c
+        dot = (a * b).sum(-1, keepdim=True)
+        if kind == "inner":
+            products.append((dot, dot))
+        else:
+            scale = safe_norm(a) * safe_norm(b)
+            # Floored by the square of the lengths' floor: a unit on its barycentre gives 0, never 1 / length.
+            across = torch.linalg.cross(a, b).square().sum(-1, keepdim=True).add(TINY**4).sqrt()
+            products.append((dot / scale, across / scale))
+    (c1, s1), (c0, s0) = products
+    if kind == "inner":
+        return c1 - c0
+    return torch.cat((c1 * c0 + s1 * s0, s1 * c0 - c1 * s0), -1)

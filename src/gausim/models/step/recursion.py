@@ -1,0 +1,127 @@
+"""The recursion of METHOD section 2: units deform about their parents, kernels inherit from the finest units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gausim.kernels import recursion as compiled
+from gausim.kernels.compiled import fits
+from gausim.models.hierarchy.batch import Inheritance
+from gausim.ops.deformation import polar_rotation
+
+
+@dataclass(frozen=True, eq=False)
+class Units:
+    """Mass-weighted aggregates of the N units of one level, in the order of its rows.
+
+    Attributes:
+        rest: X [scene units].
+        now: x_t.
+        before: x_{t-1}.
+        mass: m_c = sum of m_i.
+        log_density: log of m_c / V_c.
+        attributes: plain mean over the kernels.
+    """
+
+    rest: Float[Tensor, "N 3"]
+    now: Float[Tensor, "N 3"]
+    before: Float[Tensor, "N 3"]
+    mass: Float[Tensor, " N"]
+    log_density: Float[Tensor, " N"]
+    attributes: Float[Tensor, "N A"]
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The solved level above (or the roots of the top level), and which of its P units is the parent of each unit.
+
+    Attributes:
+        rest: X [scene units].
+        now: x_t.
+        before: x_{t-1}.
+        after: x_{t+1}.
+        template: template positions.
+        gradient: accumulated deformation gradients.
+        rotation: accumulated rotations.
+        index: the parent of each of the N units below.
+    """
+
+    rest: Float[Tensor, "P 3"]
+    now: Float[Tensor, "P 3"]
+    before: Float[Tensor, "P 3"]
+    after: Float[Tensor, "P 3"]
+    template: Float[Tensor, "P 3"]
+    gradient: Float[Tensor, "P 3 3"]
+    rotation: Float[Tensor, "P 3 3"]
+    index: Int[Tensor, " N"]
+
+    @classmethod
+    def roots(cls, rest: Float[Tensor, "P 3"]) -> Solved:
+        """What the units of the top level hang on: one root each, which never moves."""
+        identity = torch.eye(3, dtype=rest.dtype, device=rest.device).expand(len(rest), 3, 3).contiguous()
+        index = torch.arange(len(rest), device=rest.device)
+        return cls(rest, rest, rest, rest, rest, identity, identity, index)
+
+    def carry(self, target: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """The coarse prediction x_p + G_p (T - T_p)."""
+        gradient = self.gradient.index_select(0, self.index)
+        offset = target - self.template.index_select(0, self.index)
+        return self.after.index_select(0, self.index) + apply(gradient, offset)
+
+
+def apply(matrix: Float[Tensor, "N 3 3"], vector: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """A v."""
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def advance(
+    gradient: Float[Tensor, "N 3 3"], rotation: Float[Tensor, "N 3 3"], target: Float[Tensor, "N 3"], above: Solved
+) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3 3"], Float[Tensor, "N 3"]]:
+    """Accumulated gradients G = F G_p and rotations, and the new places x_p + G (T - T_p) of the units.
+
+    Args:
+        gradient: the units' own gradients F.
+        rotation: the units' own rotations.
+        target: template positions T of the units [scene units].
+        above: the solved parents.
+    """
+    if fits(gradient, rotation, target, above.after, above.template, above.gradient, above.rotation):
+        return compiled.Advance.apply(
+            gradient, rotation, target, above.after, above.template, above.gradient, above.rotation, above.index
+        )  # fmt: skip
+    accumulated = gradient @ above.gradient.index_select(0, above.index)
+    offset = target - above.template.index_select(0, above.index)
+    after = above.after.index_select(0, above.index) + apply(accumulated, offset)
+    return accumulated, rotation @ above.rotation.index_select(0, above.index), after
+
+
+def inherit(
+    finest: Solved, template: Float[Tensor, "N 3 3"] | None, kernels: Inheritance
+) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
+    """Positions x_c + G_c (X_k - X_c) of all kernels, gradients and rotations of the units, identities among them.
+
+    Args:
+        finest: the finest predicted level, solved.
+        template: the template's gradients, which act first; None for the identity. Their rotations are constants:
+            they only turn colours.
+        kernels: who inherits from whom.
+    """
+    gradient, rotation = finest.gradient, finest.rotation
+    if fits(gradient, rotation, finest.rest, finest.after, kernels.rest):
+        return compiled.Inherit.apply(
+            gradient, template, rotation, finest.rest, finest.after, kernels.rest, kernels.unit, kernels.rows,
+            kernels.padded,
+        )  # fmt: skip
+    if template is not None:
+        gradient = gradient @ template
+        rotation = rotation @ polar_rotation(template.detach())
+    unit = kernels.unit.clamp_min(0)
+    offset = kernels.rest - finest.rest.index_select(0, unit)
+    moved = finest.after.index_select(0, unit) + apply(gradient.index_select(0, unit), offset)
+    positions = torch.where((kernels.unit < 0)[:, None], kernels.rest, moved)
+    identity = torch.eye(3, dtype=moved.dtype, device=moved.device).expand(kernels.padded, 3, 3)
+    return positions, identity.index_copy(0, kernels.rows, gradient), identity.index_copy(0, kernels.rows, rotation)

@@ -1,0 +1,336 @@
+"""The template of the neural simulator: a solid body whose material a shared network reads from its units' attributes.
+
+What the geometry tells is computed once per scene: the lowest modes Phi of the solid body around the kernels
+(:mod:`gausim.models.template.solid`) and, between these modes, how much of the elastic energy and of the mass sits at
+each unit i and in each link (i, j) of neighbouring units. What the geometry does not tell is material. One
+decoder, shared by all scenes, reads it from each unit's density rho_i and attributes a_i,
+
+    s_i, b_i, d_i = decode(a_i)     p_ij, q_ij, g_ij = decode(a_i, a_j, distance)
+
+and with them, in the modes' coordinates z,
+
+    K = k (sum_i (e^{s_i} K_i + e^{b_i} B_i) + sum_ij (e^{p_ij} + e^{g_ij}) S_ij)  stiffness: shear, volume, links
+    M = sum_i rho_i M_i + sum_ij e^{q_ij} T_ij             inertia: of the units, and of matter between them
+    D = c_0 sum_i e^{d_i} rho_i M_i + c_1 K                damping
+
+k, c_0 and c_1 are one trained number each for all scenes. The links of stiffness e^{g_ij} are springs that turn and
+stretch: f is what they pull beyond the linear, J how much stiffer they are at z_t than at rest. One frame is one step
+of the trapezoidal rule, the force linear within it,
+
+    (M + (K + J(z_t))/4 + D/2) (z_{t+1} - 2 z_t + z_{t-1}) = -K z_t - D (z_t - z_{t-1}) + f(z_t)     [frame units]
+
+K, K + J, M and D are positive semi-definite whatever is decoded. Without f this never creates energy, and without
+damping keeps it; f has a potential, too, and a step that is implicit in its slope does not make vibrations grow that
+are too fast for the frames. Distances are the only geometry that the decoder reads: it means the same on every body,
+however it lies.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from gausim.models.hierarchy.batch import SceneBatch
+from gausim.models.hierarchy.clusters import Hierarchy
+from gausim.models.hierarchy.units import FixedUnits
+from gausim.models.template.solid import POISSON, SolidBody, solid_body
+from gausim.models.template.springs import Springs, neighbour_pairs
+from gausim.models.template.template import PreparedScenes, Template, modal_coordinates
+from gausim.nn.mlp import mlp
+
+# Decoded logarithms saturate here: a factor of twelve either way.
+LARGEST_LOG = 2.5
+# Stiffness and inertia of all links together, as shares of the body's own (by trace), before anything is learned.
+LINK_SHARE = 0.3
+# Stiffness of the links that are springs, their linear part in K and the rest in f and J, as the same share.
+LINK_BEYOND = 0.15
+# Units among which a cell's energy and mass are divided, by inverse squared distance.
+CELL_UNITS = 4
+# Step of the units per frame that one unit of an initial velocity's coordinate means, at the lowest mode [diagonals].
+AMPLITUDE = 0.05
+# The three numbers of all scenes move so much faster than the decoders' weights; one learning rate serves both. Damping
+# is slower: while a body's periods are not learned yet, motion that dies away fits best, and it is slow to come back.
+GAIN, DAMPING_GAIN = 10.0, 2.0
+# Frames per second at which k and the dampings are stated.
+REFERENCE_FPS = 24.0
+
+
+class BodyModes(nn.Module):
+    """What the geometry of one scene tells, in modal coordinates; nothing in here is trained.
+
+    Attributes:
+        modes: Phi (N, 3, M), orthonormal under the units' volumes.
+        gradients: of the modes (N, 3, 3, M) [1 / scene units].
+        projection: (N, 3, M), z = sum_n projection_n u_n.
+        values: eigenvalues of the homogeneous body (M,), the first is 1.
+        stiffness: K_i of shear and B_i of volume (2, N, M, M), their sum is the homogeneous body's.
+        inertia: root of M_i, (N, 3, M).
+        links: pairs of units (2, E).
+        stretch: root of S_ij, (E, M).
+        springs: the links as springs, their stiffness per unit of S_ij.
+        between: root of T_ij, (E, 3, M).
+        distance: logarithm of the links' lengths over their mean (E,).
+    """
+
+    modes: Tensor
+    gradients: Tensor
+    projection: Tensor
+    values: Tensor
+    stiffness: Tensor
+    inertia: Tensor
+    links: Tensor
+    stretch: Tensor
+    between: Tensor
+    distance: Tensor
+
+    def __init__(self, hierarchy: Hierarchy, finest: int, frame: np.ndarray, *, modes: int, spacing: float, links: int):
+        """Computes everything in the body's own axes ``frame`` (3, 3); see :class:`MaterialTemplate`."""
+        super().__init__()
+        level, kernels = hierarchy.levels[finest], hierarchy.levels[0]
+        rest, pinned = level.rest.double().numpy() @ frame.T, level.pinned.numpy()
+        mass = level.volume.double().numpy()
+        mass = mass / mass[~pinned].mean()
+        own = kernels.rest.double().numpy() @ frame.T
+        size = spacing * hierarchy.diagonal
+        body = solid_body(own, kernels.pinned.numpy(), rest, mass, pinned, modes=modes, spacing=size)
+        phi, slope = body.at(rest)
+        phi[pinned], slope[pinned] = 0, 0
+        lowest = body.values[0]
+        pairs = _links(rest, pinned, links)
+        change = phi[pairs[1]] - phi[pairs[0]]
+        offset = rest[pairs[1]] - rest[pairs[0]]
+        length = np.linalg.norm(offset, axis=1)
+        stretch = np.einsum("eam,ea->em", change, offset) / (length**2)[:, None]
+        even = math.sqrt(body.values.sum() / lowest / max(float((stretch**2).sum()), 1e-30))
+        between = change * math.sqrt(len(body.values) / max(float((change**2).sum()), 1e-30))
+        arrays = {
+            "modes": phi,
+            "gradients": slope,
+            "projection": phi * mass[:, None, None],
+            "values": np.maximum(body.values, 1e-6 * body.values[-1]) / lowest,
+            "stiffness": _cell_stiffness(body, rest, pinned) / lowest,
+            "inertia": phi * np.sqrt(mass)[:, None, None],
+            "stretch": even * stretch,
+            "between": between,
+            "distance": np.log(length / length.mean()),
+        }
+        for name, array in arrays.items():
+            self.register_buffer(name, torch.from_numpy(np.ascontiguousarray(array)).float(), persistent=False)
+        self.springs = Springs(offset, change, (even / length) ** 2)
+        self.register_buffer("links", torch.from_numpy(pairs), persistent=False)
+        self.scale = AMPLITUDE * hierarchy.diagonal * math.sqrt(float((~pinned).sum()))
+
+
+def _links(rest: np.ndarray, pinned: np.ndarray, count: int) -> np.ndarray:
+    """Pairs (2, E) of neighbouring units that have a length, not between pinned ones."""
+    pairs = neighbour_pairs(rest, count)
+    distinct = np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1) > 1e-9 * np.abs(rest).max()
+    return np.ascontiguousarray(pairs[distinct & ~pinned[pairs].all(1)].T)
+
+
+def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np.ndarray:
+    """K_i and B_i (2, N, M, M): energy of shear and of volume of the cells near each unit, pins included."""
+    _, slope = body.at(body.centres)
+    strain = (slope + slope.transpose(0, 2, 1, 3)) / 2
+    trace = np.trace(strain, axis1=1, axis2=2)
+    first, second = POISSON / ((1 + POISSON) * (1 - 2 * POISSON)), 1 / (2 * (1 + POISSON))
+    count = slope.shape[-1]
+    # Numbers per cell and mode whose squares are twice the energy: nine of shear, one of volume.
+    parts = math.sqrt(2 * second) * strain.reshape(-1, 9, count), math.sqrt(first) * trace[:, None]
+    near, units = cKDTree(rest).query(body.centres, k=min(CELL_UNITS, len(rest)))
+    near, units = near.reshape(len(body.centres), -1), units.reshape(len(body.centres), -1)
+    share = 1 / (near**2 + 1e-12)
+    share /= share.sum(1, keepdims=True)
+    found = np.zeros((2, len(rest), count, count))
+    for unit in range(len(rest)):
+        cells, place = np.nonzero(units == unit)
+        size = np.sqrt(share[cells, place] * body.weights[cells])[:, None, None]
+        for total, roots in zip(found, parts, strict=True):
+            part = (roots[cells] * size).reshape(-1, count)
+            total[unit] = part.T @ part
+    missing = np.diag(body.values) - found.sum((0, 1))  # the springs that hold the pins, and rounding
+    free = ~pinned
+    found[0, free] += missing / free.sum()
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Matrices:
+    """What moves one scene [frame units].
+
+    Attributes:
+        stiffness: K (M, M).
+        inertia: M (M, M).
+        damping: D (M, M).
+        links: factor on every link's stiffness as a spring beyond the linear (E,).
+    """
+
+    stiffness: Float[Tensor, "M M"]
+    inertia: Float[Tensor, "M M"]
+    damping: Float[Tensor, "M M"]
+    links: Float[Tensor, " E"]
+
+
+class MaterialTemplate(Template):
+    """Proposes the next state by the dynamics of a solid body, its material decoded from densities and attributes."""
+
+    has_energy, is_shared = True, True
+    # The network carries part of the motion: how lively it is is known, in the template's terms, from its first swing.
+    headroom = 2.0
+
+    def __init__(
+        self,
+        hierarchies: Sequence[Hierarchy],
+        finest: int,
+        *,
+        attributes: int,
+        frames: Sequence[np.ndarray],
+        modes: int = 48,
+        spacing: float = 0.12,
+        links: int = 12,
+        hidden: int = 48,
+        period: float = 8.0,
+        damping: float = 0.02,
+        conserve_volume: bool = True,
+    ) -> None:
+        """See the module's text.
+
+        Args:
+            hierarchies: one per scene.
+            finest: level whose units carry the modes.
+            attributes: per unit.
+            frames: axes (3, 3) of each scene in which the template works.
+            modes: number of modes kept.
+            spacing: of the solid body's grid [diagonals].
+            links: neighbours per unit.
+            hidden: width of the decoders.
+            period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
+            damping: initial c_0 and c_1 [1 / frame, frames].
+            conserve_volume: scale the template's gradients to determinant 1 (METHOD's mass conservation).
+        """
+        super().__init__()
+        self.conserve_volume = conserve_volume
+        self.bodies = nn.ModuleList(
+            BodyModes(h, finest, f, modes=modes, spacing=spacing, links=links)
+            for h, f in zip(hierarchies, frames, strict=True)
+        )
+        self.start = 2 * math.log(2 * math.pi / period), math.log(damping)
+        self.stiffness, self.damping = nn.Parameter(torch.zeros(())), nn.Parameter(torch.zeros(2))
+        self.unit_decoder = mlp((attributes, hidden, 3))
+        self.link_decoder = mlp((3 * attributes + 1, hidden, 3))
+
+    def body(self, scene_id: int) -> BodyModes:
+        """Modes of one scene."""
+        body = self.bodies[scene_id]
+        assert isinstance(body, BodyModes)
+        return body
+
+    def decode(
+        self, body: BodyModes, attributes: Float[Tensor, "N A"]
+    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "E 3"]]:
+        """s, b and d of every unit; p, q and g of every link (see the module's text).
+
+        Without attributes every unit is the same: what the decoder says of zero attributes is taken off.
+        """
+        units = self.unit_decoder(attributes) - self.unit_decoder(torch.zeros_like(attributes[:1]))
+        a, b = (attributes.index_select(0, end) for end in body.links)
+        links = self.link_decoder(torch.cat((a + b, (a - b).square(), a * b, body.distance[:, None]), -1))
+        return _saturated(units), _saturated(links)
+
+    def matrices(
+        self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"], dt: float
+    ) -> Matrices:
+        """K, M and D of one scene from the material of its units.
+
+        Args:
+            scene_id: of the scene.
+            log_density: of the units.
+            attributes: of the units.
+            dt: frame interval [s].
+        """
+        body, frame = self.body(scene_id), dt * REFERENCE_FPS
+        units, links = self.decode(body, attributes)
+        k = (self.start[0] + GAIN * self.stiffness).exp() * frame**2
+        drag, viscosity = (self.start[1] + DAMPING_GAIN * self.damping).exp()
+        beyond = LINK_BEYOND * links[:, 2].exp()
+        stretch = (LINK_SHARE * links[:, 0].exp() + beyond)[:, None] * body.stretch
+        stiffness = torch.einsum("np,pnlm->lm", units[:, :2].exp(), body.stiffness) + body.stretch.mT @ stretch
+        density = _saturated(log_density).exp()[:, None, None]
+        root, heavy = body.inertia.flatten(0, 1), (density * body.inertia).flatten(0, 1)
+        between = LINK_SHARE * links[:, 1, None, None].exp() * body.between
+        inertia = root.mT @ heavy + body.between.flatten(0, 1).mT @ between.flatten(0, 1)
+        dragged = root.mT @ (units[:, 2, None, None].exp() * density * body.inertia).flatten(0, 1)
+        damping = drag * frame * dragged + viscosity / frame * k * stiffness
+        return Matrices(k * stiffness, inertia, damping, k * beyond)
+
+    def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
+        """The template with its matrices computed."""
+
+        def made(scene_id: int, rows: Tensor) -> PreparedMaterial:
+            density, attributes = (x.index_select(0, rows) for x in (units.log_density, units.attributes))
+            matrices = self.matrices(scene_id, density, attributes, float(batch.levels[-1].dt[rows[0]]))
+            return PreparedMaterial(self.body(scene_id), matrices)
+
+        return PreparedScenes(batch, made, conserve_volume=self.conserve_volume)
+
+    def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Modes (N, 3, M), their gradients (N, 3, 3, M) and sizes (M,): what initial velocities are made of."""
+        body = self.body(scene_id)
+        sizes = body.values**-0.25
+        return body.modes * (body.scale * sizes), body.gradients * (body.scale * sizes), sizes
+
+
+def _saturated(logarithms: Tensor) -> Tensor:
+    return LARGEST_LOG * torch.tanh(logarithms / LARGEST_LOG)
+
+
+class PreparedMaterial:
+    """A scene's body while no parameter changes."""
+
+    def __init__(self, body: BodyModes, matrices: Matrices) -> None:
+        """Computes the constants; gradients flow through them."""
+        self.matrices, self.springs = matrices, body.springs
+        self.projection, self.positions = body.projection.flatten(0, 1), body.modes.flatten(0, 1)
+        # Positions and gradients of a unit side by side: one product gives both.
+        self.motions = torch.cat((body.modes, body.gradients.flatten(1, 2)), 1).flatten(0, 1)
+        self.operator = matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2
+
+    def change(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+        """z_{t+1} - 2 z_t + z_{t-1} (see the module's text)."""
+        beyond, stiffer = self.springs.linearised(z, self.matrices.links)
+        force = beyond - z @ self.matrices.stiffness - (z - previous) @ self.matrices.damping
+        operator = self.operator + stiffer / 4
+        return torch.linalg.solve(operator, force[..., None])[..., 0]
+
+    def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
+        """Displacement and its gradient, row by row, of every unit at t + 1."""
+        z, previous = modal_coordinates(now, before, self.projection)
+        after = 2 * z - previous + self.change(z, previous)
+        return (after @ self.motions.mT).view(*now.shape[:2], 12)
+
+    def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
+        """Its projection onto the modes.
+
+        With it a state is 2 M numbers to the whole step. What the network adds beyond the modes is seen in the frame
+        that it predicts and forgotten in the next; seen again, it could feed itself and grow where no energy tells.
+        """
+        z = displacement.flatten(1) @ self.projection
+        return (z @ self.positions.mT).view_as(displacement)
+
+    def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:
+        """v^T M v / 2 + m^T K m / 2 and the links' beyond it: v the step, m the middle of both states, constants all.
+
+        Without damping and links beyond the linear the template keeps this number exactly.
+        """
+        z, previous = modal_coordinates(now, before, self.projection)
+        step, middle = z - previous, (z + previous) / 2
+        inertia, stiffness = self.matrices.inertia.detach(), self.matrices.stiffness.detach()
+        energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)
+        return energy + self.springs.potential(middle, self.matrices.links.detach())

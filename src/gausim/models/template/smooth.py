@@ -1,0 +1,35 @@
+"""Smooth motions of a scene: what its template can carry, at every kernel."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import GaussianScene, SmoothMotions
+from gausim.models.hierarchy.clusters import Hierarchy
+
+
+def smooth_motions(
+    scene: GaussianScene,
+    hierarchy: Hierarchy,
+    finest: int,
+    motions: tuple[Float[Tensor, "N 3 M"], Float[Tensor, "N 3 3 M"], Float[Tensor, " M"]],
+) -> SmoothMotions:
+    """Carries motions of units to their kernels: unit displacement plus its gradient times the offset in the unit.
+
+    Args:
+        scene: the scene.
+        hierarchy: its units.
+        finest: level of the units that move.
+        motions: displacements and gradients of the units by each motion, and its size (see ``SmoothMotions.sizes``).
+    """
+    modes, gradients, sizes = motions
+    unit = hierarchy.ancestor(0, finest)
+    offset = scene.means[hierarchy.kernels] - hierarchy.levels[finest].rest[unit]
+    moved = modes[unit] + torch.einsum("kabm,kb->kam", gradients[unit], offset)
+    kernels = moved.new_zeros(scene.count, 3, modes.shape[-1])
+    kernels[hierarchy.kernels] = moved * ~hierarchy.levels[0].pinned[:, None, None]
+    still = torch.full((scene.count,), len(modes))
+    rows = torch.cat((gradients, torch.zeros_like(gradients[:1])))
+    return SmoothMotions(kernels, rows, still.index_copy(0, hierarchy.kernels, unit), sizes)

@@ -1,0 +1,375 @@
+"""Static reconstruction: the Gaussians of the rest scene from posed RGBA stills, through any renderer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gausim.core import ConfigError, DivergenceError, GaussianScene, Renderer
+from gausim.data.images import composite
+from gausim.losses.image import ImageLoss
+from gausim.reconstruction.splat_start import PointCloud, Start, start_object, start_open
+from gausim.reconstruction.splats import LearningRates, Splats
+from gausim.reconstruction.stills import ImageSet
+
+# Adam's step sizes fall to these shares of their start, exponentially: positions as in 3DGS, the rest less.
+FINAL_MEANS_RATE = 0.01
+FINAL_RATE = 0.1
+SSIM_WINDOW = 11
+# Pixels around the masks' bounding box that the structural loss sees as well.
+CROP_MARGIN = 6
+# Steps between two looks at the largest sizes that kernels may have.
+LIMIT_EVERY = 10
+# Steps of which one asks what kernels the image's error lies under; it costs another rendering.
+BLAME_EVERY = 4
+# Looks at the mean loss over a whole run that early stopping makes.
+LOOKS = 20
+# A look is better if the loss fell by this share.
+BETTER = 2e-3
+
+# Means, covariances, colours and opacities of all kernels.
+Drawable = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+@dataclass(frozen=True)
+class ReconstructionOptions:
+    """What a reconstruction is made with.
+
+    Attributes:
+        kernels: number of kernels aimed at (pruning may leave fewer).
+        iterations: optimiser steps, one image each.
+        extent: ``object``: what the masks show, within their visual hull; ``scene``: everything in the images.
+        sh_degree: degree of the spherical harmonics, 0..3.
+        hull_resolution: voxels along the longest side of the visual hull.
+        hull_margin: voxels by which a kernel's centre may leave the hull.
+        missing_masks: share of the views whose masks may miss a part that all others show.
+        start_share: share of the kernels placed at the start; splitting adds the rest. An open scene starts with all
+            of its points.
+        rounds: times that kernels are pruned and split.
+        minimum_opacity: kernels below are pruned.
+        maximum_scale: ceiling of a standard deviation [mean distances between neighbours at the start]; of objects.
+        ssim_weight: share of D-SSIM against L1 (3DGS: 0.2).
+        alpha_weight: weight of the L1 error of alpha against the mask.
+        anisotropy_limit: r of the penalty mean(max(s_max / s_min, r) - r) (PhysGaussian).
+        anisotropy_weight: its weight.
+        random_background: composite over a random colour in every step instead of black.
+        patience: stop early where the mean loss over a twentieth of the steps was not better so many times in a row,
+            after the last round; 0 never stops.
+        seed: of everything random.
+        rates: Adam's step sizes.
+    """
+
+    kernels: int = 2000
+    iterations: int = 4000
+    extent: Literal["object", "scene"] = "object"
+    sh_degree: int = 1
+    hull_resolution: int = 96
+    hull_margin: int = 1
+    missing_masks: float = 0.0
+    start_share: float = 0.6
+    rounds: int = 8
+    minimum_opacity: float = 0.05
+    maximum_scale: float = 1.5
+    ssim_weight: float = 0.2
+    alpha_weight: float = 0.2
+    anisotropy_limit: float = 3.0
+    anisotropy_weight: float = 0.02
+    random_background: bool = True
+    patience: int = 3
+    seed: int = 0
+    rates: LearningRates = field(default_factory=LearningRates)
+
+    def __post_init__(self) -> None:
+        """Checks the ranges, or raises :class:`ConfigError`."""
+        for name in ("kernels", "iterations", "hull_resolution", "rounds"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"reconstruction: {name} must be at least 1, got {getattr(self, name)}.")
+        if self.sh_degree not in (0, 1, 2, 3):
+            raise ConfigError(f"reconstruction: sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}.")
+        for name in ("missing_masks", "minimum_opacity", "ssim_weight"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"reconstruction: {name} must be in [0, 1), got {getattr(self, name)}.")
+
+    @property
+    def round_steps(self) -> tuple[int, ...]:
+        """Steps after which kernels are pruned and split: between 10 % and 70 % of the way."""
+        first, last = 0.1 * self.iterations, 0.7 * self.iterations
+        steps = {int(first + (last - first) * i / max(1, self.rounds - 1)) for i in range(self.rounds)}
+        return tuple(sorted(steps))
+
+
+def reconstruct(
+    sets: Sequence[ImageSet],
+    renderer: Renderer,
+    options: ReconstructionOptions,
+    *,
+    cloud: PointCloud | None = None,
+    name: str = "scene",
+    progress: Callable[[Reconstruction], None] | None = None,
+    begun: Mapping[str, Tensor] | None = None,
+) -> GaussianScene:
+    """Fits Gaussians to images by L1 + D-SSIM + mask loss (3DGS, with the mask against floaters).
+
+    Kernels of an object start on the surface of its visual hull (or on the points in it), those of an open scene on
+    the points. They are split where the images' error is largest and pruned where they are transparent, never seen or
+    out of bounds: the dynamics moves every kernel that is left.
+
+    Args:
+        sets: training images; the hull is carved from the first set.
+        renderer: what draws the Gaussians.
+        options: see there.
+        cloud: points to start from; an open scene needs them.
+        name: name of the scene.
+        progress: called after every step.
+        begun: :meth:`Reconstruction.state` of an interrupted one with the same arguments, to go on from.
+
+    Returns:
+        The scene: all kernels simulated and foreground, none pinned.
+
+    Raises:
+        ConfigError: an open scene without points.
+        DataError: no body projects into all masks, no points lie in it, or points of a scene have no colours.
+        DivergenceError: the loss stopped being finite.
+    """
+    run = Reconstruction(sets, renderer, options, cloud=cloud, name=name)
+    if begun is not None:
+        run.restore(begun)
+    while not run.finished:
+        run.step()
+        if progress is not None:
+            progress(run)
+    return run.scene()
+
+
+class Reconstruction:
+    """A reconstruction under way.
+
+    Attributes:
+        splats: the kernels.
+        done: steps made.
+        loss: of the latest step.
+    """
+
+    def __init__(
+        self,
+        sets: Sequence[ImageSet],
+        renderer: Renderer,
+        options: ReconstructionOptions,
+        *,
+        cloud: PointCloud | None,
+        name: str,
+    ) -> None:
+        """Places the first kernels (see :func:`reconstruct`)."""
+        self._sets, self._renderer, self._options, self._name = list(sets), renderer, options, name
+        self._start = start = _start(sets[0], options, cloud, name)
+        self.splats = Splats(
+            start.points, start.colors, start.scales, sh_degree=options.sh_degree, opacity=0.8, rates=options.rates,
+            extent=start.extent,
+        )  # fmt: skip
+        self._generator = torch.Generator().manual_seed(options.seed)
+        self._queues: list[list[int]] = [[] for _ in sets]
+        self._similarity = ImageLoss(balance=0.0, window=SSIM_WINDOW, pixels=1 / 3, crop=False)
+        self._rounds, self._patience = options.round_steps, _Patience(options)
+        self.done, self.loss = 0, math.nan
+
+    @property
+    def finished(self) -> bool:
+        """Whether all steps are made, or more would not help."""
+        return self.done >= self._options.iterations or self._patience.over
+
+    def step(self) -> None:
+        """One image.
+
+        Raises:
+            DivergenceError: the loss is not finite, or pruning left nothing.
+        """
+        images, i = self._draw()
+        background = self._background()
+        truth, mask = composite(images.images[i], background)
+        drawable = self.splats.drawable(images.cameras.centers[i])
+        rgb, alpha = self._render(images, i, background, drawable)
+        loss = self._loss(rgb, alpha, truth, mask)
+        self.loss = float(loss.detach())
+        if not math.isfinite(self.loss):
+            raise DivergenceError(
+                f"{self._name}: reconstruction loss is {self.loss} at step {self.done}. Lower the rates."
+            )
+        loss.backward()
+        if self.done % BLAME_EVERY == 0 and self.done < self._rounds[-1]:
+            self._blame(images, i, background, drawable, (rgb.detach() - truth).abs().mean(-1))
+        share = self.done / self._options.iterations
+        self.splats.step({"means": FINAL_MEANS_RATE**share, "": FINAL_RATE**share})
+        if self.done % LIMIT_EVERY == 0:
+            self._limit()
+        if self.done in self._rounds:
+            self._prune()
+            self._densify(self._rounds.index(self.done), len(self._rounds))
+            self.splats.forget()
+        self._patience.note(self.done, self.loss)
+        self.done += 1
+
+    def scene(self) -> GaussianScene:
+        """The kernels that are opaque and within bounds."""
+        self._limit()
+        opaque = torch.sigmoid(self.splats["opacity"].detach()) > self._options.minimum_opacity
+        self.splats.keep(self._inside() & opaque)
+        return self.splats.scene(self._name)
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that a reconstruction with the same arguments needs to go on bit by bit."""
+        queues = {f"queue_{k}": torch.tensor(queue, dtype=torch.int64) for k, queue in enumerate(self._queues)}
+        return {
+            **self.splats.state(),
+            **queues,
+            "done": torch.tensor(self.done),
+            "generator": self._generator.get_state(),
+            "patience": self._patience.state(),
+        }
+
+    def restore(self, state: Mapping[str, Tensor]) -> None:
+        """Goes on from :meth:`state`."""
+        self.splats.restore(state)
+        self._queues = [state[f"queue_{k}"].tolist() for k in range(len(self._queues))]
+        self.done = int(state["done"])
+        self._generator.set_state(state["generator"])
+        self._patience.restore(state["patience"])
+
+    def _draw(self) -> tuple[ImageSet, int]:
+        """An image: the set by its share, within a set every image once before any comes again."""
+        done = self.done / self._options.iterations
+        shares = torch.tensor([s.share * (s.span[0] <= done < s.span[1]) for s in self._sets])
+        k = int(torch.multinomial(shares, 1, generator=self._generator))
+        if not self._queues[k]:
+            self._queues[k] = torch.randperm(len(self._sets[k].images), generator=self._generator).tolist()
+        return self._sets[k], self._queues[k].pop()
+
+    def _background(self) -> Float[Tensor, " 3"]:
+        random = torch.rand(3, generator=self._generator)
+        return random if self._options.random_background else torch.zeros(3)
+
+    def _render(
+        self, images: ImageSet, i: int, background: Tensor, drawable: Drawable
+    ) -> tuple[Float[Tensor, "H W 3"], Float[Tensor, "H W"]]:
+        cameras = images.cameras
+        means, covars, colors, opacities = drawable
+        camera = cameras.viewmats[None, i : i + 1], cameras.Ks[None, i : i + 1]
+        drawn = self._renderer(
+            means[None], covars[None], colors[None, None], opacities[None], *camera, (cameras.width, cameras.height),
+            background=background,
+        )  # fmt: skip
+        return drawn.rgb[0, 0], drawn.alpha[0, 0]
+
+    def _blame(
+        self, images: ImageSet, i: int, background: Tensor, drawable: Drawable, error: Float[Tensor, "H W"]
+    ) -> None:
+        """Notes the share of every kernel in the image's error: the sum over pixels of its weight times the error.
+
+        That is the gradient of sum(error * rgb) with respect to a gray kernel's colour. Unlike the gradient of its
+        position it does not cancel within a large kernel (Rota Bulo et al., Revising Densification, 2024).
+        """
+        means, covars, colors, opacities = (x.detach() for x in drawable)
+        gray = torch.zeros_like(colors).requires_grad_()
+        rgb, _ = self._render(images, i, background, (means, covars, gray, opacities))
+        (share,) = torch.autograd.grad(rgb, gray, error[..., None].expand_as(rgb))
+        self.splats.blame(share.mean(-1))
+
+    def _loss(self, rgb: Tensor, alpha: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
+        options = self._options
+        loss = (1 - options.ssim_weight) * (rgb - truth).abs().mean()
+        loss = loss + options.alpha_weight * (alpha - mask).abs().mean()
+        if options.ssim_weight > 0:
+            rows, columns = _crop(mask > 0)
+            first, second = (x[rows, columns].contiguous()[None, None] for x in (rgb, truth))
+            share = first.shape[2] * first.shape[3] / mask.numel()  # outside both are background: D-SSIM is zero there
+            loss = loss + options.ssim_weight * share * self._similarity(first, second)[0]
+        ratio = (self.splats["log_scales"].amax(-1) - self.splats["log_scales"].amin(-1)).exp()
+        return loss + options.anisotropy_weight * (ratio - options.anisotropy_limit).clamp_min(0).mean()
+
+    def _inside(self) -> Bool[Tensor, " K"]:
+        return self._start.bounds.contains(self.splats["means"].detach())
+
+    @torch.no_grad()
+    def _limit(self) -> None:
+        largest = self._start.bounds.largest(self.splats["means"].detach())
+        self.splats["log_scales"].copy_(torch.minimum(self.splats["log_scales"], largest.log()[:, None]))
+
+    def _prune(self) -> None:
+        opaque = torch.sigmoid(self.splats["opacity"].detach()) > self._options.minimum_opacity
+        seen = self.splats.seen
+        keep = opaque & seen & self._inside()
+        if keep.sum() < 2:
+            raise DivergenceError(
+                f"reconstruction: only {int(keep.sum())} of {len(keep)} kernels are left after pruning (opaque: "
+                f"{int(opaque.sum())}, seen: {int(seen.sum())}). Check masks and poses, or take more iterations."
+            )
+        self.splats.keep(keep)
+
+    def _densify(self, done: int, rounds: int) -> None:
+        """Splits kernels that cover most of the images' error, so that the last round but one reaches the budget."""
+        missing = self._options.kernels - self.splats.count
+        count = min(math.ceil(missing / max(1, rounds - 1 - done)), self.splats.count)
+        if count > 0 and done < rounds - 1:
+            self.splats.split(self.splats.error.topk(count).indices)
+
+
+class _Patience:
+    """Tells when the mean loss over a stretch of steps has stopped falling."""
+
+    def __init__(self, options: ReconstructionOptions) -> None:
+        self._allowed, self._length = options.patience, max(1, options.iterations // LOOKS)
+        self._first = options.round_steps[-1] + 1
+        self._sum, self._count, self._best, self._worse = 0.0, 0, math.inf, 0
+
+    @property
+    def over(self) -> bool:
+        return self._allowed > 0 and self._worse >= self._allowed
+
+    def note(self, step: int, loss: float) -> None:
+        if step < self._first:
+            return
+        self._sum, self._count = self._sum + loss, self._count + 1
+        if self._count < self._length:
+            return
+        mean = self._sum / self._count
+        self._worse = 0 if mean < (1 - BETTER) * self._best else self._worse + 1
+        self._best, self._sum, self._count = min(self._best, mean), 0.0, 0
+
+    def state(self) -> Tensor:
+        return torch.tensor([self._sum, self._count, self._best, self._worse], dtype=torch.float64)
+
+    def restore(self, state: Tensor) -> None:
+        self._sum, self._best = float(state[0]), float(state[2])
+        self._count, self._worse = int(state[1]), int(state[3])
+
+
+def _start(images: ImageSet, options: ReconstructionOptions, cloud: PointCloud | None, name: str) -> Start:
+    if options.extent == "scene":
+        if cloud is None:
+            raise ConfigError(f"{name}: an open scene starts from points. Give those that `poses` found (points.npz).")
+        return start_open(images, cloud, name=name)
+    return start_object(
+        images,
+        round(options.start_share * options.kernels),
+        resolution=options.hull_resolution,
+        margin=options.hull_margin,
+        missing=options.missing_masks,
+        ceiling=options.maximum_scale,
+        cloud=cloud,
+        name=name,
+    )
+
+
+def _crop(mask: Bool[Tensor, "H W"]) -> tuple[slice, slice]:
+    """Rows and columns of the mask's bounding box with a margin, at least as large as the SSIM window."""
+    slices = []
+    for dim, size in enumerate(mask.shape):
+        used = mask.any(1 - dim).nonzero()[:, 0]
+        low, high = (int(used[0]), int(used[-1]) + 1) if len(used) else (0, size)
+        slices.append(slice(max(0, low - CROP_MARGIN), min(size, max(high, low + SSIM_WINDOW) + CROP_MARGIN)))
+    return slices[0], slices[1]

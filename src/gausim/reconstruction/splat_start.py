@@ -1,0 +1,218 @@
+"""Where Gaussians begin, and where they may be: on the visual hull of the masks, or on points of the open scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from gausim.core import DataError
+from gausim.ops.visual_hull import VoxelHull, carve, farthest_points, project
+from gausim.reconstruction.stills import ImageSet
+
+# Opaque foreground is what initial colours are read from; the rim mixes in what lies behind.
+OPAQUE = 200
+# Neighbours whose mean distance is the size of a kernel at the start.
+NEIGHBOURS = 3
+# Rows of the distances between points that are held at a time.
+ROWS = 2048
+# Smallest standard deviation at the start of an open scene [mean distances of the cameras].
+SMALLEST = 1e-4
+# A kernel of an open scene has at most this share of its distance to the nearest camera as standard deviation.
+OPEN_CEILING = 0.2
+
+
+@runtime_checkable
+class Bounds(Protocol):
+    """Where kernels may be, and how large there."""
+
+    def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+        """True for the points where a kernel may be."""
+        ...
+
+    def largest(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """The largest standard deviation of a kernel at these points [scene units]."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class WithinHull:
+    """Bounds of an object.
+
+    Attributes:
+        hull: body that holds the centres.
+        ceiling: of a standard deviation [scene units].
+    """
+
+    hull: VoxelHull
+    ceiling: float
+
+    def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+        """True within the hull."""
+        return self.hull.contains(points)
+
+    def largest(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """The same everywhere."""
+        return torch.full_like(points[:, 0], self.ceiling)
+
+
+@dataclass(frozen=True, eq=False)
+class BeforeCameras:
+    """Bounds of an open scene: no kernel is so large that it reaches a camera, where it would fill the image.
+
+    Attributes:
+        centers: of the cameras [scene units].
+    """
+
+    centers: Float[Tensor, "V 3"]
+
+    def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
+        """True for every point that is a number."""
+        return torch.isfinite(points).all(-1)
+
+    def largest(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """A share of the distance to the nearest camera."""
+        return OPEN_CEILING * torch.cdist(points, self.centers).amin(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points to start from.
+
+    Attributes:
+        points: their positions [scene units].
+        colors: RGB in [0, 1]; None reads those of an object from the images.
+    """
+
+    points: Float[Tensor, "P 3"]
+    colors: Float[Tensor, "P 3"] | None = None
+
+    def __post_init__(self) -> None:
+        """Checks the numbers, or raises :class:`DataError`."""
+        if len(self.points) < 2 or not torch.isfinite(self.points).all():
+            raise DataError(
+                f"points: expected at least two finite points to start from, got {len(self.points)}. "
+                "Find the poses again, or start from the masks' visual hull."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """K balls to begin with.
+
+    Attributes:
+        points: centres [scene units].
+        colors: RGB in [0, 1].
+        scales: standard deviations [scene units].
+        bounds: where kernels may be.
+        extent: length that steps of the positions are measured in [scene units].
+    """
+
+    points: Float[Tensor, "K 3"]
+    colors: Float[Tensor, "K 3"]
+    scales: Float[Tensor, " K"]
+    bounds: Bounds
+    extent: float
+
+
+def start_object(
+    images: ImageSet,
+    count: int,
+    *,
+    resolution: int,
+    margin: int,
+    missing: float,
+    ceiling: float,
+    cloud: PointCloud | None,
+    name: str,
+) -> Start:
+    """Balls evenly over the surface of the visual hull of the masks, or over the points that lie in it.
+
+    Args:
+        images: whose alpha > 0 is the object.
+        count: balls.
+        resolution: voxels along the longest side of the hull.
+        margin: voxels by which a kernel's centre may leave it.
+        missing: share of the views whose masks may miss a part that all others show.
+        ceiling: of a standard deviation [mean distances between neighbours].
+        cloud: points instead of the surface.
+        name: of the scene, for errors.
+
+    Raises:
+        DataError: no body projects into all masks, or no point lies in it.
+    """
+    masks = images.images[..., 3] > 0
+    hull = carve(masks, images.cameras.viewmats, images.cameras.Ks, resolution, missing=missing)
+    if hull is None:
+        raise DataError(
+            f"{name}: the visual hull of {len(masks)} masks is empty; expected a body that all views see. "
+            "Check that the alpha channel is the object's mask and that the poses belong to the images, or allow some "
+            "masks to miss parts (--missing-masks 0.2)."
+        )
+    room = hull.dilated(margin)
+    points, normals = hull.surface()
+    colors = None
+    if cloud is not None:
+        inside = room.contains(cloud.points)
+        if inside.sum() < 2:
+            raise DataError(
+                f"{name}: {int(inside.sum())} of {len(inside)} points lie in the visual hull of the masks. Check that "
+                "points and poses are of one world, or leave the points out."
+            )
+        points, normals = cloud.points[inside].float(), torch.zeros(int(inside.sum()), 3)
+        colors = None if cloud.colors is None else cloud.colors[inside]
+    index = farthest_points(points, max(2, count))
+    points, normals = points[index], normals[index]
+    distance = neighbour_distance(points)
+    chosen = _surface_colors(points, normals, images) if colors is None else colors[index]
+    scales = 0.6 * distance.clamp_min(1e-3 * hull.spacing)
+    return Start(points, chosen, scales, WithinHull(room, ceiling * float(distance.mean())), hull.diagonal)
+
+
+def start_open(images: ImageSet, cloud: PointCloud, *, name: str) -> Start:
+    """Balls on all points of an open scene, as large as the distances to their neighbours.
+
+    Args:
+        images: whose cameras look at it.
+        cloud: the points, with colours: those of a point that something may hide cannot be read from the images, and
+            kernels that begin with the colour of what is before or behind them grow into fog.
+        name: of the scene, for errors.
+
+    Raises:
+        DataError: the points have no colours.
+    """
+    if cloud.colors is None:
+        raise DataError(f"{name}: points of an open scene need colours. Take the points.npz that `poses` wrote.")
+    centers = images.cameras.centers
+    points, bounds = cloud.points.float(), BeforeCameras(centers)
+    extent = float((centers - points.median(0).values).norm(dim=-1).mean())
+    scales = torch.minimum(neighbour_distance(points).clamp_min(SMALLEST * extent), bounds.largest(points))
+    return Start(points, cloud.colors, scales, bounds, extent)
+
+
+def neighbour_distance(points: Float[Tensor, "K 3"]) -> Float[Tensor, " K"]:
+    """Mean distance of every point to its nearest neighbours [scene units]."""
+    nearest = min(NEIGHBOURS + 1, len(points))
+    parts = [torch.cdist(part, points).topk(nearest, largest=False).values[:, 1:] for part in points.split(ROWS)]
+    return torch.cat(parts).mean(-1)
+
+
+def _surface_colors(
+    points: Float[Tensor, "K 3"], normals: Float[Tensor, "K 3"], images: ImageSet
+) -> Float[Tensor, "K 3"]:
+    """Mean colour over the views that a point's normal faces; occlusion by other parts is left to the optimiser."""
+    pixels, _ = project(points, images.cameras.viewmats, images.cameras.Ks)
+    total, weight = torch.zeros_like(points), torch.full((len(points), 1), 1e-6)
+    mean = images.images[..., :3][images.images[..., 3] > OPAQUE].float().mean(0) / 255
+    for view, center in enumerate(images.cameras.centers):
+        x, y = pixels[view].floor().long().unbind(-1)
+        x, y = x.clamp(0, images.cameras.width - 1), y.clamp(0, images.cameras.height - 1)
+        rgba = images.images[view, y, x]
+        facing = (normals * functional.normalize(center - points, dim=-1)).sum(-1).clamp_min(1e-3)
+        w = (facing**4 * (rgba[:, 3] > OPAQUE))[:, None]
+        total, weight = total + w * rgba[:, :3].float() / 255, weight + w
+    return (total + 1e-6 * mean) / weight

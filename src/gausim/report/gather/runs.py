@@ -1,0 +1,232 @@
+"""Finds run directories and reads what they say: configuration, state, summary. Nothing in them is trusted or run."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gausim.core import RunError
+from gausim.results.summary import load_summary
+
+CONFIG, FINISHED, FAILED, EPOCHS = "config.yaml", "FINISHED", "FAILED", "epochs.csv"
+# What makes a directory with an unreadable configuration a run nevertheless.
+_TRACES = (FINISHED, FAILED, EPOCHS, "last.ckpt")
+_KEYS_OF_A_RUN = {"model", "data", "seed"}
+# Keys that do not change what is computed, or that only tell seeds apart.
+_FREE = ("paths", "logger", "callbacks", "sweep", "task_name", "evaluate", "seed", "data.seed", "trainer")
+# A refusal instead of a hang on a file that no run writes.
+_LARGEST_CONFIG = 1 << 20
+
+EVALUATED, NOT_EVALUATED, UNFINISHED = "evaluated", "not evaluated", "unfinished"
+FAILURE, BROKEN = "failed", "broken files"
+
+
+@dataclass(frozen=True, eq=False)
+class RunRecord:
+    """One run directory.
+
+    Attributes:
+        path: the directory.
+        name: its path below the searched directory.
+        status: one of the constants of this module.
+        detail: what more is known of the status, for people.
+        config: its configuration; empty where it is unreadable.
+        choices: Hydra's choice of every config group, where known.
+        summary: the content of ``evaluation/metrics.json``; None without one.
+    """
+
+    path: Path
+    name: str
+    status: str
+    detail: str
+    config: dict[str, Any] = field(default_factory=dict, repr=False)
+    choices: dict[str, str] = field(default_factory=dict, repr=False)
+    summary: dict[str, Any] | None = field(default=None, repr=False)
+
+    @property
+    def seed(self) -> Any:
+        """The seed of the configuration."""
+        return self.config.get("seed")
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """Dotted keys and values of what is computed, seeds aside."""
+        flat = dict(flatten(self.config))
+        return {k: v for k, v in flat.items() if not any(k == f or k.startswith(f"{f}.") for f in _FREE)}
+
+    @property
+    def config_hash(self) -> str:
+        """First twelve digits of the SHA-256 of the whole configuration, or ``?`` where there is none."""
+        if not self.config:
+            return "?"
+        return hashlib.sha256(json.dumps(dict(flatten(self.config)), sort_keys=True).encode()).hexdigest()[:12]
+
+    @property
+    def is_from_unfinished(self) -> bool:
+        """Whether its numbers are those of a checkpoint in the middle of training."""
+        return self.summary is not None and self.summary["run"].get("finished") is False
+
+
+def flatten(value: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
+    """Dotted keys and values as text of nested mappings."""
+    if isinstance(value, Mapping) and value:
+        for key, inner in value.items():
+            yield from flatten(inner, f"{prefix}.{key}" if prefix else str(key))
+    else:
+        yield prefix, str(value)
+
+
+def find_runs(roots: Sequence[Path], *, skip: Path | None = None) -> list[RunRecord]:
+    """All runs at or below ``roots``, in the order of their paths, each once.
+
+    Args:
+        roots: directories.
+        skip: a directory that is not searched (where the report goes).
+
+    Raises:
+        RunError: a root is no directory, or there is no run at all.
+    """
+    found: dict[Path, RunRecord] = {}
+    for root in roots:
+        if not root.is_dir():
+            raise RunError(f"{root}: no such directory. Name run directories, sweeps, or a folder of them.")
+        for folder in _run_folders(root, skip.resolve() if skip is not None else None):
+            name = root.name if folder == root else str(folder.relative_to(root))
+            found.setdefault(folder.resolve(), _read_run(folder, f"{root.name}/{name}" if len(roots) > 1 else name))
+    if not found:
+        raise RunError(
+            f"{', '.join(str(r) for r in roots)}: no run in here (no {CONFIG} of `gausim train`). "
+            "Train and evaluate first."
+        )
+    return list(found.values())
+
+
+def _run_folders(root: Path, skip: Path | None) -> Iterator[Path]:
+    """Run directories, and the directories of jobs that Hydra began and that never came to a run of their own."""
+    dead: list[Path] = []
+    alive: list[Path] = []
+    for name, folders, files in os.walk(root):
+        folder = Path(name)
+        folders[:] = sorted(f for f in folders if not f.startswith(".") and (folder / f).resolve() != skip)
+        if CONFIG in files and _is_run(folder):
+            folders.clear()
+            alive.append(folder)
+        elif (folder / ".hydra" / CONFIG).is_file():
+            dead.append(folder)
+    dead = [d for d in dead if not any(a.is_relative_to(d) for a in alive)]
+    yield from sorted(alive + dead)
+
+
+def _is_run(folder: Path) -> bool:
+    try:
+        return _KEYS_OF_A_RUN <= set(_yaml(folder / CONFIG))
+    except RunError:
+        return any((folder / trace).exists() for trace in _TRACES)
+
+
+def _yaml(path: Path) -> dict[str, Any]:
+    """A mapping from a YAML file, with the safe loader: no tag builds an object.
+
+    Raises:
+        RunError: the file is missing, too large, no YAML or no mapping.
+    """
+    try:
+        if path.stat().st_size > _LARGEST_CONFIG:
+            raise RunError(f"{path}: has more than {_LARGEST_CONFIG} bytes; no configuration is that long.")
+        text = path.read_text()
+        # Aliases let a short file stand for a huge one; what a run writes has none.
+        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text, Loader=yaml.SafeLoader)):
+            raise RunError(f"{path}: has YAML aliases, which no run writes.")
+        loaded = yaml.safe_load(text)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
+        raise RunError(f"{path}: cannot be read as YAML ({type(error).__name__}).") from error
+    if not isinstance(loaded, dict):
+        raise RunError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
+    return loaded
+
+
+def _read_run(folder: Path, name: str) -> RunRecord:
+    choices = _choices(folder)
+    own = folder / CONFIG if (folder / CONFIG).is_file() else folder / ".hydra" / CONFIG
+    try:
+        config = _yaml(own)
+    except RunError as error:
+        return RunRecord(folder, name, BROKEN, str(error), choices=choices)
+    metrics = folder / "evaluation" / "metrics.json"
+    if metrics.is_file():
+        try:
+            summary = check_summary(load_summary(metrics), metrics)
+        except (RunError, OSError, UnicodeDecodeError) as error:
+            return RunRecord(folder, name, BROKEN, str(error), config, choices)
+        unfinished = summary["run"].get("finished") is False
+        detail = f"measured before it was finished, {progress(folder)}" if unfinished else ""
+        return RunRecord(folder, name, EVALUATED, detail, config, choices, summary)
+    return RunRecord(folder, name, *_state(folder, own), config, choices)
+
+
+def _state(folder: Path, config: Path) -> tuple[str, str]:
+    if (folder / FAILED).is_file():
+        with (folder / FAILED).open("rb") as file:  # a long traceback may stand above the line that matters
+            file.seek(max(0, (folder / FAILED).stat().st_size - 4000))
+            lines = file.read().decode(errors="replace").strip().splitlines()
+        return FAILURE, lines[-1] if lines else ""
+    if (folder / FINISHED).is_file():
+        return NOT_EVALUATED, f"gausim evaluate {folder}"
+    if config.parent.name == ".hydra":
+        return FAILURE, "ended before training began"
+    return UNFINISHED, f"killed, or still running: {progress(folder)}"
+
+
+def progress(folder: Path) -> str:
+    """How far a run's own table of epochs goes."""
+    try:
+        with (folder / EPOCHS).open(newline="", errors="replace") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, csv.Error):
+        rows = []
+    return f"epoch {rows[-1].get('epoch')}" if rows else "no epoch done"
+
+
+def _choices(folder: Path) -> dict[str, str]:
+    try:
+        node: Any = _yaml(folder / ".hydra" / "hydra.yaml")
+    except RunError:
+        return {}
+    for key in ("hydra", "runtime", "choices"):
+        node = node.get(key) if isinstance(node, dict) else None
+    return {str(k): str(v) for k, v in node.items()} if isinstance(node, dict) else {}
+
+
+def check_summary(summary: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The summary, if it has the shape that tables are made from.
+
+    Raises:
+        RunError: a field is missing or of another type.
+    """
+    shapes: dict[str, type] = {"sequences": list, "splits": dict, "metrics": dict, "rows": dict, "methods": list}
+    objects = summary.get("objects")
+    problem = None
+    if not isinstance(objects, dict) or not isinstance(summary.get("run"), dict):
+        problem = "'objects' and 'run'"
+    else:
+        for name, entry in objects.items():
+            wrong = [k for k, t in shapes.items() if not isinstance(entry, dict) or not isinstance(entry.get(k), t)]
+            if not wrong and not all(_is_range(split) for split in entry["splits"].values()):
+                wrong = ["splits"]
+            if wrong:
+                problem = f"'objects.{name}.{wrong[0]}'"
+    if problem:
+        raise RunError(f"{path}: field {problem} is missing or of another type. Run `gausim evaluate RUN` again.")
+    return summary
+
+
+def _is_range(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2 and all(type(v) is int for v in value)

@@ -1,0 +1,384 @@
+"""Sorts runs into rows: runs that differ by their seed are one row, named after what their configuration chose."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from gausim.report.gather.runs import BROKEN, EVALUATED, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
+from gausim.results.summary import MOTION_ENERGY
+from gausim.results.table import footnotes
+
+FULL = "full"
+NOT_MEASURED = "not measured"
+# Settings that say which object a run is about.
+_WHICH_OBJECT = ("data.root", "data.names", "data.scene", "data.masks", "data.selections")
+# The order of rows and columns: the paper's, then what it does not have.
+_ORDER = ("jointly", "w/o mass", "w/o momentum", "w/o hierarchy")
+# At most so many differing settings are put into a row's name.
+_KEYS_IN_NAMES = 3
+# Of runs that all lack a number, the state that is shown first.
+_WORST = (FAILURE, BROKEN, UNFINISHED, NOT_EVALUATED)
+
+
+# The runs of a row, by the objects that they are about.
+About = dict[tuple[str, ...], tuple[RunRecord, ...]]
+
+
+@dataclass(frozen=True)
+class Value:
+    """A figure of a row: over sequences, and over seeds where there are several.
+
+    Attributes:
+        mean: of all seeds' means over sequences.
+        std: standard deviation over sequences (over seeds: root of the mean square); None where there is none.
+        seed_std: standard deviation of the seeds' means (n - 1); None for one seed.
+        seeds: how many.
+    """
+
+    mean: float
+    std: float | None
+    seed_std: float | None
+    seeds: int
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A value, or why there is none, and the runs it comes from."""
+
+    value: Value | None
+    status: str = ""
+    runs: tuple[RunRecord, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Runs of one configuration and one method of their summaries; they differ by their seeds.
+
+    Attributes:
+        label: name of the row.
+        family: the model's name, without what was varied.
+        variation: what was varied, ``full`` for nothing.
+        method: row of the summaries.
+        about: the runs, evaluated ones or not, by the objects that they are about. A network per object, each of the
+            same configuration, is one group; so is one network of several objects.
+    """
+
+    label: str
+    family: str
+    variation: str
+    method: str
+    about: About
+
+    @property
+    def runs(self) -> tuple[RunRecord, ...]:
+        """All of its runs."""
+        return tuple(run for same in self.about.values() for run in same)
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """All of its objects."""
+        return tuple(name for names in self.about for name in names)
+
+    def of(self, name: str) -> tuple[RunRecord, ...]:
+        """The runs that are about an object; they differ by their seeds."""
+        return next((same for names, same in self.about.items() if name in names), ())
+
+    @property
+    def evaluated(self) -> list[RunRecord]:
+        """Runs that have numbers."""
+        return [r for r in self.runs if r.summary is not None]
+
+    def singles(self) -> list[Group]:
+        """Each evaluated run as a group of its own."""
+        return [
+            replace(self, about={names: (run,)})
+            for names, same in self.about.items()
+            for run in same
+            if run.summary is not None
+        ]
+
+    def entries(self, name: str) -> list[tuple[RunRecord, dict[str, Any]]]:
+        """Evaluated runs and their entries of an object."""
+        return [(r, r.summary["objects"][name]) for r in self.of(name) if r.summary and name in r.summary["objects"]]
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """Everything that a report is about.
+
+    Attributes:
+        runs: all runs.
+        groups: rows of the tables.
+        objects: columns, those with numbers first.
+        notes: what a reader must know to trust the tables.
+    """
+
+    runs: tuple[RunRecord, ...]
+    groups: tuple[Group, ...]
+    objects: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def splits(self, name: str) -> dict[str, tuple[int, int]]:
+        """Ranges of frames of an object, as its first evaluated run has them."""
+        for group in self.groups:
+            for _, entry in group.entries(name):
+                return {key: (split[0], split[1]) for key, split in entry["splits"].items()}
+        return {}
+
+    def info(self, metric: str) -> dict[str, Any] | None:
+        """How a metric is printed; None where no run has it."""
+        for group in self.groups:
+            for run in group.evaluated:
+                for entry in (run.summary or {})["objects"].values():
+                    if isinstance(entry["metrics"].get(metric), dict):
+                        return entry["metrics"][metric]
+        return None
+
+
+def make_study(runs: Sequence[RunRecord]) -> Study:
+    """Groups runs and names the rows."""
+    by_config: dict[str, list[RunRecord]] = {}
+    for run in runs:
+        # A run without a configuration is a row of its own.
+        key = json.dumps(run.settings, sort_keys=True) if run.config else str(run.path)
+        by_config.setdefault(key, []).append(run)
+    members = _rows([tuple(same) for same in by_config.values()], runs)
+    named = [_names(next(iter(about.values()))[0], max(map(len, about))) for about in members]
+    labels = _distinct(named, members)
+    groups = [
+        Group(label if method is None else f"{label}: {method}", family, variation, method or row, about)
+        for (label, family, variation), about in zip(labels, members, strict=True)
+        for method, row in _methods([run for same in about.values() for run in same])
+    ]
+    families = list(dict.fromkeys(g.family for g in groups))
+    groups.sort(key=lambda g: (families.index(g.family), _place(g.variation)))
+    # Dictionaries keep the order and drop what comes twice.
+    known = dict.fromkeys(o for g in groups for run in g.evaluated for o in (run.summary or {})["objects"])
+    every = known | dict.fromkeys(o for g in groups for o in g.objects)
+    return Study(tuple(runs), tuple(groups), tuple(every), tuple(_notes(groups)))
+
+
+def _rows(members: Sequence[tuple[RunRecord, ...]], runs: Sequence[RunRecord]) -> list[About]:
+    """Puts runs that differ by the one object that they are about into one row; joint runs are rows of their own."""
+    rows: list[About] = []
+    for same in members:
+        names = _objects(same, runs)
+        fitting = (row for row in rows if len(names) == 1 and _continues(row, names, same[0]))
+        row = next(fitting, None)
+        if row is None:
+            rows.append({names: same})
+        else:
+            row[names] = same
+    return rows
+
+
+def _continues(row: About, names: tuple[str, ...], run: RunRecord) -> bool:
+    """Whether a run on one object belongs to a row of single objects: another object, the same settings besides."""
+    if names in row or any(len(other) > 1 for other in row):
+        return False
+    first = next(iter(row.values()))[0]
+    return bool(run.config) and bool(first.config) and _without_data(first) == _without_data(run)
+
+
+def _without_data(run: RunRecord) -> dict[str, str]:
+    """The settings that do not say which object it is."""
+    return {k: v for k, v in run.settings.items() if not any(k == d or k.startswith(f"{d}.") for d in _WHICH_OBJECT)}
+
+
+def _place(variation: str) -> list[int]:
+    """What a variation is sorted by: nothing varied first, then the paper's order, then the order of the runs."""
+    parts = variation.split(" (")[0].split(", ") if variation != FULL else []
+    return [_ORDER.index(part) if part in _ORDER else len(_ORDER) for part in parts]
+
+
+def _methods(same: Sequence[RunRecord]) -> list[tuple[str | None, str]]:
+    """Methods of the summaries: (what is added to the label, row); usually one and nothing."""
+    rows = dict.fromkeys(
+        str(m) for r in same if r.summary for entry in r.summary["objects"].values() for m in entry["methods"]
+    )
+    return [(None, next(iter(rows), ""))] if len(rows) < 2 else [(m, m) for m in rows]
+
+
+def _objects(same: Sequence[RunRecord], runs: Sequence[RunRecord]) -> tuple[str, ...]:
+    """What the runs are about: from their summaries, else from a run on the same data, else the data's directory."""
+    for pool in (same, [r for r in runs if _data(r) == _data(same[0])]):
+        for run in pool:
+            if run.summary is not None:
+                return tuple(run.summary["objects"])
+    names, root = _data(same[0])
+    if isinstance(names, list) and names:
+        return tuple(str(n) for n in names)
+    roots = root if isinstance(root, list) else [root]
+    return tuple(str(r.get("root", "?") if isinstance(r, dict) else r).rstrip("/").rsplit("/", 1)[-1] for r in roots)
+
+
+def _data(run: RunRecord) -> tuple[Any, Any]:
+    data = run.config.get("data")
+    return (data.get("names"), data.get("root", "?")) if isinstance(data, dict) else (None, "?")
+
+
+def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
+    """(label, family, variation) from what the configuration computes, not from what it is called."""
+    model = run.config.get("model")
+    simulator = model.get("simulator", {}) if isinstance(model, dict) else {}
+    simulator = simulator if isinstance(simulator, dict) else {}
+    family = run.choices.get("model") or str(run.config.get("name") or run.name)
+    varied = ["jointly"] if objects > 1 else []
+    if simulator.get("conserve_mass") is False:
+        varied.append("w/o mass")
+    if simulator.get("conserve_momentum") is False:
+        varied.append("w/o momentum")
+    if simulator.get("predicted_levels") == [0]:
+        varied.append("w/o hierarchy")
+    ablation = run.config.get("ablation")
+    name = ablation.get("name") if isinstance(ablation, dict) else None
+    if varied in ([], ["jointly"]) and name not in (None, "none", "full", "joint"):
+        varied.append(str(name))
+    variation = ", ".join(varied) or FULL
+    return (family if not varied else f"{family} {variation}"), family, variation
+
+
+def _distinct(labels: list[tuple[str, str, str]], members: Sequence[About]) -> list[tuple[str, str, str]]:
+    """Adds to labels that two configurations on one object share what tells them apart: the run's name, or settings.
+
+    Of several full configurations the one that the ablations are variations of keeps the plain label.
+    """
+    objects = [[name for names in about for name in names] for about in members]
+    firsts = [next(iter(about.values()))[0] for about in members]
+    taken = Counter((label, o) for (label, _, _), names in zip(labels, objects, strict=True) for o in names)
+    plain = {_reference(family, labels, firsts) for _, family, _ in labels}
+    result = []
+    for i, (label, family, variation) in enumerate(labels):
+        if i in plain or all(taken[label, o] < 2 for o in objects[i]):
+            result.append((label, family, variation))
+            continue
+        rivals = [run for j, run in enumerate(firsts) if labels[j][0] == label and j != i]
+        tag = _difference(firsts[i], rivals)
+        result.append((f"{label} ({tag})", family, tag if variation == FULL else f"{variation} ({tag})"))
+    return result
+
+
+def _reference(family: str, labels: Sequence[tuple[str, str, str]], firsts: Sequence[RunRecord]) -> int | None:
+    """The full configuration that differs least from the family's ablations; None without any, or in a tie."""
+    full = [i for i, label in enumerate(labels) if label[1:] == (family, FULL)]
+    ablated = [firsts[i].settings for i, label in enumerate(labels) if label[1] == family and i not in full]
+    if not ablated:
+        return None
+    distances = []
+    for i in full:
+        own = firsts[i].settings
+        distances.append(sum(own.get(k) != other.get(k) for other in ablated for k in {*own, *other}))
+    nearest = [i for i, d in zip(full, distances, strict=True) if d == min(distances)]
+    return nearest[0] if len(nearest) == 1 else None
+
+
+def _difference(run: RunRecord, rivals: Sequence[RunRecord]) -> str:
+    name = str(run.config.get("name") or run.name)
+    if all(str(r.config.get("name") or r.name) != name for r in rivals):
+        return name
+    own = run.settings
+    keys = sorted(
+        k for k in own if any(r.settings.get(k) != own[k] for r in rivals) and not k.endswith(("name", "root"))
+    )
+    shown = [f"{k.rsplit('.', 1)[-1]}={own[k]}" for k in keys[:_KEYS_IN_NAMES]]
+    more = f", {len(keys) - _KEYS_IN_NAMES} more" if len(keys) > _KEYS_IN_NAMES else ""
+    return ", ".join(shown) + more if shown else run.name
+
+
+def says(group: Group) -> list[str]:
+    """What the group's method says of itself, each sentence once."""
+    entries = (entry for name in group.objects for _, entry in group.entries(name))
+    return list(dict.fromkeys(note for entry in entries for note in footnotes(entry, group.method)))
+
+
+def _notes(groups: Sequence[Group]) -> list[str]:
+    notes = []
+    for group in groups:
+        notes += [f"{group.label}: {note}" for note in says(group)]
+        for name in group.objects:
+            entries = [entry for _, entry in group.entries(name)]
+            if len({json.dumps(e["sequences"]) for e in entries}) > 1:
+                notes.append(f"{group.label}, {name}: the seeds were evaluated on different sequences.")
+            if len({json.dumps(e["splits"]) for e in entries}) > 1:
+                notes.append(f"{group.label}, {name}: the seeds were evaluated on different ranges of frames.")
+            if len({json.dumps(s) for e in entries if (s := dig(e, "sources", "scene", "sha256"))}) > 1:
+                notes.append(f"{group.label}, {name}: the seeds were evaluated on different rest scenes.")
+        for same in group.about.values():
+            seeds = Counter(str(r.seed) for r in same if r.summary is not None)
+            twice = [seed for seed, count in seeds.items() if count > 1]
+            if twice:
+                notes.append(f"{group.label}: seed {', '.join(twice)} is there more than once, and counts as often.")
+        missing = len(group.runs) - len(group.evaluated)
+        if missing and group.evaluated:
+            notes.append(f"{group.label}: {missing} of {len(group.runs)} runs have no numbers.")
+    return notes
+
+
+def cell(group: Group, name: str, split: str, views: str, metric: str, *, row: str | None = None) -> Cell:
+    """A figure of a group on an object, pooled over its seeds.
+
+    Args:
+        group: the row.
+        name: the object.
+        split: range of frames.
+        views: ``train``, ``heldout`` or ``points``.
+        metric: its key.
+        row: another row of the same summaries (a reference); the group's own method when None.
+    """
+
+    def find(entry: dict[str, Any]) -> Any:
+        return dig(entry["rows"], row or group.method, split, views, metric)
+
+    return pooled(group, name, find, metric)
+
+
+def pooled(group: Group, name: str, find: Callable[[dict[str, Any]], Any], metric: str) -> Cell:
+    """Pools what ``find`` picks out of every seed's entry of an object."""
+    if name not in group.objects:
+        return Cell(None)
+    entries = group.entries(name)
+    if not entries:
+        states = {r.status for r in group.of(name)}
+        worst = next((s for s in _WORST if s in states), NOT_MEASURED)
+        return Cell(None, worst, group.of(name))
+    found = [(run, find(entry)) for run, entry in entries]
+    # Sequences at rest spoil a mean of ratios; the pooled ratio is what tables show of the energy.
+    key = "pooled" if metric == MOTION_ENERGY else "mean"
+    numbers = [(run, number(dig(c, key)), number(dig(c, "std"))) for run, c in found]
+    valid = [(run, mean, std) for run, mean, std in numbers if mean is not None]
+    if not valid:
+        absent = [dig(entry, "absent", metric) for _, entry in entries]
+        reason = next((a for a in absent if isinstance(a, str)), NOT_MEASURED)
+        return Cell(None, reason, tuple(run for run, _ in entries))
+    means = [mean for _, mean, _ in valid]
+    stds = [std for _, _, std in valid if std is not None]
+    std = math.sqrt(sum(s * s for s in stds) / len(stds)) if stds and metric != MOTION_ENERGY else None
+    value = Value(sum(means) / len(means), std, deviation(means), len(means))
+    return Cell(value, EVALUATED, tuple(run for run, _, _ in valid))
+
+
+def deviation(values: Sequence[float]) -> float | None:
+    """Sample standard deviation (n - 1); None for fewer than two."""
+    if len(values) < 2:
+        return None
+    mean = sum(values) / len(values)
+    return math.sqrt(sum((v - mean) ** 2 for v in values) / (len(values) - 1))
+
+
+def number(value: Any) -> float | None:
+    """A finite number as float; None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        return None
+    return float(value)
+
+
+def dig(node: Any, *keys: str) -> Any:
+    """What nested dictionaries hold under these keys; None where they do not."""
+    for key in keys:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node

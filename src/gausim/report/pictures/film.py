@@ -1,0 +1,105 @@
+"""The video that a report begins with: truth, prediction and error in a view that training never saw."""
+
+from __future__ import annotations
+
+import base64
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from gausim.core import RunError
+from gausim.report.gather.runs import RunRecord
+from gausim.report.pictures.frames import ERROR_RANGE, Timeline, brighten, error_colors, light_gain, time_line
+from gausim.report.pictures.media import video_uri
+from gausim.results.pictures import Pictures, kept_pictures
+
+# A panel fits into this box [pixels]; a video that is over sooner is shown at half speed [seconds].
+_WIDEST, _HIGHEST, _SHORT = 352, 400, 4.0
+
+
+@dataclass(frozen=True)
+class Film:
+    """A video of truth, prediction and error side by side.
+
+    Attributes:
+        uri: the MP4 as a data URI.
+        poster: its picture before it plays, a data URI.
+        width: of the video [pixels].
+        caption: what it shows.
+    """
+
+    uri: str
+    poster: str
+    width: int
+    caption: str
+
+
+def make_film(run: RunRecord, name: str, method: str) -> Film:
+    """The video of an evaluated run, in the first view never trained on, else in the first view.
+
+    Args:
+        run: the run.
+        name: the object.
+        method: row of the evaluation.
+
+    Raises:
+        RunError: the evaluation kept no pictures of this object and method, or they cannot be read.
+    """
+    found = next((item for item in kept_pictures(run.path, name) if method in item.predictions), None)
+    if found is None:
+        raise RunError(
+            f"its evaluation kept no pictures of {name} predicted by {method}. Make them with `gausim evaluate "
+            f"{shlex.quote(str(run.path))}`."
+        )
+    view = next((i for i, v in enumerate(found.views) if v in found.heldout_views), 0)
+    seen_by = _one_view(found, view)
+    gain, slow = light_gain(seen_by.truth), 2 if len(found.truth) < _SHORT * found.fps else 1
+    frames = list(_frames(seen_by, method, gain))
+    poster = frames[min(found.first_unseen, len(frames) - 1)]
+    uri = video_uri(frames, found.fps / slow)
+    return Film(uri, _jpeg(poster), poster.shape[1], _caption(seen_by, gain, slow))
+
+
+def _one_view(pictures: Pictures, view: int) -> Pictures:
+    one = slice(view, view + 1)
+    background = None if pictures.background is None else pictures.background[one]
+    predictions = {name: frames[:, one] for name, frames in pictures.predictions.items()}
+    return replace(
+        pictures,
+        views=pictures.views[one],
+        truth=pictures.truth[:, one],
+        predictions=predictions,
+        background=background,
+    )
+
+
+def _frames(pictures: Pictures, method: str, gain: float) -> Iterator[np.ndarray]:
+    height, width = pictures.truth.shape[2:4]
+    zoom = min(_WIDEST / width, _HIGHEST / height)
+    # The encoder takes even sizes.
+    size = 2 * max(1, round(width * zoom / 2)), 2 * max(1, round(height * zoom / 2))
+    truth, predicted = (pictures.over_background(f)[:, 0] for f in (pictures.truth, pictures.predictions[method]))
+    timeline = Timeline(len(truth), pictures.first_unseen)
+    for number, (true, ours) in enumerate(zip(truth, predicted, strict=True)):
+        panels = (brighten(true, gain), brighten(ours, gain), error_colors(true, ours))
+        picture = np.concatenate([cv2.resize(p, size, interpolation=cv2.INTER_CUBIC) for p in panels], 1)
+        yield np.concatenate((picture, time_line(number, timeline, picture.shape[1])))
+
+
+def _caption(pictures: Pictures, gain: float, slow: int) -> str:
+    (view,) = pictures.views
+    kind = "never trained on" if view in pictures.heldout_views else "a training view; the evaluation has no other"
+    speed = ", at half speed" if slow > 1 else ""
+    bright = f", brightened {gain:g}×" if gain != 1 else ""
+    return (
+        f"{pictures.sequence} in {view} ({kind}){speed}{bright}. Error: distance of the colours, from 0 (black) to "
+        f"{ERROR_RANGE:g} and more (brightest)."
+    )
+
+
+def _jpeg(picture: np.ndarray) -> str:
+    _, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()

@@ -1,0 +1,279 @@
+"""Pictures of a report, as data URIs: error curves, space-time slices, image grids, cameras side by side, videos."""
+
+from __future__ import annotations
+
+import base64
+import io
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+
+from gausim.core import GausSimError
+from gausim.io.video import SMALL, write_video
+from gausim.report.gather.diagnosis import read_diagnosis
+from gausim.report.gather.study import Group, Study
+from gausim.report.pictures.diagnosis import diagnosis_plot
+from gausim.report.pictures.figures import contact_frames, error_plot
+from gausim.report.pictures.frames import (
+    Timeline,
+    brighten,
+    label_bar,
+    light_gain,
+    moving_line,
+    space_time_slice,
+    timeline_bar,
+)
+from gausim.results.curves import POINT_ARRAYS, STATIC, ObjectCurves, load_curves
+from gausim.results.pictures import Pictures, kept_pictures
+
+_DPI = 100
+_BORDER = "#f0962a"
+TRUTH = "ground truth"
+# More predictions than these side by side are too small to see; the tables have them all.
+MOST_METHODS, MOST_VIEWS = 5, 3
+# Height of a panel of a video [pixels].
+_PANEL = 168
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """One picture or video: heading, how to read it, ``image`` or ``video``, and its data URI."""
+
+    title: str
+    caption: str
+    kind: str
+    uri: str
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """Pictures of one sequence: (name, frames over the background) with the truth first.
+
+    Attributes:
+        pictures: what they were made from (cameras, border of the seen frames).
+        columns: names and (F, V, h, w, 3) frames, brightened.
+        note: what was done to them, for captions.
+    """
+
+    pictures: Pictures
+    columns: list[tuple[str, np.ndarray]]
+    note: str
+
+
+def object_figures(study: Study, name: str) -> tuple[list[Exhibit], list[str]]:
+    """All pictures of one object, and what could not be shown and why."""
+    figures: list[Exhibit] = []
+    problems: list[str] = []
+    curves = _curves(study, name, problems)
+    if curves:
+        figures.append(_error_curves(name, curves))
+    figures += _motions(study, name)
+    for shown in _shown(study, name, problems):
+        figures += [_slices(shown), _grid(shown), _cameras(shown)]
+        # The page opens with a video of each; this one is for comparing them.
+        figures += [_video(shown)] if len(shown.columns) > 2 else []
+    return figures, problems
+
+
+def _motions(study: Study, name: str) -> list[Exhibit]:
+    """Spectra and phase errors, of the first seed of every row, where the true motion is known."""
+    named = []
+    for group in study.groups:
+        found = [d for _, entry in group.entries(name) if (d := read_diagnosis(entry)) and group.method in d.rows]
+        named += [(group.label, found[0], group.method)] if found else []
+    if not named:
+        return []
+    caption = (
+        "First seed of each row. Left: power of the true and the predicted points over frequency. Right: how far the "
+        "prediction is out of step, over the principal motions; unrelated motions have 104 degrees."
+    )
+    return [Exhibit(f"Spectrum and phase: {name}", caption, "image", _drawn(diagnosis_plot(named, title=name)))]
+
+
+def _curves(study: Study, name: str, problems: list[str]) -> list[tuple[Group, list[ObjectCurves]]]:
+    found = []
+    for group in study.groups:
+        seeds = []
+        for run, _ in group.entries(name):
+            try:
+                seeds += [
+                    _checked(c) for c in load_curves(run.path / "evaluation" / "metrics.npz") if c.facts.name == name
+                ]
+            except (GausSimError, ValueError, TypeError, KeyError) as error:
+                problems.append(f"{group.label}: {error}")
+        if seeds:
+            found.append((group, seeds))
+    return found
+
+
+def _checked(curves: ObjectCurves) -> ObjectCurves:
+    """The curves, if their arrays have the axes that plots need."""
+    sequences, views = len(curves.facts.sequences), len(curves.facts.views)
+    for row, metrics in curves.values.items():
+        for metric, values in metrics.items():
+            axes = (sequences, -1) if metric in POINT_ARRAYS else (sequences, -1, views)
+            if values.ndim != len(axes) or any(a not in (-1, n) for a, n in zip(axes, values.shape, strict=True)):
+                raise ValueError(f"metrics.npz: {row}/{metric} has shape {values.shape}, expected {axes}")
+    return curves
+
+
+def _error_curves(name: str, curves: Sequence[tuple[Group, list[ObjectCurves]]]) -> Exhibit:
+    """Errors over time of all rows, mean over sequences and seeds; the seen frames are shaded."""
+    rows = [(group.label, [(c, group.method) for c in seeds]) for group, seeds in curves]
+    figure = error_plot([*rows, (STATIC, [(curves[0][1][0], STATIC)])])
+    caption = (
+        "Mean over sequences and seeds, band: ± one standard deviation over both. Shaded: frames that training saw."
+    )
+    return Exhibit(f"Errors over time: {name}", caption, "image", _drawn(figure))
+
+
+def _shown(study: Study, name: str, problems: list[str]) -> Iterator[Shown]:
+    """One set of pictures per sequence and cameras; runs that kept the same ones stand side by side."""
+    sets: dict[tuple[object, ...], list[tuple[str, Pictures, np.ndarray]]] = {}
+    for group in study.groups:
+        for run, _ in group.entries(name)[:1]:
+            try:
+                kept = kept_pictures(run.path, name)
+            except GausSimError as error:
+                problems.append(f"{group.label}: {error}")
+                continue
+            for p in kept:
+                if group.method in p.predictions:
+                    key = (p.sequence, p.views, p.truth.shape)
+                    sets.setdefault(key, []).append((group.label, p, p.predictions[group.method]))
+    for members in sets.values():
+        if len(members) > MOST_METHODS:
+            left = ", ".join(label for label, _, _ in members[MOST_METHODS:])
+            problems.append(f"pictures show the first {MOST_METHODS} rows only; left out: {left}")
+        yield _lit(members[:MOST_METHODS])
+
+
+def _lit(members: Sequence[tuple[str, Pictures, np.ndarray]]) -> Shown:
+    first = members[0][1]
+    gain = light_gain(first.truth)
+    columns = [(TRUTH, first.truth), *((label, frames) for label, _, frames in members)]
+    shown = [(label, brighten(first.over_background(frames), gain)) for label, frames in columns]
+    behind = "over plain grey (the recording keeps no background)" if first.background is None else (
+        "over the original background"
+    )  # fmt: skip
+    note = (
+        f"{first.sequence}; composited {behind}, brightened {gain:g}×, made smaller: for the eye, no number uses this."
+    )
+    return Shown(first, shown, note)
+
+
+def _slices(shown: Shown) -> Exhibit:
+    """Space-time slices through the line that moves most, one row per method and column per camera."""
+    pictures, views = shown.pictures, _some_views(shown.pictures)
+    figure = Figure(figsize=(5.2 * len(views), 1.5 * len(shown.columns) + 0.6), dpi=_DPI, layout="constrained")
+    grid = figure.subplots(len(shown.columns), len(views), squeeze=False)
+    for column, view in enumerate(views):
+        line = moving_line(shown.columns[0][1][:, view])
+        for axes, (label, frames) in zip(grid[:, column], shown.columns, strict=True):
+            axes.imshow(space_time_slice(frames[:, view], line), aspect="auto", interpolation="nearest")
+            axes.axvline(pictures.first_unseen - 0.5, color=_BORDER, linewidth=1.4)
+            axes.set(yticks=[], xlim=(-0.5, len(frames) - 0.5))
+            axes.tick_params(labelsize=7, labelbottom=axes is grid[-1, column])
+            if column == 0:
+                axes.set_ylabel(_short(label), fontsize=8)
+        grid[0, column].set_title(f"{_view_name(pictures, view)}: {line[0]} {line[1]}", fontsize=9)
+        grid[-1, column].set_xlabel("frame (foreseen right of the line)", fontsize=8)
+    return Exhibit(f"Space-time slices: {pictures.object}", shown.note, "image", _drawn(figure))
+
+
+def _grid(shown: Shown) -> Exhibit:
+    """Chosen frames in the first camera, one row per method."""
+    pictures, view = shown.pictures, _some_views(shown.pictures)[0]
+    frames = contact_frames(len(pictures.truth), pictures.first_unseen)
+    rows = [(label, [images[f, view] for f in frames]) for label, images in shown.columns]
+    heads = [(str(f), "#c2410c" if f >= pictures.first_unseen else "black") for f in frames]
+    title = f"Frames: {pictures.object}, {_view_name(pictures, view)}"
+    return Exhibit(title, f"Orange numbers: foreseen frames. {shown.note}", "image", _panels(rows, heads))
+
+
+def _cameras(shown: Shown) -> Exhibit:
+    """The last seen, a foreseen and the last frame in several cameras."""
+    pictures, views = shown.pictures, _some_views(shown.pictures)
+    last, border = len(pictures.truth) - 1, pictures.first_unseen
+    chosen = sorted({min(border - 1, last), min((border + last) // 2, last), last})
+    rows = [(label, [images[f, v] for f in chosen for v in views]) for label, images in shown.columns]
+    heads = [(f"{_view_name(pictures, v)}, {f}", "#c2410c" if f >= border else "black") for f in chosen for v in views]
+    title = f"Several cameras: {pictures.object}"
+    return Exhibit(title, f"Camera and frame; orange: foreseen. {shown.note}", "image", _panels(rows, heads))
+
+
+def _panels(rows: Sequence[tuple[str, list[np.ndarray]]], heads: Sequence[tuple[str, str]]) -> str:
+    height, width = rows[0][1][0].shape[:2]
+    size = (1.25 * len(heads), 1.25 * height / width * len(rows) + 0.3)
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    grid = figure.subplots(len(rows), len(heads), squeeze=False)
+    for line, (label, images) in zip(grid, rows, strict=True):
+        for axes, image in zip(line, images, strict=True):
+            axes.set(xticks=[], yticks=[])
+            axes.imshow(image)
+        line[0].set_ylabel(_short(label), fontsize=8)
+    for axes, (head, color) in zip(grid[0], heads, strict=True):
+        axes.set_title(head, fontsize=7, color=color)
+    return _drawn(figure)
+
+
+def _video(shown: Shown) -> Exhibit:
+    """All methods side by side in several cameras."""
+    pictures, views = shown.pictures, _some_views(shown.pictures)
+    uri = video_uri(_video_frames(shown, views), pictures.fps)
+    names = ", ".join(_view_name(pictures, v) for v in views)
+    return Exhibit(f"Side by side: {pictures.object}", f"Rows: {names}. {shown.note}", "video", uri)
+
+
+def video_uri(frames: Iterable[np.ndarray], fps: float) -> str:
+    """The MP4 of (H, W, 3) uint8 frames as a data URI."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "video.mp4"
+        write_video(path, frames, fps, quality=SMALL)
+        return "data:video/mp4;base64," + base64.b64encode(path.read_bytes()).decode()
+
+
+def _video_frames(shown: Shown, views: Sequence[int]) -> Iterator[np.ndarray]:
+    timeline = Timeline(len(shown.pictures.truth), shown.pictures.first_unseen)
+    zoom = _PANEL / shown.columns[0][1].shape[2]
+    for number in range(timeline.frames):
+        columns = []
+        for label, frames in shown.columns:
+            panels = [
+                cv2.resize(frames[number, v], None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC) for v in views
+            ]
+            columns.append(np.concatenate([label_bar(_short(label), panels[0].shape[1]), *panels]))
+        picture = np.concatenate(columns, 1)
+        yield np.concatenate((picture, timeline_bar(number, timeline, shown.pictures.sequence, picture.shape[1])))
+
+
+def _some_views(pictures: Pictures) -> list[int]:
+    """A few cameras: trained ones, and one that training never saw where there is one."""
+    trained = [i for i, v in enumerate(pictures.views) if v not in pictures.heldout_views]
+    heldout = [i for i, v in enumerate(pictures.views) if v in pictures.heldout_views]
+    return [*trained[: MOST_VIEWS - bool(heldout)], *heldout[:1]]
+
+
+def _view_name(pictures: Pictures, view: int) -> str:
+    name = pictures.views[view]
+    return f"{name} (held out)" if name in pictures.heldout_views else name
+
+
+def _short(label: str, most: int = 22) -> str:
+    return label if len(label) <= most else label[: most - 2] + ".."
+
+
+def _drawn(figure: Figure) -> str:
+    # A dollar sign in a name would start a formula.
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        text.set_parse_math(False)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="webp", pil_kwargs={"quality": 85})
+    return "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode()

@@ -1,0 +1,291 @@
+"""The tables of a report, before anybody has written them as HTML, Markdown or LaTeX."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
+from gausim.report.gather import paper
+from gausim.report.gather.runs import RunRecord
+from gausim.report.gather.study import NOT_MEASURED, Cell, Group, Study, Value, cell, dig, pooled, says
+from gausim.results.curves import ERROR_3D
+from gausim.results.summary import MOTION_ENERGY
+from gausim.results.table import NO_FORESIGHT
+
+METHOD, REFERENCE, PAPER = "method", "reference", "paper"
+# The splits of the paper; `unseen_all` exists where recordings go on beyond frame 49.
+SPLITS = ("seen", "unseen", "unseen_all")
+VIEWS = {"train": "training cameras", "heldout": "cameras never trained on", "points": "3D, true points"}
+# (metric, views) of the tables, the paper's three first. A table that no run has anything for is left out.
+TABLES = (
+    ("l2", "train"),
+    ("ssim", "train"),
+    ("lpips", "train"),
+    ("psnr", "train"),
+    ("flip", "train"),
+    (ERROR_3D, "points"),
+    (MOTION_ENERGY, "points"),
+    (MOTION_ENERGY, "train"),
+    ("l2", "heldout"),
+    ("ssim", "heldout"),
+    ("lpips", "heldout"),
+    ("psnr", "heldout"),
+    ("flip", "heldout"),
+)
+# What tables belong to, in the order of a page.
+ABLATIONS, MOTION = "Ablations", "3D error and motion"
+TRAINING_VIEWS, NEW_VIEWS = "Images in the training views", "Images in views never trained on"
+COST, CONTRAST = "Time and memory", "Colour contrast"
+SECTIONS = (ABLATIONS, MOTION, TRAINING_VIEWS, NEW_VIEWS, COST, CONTRAST)
+# How metrics are named and printed that no run has.
+_LPIPS = {"label": "LPIPS", "scale": 100.0, "unit": "1e-2", "higher_is_better": False}
+NOTHING = "–"
+FLOOR = "reconstruction (floor)"
+OLD_EVALUATION = "Not measured: by an evaluation of an earlier version; call `gausim evaluate RUN` again."
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One place of a table.
+
+    Attributes:
+        text: the number, or why there is none.
+        extra: what stands small behind it (spread over seeds).
+        best: to be printed bold.
+        missing: ``text`` is no number.
+        runs: what it was computed from.
+    """
+
+    text: str
+    extra: str = ""
+    best: bool = False
+    missing: bool = False
+    runs: tuple[RunRecord, ...] = ()
+
+
+@dataclass(frozen=True)
+class Line:
+    """One row: its label, whose figures these are (method, reference or paper), and its entries."""
+
+    label: str
+    kind: str
+    entries: tuple[Entry, ...]
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """One table.
+
+    Attributes:
+        key: short name for files and anchors.
+        section: what it belongs to, of ``SECTIONS``.
+        title: heading.
+        caption: how to read it.
+        columns: groups of columns: (heading, headings of its columns).
+        lines: the rows.
+        stub: heading of the labels.
+    """
+
+    key: str
+    section: str
+    title: str
+    caption: str
+    columns: tuple[tuple[str, tuple[str, ...]], ...]
+    lines: tuple[Line, ...] = field(default=())
+    stub: str = ""
+
+
+def metric_info(study: Study, metric: str) -> dict[str, Any] | None:
+    """Label, scale, unit and direction of a metric, checked; LPIPS is known even where nobody measured it."""
+    found = study.info(metric) or (_LPIPS if metric == "lpips" else None)
+    if found is None:
+        return None
+    scale = found.get("scale")
+    return {
+        "label": str(found.get("label", metric)),
+        "scale": float(scale) if isinstance(scale, (int, float)) else 1.0,
+        "unit": str(found.get("unit", "")),
+        "higher_is_better": found.get("higher_is_better"),
+    }
+
+
+def split_title(study: Study, name: str, split: str) -> str:
+    """Seen, or Unseen and the number of frames, as the paper says it."""
+    start, stop = study.splits(name)[split]
+    return "Seen" if split == "seen" else f"Unseen {stop - start}"
+
+
+def _columns(study: Study) -> list[tuple[str, list[str]]]:
+    """Objects and the splits that each has."""
+    return [(name, [s for s in SPLITS if s in study.splits(name)] or ["seen"]) for name in study.objects]
+
+
+def metric_sheet(study: Study, metric: str, views: str) -> Sheet | None:
+    """Rows methods, columns objects and ranges of frames, as the paper has it; None where nobody has the metric."""
+    info = metric_info(study, metric)
+    if info is None:
+        return None
+    columns = _columns(study)
+    rows = [[cell(g, name, s, views, metric) for name, splits in columns for s in splits] for g in study.groups]
+    if not any(c.value for row in rows for c in row) and (metric, views) != ("lpips", "train"):
+        return None
+    best = [best_of([row[i] for row in rows], metric, info) for i in range(len(rows[0]))]
+    lines = [
+        Line(group.label, METHOD, tuple(entry(c, info, best=n in best[i]) for i, c in enumerate(row)))
+        for n, (group, row) in enumerate(zip(study.groups, rows, strict=True))
+    ]
+    lines += [*_references(study, columns, metric, views, info), *_floor(study, columns, metric, views, info)]
+    lines += _paper_lines(columns, metric, views)
+    heads = tuple(
+        (name, tuple(split_title(study, name, s) if study.splits(name) else "Seen" for s in splits))
+        for name, splits in columns
+    )
+    title = f"{info['label']}{_unit(info)}, {VIEWS[views]}"
+    caption = " ".join([_caption(metric, views, info, lines), *_blind(study.groups)])
+    section = MOTION if metric in (ERROR_3D, MOTION_ENERGY) else NEW_VIEWS if views == "heldout" else TRAINING_VIEWS
+    return Sheet(f"{metric}_{views}", section, title, caption, heads, tuple(lines), "method")
+
+
+def _blind(groups: Sequence[Group]) -> list[str]:
+    """A footnote for every row whose unseen frames are no prediction."""
+    return [f"{group.label}: {NO_FORESIGHT}" for group in groups if NO_FORESIGHT in says(group)]
+
+
+def _unit(info: dict[str, Any]) -> str:
+    unit = {"1e-3": "×10⁻³", "1e-2": "×10⁻²", "1e-1": "×10⁻¹"}.get(info["unit"], info["unit"])
+    arrow = {True: "↑", False: "↓"}.get(info["higher_is_better"], "")
+    return "".join(f" [{part}]" if i == 0 else f" {part}" for i, part in enumerate((unit, arrow)) if part)
+
+
+def _caption(metric: str, views: str, info: dict[str, Any], lines: Sequence[Line]) -> str:
+    parts = []
+    if metric == MOTION_ENERGY:
+        parts.append(
+            "Predicted over true motion energy, all sequences together: 1 is right, 0 stands still. A prediction that "
+            "dissipates gets deceptively low errors on late frames; this table tells."
+        )
+    else:
+        parts.append("Mean ± standard deviation over sequences; small: standard deviation over seeds.")
+    if views != "points":
+        parts.append("Foreground on black, as recorded; nothing brightened.")
+    if any(line.kind == PAPER for line in lines):
+        parts.append("Grey: the paper's own figures, of its own recordings, cameras and image sizes.")
+    if metric == "lpips" and any(NO_WEIGHTS in e.text for line in lines for e in line.entries):
+        parts.append(NO_LPIPS)
+    if any(e.text == NOT_MEASURED for line in lines for e in line.entries):
+        parts.append(OLD_EVALUATION)
+    return " ".join(parts)
+
+
+def entry(c: Cell, info: dict[str, Any], *, best: bool = False) -> Entry:
+    """A cell as it is printed."""
+    if c.value is None:
+        return Entry(c.status or NOTHING, missing=True, runs=c.runs)
+    extra = [f"± {c.value.seed_std * info['scale']:.2f}, {c.value.seeds} seeds"] if c.value.seed_std is not None else []
+    extra += ["unfinished"] if any(r.is_from_unfinished for r in c.runs) else []
+    return Entry(number_text(c.value, info["scale"]), ", ".join(extra), best, runs=c.runs)
+
+
+def number_text(value: Value, scale: float) -> str:
+    """Mean and, where there is one, standard deviation over sequences."""
+    spread = "" if value.std is None else f" ± {value.std * scale:.2f}"
+    return f"{value.mean * scale:.2f}{spread}"
+
+
+def best_of(cells: Sequence[Cell], metric: str, info: dict[str, Any]) -> set[int]:
+    """Rows with the best mean as printed; nobody is best alone or where no direction is good."""
+    better = info["higher_is_better"]
+    if better is None and metric != MOTION_ENERGY:
+        return set()
+    means = {i: round(c.value.mean * info["scale"], 2) for i, c in enumerate(cells) if c.value is not None}
+    if len(means) < 2:
+        return set()
+    merit = {i: abs(m - 1) if metric == MOTION_ENERGY else -m if better else m for i, m in means.items()}
+    return {i for i, m in merit.items() if m == min(merit.values())}
+
+
+def _references(
+    study: Study, columns: Sequence[tuple[str, list[str]]], metric: str, views: str, info: dict[str, Any]
+) -> list[Line]:
+    """Rows of the summaries that are no method: the static prediction and others, each distinct one once."""
+    names = dict.fromkeys(
+        row for g in study.groups for name in study.objects for _, e in g.entries(name)
+        for row in e["rows"] if row not in e["methods"]
+    )  # fmt: skip
+    lines = []
+    for row in names:
+
+        def find(group: Group, name: str, split: str, row: str = row) -> Cell:
+            return cell(group, name, split, views, metric, row=row)
+
+        lines += _distinct_lines(row, study, columns, find, info)
+    return lines
+
+
+def _floor(
+    study: Study, columns: Sequence[tuple[str, list[str]]], metric: str, views: str, info: dict[str, Any]
+) -> list[Line]:
+    """The reconstruction against frame 0, under the seen frames: what no motion can beat by much."""
+    if views != "train":
+        return []
+
+    def find(group: Group, name: str, split: str) -> Cell:
+        if split != "seen":
+            return Cell(None)
+        return pooled(group, name, lambda e: dig(e, "floor", metric), metric)
+
+    return _distinct_lines(FLOOR, study, columns, find, info)
+
+
+def _distinct_lines(
+    label: str,
+    study: Study,
+    columns: Sequence[tuple[str, list[str]]],
+    find: Callable[[Group, str, str], Cell],
+    info: dict[str, Any],
+) -> list[Line]:
+    """One line of a reference, or several where runs were evaluated on other sequences or scenes.
+
+    References do not depend on seeds: each run speaks for itself, and runs that say the same are named together.
+    """
+    versions: list[list[list[Cell]]] = []  # object -> version -> cells of its splits
+    for name, splits in columns:
+        found: dict[tuple[Any, ...], list[Cell]] = {}
+        for single in (one for g in study.groups for one in g.singles()):
+            cells = [find(single, name, split) for split in splits]
+            if any(c.value for c in cells):
+                key = tuple(None if c.value is None else float(f"{c.value.mean:.6g}") for c in cells)
+                known = found.get(key)
+                joined = (
+                    [replace(k, runs=k.runs + c.runs) for k, c in zip(known, cells, strict=True)] if known else cells
+                )
+                found[key] = joined
+        versions.append(list(found.values()))
+    lines = []
+    for number in range(max((len(v) for v in versions), default=0)):
+        entries: list[Entry] = []
+        for (_, splits), version in zip(columns, versions, strict=True):
+            cells = version[number] if number < len(version) else [Cell(None)] * len(splits)
+            entries += [entry(c if c.value else Cell(None), info) for c in cells]
+        lines.append(Line(label if number == 0 else f"{label} [{number + 1}]", REFERENCE, tuple(entries)))
+    return lines
+
+
+def _paper_lines(columns: Sequence[tuple[str, list[str]]], metric: str, views: str) -> list[Line]:
+    table = paper.TABLES.get(metric, {}) if views == "train" else {}
+    if not any(paper.paper_object(name) for name, _ in columns):
+        return []
+    lines = []
+    for method, figures in table.items():
+        entries = []
+        for name, splits in columns:
+            object_name = paper.paper_object(name)
+            pairs = figures[object_name] if object_name else None
+            late = "unseen_all" if object_name in paper.LATE and "unseen_all" in splits else "unseen"
+            for split in splits:
+                pair = None if pairs is None else {"seen": pairs[0], late: pairs[1]}.get(split)
+                entries.append(Entry(f"{pair[0]:.2f} ± {pair[1]:.2f}") if pair else Entry(NOTHING, missing=True))
+        lines.append(Line(method, PAPER, tuple(entries)))
+    return lines

@@ -1,0 +1,184 @@
+"""How well a method foresees an object, as figures that readers ask for first and as three sentences."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from gausim.report.gather.study import dig, number
+from gausim.results.curves import ERROR_3D, STATIC
+from gausim.results.summary import MOTION_ENERGY
+from gausim.results.table import said
+
+# A prediction whose error is at least so much of the static one's is no prediction.
+NO_BETTER = 0.9
+# Upper ends and words: error over that of no motion, and predicted over true energy.
+_FORESIGHT = (
+    (0.2, "it foresees the motion closely"),
+    (0.5, "it foresees most of the motion"),
+    (NO_BETTER, "it foresees part of the motion"),
+    (1.1, "that is no better than predicting no motion"),
+    (math.inf, "that is worse than predicting no motion"),
+)
+_LIVELINESS = (
+    (0.1, "it all but stands still"),
+    (0.5, "it is much stiller than the object"),
+    (0.8, "it dies down sooner than the object does"),
+    (1.25, "it is about as lively as the object"),
+    (2.0, "it is livelier than the object"),
+    (math.inf, "it gains energy that the object does not have"),
+)
+# Images of a view count as equally good within so many decibels.
+_SAME_DB = 1.0
+_EVALUATE = "`gausim evaluate RUN` measures it."
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the sentences are made of; means over seeds, None where a figure is not known.
+
+    Attributes:
+        frames: first and last frame that training did not see; None where the recordings end before.
+        measured: what the errors are of: ``points`` (3D) or ``train`` (l2 of the images in the training views).
+        error: error on unseen frames over that of a prediction of no motion.
+        seen_error: the same on the frames that training saw.
+        energy: predicted over true motion energy on unseen frames.
+        psnr: by ``train`` and ``heldout`` views, of unseen frames [dB].
+        still_psnr: the same of a prediction of no motion.
+        heldout_views: names of the views that training never saw.
+        seeds: number of evaluations.
+        repeats: whether the method repeats what it was fitted to instead of foreseeing.
+    """
+
+    frames: tuple[int, int] | None
+    measured: str
+    error: float | None
+    seen_error: float | None
+    energy: float | None
+    psnr: dict[str, float | None]
+    still_psnr: dict[str, float | None]
+    heldout_views: tuple[str, ...]
+    seeds: int
+    repeats: bool
+
+    @property
+    def merit(self) -> float:
+        """What runs are sorted by: the error on unseen frames (on seen ones where there are none), unknown last."""
+        known = self.error if self.frames is not None else self.seen_error
+        return math.inf if known is None else known
+
+
+def outcome(entries: Sequence[dict[str, Any]], method: str) -> Outcome:
+    """The outcome of a method on one object.
+
+    Args:
+        entries: the object's entries in ``metrics.json``, one per seed; at least one.
+        method: row of their tables.
+    """
+
+    def mean(row: str, split: str, views: str, metric: str, key: str) -> float | None:
+        found = [number(dig(entry["rows"], row, split, views, metric, key)) for entry in entries]
+        known = [value for value in found if value is not None]
+        return sum(known) / len(known) if known else None
+
+    splits = entries[0]["splits"]
+    start, end = splits.get("unseen", (0, 0))
+    split = "unseen" if "unseen" in splits else "seen"
+    in_3d = [mean(method, part, "points", ERROR_3D, "ratio") for part in ("seen", "unseen")]
+    measured, metric = ("points", ERROR_3D) if any(r is not None for r in in_3d) else ("train", "l2")
+    heldout = entries[0].get("heldout_views")
+    return Outcome(
+        frames=(start, end - 1) if "unseen" in splits else None,
+        measured=measured,
+        error=mean(method, "unseen", measured, metric, "ratio"),
+        seen_error=mean(method, "seen", measured, metric, "ratio"),
+        energy=mean(method, split, measured, MOTION_ENERGY, "pooled"),
+        psnr={views: mean(method, split, views, "psnr", "mean") for views in ("train", "heldout")},
+        still_psnr={views: mean(STATIC, split, views, "psnr", "mean") for views in ("train", "heldout")},
+        heldout_views=tuple(str(view) for view in heldout) if isinstance(heldout, list) else (),
+        seeds=len(entries),
+        repeats=said(entries[0], method).get("extrapolates") is False,
+    )
+
+
+def sentences(found: Outcome) -> tuple[str, str, str]:
+    """Three sentences: how far off it is where it foresees, how lively it is, and how it looks from elsewhere."""
+    return _error(found), _energy(found), _views(found)
+
+
+def _error(found: Outcome) -> str:
+    over = f"; mean of {found.seeds} seeds" if found.seeds > 1 else ""
+    seen = found.seen_error
+    if found.frames is None:
+        begin = "The recordings end with the frames trained on, so nothing is known of frames never seen"
+        return f"{begin}." if seen is None else f"{begin}; on the frames seen, {_off(found, seen)}."
+    frames = f"On frames never seen ({found.frames[0]}–{found.frames[1]}{over})"
+    if found.error is None:
+        return f"{frames}, nothing says how far off it is beside a model that predicts no motion: {_EVALUATE}"
+    aside = "" if seen is None else f" ({seen:.2f} on the frames it was trained on)"
+    return f"{frames}, {_off(found, found.error)}{aside}: {_foresight(found)}."
+
+
+def _off(found: Outcome, error: float) -> str:
+    what, how = ("points", "") if found.measured == "points" else ("images in the training views", " (l2)")
+    return f"its {what} are {error:.2f} times as far off{how} as those of a model that predicts no motion"
+
+
+def _foresight(found: Outcome) -> str:
+    assert found.error is not None
+    if found.repeats:
+        return "it does not foresee, but repeats what was fitted to the frames it was trained on"
+    words = _words(_FORESIGHT, found.error)
+    if found.error < NO_BETTER or found.seen_error is None:
+        return words
+    learned = found.seen_error < NO_BETTER
+    return words + (", although it learned the frames it was trained on" if learned else ", and it learned no more of "
+                    "the frames it was trained on")  # fmt: skip
+
+
+def _energy(found: Outcome) -> str:
+    if found.energy is None:
+        return f"Nothing says how lively its motion is: {_EVALUATE}"
+    words = _words(_LIVELINESS, found.energy)
+    if 0.8 <= found.energy < 1.25 and found.merit >= NO_BETTER:
+        words = "it moves as much as the object, but not as the object does"
+    return f"Its motion there has {found.energy:.2f} times the energy of the true motion: {words}."
+
+
+def _views(found: Outcome) -> str:
+    new, trained = found.psnr["heldout"], found.psnr["train"]
+    if new is None and trained is None:
+        return f"Nothing says how good its images are (PSNR): {_EVALUATE}"
+    if new is None:
+        if found.heldout_views:
+            where = f"Nothing was measured in {_names(found.heldout_views)}, `gausim evaluate RUN` does"
+        else:
+            where = "No view was kept out of training, so nothing tells how it looks from elsewhere"
+        return f"{where}; in the training views its images have a PSNR of {trained:.1f} dB{_gain(found, 'train')}."
+    begin = f"In {_names(found.heldout_views)}, its images have a PSNR of {new:.1f} dB"
+    if trained is None:
+        return f"{begin}{_gain(found, 'heldout')}."
+    apart = new - trained
+    than = "about as good as" if abs(apart) < _SAME_DB else "better than" if apart > 0 else "worse than"
+    return f"{begin}, {than} in the training views ({trained:.1f} dB){_gain(found, 'heldout')}."
+
+
+def _names(views: Sequence[str]) -> str:
+    which = "a view" if len(views) < 2 else f"{len(views)} views"
+    return f"{which} that it was never trained on" + (f" ({', '.join(views)})" if views else "")
+
+
+def _gain(found: Outcome, views: str) -> str:
+    """How much better than a prediction of no motion, as the end of a sentence."""
+    own, still = found.psnr[views], found.still_psnr[views]
+    if own is None or still is None:
+        return ""
+    gain = own - still
+    return f" and {abs(gain):.1f} dB {'above' if gain >= 0 else 'below'} those of a model that predicts no motion"
+
+
+def _words(scale: Sequence[tuple[float, str]], value: float) -> str:
+    """The words of a figure as it is printed."""
+    return next(words for end, words in scale if round(value, 2) < end)

@@ -1,0 +1,136 @@
+"""Per-frame figures of an evaluated object: what the tables and plots are computed from.
+
+``metrics.npz`` holds them as ``OBJECT/ROW/METRIC``: image metrics and ``image_energy`` as (S, F, V) over sequences,
+frames and views, ``error_3d`` and ``point_energy`` as (S, F). NaN pads sequences that are shorter than the longest.
+Energies of frame t belong to the step from t-1 to t and exist for the row ``truth`` too.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gausim.core import RunError
+from gausim.io.npz import read_npz
+from gausim.results.pictures import Pictures
+
+STATIC = "static"
+TRUTH = "truth"
+IMAGE_ENERGY = "image_energy"
+ERROR_3D = "error_3d"
+POINT_ENERGY = "point_energy"
+# Arrays without a view axis.
+POINT_ARRAYS = (ERROR_3D, POINT_ENERGY)
+_FACTS = "facts"
+
+
+@dataclass(frozen=True)
+class ImageMetricInfo:
+    """How an image metric is named and printed (value times scale, in unit)."""
+
+    key: str
+    label: str
+    scale: float
+    unit: str
+    higher_is_better: bool
+
+
+@dataclass(frozen=True)
+class ObjectFacts:
+    """What was evaluated.
+
+    Attributes:
+        name: the object.
+        fps: frames per second.
+        sequences: names of the S sequences.
+        frames: number of frames of each.
+        views: names of the V evaluated views.
+        train_views: those of them that training saw.
+        first_unseen: first frame that training did not see.
+        methods: rows that are predictions of a method (the others are references).
+        metrics: the image metrics.
+        mean_color: mean colour of the true foreground in [0, 1].
+        max_l2: largest per-pixel colour distance of any prediction of the first method.
+    """
+
+    name: str
+    fps: float
+    sequences: tuple[str, ...]
+    frames: tuple[int, ...]
+    views: tuple[str, ...]
+    train_views: tuple[str, ...]
+    first_unseen: int
+    methods: tuple[str, ...]
+    metrics: tuple[ImageMetricInfo, ...]
+    mean_color: tuple[float, float, float]
+    max_l2: float
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectCurves:
+    """Facts and arrays of one object: ``values[row][metric]``, see the module's text for shapes.
+
+    Attributes:
+        facts: what was evaluated.
+        values: the arrays.
+        record: plain data that goes into the summary as it is (``efficiency``, ``sources``, ``absent``).
+        pictures: of one sequence; they have a file of their own.
+    """
+
+    facts: ObjectFacts
+    values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)
+    pictures: Pictures | None = None
+
+    @property
+    def rows(self) -> list[str]:
+        """Rows of the tables: all but the truth."""
+        return [row for row in self.values if row != TRUTH]
+
+    def view_indices(self, group: str) -> list[int]:
+        """Columns of the view axis of group ``train`` or ``heldout``."""
+        trained = [v in self.facts.train_views for v in self.facts.views]
+        return [i for i, t in enumerate(trained) if t == (group == "train")]
+
+
+def save_curves(path: Path, objects: list[ObjectCurves]) -> None:
+    """Writes all objects' arrays and facts into one npz (the facts as JSON text; nothing is pickled)."""
+    arrays: dict[str, Any] = {}
+    for curves in objects:
+        arrays[f"{curves.facts.name}/{_FACTS}"] = np.array(json.dumps(asdict(curves.facts)))
+        for row, metrics in curves.values.items():
+            for metric, values in metrics.items():
+                arrays[f"{curves.facts.name}/{row}/{metric}"] = values
+    np.savez_compressed(path, **arrays)
+
+
+def load_curves(path: Path) -> list[ObjectCurves]:
+    """Reads what :func:`save_curves` wrote.
+
+    Raises:
+        RunError: the file is missing or not such a file.
+    """
+    try:
+        arrays = read_npz(path)
+    except ValueError as error:
+        raise RunError(f"{path}: cannot be read ({error}). Write it with `gausim evaluate RUN`.") from error
+    objects = {n.rsplit("/", 1)[0]: _facts(str(a)) for n, a in arrays.items() if n.endswith(f"/{_FACTS}")}
+    if not objects:
+        raise RunError(f"{path}: holds no array '*/{_FACTS}'; expected a metrics.npz of `gausim evaluate RUN`.")
+    found = {name: ObjectCurves(facts) for name, facts in objects.items()}
+    for name, array in arrays.items():
+        owner, row, metric = (*name.rsplit("/", 2), "")[:3]
+        if owner in found and metric:
+            found[owner].values.setdefault(row, {})[metric] = array
+    return list(found.values())
+
+
+def _facts(text: str) -> ObjectFacts:
+    data: dict[str, Any] = json.loads(text)
+    metrics = tuple(ImageMetricInfo(**m) for m in data.pop("metrics"))
+    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
+    return ObjectFacts(**fields, metrics=metrics)

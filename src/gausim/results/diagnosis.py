@@ -1,0 +1,102 @@
+"""What kind of error a prediction makes where the true motion is known: frequency, damping, phase, first velocity."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gausim.metrics.level_error import level_error
+from gausim.metrics.oscillation import (
+    coordinates,
+    oscillation,
+    phase_error,
+    principal_motions,
+    spectrum,
+    velocity_cosine,
+)
+from gausim.results.curves import TRUTH
+
+# Principal motions that are looked at; more hold too little to have a frequency that can be told.
+MOTIONS = 8
+# Points of each sequence that are kept: enough for smooth motion, few enough to keep all sequences.
+POINTS = 2048
+
+
+class Diagnosis:
+    """Collects true and predicted displacements of all sequences of an object and compares them at the end."""
+
+    def __init__(self, fps: float) -> None:
+        """Begins with no sequence; ``fps`` frames per second."""
+        self._fps = fps
+        self._truth: list[NDArray] = []
+        self._predicted: dict[str, list[NDArray]] = {}
+        self._levels: dict[str, NDArray] = {}
+
+    def add(
+        self,
+        truth: Tensor,
+        rest: Tensor,
+        predictions: Mapping[str, Tensor],
+        units: Mapping[str, Sequence[Tensor]] | None = None,
+    ) -> None:
+        """Takes one sequence.
+
+        Args:
+            truth: true positions (F, P, 3).
+            rest: at rest (P, 3).
+            predictions: positions as every row predicts them.
+            units: of the rows with a hierarchy: the unit of each point, level by level, the small ones first.
+        """
+        for name, levels in (units or {}).items():
+            pairs = [level_error(predictions[name].to(truth), truth, rest, unit) for unit in levels]
+            sums = np.array([[float(error.sum()), float(still.sum())] for error, still in pairs])
+            self._levels[name] = self._levels.get(name, 0.0) + sums
+        every = -(-truth.shape[1] // POINTS)
+        self._truth.append(_thin(truth - rest, every))
+        for name, points in predictions.items():
+            self._predicted.setdefault(name, []).append(_thin(points - rest.to(points), every))
+
+    def summary(self) -> dict[str, Any] | None:
+        """Plain data of what was found (see report.summary), or None without a sequence that moves."""
+        if not self._truth or not any(np.abs(d).max() > 0 for d in self._truth):
+            return None
+        shapes, share = principal_motions(self._truth, MOTIONS)
+        truth = [coordinates(d, shapes) for d in self._truth]
+        found: dict[str, Any] = {"share": share.tolist(), "frequency": [], "rows": {}}
+        for name, motions in {TRUTH: self._truth, **self._predicted}.items():
+            series = [coordinates(d, shapes) for d in motions]
+            frequency, power = spectrum(series, self._fps)
+            rings = [oscillation([s[:, m] for s in series], self._fps) for m in range(len(share))]
+            row: dict[str, Any] = {
+                "spectrum": power.tolist(),
+                "frequencies": [_finite(ring.frequency) for ring in rings],
+                "dampings": [_finite(ring.damping) for ring in rings],
+            }
+            if name != TRUTH:
+                row["phase_error"] = [_finite(v) for v in phase_error(series, truth)]
+                row["velocity_cosine"] = _mean(
+                    [velocity_cosine(p, t) for p, t in zip(motions, self._truth, strict=True)]
+                )
+            if name in self._levels:
+                row["level_errors"] = [_finite(own / still if still else math.nan) for own, still in self._levels[name]]
+            found["frequency"] = frequency.tolist()
+            found["rows"][name] = row
+        return found
+
+
+def _thin(displacement: Tensor, every: int) -> NDArray:
+    return displacement[:, ::every].detach().cpu().float().numpy()
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    known = [v for v in values if math.isfinite(v)]
+    return sum(known) / len(known) if known else None
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None

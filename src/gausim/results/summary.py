@@ -1,0 +1,200 @@
+"""From per-frame figures to the numbers of a table, and the file that holds them.
+
+``metrics.json`` (schema ``gausim.evaluation/1``)::
+
+    {"schema": "gausim.evaluation/1",
+     "run": {...},                                    what was evaluated, as the caller states it
+     "provenance": {"gausim", "torch", "python", "commit", "modified"},   of the program that evaluated
+     "objects": {NAME: {
+        "fps", "sequences", "frames", "views", "train_views", "heldout_views", "methods",
+        "splits": {"seen": [0, 16], "unseen": [16, 50], "unseen_near": [16, 26], "unseen_all": [16, 60]},
+        "metrics": {KEY: {"label", "scale", "unit", "higher_is_better"}},
+        "contrast": {"mean_color": [r, g, b], "norm": x, "max_l2": x},
+        "floor": {KEY: CELL},                         the reconstruction against frame 0 of every training view
+        "rows": {ROW: {SPLIT: {GROUP: {KEY: CELL}}}}, GROUP: train | heldout (views), points (3D)
+        "efficiency": {METHOD: {"seconds_per_frame": {"mean", "std"}, "frames", "seconds_per_image", "device",
+            "threads", "memory": {"kind", "peak_bytes", "added_bytes", "first_added_bytes"}, "levels": {"counts",
+            "predicted", "predictions", "kernels"}}}, memory and levels null where unknown
+        "sources": {"root", "scene": {"file", "sha256"}, "masks": {...}, "manifest": {...}},
+        "absent": {KEY: why},                         metrics that could not be computed
+        "footnotes": {METHOD: {"extrapolates": bool, "notes": [text, ...], "fit": {"seconds", "cpu_seconds",
+            "peak_bytes"}, "largest_eigenvalue": x}}          fit null where it was not counted; the eigenvalue is of
+                                                      the step linearised at rest, only of simulators with a network
+        "diagnosis": {"share": [...], "frequency": [Hz, ...], "rows": {ROW: {"spectrum", "frequencies": [Hz, ...],
+            "dampings": [...], "phase_error": [degrees, ...], "velocity_cosine": x,
+            "level_errors": [x, ...]}}}                where the true motion is known
+     }}}
+
+A CELL is ``{"mean", "std", "ratio"}``: mean and standard deviation over sequences (of the mean over frames and views
+of a sequence) and the mean divided by the static row's (null for the floor and for what is better when higher). Ends
+of splits are exclusive. The cell of ``motion_energy`` has besides ``"pooled"``: predicted over true energy summed over
+all sequences, which no single sequence at rest can spoil; its mean and std are over the sequences' own ratios and its
+ratio is null. Undefined numbers are null. ``footnotes`` are what a method says of itself, and what its training cost;
+one that does not extrapolate repeats beyond the trained frames what it was fitted to. ``diagnosis`` looks at the motion
+in the principal motions of the truth: ``share`` of the squared displacement, ``frequencies`` and ``dampings`` (of
+critical) of each; power per ``frequency`` over all of them; ``phase_error`` per frame; ``level_errors`` over static's,
+of the units' centres at each level of a hierarchy, the small ones first; the truth is a row. ``provenance``,
+``efficiency``, ``sources``, ``absent``, ``footnotes`` and ``diagnosis`` are not in files of earlier versions.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gausim.core import RunError
+from gausim.io.plain_json import parse_json
+from gausim.results.curves import ERROR_3D, IMAGE_ENERGY, POINT_ARRAYS, POINT_ENERGY, STATIC, TRUTH, ObjectCurves
+
+SCHEMA = "gausim.evaluation/1"
+MOTION_ENERGY = "motion_energy"
+# The shorter of the paper's two test ranges ends here; every READY sequence reaches it.
+HEADLINE_STOP = 50
+# The first frames after training, where errors have not yet grown to the motion's own size.
+NEAR_FRAMES = 10
+
+_POINT_METRICS = {
+    ERROR_3D: {"label": "3D error", "scale": 1.0, "unit": "% of diagonal", "higher_is_better": False},
+    MOTION_ENERGY: {"label": "motion energy", "scale": 1.0, "unit": "", "higher_is_better": None},
+}
+
+
+def frame_splits(frames: int, first_unseen: int) -> dict[str, tuple[int, int]]:
+    """Named ranges [first, end) of frames; ``unseen_all`` only where it goes beyond ``unseen``."""
+    splits = {"seen": (0, min(first_unseen, frames))}
+    if frames > first_unseen:
+        stop = min(frames, max(HEADLINE_STOP, first_unseen + 1))
+        splits["unseen"] = (first_unseen, stop)
+        splits["unseen_near"] = (first_unseen, min(first_unseen + NEAR_FRAMES, frames))
+        if frames > stop:
+            splits["unseen_all"] = (first_unseen, frames)
+    return splits
+
+
+def summarise(curves: ObjectCurves) -> dict[str, Any]:
+    """The entry of one object in ``metrics.json``."""
+    facts = curves.facts
+    splits = frame_splits(max(facts.frames), facts.first_unseen)
+    groups = {g: curves.view_indices(g) for g in ("train", "heldout")}
+    metrics = {
+        m.key: {"label": m.label, "scale": m.scale, "unit": m.unit, "higher_is_better": m.higher_is_better}
+        for m in facts.metrics
+    }
+    color = [float(c) for c in facts.mean_color]
+    return {
+        "fps": facts.fps,
+        "sequences": list(facts.sequences),
+        "frames": list(facts.frames),
+        "views": list(facts.views),
+        "train_views": [facts.views[i] for i in groups["train"]],
+        "heldout_views": [facts.views[i] for i in groups["heldout"]],
+        "methods": list(facts.methods),
+        "splits": {name: list(split) for name, split in splits.items()},
+        "metrics": metrics | _POINT_METRICS,
+        "contrast": {"mean_color": color, "norm": math.hypot(*color), "max_l2": facts.max_l2},
+        "floor": _floor(curves, groups["train"]),
+        "rows": {row: _row(curves, row, splits, groups) for row in curves.rows},
+        **curves.record,
+    }
+
+
+def _floor(curves: ObjectCurves, views: list[int]) -> dict[str, Any]:
+    if not views or STATIC not in curves.values:
+        return {}
+    frame0 = {m.key: curves.values[STATIC][m.key][:, 0][:, views].mean(1) for m in curves.facts.metrics}
+    return {key: _cell(values) for key, values in frame0.items()}
+
+
+def _row(
+    curves: ObjectCurves, row: str, splits: dict[str, tuple[int, int]], groups: dict[str, list[int]]
+) -> dict[str, Any]:
+    """Cells of one row: split -> group -> metric; groups without data are left out."""
+    result: dict[str, Any] = {}
+    for split, (start, stop) in splits.items():
+        cells: dict[str, dict[str, Any]] = {}
+        for metric, values in curves.values[row].items():
+            places = {"points": None} if metric in POINT_ARRAYS else {g: v for g, v in groups.items() if v}
+            for group, views in places.items():
+                window = _window(values, start, stop, views)
+                if metric in (IMAGE_ENERGY, POINT_ENERGY):
+                    true = _window(curves.values[TRUTH][metric], start, stop, views)
+                    cells.setdefault(group, {})[MOTION_ENERGY] = _energy_cell(window, true)
+                else:
+                    static = curves.values.get(STATIC, {}).get(metric)
+                    reference = None if static is None else _means(_window(static, start, stop, views))
+                    cells.setdefault(group, {})[metric] = _cell(_means(window), _ratio_base(curves, metric, reference))
+        result[split] = cells
+    return result
+
+
+def _window(values: np.ndarray, start: int, stop: int, views: list[int] | None) -> np.ndarray:
+    """(S, everything else) of the frames and views asked for."""
+    window = values[:, start:stop] if views is None else values[:, start:stop][:, :, views]
+    return window.reshape(len(values), -1)
+
+
+def _ratio_base(curves: ObjectCurves, metric: str, reference: np.ndarray | None) -> np.ndarray | None:
+    """What to divide by; nothing for metrics of which more is better (a ratio of decibels says nothing)."""
+    better = {m.key: m.higher_is_better for m in curves.facts.metrics}
+    return None if better.get(metric, False) else reference
+
+
+def _means(values: np.ndarray) -> np.ndarray:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a sequence that ends before the split has no mean
+        return np.nanmean(values, axis=1)
+
+
+def _cell(values: np.ndarray, reference: np.ndarray | None = None) -> dict[str, float | None]:
+    defined = values[~np.isnan(values)]
+    mean = float(defined.mean()) if len(defined) else math.nan
+    std = float(defined.std()) if len(defined) else math.nan
+    ratio = math.nan
+    if reference is not None and not np.isnan(reference).all() and np.nanmean(reference) > 0:
+        ratio = mean / float(np.nanmean(reference))
+    return {"mean": _finite(mean), "std": _finite(std), "ratio": _finite(ratio)}
+
+
+def _energy_cell(predicted: np.ndarray, true: np.ndarray) -> dict[str, float | None]:
+    both = ~(np.isnan(predicted) | np.isnan(true))
+    p, t = (np.where(both, v, 0.0).sum(1) for v in (predicted, true))
+    own = np.divide(p, t, out=np.full_like(p, np.nan), where=t > 0)
+    pooled = float(p.sum() / t.sum()) if t.sum() > 0 else math.nan
+    return {**_cell(own), "ratio": None, "pooled": _finite(pooled)}
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def write_summary(
+    path: Path, objects: list[ObjectCurves], run: dict[str, Any], *, provenance: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """Writes ``metrics.json`` and returns what it holds."""
+    entries = {c.facts.name: summarise(c) for c in objects}
+    summary = {"schema": SCHEMA, "run": run, "provenance": provenance or {}, "objects": entries}
+    path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
+    return summary
+
+
+def load_summary(path: Path) -> dict[str, Any]:
+    """Reads a ``metrics.json``.
+
+    Raises:
+        RunError: it is missing, no JSON or of another schema.
+    """
+    try:
+        summary = parse_json(path.read_bytes())
+    except FileNotFoundError:
+        raise RunError(f"{path}: no such file. Write it with `gausim evaluate RUN`.") from None
+    except ValueError as error:
+        raise RunError(f"{path}: cannot be read as JSON ({error}). Run `gausim evaluate RUN` again.") from error
+    found = summary.get("schema") if isinstance(summary, dict) else None
+    if found != SCHEMA:
+        raise RunError(f"{path}: field 'schema' is {found!r}, expected {SCHEMA!r}. Run `gausim evaluate RUN` again.")
+    return summary

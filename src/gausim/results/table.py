@@ -1,0 +1,143 @@
+"""Tables from ``metrics.json``: Markdown text, and headers and rows for any other printer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
+from gausim.results.summary import MOTION_ENERGY
+
+SPLIT_TITLES = {"seen": "seen", "unseen": "unseen", "unseen_near": "unseen, first", "unseen_all": "unseen, all"}
+GROUP_TITLES = {"points": "3D, true points", "train": "training views", "heldout": "views never trained on"}
+LEGEND = (
+    "Mean ± standard deviation over sequences; `/ static` is the ratio to the static prediction (below 1 is better); "
+    "motion energy is the predicted over the true one, all sequences together (1 is right, 0 stands still); floor is "
+    "the reconstruction itself against frame 0. Images are foreground on black."
+)
+FLOOR_ROW = "floor"
+NO_FORESIGHT = "Does not foresee: its frames after the trained ones repeat what was fitted."
+
+
+@dataclass(frozen=True)
+class Table:
+    """A title, column heads and rows of text; ``breaks`` are rows that begin a new block of frames."""
+
+    title: str
+    head: list[str]
+    rows: list[list[str]]
+    breaks: list[int]
+
+
+def object_tables(name: str, entry: dict[str, Any]) -> list[Table]:
+    """The tables of one object: 3D first where truth exists, then training views, then held-out views."""
+    present = {g for row in entry["rows"].values() for split in row.values() for g in split}
+    return [_group_table(name, entry, group) for group in GROUP_TITLES if group in present]
+
+
+def _group_table(name: str, entry: dict[str, Any], group: str) -> Table:
+    metrics = _metrics_of(entry, group)
+    infos = {m: entry["metrics"].get(m) or entry["metrics"][MOTION_ENERGY] for m in metrics}
+    head = ["frames", "row"]
+    for metric, info in infos.items():
+        head.append(f"{info['label']} [{info['unit']}]" if info["unit"] else info["label"])
+        if _has_ratio(metric, info):
+            head.append("/ static")
+    rows, breaks = [], []
+    if group == "train" and entry["floor"]:
+        rows.append(_line("0", FLOOR_ROW, entry["floor"], infos))
+    for split, (start, stop) in entry["splits"].items():
+        breaks.append(len(rows))
+        frames = f"{SPLIT_TITLES[split]} {start}..{stop - 1}"
+        for row, cells in entry["rows"].items():
+            if group in cells[split]:
+                rows.append(_line(frames, row, cells[split][group], infos))
+    return Table(f"{name}: {GROUP_TITLES[group]}", head, rows, breaks)
+
+
+def _metrics_of(entry: dict[str, Any], group: str) -> list[str]:
+    """Metrics that any row has in this group, in their first order, the energy last."""
+    found: dict[str, None] = {}
+    for row in entry["rows"].values():
+        for split in row.values():
+            found.update(dict.fromkeys(split.get(group, {})))
+    return sorted(found, key=lambda m: m == MOTION_ENERGY)
+
+
+def _has_ratio(metric: str, info: dict[str, Any]) -> bool:
+    return metric != MOTION_ENERGY and not info["higher_is_better"]
+
+
+def _line(frames: str, row: str, cells: dict[str, Any], infos: dict[str, Any]) -> list[str]:
+    line = [frames, row]
+    for metric, info in infos.items():
+        cell = cells.get(metric, {})
+        if metric == MOTION_ENERGY:
+            line.append(_number(cell.get("pooled"), 2))
+            continue
+        mean, std = cell.get("mean"), cell.get("std")
+        scale = info["scale"]
+        line.append("" if mean is None else f"{mean * scale:.2f} ± {(std or 0.0) * scale:.2f}")
+        if _has_ratio(metric, info):
+            line.append(_number(cell.get("ratio"), 3))
+    return line
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def said(entry: dict[str, Any], method: str) -> dict[str, Any]:
+    """The ``footnotes`` of a method in an object's entry; empty where there are none."""
+    every = entry.get("footnotes")
+    own = every.get(method) if isinstance(every, dict) else None
+    return own if isinstance(own, dict) else {}
+
+
+def footnotes(entry: dict[str, Any], method: str) -> list[str]:
+    """What a method says of itself in an object's entry: sentences, the first that it does not foresee."""
+    own = said(entry, method)
+    notes = own.get("notes")
+    sentences = [str(note) for note in notes] if isinstance(notes, list) else []
+    return [NO_FORESIGHT, *sentences] if own.get("extrapolates") is False else sentences
+
+
+def gaps(summary: dict[str, Any]) -> list[str]:
+    """What no table of an evaluation has, and how to get it: sentences."""
+    absent = [entry.get("absent") for entry in summary["objects"].values()]
+    lacks_lpips = any(isinstance(a, dict) and a.get("lpips") == NO_WEIGHTS for a in absent)
+    return [NO_LPIPS] if lacks_lpips else []
+
+
+def markdown_table(table: Table) -> str:
+    """One table as GitHub Markdown, its title as a heading."""
+    lines = [f"### {table.title}", "", _markdown_row(table.head)]
+    lines.append(_markdown_row(["---", "---"] + ["---:"] * (len(table.head) - 2)))
+    return "\n".join(lines + [_markdown_row(row) for row in table.rows]) + "\n"
+
+
+def _markdown_row(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def markdown(summary: dict[str, Any]) -> str:
+    """The whole ``table.md`` of an evaluation."""
+    run = ", ".join(f"{key} {value}" for key, value in summary["run"].items())
+    parts = ["# Evaluation", "", run, "", " ".join([LEGEND, *gaps(summary)]), ""]
+    for name, entry in summary["objects"].items():
+        count, frames = len(entry["sequences"]), max(entry["frames"])
+        parts += [f"## {name}", "", f"{count} sequences of {frames} frames at {entry['fps']:g} fps.", ""]
+        parts += [markdown_table(table) for table in object_tables(name, entry)]
+        parts += [f"* {row}: {note}\n" for row in entry["methods"] for note in footnotes(entry, row)]
+    return "\n".join([*parts, _contrast(summary)])
+
+
+def _contrast(summary: dict[str, Any]) -> str:
+    """The paper's table of colour contrast, which explains differences of absolute errors between objects."""
+    head = ["object", "mean foreground colour", "its norm", "largest l2 of a pixel"]
+    rows = []
+    for name, entry in summary["objects"].items():
+        contrast = entry["contrast"]
+        color = ", ".join(f"{c:.2f}" for c in contrast["mean_color"])
+        rows.append([name, f"({color})", f"{contrast['norm']:.2f}", f"{contrast['max_l2']:.2f}"])
+    return "## Colour contrast\n\n" + markdown_table(Table("foreground against black", head, rows, []))

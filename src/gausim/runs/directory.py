@@ -1,0 +1,331 @@
+"""Run directories: what a run was asked, whether it is finished, whether it may be resumed."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import traceback
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+from lightning.pytorch.utilities import rank_zero_only
+
+from gausim.core import GausSimError, RunError
+from gausim.io.files import remove_leftovers, write_durably
+from gausim.runs.checkpoint import (
+    BEFORE_THE_END,
+    LAST_CHECKPOINT,
+    PREVIOUS_CHECKPOINT,
+    check_resumable,
+)
+from gausim.runs.files import sole_writer, unwritable
+from gausim.runs.names import EPOCHS, MLFLOW_ID, MOTION, WANDB_ID
+from gausim.runs.renamed import with_present_names
+
+CONFIG, FINISHED, FAILED, LOCK = "config.yaml", "FINISHED", "FAILED", ".lock"
+EVALUATION, EVENTS = "evaluation/metrics.json", "events.jsonl"
+GRANTED = "granted more"  # the event of more epochs and minutes
+FETCHED = "FETCHED"  # in a directory that `gausim fetch` made: from where
+DAMAGED_CHECKPOINT = "last.damaged.ckpt"
+# What may differ when a run is resumed: where it is kept, how it is shown and what computes it, not what is learned.
+FREE_KEYS = (
+    "paths",
+    "logger",
+    "callbacks",
+    "sweep",
+    "task_name",
+    "doctor",
+    "evaluate",
+    "trainer.threads",
+    "render.threads",
+    "trainer.accelerator",
+    "trainer.devices",
+    "trainer.num_nodes",
+    "trainer.timeout_minutes",
+    "trainer.log_every_n_steps",
+    "trainer.progress",
+    "trainer.overwrite",
+)
+# What `overwrite` removes; anything else in the directory is not ours.
+OWN_FILES = (
+    CONFIG,
+    FINISHED,
+    FAILED,
+    EVENTS,
+    LAST_CHECKPOINT,
+    PREVIOUS_CHECKPOINT,
+    BEFORE_THE_END,
+    DAMAGED_CHECKPOINT,
+    EPOCHS,
+    MOTION,
+    WANDB_ID,
+    MLFLOW_ID,
+)
+OWN_FOLDERS = ("panels", "snapshots", "tensorboard", "csv", "wandb")
+
+
+class RunDirectory:
+    """A directory that holds exactly one training run.
+
+    Attributes:
+        path: the directory.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        """Names the directory; :meth:`prepare` makes it."""
+        self.path = Path(path)
+        self._prepared = False
+
+    @property
+    def checkpoint(self) -> Path:
+        """The last checkpoint."""
+        return self.path / LAST_CHECKPOINT
+
+    @property
+    def has_checkpoint(self) -> bool:
+        """Whether something was learned here."""
+        return any((self.path / name).is_file() for name in (LAST_CHECKPOINT, PREVIOUS_CHECKPOINT))
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the run came to its end."""
+        return (self.path / FINISHED).is_file()
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether an error ended the run, and nobody has tried again since."""
+        return (self.path / FAILED).is_file()
+
+    @property
+    def was_pruned(self) -> bool:
+        """Whether a search ended the run early."""
+        return self.is_finished and bool(self.facts().get("pruned"))
+
+    def facts(self) -> dict[str, Any]:
+        """What a finished run says about itself.
+
+        Raises:
+            RunError: it is not finished, or its marker cannot be read.
+        """
+        path = self.path / FINISHED
+        try:
+            loaded = dict(json.loads(path.read_text()))
+            loaded["last_epoch"] = dict(loaded["last_epoch"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise RunError(
+                f"{path}: expected facts of a finished run ({type(error).__name__}). Train anew with "
+                "trainer.overwrite=true."
+            ) from error
+        return loaded
+
+    def failure(self) -> str:
+        """The error that ended a failed run, in one line."""
+        lines = (self.path / FAILED).read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "unknown"
+
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration of the run.
+
+        Raises:
+            RunError: there is no run here, or its configuration is unreadable.
+        """
+        path = self.path / CONFIG
+        if not path.is_file():
+            raise RunError(f"{self.path}: no run here ({CONFIG} is missing). Train first (`gausim train name=NAME`).")
+        try:
+            loaded = yaml.safe_load(path.read_text())
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise RunError(f"{path}: cannot be read as YAML ({error}).") from error
+        if not isinstance(loaded, dict):
+            raise RunError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
+        return dict(with_present_names(loaded))
+
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """The block that trains: no other process may, and what the disk refuses becomes a RunError.
+
+        Raises:
+            BusyError: another process trains here.
+            RunError: the directory cannot be written.
+        """
+        try:
+            if getattr(rank_zero_only, "rank", 0):  # the other ranks of a run belong to its first
+                yield
+                return
+            with sole_writer(self.path / LOCK):
+                yield
+        except OSError as error:
+            explained = unwritable(error, self.path)
+            if explained is None:
+                raise
+            raise explained from error
+
+    def prepare(self, config: Mapping[str, Any], *, overwrite: bool = False) -> Path | None:
+        """Makes the directory and writes the configuration; returns the checkpoint to resume from, if there is one.
+
+        Args:
+            config: the resolved configuration, plain containers only.
+            overwrite: remove what an earlier run left here.
+
+        Raises:
+            RunError: the run here is finished (one that was cut short goes on, once more for as long), was started with
+                another configuration, or no checkpoint of it is whole.
+        """
+        remove_leftovers(self.path)
+        if overwrite:
+            self._clear()
+        if self.is_finished and self._was_cut_short(config):
+            self._go_on()
+        if self.is_finished:
+            raise RunError(
+                f"{self.path}: this run is finished. Give the new one another name (name=NAME) or seed, or remove the "
+                "old one with trainer.overwrite=true."
+            )
+        if self.has_checkpoint:
+            self.check_unchanged(config)
+        resume = self._whole_checkpoint()
+        write_durably(self.path / CONFIG, yaml.safe_dump(dict(config), sort_keys=False).encode())
+        (self.path / FAILED).unlink(missing_ok=True)
+        self.record("resumed" if resume else "started")
+        self._prepared = True
+        return resume
+
+    @property
+    def allowances(self) -> int:
+        """How often this run was granted its epochs and minutes: once, and once more each time it was cut short."""
+        path = self.path / EVENTS
+        granted = json.dumps({"event": GRANTED})[1:-1]  # looked for as text: a kill may have torn off the last line
+        return 1 + (path.read_text().count(granted) if path.is_file() else 0)
+
+    def _was_cut_short(self, config: Mapping[str, Any]) -> bool:
+        """Whether this very configuration ended here before it had learned, and can go on."""
+        if not (self.path / BEFORE_THE_END).is_file() or changed_keys(self.config(), config):
+            return False
+        return bool(dict(self.facts().get("learning") or {}).get("cut_short"))
+
+    def _go_on(self) -> None:
+        check_resumable(self.path / BEFORE_THE_END)
+        self.record(GRANTED)
+        (self.path / PREVIOUS_CHECKPOINT).unlink(missing_ok=True)
+        os.replace(self.path / BEFORE_THE_END, self.checkpoint)
+        (self.path / FINISHED).unlink()
+
+    def check_unchanged(self, config: Mapping[str, Any]) -> None:
+        """Compares the configuration of the run here with one that meets it.
+
+        Raises:
+            RunError: they differ in a key that changes what is learned.
+        """
+        changed = changed_keys(self.config(), config) if (self.path / CONFIG).is_file() else []
+        if changed:
+            raise RunError(
+                f"{self.path}: the run here was started with another configuration; changed: {', '.join(changed)}. "
+                "Restore these keys to resume it, give the new run another name, or set trainer.overwrite=true."
+            )
+
+    def record(self, event: str) -> None:
+        """Adds a line to the run's history: what happened, when, and in which process."""
+        line = {"time": _now(), "event": event, "host": platform.node(), "process": os.getpid()}
+        with (self.path / EVENTS).open("a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    @contextmanager
+    def noting_failure(self) -> Iterator[None]:
+        """The block that trains: an error that ends it is kept in ``FAILED``.
+
+        One before the run was prepared, as that it is finished, says nothing about the run and is not kept.
+        """
+        try:
+            yield
+        except Exception as error:
+            if self._prepared and not getattr(rank_zero_only, "rank", 0):
+                with suppress(OSError):  # the disk may be what failed; the error itself matters more
+                    self._note(error)
+            raise
+
+    def _note(self, error: Exception) -> None:
+        # An error meant for people explains itself; of any other the way to it is wanted. The last line says which.
+        trace = "" if isinstance(error, GausSimError) else "".join(traceback.format_exception(error)) + "\n"
+        head = f"time: {_now()}\nhost: {platform.node()}\nprocess: {os.getpid()}\n\n"
+        write_durably(self.path / FAILED, f"{head}{trace}{one_line(error)}\n".encode())
+        self.record("failed")
+
+    def _whole_checkpoint(self) -> Path | None:
+        """The last checkpoint, or the one before it where the last is damaged (which is then set aside)."""
+        problems: list[str] = []
+        for path in (self.checkpoint, self.path / PREVIOUS_CHECKPOINT):
+            if not path.is_file():
+                continue
+            try:
+                check_resumable(path)
+            except RunError as error:
+                problems.append(str(error))
+                continue
+            if problems:
+                aside = self.path / DAMAGED_CHECKPOINT
+                os.replace(self.checkpoint, aside)
+                warnings.warn(
+                    f"{problems[0]} Resuming from {path}, the checkpoint before it; the damaged file is now {aside}.",
+                    stacklevel=3,
+                )
+            return path
+        if problems:
+            raise RunError(
+                f"{self.path}: no checkpoint here is whole. {' '.join(problems)} Train anew (trainer.overwrite=true), "
+                "or under another name."
+            )
+        return None
+
+    def awaits_evaluation(self, config: Mapping[str, Any]) -> bool:
+        """Whether this very configuration is trained to its end here, and was not evaluated since."""
+        finished, measured = self.path / FINISHED, self.path / EVALUATION
+        if not self.is_finished or self.was_pruned or changed_keys(self.config(), config):
+            return False
+        return not measured.is_file() or measured.stat().st_mtime < finished.stat().st_mtime
+
+    def finish(self, facts: Mapping[str, Any]) -> None:
+        """Marks the run as finished, with a few facts about it."""
+        write_durably(self.path / FINISHED, (json.dumps(dict(facts), indent=1) + "\n").encode())
+        self.record("finished")
+
+    def _clear(self) -> None:
+        for name in OWN_FILES:
+            (self.path / name).unlink(missing_ok=True)
+        for name in OWN_FOLDERS:
+            if (self.path / name).is_dir():
+                shutil.rmtree(self.path / name)
+
+
+def one_line(error: BaseException) -> str:
+    """An error's type and message in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="milliseconds")
+
+
+def changed_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Dotted keys whose values differ between two configurations, those aside that a resumed run may change."""
+    different = differing_keys(old, new)
+    return [k for k in different if not any(k == free or k.startswith(f"{free}.") for free in FREE_KEYS)]
+
+
+def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Dotted keys whose values differ between two nested mappings."""
+    first, second = dict(_flatten(old)), dict(_flatten(new))
+    keys = sorted(set(first) | set(second))
+    return [k for k in keys if k not in first or k not in second or first[k] != second[k]]
+
+
+def _flatten(value: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    if isinstance(value, Mapping) and value:
+        return [item for k, v in value.items() for item in _flatten(v, f"{prefix}.{k}" if prefix else str(k))]
+    return [(prefix, value)]

@@ -1,0 +1,65 @@
+"""What the static prediction scores on each training sequence and how much the truth moves: yardsticks of training."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+from gausim.data.dataset import SequenceSample
+from gausim.training.supervision.images import Supervision
+
+
+@dataclass
+class Yardstick:
+    """Constants of one sequence, as far as its frames have been seen.
+
+    Attributes:
+        floor: loss of the rest state on frame 0, what the reconstruction itself leaves.
+        static: loss of the rest state on frames 1, 2, ...
+        motion: squared change of the truth from frame t to t + 1 (images: summed over pixels).
+    """
+
+    floor: float = 0.0
+    static: list[float] = field(default_factory=list)
+    motion: list[float] = field(default_factory=list)
+
+
+def excess(loss: float, static: float, floor: float) -> float:
+    """A loss over that of the rest state, both above what the reconstruction leaves; finite where nothing moves yet."""
+    return (loss - floor) / max(static - floor, 1e-3 * static, 1e-12)
+
+
+class Yardsticks:
+    """Measures each sequence once; later batches look the numbers up."""
+
+    def __init__(self, supervision: Supervision) -> None:
+        """Keeps what measures."""
+        self._supervision = supervision
+        self._known: dict[int, Yardstick] = {}
+
+    def of(self, sample: SequenceSample, rest: Tensor) -> Yardstick:
+        """The yardstick of a sample's sequence, for at least the sample's frames; ``rest`` is its scene's."""
+        known = self._known.setdefault(sample.sequence_id, Yardstick())
+        seen = len(known.static)
+        if seen < sample.steps:
+            losses, motion = self._supervision.static(sample, rest, seen)
+            if seen == 0:
+                known.floor = losses[0]
+            known.static += losses[1:]
+            known.motion += motion
+        return known
+
+    def learn(self, sequences: Sequence[int], yards: Sequence[Yardstick]) -> None:
+        """Takes what the ranks found, so that each knows what one rank alone would."""
+        self._known.update(zip(sequences, yards, strict=True))
+
+    def state_dict(self) -> dict[int, dict[str, Any]]:
+        """What is known of each sequence: measured with other frames at once, the last bits would differ."""
+        return {sequence: asdict(known) for sequence, known in self._known.items()}
+
+    def load_state_dict(self, state: dict[int, dict[str, Any]]) -> None:
+        """Continues with what ``state`` knew."""
+        self._known = {sequence: Yardstick(**known) for sequence, known in state.items()}

@@ -1,0 +1,157 @@
+"""What kind of error the motion has, live in training: beyond the seen frames, per level, in frequency and phase."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import Tensor
+
+from gausim.core import ConfigError, DivergenceError
+from gausim.data.objects import ObjectData
+from gausim.data.records import GroundTruth
+from gausim.metrics.motion_energy import motion_energy
+from gausim.nn.mode import evaluating
+from gausim.report.gather.diagnosis import read_diagnosis
+from gausim.results.diagnosis import Diagnosis
+from gausim.runs.names import MOTION
+from gausim.runs.randomness import undisturbed
+from gausim.training.callbacks.cadence import has_come, training_data
+from gausim.training.callbacks.epoch_table import EpochTable
+from gausim.training.contracts import Hierarchical
+from gausim.training.module import GausSimModule
+from gausim.training.supervision.points import attach_points
+
+METHOD = "prediction"
+LEVELS = 3
+
+
+class MotionWatch(Callback):
+    """Foresees the first training sequences of every object whose true motion is known and tells how.
+
+    It looks at frames that training does not see, as evaluation does, and nothing of it reaches training: ``gap`` is
+    the generalisation gap, the error of the unseen frames less that of the seen ones, both over the static
+    prediction's. Rows go to ``motion.csv`` of the run, means over objects to every logger.
+    """
+
+    COLUMNS = (
+        "epoch", "step", "object", "error_seen", "error_unseen", "gap", "energy_seen", "energy_unseen",
+        "velocity_cosine", "frequency_error", "damping_ratio", "phase_seen", "phase_unseen",
+        *(f"error_level_{level}" for level in range(1, LEVELS + 1)),
+    )  # fmt: skip
+
+    def __init__(self, *, every_epochs: int = 10, sequences: int = 4) -> None:
+        """Keeps the settings.
+
+        Args:
+            every_epochs: epochs between looks; the last epoch always has one. 0 is never.
+            sequences: at most so many of every object, the first ones.
+
+        Raises:
+            ConfigError: a number out of range.
+        """
+        if every_epochs < 0 or sequences < 1:
+            raise ConfigError(
+                f"callbacks.motion: expected every_epochs >= 0 and sequences >= 1, got {every_epochs} and {sequences}."
+            )
+        self._every, self._sequences = every_epochs, sequences
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Drops rows of epochs that a resumed run does again."""
+        if trainer.is_global_zero:
+            self._table(trainer).resume_at(trainer.current_epoch)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Looks when the epoch has come."""
+        if not (trainer.is_global_zero and has_come(trainer, self._every)):
+            return
+        assert isinstance(pl_module, GausSimModule)
+        with undisturbed(), torch.no_grad():
+            rows = self._look(trainer, pl_module)
+        for name, row in rows.items():
+            place = {"epoch": trainer.current_epoch + 1, "step": trainer.global_step, "object": name}
+            self._table(trainer).append({**place, **row})
+        means = {key: _mean([row[key] for row in rows.values() if key in row]) for key in self.COLUMNS[3:]}
+        known = {f"motion/{key}": value for key, value in means.items() if np.isfinite(value)}
+        for logger in trainer.loggers if known else ():
+            logger.log_metrics(known, step=trainer.global_step)
+
+    def _table(self, trainer: Trainer) -> EpochTable:
+        return EpochTable(Path(trainer.default_root_dir) / MOTION, self.COLUMNS)
+
+    def _look(self, trainer: Trainer, module: GausSimModule) -> dict[str, dict[str, float]]:
+        rows, first = {}, 0
+        with evaluating(module):
+            for scene_id, item in enumerate(training_data(trainer).objects):
+                found = list(self._foreseen(module, item, scene_id, first))
+                first += len(item.sequences)
+                if found:
+                    rows[item.name] = figures(found, item, _units(module, scene_id))
+        return rows
+
+    def _foreseen(
+        self, module: GausSimModule, item: ObjectData, scene_id: int, first: int
+    ) -> Iterator[tuple[GroundTruth, Tensor, Tensor]]:
+        """True motion of each sequence, the predicted one and the kernels that the points are attached to."""
+        points = item.rest_points
+        if points is None:
+            return
+        scene = module.simulator.scenes[scene_id]
+        attached = attach_points(scene, points)
+        for number, record in enumerate(item.sequences[: self._sequences]):
+            truth = item.ground_truth(record)
+            if truth is None:
+                continue
+            try:
+                made = module.foresee(first + number, len(truth.positions) - 1)
+            except DivergenceError as error:
+                module.print(f"motion of {item.name}/{record.name} is not told: {error}")
+                continue
+            yield truth, made.carry(truth.rest, attached, scene.means).to(truth.positions), attached
+
+
+def figures(
+    found: Sequence[tuple[GroundTruth, Tensor, Tensor]], item: ObjectData, units: Sequence[Tensor]
+) -> dict[str, float]:
+    """The figures of one object; what cannot be told is left out."""
+    unseen, diagnosis = item.train_frames.stop, Diagnosis(item.fps)
+    sums: dict[str, list[np.ndarray]] = {}
+    for truth, points, attached in found:
+        diagnosis.add(truth.positions, truth.rest, {METHOD: points}, {METHOD: [unit[attached] for unit in units]})
+        static = truth.rest.expand_as(truth.positions)
+        pairs = {
+            "error": [(x - truth.positions).norm(dim=-1).mean(-1) for x in (points, static)],
+            "energy": [motion_energy(points), motion_energy(truth.positions)],
+        }
+        for name, pair in pairs.items():
+            sums.setdefault(name, []).append(torch.stack(pair).cpu().double().numpy())
+    row = {"error_seen": _ratio(sums["error"], slice(1, unseen))}
+    row["error_unseen"] = _ratio(sums["error"], slice(unseen, None))
+    row["gap"] = row["error_unseen"] - row["error_seen"]
+    row["energy_seen"] = _ratio(sums["energy"], slice(0, unseen - 1))
+    row["energy_unseen"] = _ratio(sums["energy"], slice(unseen - 1, None))
+    read = read_diagnosis({"diagnosis": diagnosis.summary(), "splits": {"seen": [0, unseen]}})
+    if read is not None:
+        row |= {f"error_level_{i}": float(v) for i, v in enumerate(read.rows[METHOD].levels[:LEVELS], 1)}
+        row["velocity_cosine"] = read.rows[METHOD].cosine
+        row["frequency_error"] = read.frequency_error(METHOD)
+        row["damping_ratio"] = read.damping_ratio(METHOD)
+        row["phase_seen"], row["phase_unseen"] = (read.phase(METHOD, seen=seen) for seen in (True, False))
+    return {name: value for name, value in row.items() if np.isfinite(value)}
+
+
+def _units(module: GausSimModule, scene_id: int) -> Sequence[Tensor]:
+    model = module.simulator
+    return model.units_of_kernels(scene_id) if isinstance(model, Hierarchical) else ()
+
+
+def _ratio(pairs: Sequence[np.ndarray], span: slice) -> float:
+    own, reference = (sum(float(pair[i, span].sum()) for pair in pairs) for i in (0, 1))
+    return own / reference if reference > 0 else float("nan")
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else float("nan")

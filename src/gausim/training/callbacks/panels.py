@@ -1,0 +1,130 @@
+"""Pictures of training: what the network predicts of the frames it sees, every few epochs, for every dashboard."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import Tensor
+
+from gausim.core import ConfigError, DivergenceError
+from gausim.data.dataset import SequenceSample
+from gausim.data.images import composite
+from gausim.metrics.l2 import L2
+from gausim.render.draw import to_bytes
+from gausim.runs.randomness import undisturbed
+from gausim.training.callbacks.cadence import has_come, training_data
+from gausim.training.loggers.media import Clip, MediaLog, forget_media, safe_name, write_media
+from gausim.training.module import GausSimModule
+
+COLUMNS = ["object", "sequence", "camera", "T", "l2 x1000", "static x1000", "l2 / static", "motion energy", "seconds"]
+PREDICTION, STATIC = "prediction", "static"
+
+
+class Panels(Callback):
+    """Predicts the first sequence of every object in its first training camera and shows it.
+
+    Frames 0..``t_max`` of the curriculum are predicted, whatever T is at the time; frames that training may not see are
+    not touched. Videos, pictures and tables go to ``panels/`` of the run and to every logger that shows media, errors
+    as numbers to every logger. Training is the same with and without.
+    """
+
+    def __init__(self, *, every_epochs: int = 5, objects: int = 4) -> None:
+        """Keeps the settings.
+
+        Args:
+            every_epochs: epochs between panels; the last epoch always has some. 0 is never.
+            objects: at most so many objects, the first ones.
+
+        Raises:
+            ConfigError: a number out of range.
+        """
+        if every_epochs < 0 or objects < 1:
+            raise ConfigError(
+                f"callbacks.panels: expected every_epochs >= 0 and objects >= 1, got {every_epochs} and {objects}."
+            )
+        self._every, self._objects = every_epochs, objects
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Drops what is shown of steps that a resumed run does again."""
+        if trainer.is_global_zero:
+            forget_media(Path(trainer.default_root_dir), trainer.global_step)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Shows what is predicted when the epoch has come."""
+        if trainer.is_global_zero and has_come(trainer, self._every):
+            assert isinstance(pl_module, GausSimModule)
+            with undisturbed():
+                self._show(trainer, pl_module)
+
+    def _show(self, trainer: Trainer, module: GausSimModule) -> None:
+        clips, rows = [], []
+        numbers: dict[str, float] = {}
+        for sample in self._samples(trainer, module):
+            began = time.monotonic()
+            try:
+                clip, figures = _clip(module, sample)
+            except DivergenceError as error:
+                module.print(f"no panel of {sample.object_name} at step {trainer.global_step}: {error}")
+                continue
+            steps = int(module.last_stats.get("steps", 0))
+            names = [sample.object_name, sample.sequence_name, sample.cameras.names[0], str(steps)]
+            shown = [f"{value:.4g}" for value in (*figures.values(), time.monotonic() - began)]
+            clips.append(clip)
+            rows.append([*names, *shown])
+            prefix = f"objects/{sample.object_name}"
+            numbers |= {f"{prefix}/l2": figures["l2"] / 1000, f"{prefix}/ratio_static": figures["ratio"]}
+        if not clips:
+            return
+        media = write_media(Path(trainer.default_root_dir), trainer.global_step, clips, COLUMNS, rows)
+        for logger in trainer.loggers:
+            logger.log_metrics(numbers, step=trainer.global_step)
+            if isinstance(logger, MediaLog):
+                logger.log_media(media)
+
+    def _samples(self, trainer: Trainer, module: GausSimModule) -> list[SequenceSample]:
+        data = training_data(trainer)
+        first: dict[int, int] = {}
+        for sequence, (scene_id, _) in enumerate(data.index.entries):
+            first.setdefault(scene_id, sequence)
+        frames = range(data.curriculum.t_max + 1)
+        chosen = list(first.items())[: self._objects]
+        return [data.index.sample(s, frames, data.objects[i].train_views[:1]).to(module.device) for i, s in chosen]
+
+
+def _clip(module: GausSimModule, sample: SequenceSample) -> tuple[Clip, dict[str, float]]:
+    """What is shown of a sequence, and its figures: l2 and static's [1e-3], their ratio, motion energy."""
+    prediction = module.predict_images(sample)[:, 0].clamp(0, 1)
+    if not bool(torch.isfinite(prediction).all()):
+        raise DivergenceError("the predicted images are not finite")
+    truth, alpha = (x[:, 0] for x in composite(sample.frames))
+    truth = truth.to(prediction)
+    mask, scale = alpha > 0, L2.scale
+    metric = L2()
+    by_frame = {
+        PREDICTION: metric.per_image(prediction, truth, mask) * scale,
+        STATIC: metric.per_image(prediction[:1].expand_as(truth), truth, mask) * scale,
+    }
+    errors = {name: values.double().cpu().numpy() for name, values in by_frame.items()}
+    own, still = (float(np.mean(errors[name][1:])) for name in (PREDICTION, STATIC))
+    moved = _energy(truth)
+    figures = {
+        "l2": own,
+        "static": still,
+        "ratio": own / still if still > 0 else math.nan,
+        "energy": _energy(prediction) / moved if moved > 0 else math.nan,
+    }
+    name = safe_name(sample.object_name, sample.sequence_name)
+    title = f"{sample.object_name}/{sample.sequence_name} {sample.cameras.names[0]}"
+    drawn = [to_bytes(images).cpu().numpy() for images in (truth, prediction)]
+    return Clip(name, title, sample.fps, drawn[0], drawn[1], errors), figures
+
+
+def _energy(images: Float[Tensor, "F H W 3"]) -> float:
+    """Squared change from frame to frame, summed."""
+    return float(images.diff(dim=0).square().sum())

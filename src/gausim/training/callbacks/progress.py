@@ -1,0 +1,131 @@
+"""One line and one row per epoch, and the progress bar."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import RichProgressBar
+
+from gausim.data.datamodule import ReadyDataModule
+from gausim.runs.names import EPOCHS
+from gausim.training.callbacks.convergence import Convergence
+from gausim.training.callbacks.epoch_table import EpochTable, short
+from gausim.training.callbacks.time_budget import TimeBudget
+from gausim.training.module import GausSimModule
+
+# Epochs that the time left is told from.
+RECENT = 8
+
+
+class EpochSummary(Callback):
+    """One line per epoch on the console and one row per epoch in ``epochs.csv`` of the run."""
+
+    COLUMNS = (
+        "epoch", "step", "steps", "loss_image", "ratio_static", "excess_static", "held_back", "ratio_first",
+        "motion_energy", "loss_momentum", "momentum_share", "loss_static", "energy_growth", "grad_network",
+        "grad_scene", "grad_template", "grad_initial", "exploded",
+        "lr", "seconds",
+    )  # fmt: skip
+
+    def __init__(self, *, console: bool = True) -> None:
+        """``console`` prints the line; the row is written in any case."""
+        self._console, self._began, self._elapsed = console, time.monotonic(), 0.0
+        self._paces: deque[tuple[int, float]] = deque(maxlen=RECENT)
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Starts the clock."""
+        self._began = time.monotonic()
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Drops rows of epochs that a resumed run does again, and goes on with the clock of a cut epoch."""
+        self._began = time.monotonic() - self._elapsed
+        if trainer.is_global_zero:
+            self._table(trainer).resume_at(trainer.current_epoch)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Writes the row and prints the line.
+
+        Callbacks come before the module's own end of epoch, so the means are asked for here.
+        """
+        assert isinstance(pl_module, GausSimModule)
+        means: dict[str, Any] = pl_module.epoch_means()
+        means.update(epoch=trainer.current_epoch + 1, step=trainer.global_step, seconds=time.monotonic() - self._began)
+        if not trainer.is_global_zero:
+            return
+        self._table(trainer).append(means)
+        if self._console:
+            pl_module.print(self._line(trainer, means))
+            sys.stdout.flush()  # where output is piped, the epochs of a long run should show as they end
+
+    def state_dict(self) -> dict[str, float]:
+        """Seconds that the epoch under way has taken."""
+        return {"elapsed": time.monotonic() - self._began}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Takes them."""
+        self._elapsed = float(state_dict["elapsed"])
+
+    def _line(self, trainer: Trainer, means: dict[str, Any]) -> str:
+        parts = [f"epoch {means['epoch']}/{trainer.max_epochs}", f"T {means.get('steps', math.nan):.0f}"]
+        labels = {
+            "loss_image": "loss {:.4g}", "excess_static": "{:.3f} of static", "ratio_first": "first frame {:.3f}",
+            "held_back": "held back {:.3f}", "motion_energy": "motion {:.2f}", "grad_network": "|g| {:.3g}",
+            "momentum_share": "momentum {:.1%}",
+        }  # fmt: skip
+        parts += [text.format(means[name]) for name, text in labels.items() if name in means]
+        if means.get("exploded", 0) > 0:
+            parts.append(f"exploded {means['exploded']:.0%}")
+        parts.append(f"{means['seconds']:.1f} s")
+        fitted = hasattr(trainer.lightning_module, "plan")  # in stages, which have lengths of their own
+        self._paces.append((int(means.get("steps", 0)), means["seconds"]))
+        left = None if fitted else _minutes_left(trainer, self._paces)
+        judged = any(isinstance(c, Convergence) and c.is_learning for c in cast(Any, trainer).callbacks)
+        return "  ".join(
+            [*parts, *([] if left is None else [f"{'at most' if judged else 'about'} {left:.0f} min left"])]
+        )
+
+    def _table(self, trainer: Trainer) -> EpochTable:
+        return EpochTable(Path(trainer.default_root_dir) / EPOCHS, self.COLUMNS)
+
+
+def _minutes_left(trainer: Trainer, paces: Sequence[tuple[int, float]]) -> float | None:
+    """What the epochs to come will take, by a line through T and seconds of those that are over [minutes].
+
+    None where there are none, where nothing says how many frames they predict, or where all that are over had
+    one T, which tells nothing about another.
+    """
+    data: Any = getattr(trainer, "datamodule", None)
+    done, epochs = trainer.current_epoch + 1, trainer.max_epochs or 0
+    if not isinstance(data, ReadyDataModule) or done >= epochs:
+        return None
+    coming = np.array([data.steps(epoch) for epoch in range(done, epochs)])
+    steps, seconds = np.array(paces).T
+    alike = np.ptp(steps) == 0
+    if alike and (coming != steps[0]).any():
+        return None
+    slope = 0.0 if alike else max(0.0, float(np.polyfit(steps, seconds, 1)[0]))
+    left = float(np.maximum(seconds.mean() + slope * (coming - steps.mean()), 0.0).sum()) / 60.0
+    budgets = [c.minutes_left for c in cast(Any, trainer).callbacks if isinstance(c, TimeBudget)]
+    return float(min([left, *budgets]))
+
+
+class Progress(RichProgressBar):
+    """Lightning's rich progress bar with our numbers."""
+
+    def __init__(self, *, refresh_rate: int = 1, leave: bool = False) -> None:
+        """``refresh_rate`` in batches; ``leave`` keeps the bar of every epoch."""
+        super().__init__(refresh_rate=refresh_rate, leave=leave)
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
+        """T, the loss against the static prediction's, and the motion energy."""
+        stats = getattr(pl_module, "last_stats", {})
+        names = {"steps": "T", "excess_static": "of static", "motion_energy": "motion"}
+        return {label: short(stats[name]) for name, label in names.items() if name in stats}

@@ -1,0 +1,122 @@
+"""Checkpoints of a run, and what Lightning leaves out of them."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, cast
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.callbacks import Checkpoint
+
+from gausim.core import ConfigError
+from gausim.runs.checkpoint import BEFORE_THE_END, LAST_CHECKPOINT, digest
+from gausim.runs.randomness import random_state, restore_random_state
+from gausim.training.callbacks.cadence import has_come
+from gausim.training.callbacks.convergence import Convergence
+from gausim.training.loggers.files import Resumable
+from gausim.training.ranks.ranks import Ranks
+
+
+class RunCheckpoint(Checkpoint):
+    """Saves ``last.ckpt`` every so often, within epochs too, and numbered snapshots where asked for.
+
+    Where its allowance and not convergence begins the end of a run, ``before_the_end.ckpt`` is what more time goes on
+    from.
+    """
+
+    def __init__(
+        self, *, every_epochs: int = 1, every_minutes: float = 1.0, every_steps: int = 0, snapshot_every: int = 0
+    ) -> None:
+        """Keeps the settings; none of them changes what is learned.
+
+        Args:
+            every_epochs: epochs between saves of ``last.ckpt``; the last epoch is always saved.
+            every_minutes: wall-clock minutes after which it is saved within an epoch; 0 is never.
+            every_steps: optimiser steps after which it is saved within an epoch; 0 is never.
+            snapshot_every: epochs between ``epoch_NNNN.ckpt`` files that stay; 0 is never.
+
+        Raises:
+            ConfigError: a number out of range.
+        """
+        if every_epochs < 1 or min(every_minutes, every_steps, snapshot_every) < 0:
+            raise ConfigError(
+                "callbacks.checkpoint: expected every_epochs >= 1 and every_minutes, every_steps, snapshot_every >= 0, "
+                f"got {every_epochs}, {every_minutes}, {every_steps} and {snapshot_every}."
+            )
+        self._every, self._snapshot_every = every_epochs, snapshot_every
+        self._minutes, self._steps = every_minutes, every_steps
+        self._saved_at, self._saved_step = time.monotonic(), 0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Counts from here."""
+        self._saved_at, self._saved_step = time.monotonic(), trainer.global_step
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Saves within an epoch; where the epoch is about to end, its end saves."""
+        if not (trainer.is_last_batch or trainer.should_stop) and self._due(trainer):
+            self._save(trainer)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Saves when the epoch has come, the optimiser included (Lightning calls this last)."""
+        if has_come(trainer, self._every) or self._due(trainer):
+            self._save(trainer)
+        epoch = trainer.current_epoch + 1
+        if any(isinstance(c, Convergence) and c.began_to_end(trainer) for c in cast(Any, trainer).callbacks):
+            trainer.save_checkpoint(Path(trainer.default_root_dir) / BEFORE_THE_END, weights_only=False)
+        if self._snapshot_every and epoch % self._snapshot_every == 0:
+            snapshots = Path(trainer.default_root_dir) / "snapshots"
+            trainer.save_checkpoint(snapshots / f"epoch_{epoch:04d}.ckpt", weights_only=False)
+
+    def _due(self, trainer: Trainer) -> bool:
+        if self._steps and trainer.global_step - self._saved_step >= self._steps:
+            return True
+        # All ranks save together, so one clock decides.
+        late = bool(self._minutes) and time.monotonic() - self._saved_at >= 60.0 * self._minutes
+        return bool(trainer.strategy.broadcast(late))
+
+    def _save(self, trainer: Trainer) -> None:
+        for logger in trainer.loggers:
+            logger.save()  # rows up to this step must not be lost: a resumed run does not log them again
+        trainer.save_checkpoint(Path(trainer.default_root_dir) / LAST_CHECKPOINT, weights_only=False)
+        self._saved_at, self._saved_step = time.monotonic(), trainer.global_step
+
+
+class ExactResume(Callback):
+    """Restores what Lightning does not: random generators, loggers' rows, and that a run was already over."""
+
+    def __init__(self) -> None:
+        """Nothing to set."""
+        self._random: dict[str, Any] | None = None
+        self._ranks = Ranks()
+
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Adds the state of each rank's global random generators and whether training ends with this epoch.
+
+        Raises:
+            RunError: the ranks' weights are no longer the same.
+        """
+        epochs: Any = trainer.fit_loop.epoch_progress.current
+        at_epoch_end = epochs.processed > epochs.completed
+        if self._ranks.size > 1:
+            self._ranks.check_alike(digest(checkpoint["state_dict"]), f"weights at step {trainer.global_step}")
+        states = self._ranks.gather(random_state())
+        checkpoint["resume"] = {"random": states, "over": at_epoch_end and trainer.should_stop}
+
+    def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Takes them; a run that was stopped for good is not trained further."""
+        own = checkpoint["resume"]
+        if self._ranks.rank < len(own["random"]):  # one that was not there draws from its seed
+            self._random = own["random"][self._ranks.rank]
+        if own["over"]:
+            trainer.should_stop = True
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Restores the generators and drops what the loggers hold of steps that will be done again."""
+        if self._random is not None:
+            restore_random_state(self._random)
+        for logger in trainer.loggers:
+            if isinstance(logger, Resumable):
+                logger.resume_at(trainer.global_step)

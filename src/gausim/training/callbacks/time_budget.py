@@ -1,0 +1,75 @@
+"""The time that a run may take."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from lightning.pytorch import Callback, LightningModule, Trainer
+
+from gausim.core import ConfigError
+from gausim.training.module import GausSimModule
+
+
+class TimeBudget(Callback):
+    """Ends training after so many minutes, resumed runs included; the epoch under way is cut and saved.
+
+    A clock never runs twice alike: with ``drives_schedule`` the learning rates, and without it the number of steps,
+    differ between any two runs. A resumed run is exact in everything else.
+    """
+
+    def __init__(self, *, minutes: float, clock: str = "wall", drives_schedule: bool = True) -> None:
+        """Keeps the settings.
+
+        Args:
+            minutes: the budget.
+            clock: ``wall``, or ``cpu`` for processor time of this process.
+            drives_schedule: the learning-rate schedule also advances with the budget, so that it comes to its end.
+
+        Raises:
+            ConfigError: an unknown clock or a budget that is not positive.
+        """
+        if clock not in ("wall", "cpu") or not minutes > 0:
+            raise ConfigError(f"trainer: expected max_minutes > 0 and clock wall or cpu, got {minutes} and {clock!r}.")
+        self._budget, self._drives = 60.0 * minutes, drives_schedule
+        self._clock = time.monotonic if clock == "wall" else time.process_time
+        self._used, self._mark = 0.0, 0.0
+
+    @property
+    def spent(self) -> bool:
+        """Whether the budget is used up."""
+        return self._used >= self._budget
+
+    @property
+    def minutes_left(self) -> float:
+        """What is left of the budget, on its own clock [minutes]."""
+        return max(0.0, self._budget - self._used) / 60.0
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Starts the clock; a resumed run's first step has the learning rate of the time used so far."""
+        self._mark = self._clock()
+        self._drive(pl_module)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Stops the training once the budget is used up."""
+        now = self._clock()
+        # One clock for all ranks: their learning rates and their last step must agree.
+        self._used = float(trainer.strategy.broadcast(self._used + now - self._mark))
+        self._mark = now
+        self._drive(pl_module)
+        if self.spent:
+            trainer.should_stop = True
+
+    def _drive(self, pl_module: LightningModule) -> None:
+        if self._drives and isinstance(pl_module, GausSimModule):
+            pl_module.time_fraction = min(1.0, self._used / self._budget)
+
+    def state_dict(self) -> dict[str, float]:
+        """The time used."""
+        return {"used": self._used}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Continues to count."""
+        self._used = float(state_dict["used"])

@@ -1,0 +1,164 @@
+"""Loggers that go on where a resumed run goes on: no row twice, none lost up to the checkpoint."""
+
+from __future__ import annotations
+
+import csv
+import io
+import tempfile
+from argparse import Namespace
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import yaml
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
+from PIL import Image
+
+from gausim.io.files import write_durably
+from gausim.io.video import read_video, video_rate, write_gif
+from gausim.training.loggers.media import Media
+
+
+@runtime_checkable
+class Resumable(Protocol):
+    """A logger that can forget what was logged after a step."""
+
+    def resume_at(self, step: int) -> None:
+        """Drops what was logged for later optimiser steps than ``step``; 0 is a new run."""
+        ...
+
+
+class CsvLog(Logger):
+    """One table ``metrics.csv``; a row is on the disk as soon as it is logged."""
+
+    def __init__(self, save_dir: str | Path, *, name: str = "csv") -> None:
+        """The table goes to ``save_dir/name``."""
+        super().__init__()
+        self._name = name
+        self.path = Path(save_dir) / name / "metrics.csv"
+        self._columns: list[str] = []
+
+    @property
+    def name(self) -> str:
+        """The folder's name."""
+        return self._name
+
+    @property
+    def version(self) -> str:
+        """None: a run has one table."""
+        return ""
+
+    @rank_zero_only
+    def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kwargs: Any) -> None:
+        """Nothing: the run directory holds its configuration."""
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Writes one row; columns not seen before are added to the table."""
+        row: dict[str, Any] = {"step": step, **{name: float(value) for name, value in metrics.items()}}
+        if set(row) <= set(self._columns) and self.path.is_file():
+            with self.path.open("a", newline="") as file:
+                csv.DictWriter(file, self._columns).writerow(row)
+        else:
+            self._rewrite([*self._rows(), row])
+
+    @rank_zero_only
+    def resume_at(self, step: int) -> None:
+        """Drops the rows of later steps, and a row that was cut while it was written."""
+        if self.path.is_file():
+            whole = [row for row in self._rows() if None not in row and None not in row.values()]
+            self._rewrite([row for row in whole if int(row["step"] or 0) <= step])
+
+    def rows(self) -> list[tuple[int, dict[str, float]]]:
+        """Steps and numbers of the whole table, in the order in which they were logged."""
+        found = ((row.pop("step"), row) for row in self._rows())
+        return [(int(step or 0), {k: float(v) for k, v in row.items() if v}) for step, row in found]
+
+    def _rows(self) -> list[dict[str, Any]]:
+        if not self.path.is_file():
+            return []
+        with self.path.open(newline="") as file:
+            return list(csv.DictReader(file))
+
+    def _rewrite(self, rows: list[dict[str, Any]]) -> None:
+        self._columns = list(dict.fromkeys(["step", *(name for row in rows for name in row)]))
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, self._columns)
+        writer.writeheader()
+        writer.writerows(rows)
+        write_durably(self.path, text.getvalue().encode())
+
+
+class TensorBoardLog(TensorBoardLogger):
+    """TensorBoard's events in one folder; those of steps that a resumed run does again are marked as void.
+
+    Videos are animated GIFs under IMAGES, tables and the configuration are under TEXT.
+    """
+
+    def __init__(self, save_dir: str | Path, *, name: str = "tensorboard") -> None:
+        """The events go to ``save_dir/name``."""
+        super().__init__(save_dir, name=name, version="")
+
+    @rank_zero_only
+    def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
+        """Shows the configuration."""
+        text = yaml.safe_dump(dict(params), sort_keys=False)
+        self.experiment.add_text("config", "    " + text.replace("\n", "\n    "))  # indented text is code in Markdown
+
+    @rank_zero_only
+    def resume_at(self, step: int) -> None:
+        """Tells TensorBoard to forget what earlier files hold of later steps."""
+        from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+
+        restart = Event(step=step + 1, session_log=SessionLog(status=SessionLog.START))
+        self.experiment.file_writer.add_event(restart)
+
+    @rank_zero_only
+    def log_media(self, media: Media) -> None:
+        """Shows the media of one step."""
+        for name in media.names:
+            self._image(f"{name}/video", _gif(media.video(name)), media.step)
+            for kind, path in media.pictures(name).items():
+                self._image(f"{name}/{kind}", path.read_bytes(), media.step)
+            self._image(f"{name}/errors", error_plot(media, name), media.step)
+        columns, rows = media.objects()
+        lines = ["| " + " | ".join(cells) + " |" for cells in (columns, ["---"] * len(columns), *rows)]
+        self.experiment.add_text("objects", "\n".join(lines), media.step)
+
+    def _image(self, tag: str, encoded: bytes, step: int) -> None:
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        height, width = _size(encoded)
+        image = Summary.Image(encoded_image_string=encoded, height=height, width=width, colorspace=3)
+        self.experiment.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=image)]), step)
+
+
+def error_plot(media: Media, name: str) -> bytes:
+    """The errors of a sequence by frame, as PNG."""
+    from matplotlib.figure import Figure
+
+    columns, rows = media.errors(name)
+    figure = Figure(figsize=(5.0, 2.8), dpi=100, layout="constrained")
+    axes = figure.subplots()
+    for column, (label, style) in enumerate(zip(columns[1:], ("-", "--"), strict=False), 1):
+        axes.plot([int(row[0]) for row in rows], [float(row[column] or "nan") for row in rows], style, label=label)
+    axes.set(xlabel="frame", ylabel="l2 x 1000", ylim=(0, None))
+    axes.set_title(f"{name}, step {media.step}", fontsize=9, parse_math=False)
+    axes.legend(fontsize=8)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png")
+    return stream.getvalue()
+
+
+def _gif(video: Path) -> bytes:
+    """TensorBoard plays no other videos."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "video.gif"
+        write_gif(path, read_video(video), video_rate(video))
+        return path.read_bytes()
+
+
+def _size(encoded: bytes) -> tuple[int, int]:
+    with Image.open(io.BytesIO(encoded)) as image:
+        return image.height, image.width

@@ -1,0 +1,456 @@
+"""The LightningModule that learns dynamics from images (METHOD section 4)."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, cast
+
+import torch
+from jaxtyping import Float
+from lightning.pytorch import LightningModule
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from gausim.core import ConfigError, DivergenceError, Renderer, SimState, Trajectory
+from gausim.data.dataset import SampleFacts, SequenceSample
+from gausim.data.sampler import hash_seed
+from gausim.losses.objective import Objective
+from gausim.losses.static import static_loss
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.nn.mode import evaluating
+from gausim.render.draw import draw
+from gausim.runs.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes, fingerprints
+from gausim.runs.cost import TrainingCost
+from gausim.training.baseline_metrics import Yardsticks
+from gausim.training.contracts import InitialVelocities, Mixing, SceneBatch, Simulator
+from gausim.training.exchange import Exchange
+from gausim.training.optimizers import OptimizerSettings
+from gausim.training.passivity import FreeMotion
+from gausim.training.ranks.ranks import Ranks, interleave
+from gausim.training.rollout import Explosions, States, UnitNoise, after, describe, windows
+from gausim.training.statistics import Found, Tally
+from gausim.training.supervision.images import ImageSupervision, Supervision
+from gausim.training.supervision.motion_tracks import TrackSupervision
+
+# Below this share of the true motion energy a prediction counts as collapsed to the rest state.
+COLLAPSED = 0.05
+# Optimiser steps before a collapse is worth a warning: initial states begin at rest, so every run begins static.
+COLLAPSE_AFTER = 100
+# Batches in a row whose rollout explodes before anything can be learned from it; then training has diverged.
+BARREN_BATCHES = 20
+
+
+class GausSimModule(LightningModule):
+    """Trains a simulator: rollout as one graph, drawing, losses, one optimiser step per batch.
+
+    Backward runs after every stretch through which gradients flow, so that memory does not grow with T. Under several
+    ranks each computes its share of the sequences; the sums of gradients, statistics and numbers over the ranks are
+    those of one rank that computes them all.
+    """
+
+    def __init__(
+        self,
+        *,
+        model: nn.Module,
+        initial_states: nn.Module | None,
+        scene_of_sequence: Sequence[int],
+        renderer: Renderer,
+        objective: Objective | None = None,
+        optimizer: OptimizerSettings | None = None,
+        supervision: Supervision | None = None,
+        seed: int = 0,
+        share_every: int = 50,
+    ) -> None:
+        """Takes everything it works with; it builds nothing.
+
+        Args:
+            model: the simulator (see :class:`gausim.training.contracts.Simulator`).
+            initial_states: one parameter per training sequence, in their order; None where the model has its own.
+            scene_of_sequence: the scene of each training sequence.
+            renderer: draws the predictions, for training on images and for the pictures.
+            objective: what is minimised; METHOD's when None.
+            optimizer: who learns how fast; METHOD's when None.
+            supervision: what predictions are compared with; the images when None.
+            seed: of the static loss's draws and the input noise, together with the step's number.
+            share_every: optimiser steps between measurements of the momentum loss's share of the gradient; 0 is never.
+
+        Raises:
+            ConfigError: the initial states do not fit the sequences.
+        """
+        super().__init__()
+        self.automatic_optimization = False
+        self.model, self.initial_states = model, initial_states
+        self.objective = objective if objective is not None else Objective()
+        self.settings = optimizer if optimizer is not None else OptimizerSettings()
+        self.scene_of_sequence = tuple(scene_of_sequence)
+        self.seed, self.share_every = seed, share_every
+        count = len(self.scene_of_sequence)
+        if initial_states is not None and (own := len(list(initial_states.parameters()))) != count:
+            raise ConfigError(f"initial states: {own} parameters for {count} sequences; expected one each.")
+        self.free_motion = FreeMotion(model, self.objective)
+        self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
+        self.images = ImageSupervision(self.simulator.scenes, renderer, self.objective.image)
+        self.supervision = self.images if supervision is None else supervision
+        self.yardsticks = Yardsticks(self.supervision)
+        self.average = WeightAverage(self.settings.ema_decay)
+        self.summary: dict[str, float] = {}
+        self.last_stats: dict[str, float] = {}
+        self.time_fraction, self.progress_limit = 0.0, 1.0
+        self._sums: dict[str, list[float]] = {}
+        self._warned, self._barren = False, 0
+        self.ranks, self._shown, self.cost = Ranks(), 0, TrainingCost()
+        self._exchange = Exchange(self.ranks, model)
+
+    @property
+    def method_name(self) -> str:
+        """What the predictions are called in tables."""
+        return "gausim"
+
+    @property
+    def footnotes(self) -> dict[str, Any]:
+        """Whether the method extrapolates, what readers of its figures must know, and what training cost."""
+        return {"extrapolates": True, "notes": self.notes(), "fit": self.cost.summary() if self.cost.seconds else None}
+
+    def notes(self) -> list[str]:
+        """What a reader of the figures must know, in sentences."""
+        return self.cost.notes()
+
+    @property
+    def renderer(self) -> Renderer:
+        """What draws the predictions."""
+        return self.images.renderer
+
+    @property
+    def simulator(self) -> Simulator:
+        """The model, as what it can do."""
+        return cast(Simulator, self.model)
+
+    def groups(self) -> dict[str, list[nn.Parameter]]:
+        """All parameters by the name that tells how fast they learn."""
+        assert self.initial_states is not None
+        return {**self.simulator.parameter_groups(), "initial": list(self.initial_states.parameters())}
+
+    def configure_optimizers(self) -> Optimizer:
+        """One optimiser over the groups of the model and the initial states."""
+        groups = self.groups()
+        grouped = {id(p) for members in groups.values() for p in members}
+        missing = [n for n, p in self.named_parameters() if p.requires_grad and id(p) not in grouped]
+        if missing:
+            raise ConfigError(f"optimizer: parameters in no group: {missing}. Add them to parameter_groups().")
+        return self.settings.build({name: [p for p in own if p.requires_grad] for name, own in groups.items()})
+
+    # ------------------------------------------------------------------------------------------------ one step
+
+    def training_step(self, samples: list[SequenceSample], batch_idx: int) -> None:
+        """Rolls the batch forward, draws it, and makes one step of the optimiser."""
+        optimizer = cast(Any, self.optimizers())
+        factor = self._set_rates(optimizer, batch_idx)
+        draws = torch.Generator().manual_seed(hash_seed(self.seed, self.global_step))
+        stats = self.optimise(samples, optimizer.optimizer, draws, optimizer.step)
+        self._record({**stats, "lr": self.settings.network_lr * factor}, self._shown)
+
+    def optimise(
+        self,
+        samples: list[SequenceSample],
+        optimizer: Optimizer,
+        draws: torch.Generator,
+        advance: Callable[[], object] | None = None,
+    ) -> dict[str, float]:
+        """One step of the optimiser with all losses; works without a trainer, too.
+
+        Args:
+            samples: this rank's share of the batch; it may be empty where there are several.
+            optimizer: from :meth:`configure_optimizers`.
+            draws: of the static loss and the input noise.
+            advance: makes the optimiser's step; its own ``step`` when None.
+
+        Returns:
+            What is logged of the step.
+
+        Raises:
+            DivergenceError: a number is not finite; no parameter has moved.
+        """
+        optimizer.zero_grad(set_to_none=True)
+        whole = interleave(self.ranks.gather([sample.facts for sample in samples]))
+        self._prime(samples)
+        tally = self._rollout(samples, whole, draws)
+        self._static(samples, whole, draws, tally)
+        self._unmix(samples, len(whole))
+        weights = [p for p in self.parameters() if p.requires_grad]
+        self._exchange.step(weights, self._network(), tally)
+        stats = self._read(samples, whole, tally.fetch(self.settings.clip(optimizer)))
+        self._exchange.absorb()
+        (advance or optimizer.step)()
+        self.average.update(self)
+        self._shown = len(whole)
+        return stats
+
+    @torch.no_grad()
+    def _prime(self, samples: list[SequenceSample]) -> None:
+        """The first statistics of a new model's inputs: those of the first batch's first frame."""
+        if self._exchange.begun:
+            return
+        self._exchange.begun = True
+        if not self._exchange.has_statistics:
+            if samples:
+                batch = self.simulator.batch([s.scene_id for s in samples])
+                self.simulator.step(batch, self.initial(samples, batch))
+            self._exchange.statistics()
+
+    def _backward(self, loss: Tensor) -> None:
+        if self._trainer is None:
+            loss.backward()
+        else:
+            self.manual_backward(loss)
+
+    def _set_rates(self, optimizer: Any, batch_idx: int) -> float:
+        batches, epochs = self.trainer.num_training_batches, self.trainer.max_epochs or 1
+        done = self.current_epoch + batch_idx / max(1.0, float(batches))
+        done = min(max(done, self.time_fraction * epochs), self.progress_limit * epochs)
+        return self.settings.set_rates(optimizer.optimizer, done, epochs)
+
+    def _rollout(self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator) -> Tally:
+        steps = whole[0].steps
+        if any(s.steps != steps for s in whole):
+            raise ConfigError(f"a batch needs sequences of equal length, got {[s.steps for s in whole]} steps.")
+        batch = self.simulator.batch([s.scene_id for s in samples]) if samples else None
+        tally, length = Tally(), self.objective.window(steps)
+        device = next(self.parameters()).device
+        explosions = Explosions(batch, self.diagonals, whole, self.objective.explosion, ranks=self.ranks,
+                                deferred=device if self._defers(device) else None)  # fmt: skip
+        free, unit = self.free_motion.chosen(draws), self._momentum_unit(samples)
+        if batch is None:  # hears where the others' rollout ends
+            any(explosions.end(None, start, tally.reach) for start in range(0, steps, length))
+            return tally
+        comparison = self.supervision.comparison(samples, batch)
+        starts: list[Callable[[SimState], SimState]] = [explosions.restart, *self._noise(batch, draws)]
+        initial, kept = self.initial(samples, batch), self.objective.checkpoint_steps
+        per = self.objective.step_weight(steps) / len(whole)
+        own, last = torch.zeros(len(samples), device=device), initial
+        for start, made in windows(self.simulator, batch, initial, steps, length, starts, checkpoint=kept):
+            states = States.of(made)
+            if explosions.end(states.positions, start, tally.reach):
+                break
+            losses, motion = comparison(explosions.spared(states), start)
+            tally.motion.append(motion)
+            momentum = explosions.counted(torch.stack([step.momentum for step in made]))
+            self._descend(explosions.counted(losses), unit * momentum, per, tally, measure=start == 0)
+            own = own + per * explosions.counted(losses).detach().sum(0)
+            last = after(made, last)
+        else:
+            if free is not None:
+                state = explosions.restart(last)
+                tally.growth = self.free_motion.descend(batch, state, own, len(whole), free, self._backward)
+        return tally
+
+    @staticmethod
+    def _defers(device: torch.device) -> bool:
+        """Whether reading a number would make the host wait; such reads are put off to the step's end."""
+        return device.type != "cpu"
+
+    def _noise(self, batch: SceneBatch, draws: torch.Generator) -> list[UnitNoise]:
+        if self.objective.input_noise == 0:
+            return []
+        deviations = [self.objective.input_noise * d for d in self.diagonals]
+        places = [self.ranks.rank + i * self.ranks.size for i in range(len(batch.members))]
+        return [UnitNoise(batch, self.simulator.scenes, deviations, draws.initial_seed(), places)]
+
+    def _descend(self, losses: Tensor, momentum: Tensor, per: float, tally: Tally, *, measure: bool) -> None:
+        """Backward of one stretch; the mean over sequences, whatever the stretch's length."""
+        images_term = self.objective.image_weight * per * losses.sum()
+        momentum_term = self.objective.momentum_weight * per * momentum.sum()
+        weighted = momentum_term.requires_grad and self.objective.momentum_weight > 0
+        network = self._network()
+        if measure and weighted and network and self.share_every and self.global_step % self.share_every == 0:
+            tally.pulls = _pull(images_term, network), _pull(momentum_term, network)
+        self._backward(images_term + momentum_term if weighted else images_term)
+        tally.images.append(losses.detach())
+        tally.momentum.append(momentum.detach())
+
+    def _network(self) -> list[nn.Parameter]:
+        return [p for p in self.simulator.parameter_groups()["network"] if p.requires_grad]
+
+    def _static(
+        self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator, tally: Tally
+    ) -> None:
+        chance = self.objective.static_chance(whole[0].steps)
+        if float(torch.rand((), generator=draws)) >= chance:
+            return
+        if self.objective.rest_image_weight and samples:
+            batch = self.simulator.batch([s.scene_id for s in samples])
+            step = self.simulator.step(batch, SimState(batch.rest, batch.rest))
+            losses, _ = self.images.at_rest(samples, batch)(States.of([step]), 0)
+            if losses.requires_grad:
+                self._backward(self.objective.rest_image_weight / len(whole) * losses.sum())
+        scene_ids = sorted({s.scene_id for s in whole})
+        own = scene_ids[self.ranks.rank :: self.ranks.size]
+        if not own:
+            return
+        batch = self.simulator.batch(own)
+        step = self.simulator.step(batch, SimState(batch.rest, batch.rest))
+        diagonal = torch.cat([batch.rest.new_full((len(batch.rest[m.kernels]), 1), self.diagonals[m.scene_id])
+                              for m in batch.members])  # fmt: skip
+        loss = static_loss(step.positions, batch.rest, diagonal) / len(scene_ids)
+        if loss.requires_grad:
+            self._backward(self.objective.static_weight * loss)
+        tally.static = loss.detach()
+
+    def _unmix(self, samples: list[SequenceSample], count: int) -> None:
+        """Backward of the template's mixing of modes, for each sequence in units of its rest state's loss."""
+        weight = self.objective.mixing_weight
+        if not weight or not isinstance(self.model, Mixing):
+            return
+        for sample in samples:
+            mixing = self.model.mixing(sample.scene_id)
+            if mixing is None or not mixing.requires_grad:
+                continue
+            self._backward(weight / count * self._rest_loss(sample) * mixing)
+
+    def _momentum_unit(self, samples: list[SequenceSample]) -> float:
+        """What the rest state scores on the frames of the batch, over all ranks: the unit of the momentum loss."""
+        if self.objective.momentum_weight == 0:
+            return 0.0
+        scores = interleave(self.ranks.gather([self._rest_loss(sample) for sample in samples]))
+        return sum(scores) / len(scores)
+
+    def _rest_loss(self, sample: SequenceSample) -> float:
+        """What the rest state scores on the frames of a sample, their mean: the unit of penalties."""
+        rest = self.simulator.scenes[sample.scene_id].means.to(next(self.parameters()).device)
+        yard = self.yardsticks.of(sample, rest)
+        losses = yard.static[: sample.steps]
+        return sum(losses) / len(losses)
+
+    # ------------------------------------------------------------------------------------------------ states, images
+
+    def initial(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> SimState:
+        """x_0 (the rest state) and the trainable x_{-1} of the sequences of a batch."""
+        states = cast(InitialVelocities, self.initial_states)
+        previous = torch.cat([states.previous(s.sequence_id) for s in samples])
+        return SimState(batch.rest, previous.to(batch.rest))
+
+    @torch.no_grad()
+    def foresee(self, sequence_id: int, steps: int) -> Trajectory:
+        """Frames 0..``steps`` of a training sequence, from its own initial state, for all kernels of its scene.
+
+        Raises:
+            DivergenceError: a position is not finite; names the frame.
+        """
+        scene_id = self.scene_of_sequence[sequence_id]
+        previous = cast(InitialVelocities, self.initial_states).previous(sequence_id)
+        initial = SimState(self.simulator.scenes[scene_id].means.to(previous), previous)
+        return SceneDynamics(cast(Any, self.model), scene_id).rollout(initial, steps)
+
+    @torch.no_grad()
+    def predict_images(self, sample: SequenceSample) -> Float[Tensor, "F V H W 3"]:
+        """Images of frames 0..T of one training sequence, in evaluation mode."""
+        batch = self.simulator.batch([sample.scene_id])
+        look, units = self.images.looks.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
+        frames = [self.images.rest_image(sample, batch.rest).rgb]
+        with evaluating(self):
+            for _, made in windows(self.simulator, batch, self.initial([sample], batch), sample.steps, 1):
+                states = States.of(made).tensors()
+                frames.append(draw(self.images.renderer, look, *states, units, sample.cameras).rgb)
+        return torch.cat(frames)
+
+    # ------------------------------------------------------------------------------------------------ numbers
+
+    def _read(self, samples: list[SequenceSample], whole: list[SampleFacts], found: Found) -> dict[str, float]:
+        """Joins the numbers of all ranks, checks them and forms what is logged."""
+        batch = self.simulator.batch([s.scene_id for s in samples]) if samples else None
+        yards = []
+        for i, sample in enumerate(samples):
+            assert batch is not None
+            yards.append(self.yardsticks.of(sample, batch.rest[batch.members[i].kernels]))
+        shares = self.ranks.gather((found, yards))
+        numbers = Found.join([share[0] for share in shares]).numbers(whole, self.objective.explosion)
+        yards = interleave([share[1] for share in shares])
+        self.yardsticks.learn([s.sequence_id for s in whole], yards)
+        self._barren = 0 if numbers.images else self._barren + 1
+        if self._barren >= BARREN_BATCHES:
+            far = f"kernels moved beyond {self.objective.explosion} diagonals in {BARREN_BATCHES} batches in a row"
+            raise DivergenceError(describe(0, whole, None, far))
+        return numbers.stats(whole[0].steps, len(whole), yards)
+
+    def _record(self, stats: dict[str, float], weight: int) -> None:
+        self.last_stats = stats
+        for name, value in stats.items():
+            entry = self._sums.setdefault(name, [0.0, 0.0])
+            entry[0] += value * weight
+            entry[1] += weight
+        every = getattr(self.trainer, "log_every_n_steps", 0)
+        if every and self.global_step % every == 0:
+            for logger in self.trainer.loggers:
+                logger.log_metrics({f"train/{k}": v for k, v in stats.items()}, step=self.global_step)
+
+    def note(self, name: str, value: float) -> None:
+        """Adds a number of the epoch under way to its means."""
+        self._sums[name] = [value, 1.0]
+
+    def epoch_means(self) -> dict[str, float]:
+        """Means over the sequences of the epoch so far."""
+        return {name: total / weight for name, (total, weight) in self._sums.items() if weight}
+
+    def on_train_start(self) -> None:
+        """Counts the cost from here."""
+        self.cost.begin()
+
+    def on_train_epoch_start(self) -> None:
+        """Starts the epoch's sums anew."""
+        self._sums.clear()
+
+    def on_train_epoch_end(self) -> None:
+        """Forms the epoch's means and warns of a collapse."""
+        self.summary = self.epoch_means()
+        row = {f"epoch/{name}": value for name, value in self.summary.items()}
+        for logger in self.trainer.loggers:  # not log_dict: Lightning would write it after the epoch's checkpoint
+            logger.log_metrics({"epoch": self.current_epoch, **row}, step=self.global_step)
+        energy = self.summary.get("motion_energy")
+        if energy is not None and energy < COLLAPSED and self.global_step >= COLLAPSE_AFTER and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"the prediction has collapsed to the rest state: it moves with {100 * energy:.1f} % of the true "
+                "motion energy. Let T grow more slowly (data.curriculum.epochs_per_increase), raise "
+                "optimizer.initial_lr or use loss.backprop_steps > 1.",
+                stacklevel=2,
+            )
+
+    # ------------------------------------------------------------------------------------------------ checkpoints
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Adds the scenes' fingerprints, the averaged weights and the epoch's numbers."""
+        own: dict[str, Any] = {"format": RESUME_FORMAT, "scenes": fingerprints(self.simulator.scenes)}
+        own["average"] = self.average.state_dict()
+        own["epoch"] = {"sums": self._sums, "summary": self.summary, "warned": self._warned, "barren": self._barren}
+        own["yardsticks"] = self.yardsticks.state_dict()
+        if isinstance(self.supervision, TrackSupervision):
+            own["tracks"] = self.supervision.state_dict()
+        checkpoint["gausim"], checkpoint["cost"] = own, self.cost.state_dict()
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuses a checkpoint of other scenes; restores what :meth:`on_save_checkpoint` added.
+
+        Raises:
+            RunError: naming both scenes.
+        """
+        check_scenes(checkpoint, self.simulator.scenes, "the checkpoint")
+        self.take_notes(checkpoint)
+        own = checkpoint["gausim"]
+        self.average.load_state_dict(own["average"])
+        epoch = own["epoch"]
+        self._sums, self.summary = epoch["sums"], epoch["summary"]
+        self._warned, self._barren = epoch["warned"], epoch["barren"]
+        self.yardsticks.load_state_dict(own["yardsticks"])
+        if isinstance(self.supervision, TrackSupervision):
+            self.supervision.load_state_dict(own.get("tracks", {}))
+
+    def take_notes(self, checkpoint: Mapping[str, Any]) -> None:
+        """What a checkpoint says of its training, for :attr:`footnotes`."""
+        if "cost" in checkpoint:  # not in those of earlier versions
+            self.cost.load_state_dict(checkpoint["cost"])
+
+
+def _pull(loss: Tensor, network: Sequence[nn.Parameter]) -> Float[Tensor, " P"]:
+    """Gradient of the network by one term."""
+    grads = torch.autograd.grad(loss, network, retain_graph=True, allow_unused=True, materialize_grads=True)
+    return torch.cat([g.reshape(-1) for g in grads])

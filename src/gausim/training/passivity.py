@@ -1,0 +1,132 @@
+"""No energy without a force: a regulariser of free motion beyond the frames that training sees."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from typing import cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gausim.core import ConfigError, SimState
+from gausim.data.sampler import hash_seed
+from gausim.losses.objective import Objective
+from gausim.training.contracts import Energetic, SceneBatch, Simulator, Step
+from gausim.training.rollout import after, windows
+
+# The motion that goes on is made smaller or larger by up to these factors, so that no size of motion is left out.
+SMALLEST, LARGEST = 0.2, 1.5
+TINY = 1e-30
+# Tells the random numbers of free motion from the others of a step.
+FREE_MOTION = 1
+
+
+def energy_growth(
+    model: Simulator, batch: SceneBatch, state: SimState, frames: int, stretch: int, draws: torch.Generator
+) -> Iterator[Float[Tensor, " S"]]:
+    """Lets the motion of a batch go on freely and says by how much its energy grows.
+
+    The energy of a vibration in the template's terms is not constant from frame to frame, so the means over stretches
+    of about a period are compared.
+
+    Args:
+        model: has an energy (:meth:`gausim.training.contracts.Energetic.energy`).
+        batch: the disjoint graph.
+        state: from which the motion goes on, at a random size.
+        frames: how far.
+        stretch: frames per stretch; gradients stop at its beginning.
+        draws: the random size.
+
+    A motion that explodes ends without a word: its gradients are not finite.
+
+    Yields:
+        max(0, ln E_k / E_{k-1}) of every member, stretch by stretch from the second on; differentiable.
+    """
+    low, high = math.log(SMALLEST), math.log(LARGEST)
+    size = math.exp(low + (high - low) * float(torch.rand((), generator=draws)))
+    state = SimState(
+        *(batch.rest + size * (x - batch.rest) for x in (state.positions.detach(), state.previous.detach()))
+    )
+    with torch.no_grad():
+        ((_, made),) = windows(model, batch, state, stretch, stretch)
+        before = _mean_energy(model, batch, state, made)
+    state = after(made, state)
+    for _, made in windows(model, batch, state, frames - stretch, stretch):
+        now = _mean_energy(model, batch, state, made)
+        if not bool(torch.isfinite(now).all()):
+            return  # exploded; nothing can be learned from it (the one number of a step that a GPU is waited for)
+        yield (now.clamp_min(TINY) / before.clamp_min(TINY)).log().clamp_min(0)
+        before, state = now.detach(), after(made, state)
+
+
+def _mean_energy(model: Simulator, batch: SceneBatch, state: SimState, made: list[Step]) -> Float[Tensor, " S"]:
+    assert isinstance(model, Energetic)
+    positions, prepared = [state.positions, *(step.positions for step in made)], model.prepare(batch)
+    energies = [model.energy(batch, SimState(b, a), prepared) for a, b in zip(positions, positions[1:], strict=False)]
+    return torch.stack(energies).mean(0)
+
+
+class FreeMotion:
+    """The term of the loss: how often, how far and with what weight motion goes on freely.
+
+    Attributes:
+        weight: of the growth of energy; 0 where the model knows none.
+    """
+
+    def __init__(self, model: nn.Module, objective: Objective) -> None:
+        """Keeps its parts.
+
+        Raises:
+            ConfigError: a weight was asked for, and the model knows no energy.
+        """
+        self.weight, self._objective = energy_weight(objective, model), objective
+        self._model = cast(Simulator, model)
+
+    def chosen(self, draws: torch.Generator) -> torch.Generator | None:
+        """Whether this batch's motion goes on to see if its energy grows: the generator of that, or None."""
+        if self.weight == 0 or float(torch.rand((), generator=draws)) >= self._objective.energy_probability:
+            return None
+        return torch.Generator().manual_seed(hash_seed(draws.initial_seed(), FREE_MOTION))
+
+    def descend(
+        self,
+        batch: SceneBatch,
+        state: SimState,
+        losses: Float[Tensor, " S"],
+        count: int,
+        draws: torch.Generator,
+        backward: Callable[[Tensor], None],
+    ) -> Float[Tensor, ""]:
+        """Backward of the growth, each member's as a share of its image loss; returns the mean growth.
+
+        Args:
+            batch: the disjoint graph.
+            state: from which the motion goes on.
+            losses: of the members.
+            count: sequences of the step, over all ranks.
+            draws: from :meth:`chosen`.
+            backward: of a loss.
+        """
+        frames, stretch = self._objective.energy_frames, self._objective.energy_stretch
+        total = losses.new_zeros(())
+        for growth in energy_growth(self._model, batch, state, frames, stretch, draws):
+            if growth.requires_grad:
+                backward(self.weight * (losses * growth).sum())
+            total += growth.detach().sum() / count
+        return total
+
+
+def energy_weight(objective: Objective, model: nn.Module) -> float:
+    """Weight of the energy's growth; one that was asked for needs a model that knows an energy."""
+    knows = isinstance(model, Energetic) and model.knows_energy
+    if objective.energy_weight is None:
+        return 1.0 if knows else 0.0
+    if objective.energy_weight and not knows:
+        name = type(getattr(model, "template", model)).__name__
+        raise ConfigError(
+            f"loss.energy_weight is {objective.energy_weight}, but {name} knows no energy. Use a template that does "
+            "(gausim.models.template.elastic.ElasticTemplate), or set it to 0 or null."
+        )
+    return float(objective.energy_weight)

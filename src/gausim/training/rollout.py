@@ -1,0 +1,355 @@
+"""Rolling a batch forward in stretches that gradients do not leave, and drawing what was predicted."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint as torch_checkpoint
+
+from gausim.core import Cameras, DivergenceError, GaussianScene, Rendered, Renderer, SimState
+from gausim.data.dataset import SampleFacts, SequenceSample
+from gausim.data.sampler import hash_seed
+from gausim.nn.normaliser import gathering_nothing, normalisers_of
+from gausim.render.draw import SceneAppearance, draw
+from gausim.training.contracts import SceneBatch, Simulator
+from gausim.training.contracts import Step as PredictedStep
+from gausim.training.ranks.ranks import Ranks, interleave
+
+
+@dataclass(frozen=True, eq=False)
+class ViewGroup:
+    """Sequences of a batch that one call of the renderer can draw together.
+
+    Attributes:
+        scene_id: their scene.
+        members: their places in the batch.
+        cameras: what looks at all of them.
+    """
+
+    scene_id: int
+    members: tuple[int, ...]
+    cameras: Cameras
+
+
+class Views:
+    """Tells which sequences can be drawn together; the cameras of each are fetched from the device once.
+
+    A sequence's cameras stand still, so its number and the names of its views say which they are.
+    """
+
+    def __init__(self) -> None:
+        """Knows no sequence yet."""
+        self._keys: dict[tuple[int, tuple[str, ...]], Hashable] = {}
+
+    def key(self, sample: SequenceSample) -> Hashable:
+        """What must agree for two sequences to be drawn in one call: scene, cameras and image size."""
+        cameras, known = sample.cameras, (sample.sequence_id, sample.cameras.names)
+        if known not in self._keys:
+            numbers = [x.detach().cpu().numpy().tobytes() for x in (cameras.viewmats, cameras.Ks)]
+            self._keys[known] = (sample.scene_id, *numbers, cameras.width, cameras.height)
+        return self._keys[known]
+
+    def groups(self, samples: Sequence[SequenceSample]) -> list[ViewGroup]:
+        """Sorts the sequences of a batch by scene and cameras."""
+        places: dict[Hashable, list[int]] = {}
+        for i, sample in enumerate(samples):
+            places.setdefault(self.key(sample), []).append(i)
+        return [ViewGroup(samples[p[0]].scene_id, tuple(p), samples[p[0]].cameras) for p in places.values()]
+
+
+@dataclass(eq=False)
+class Frame:
+    """One predicted frame without what the model adds to it (see :class:`gausim.training.contracts.Step`)."""
+
+    positions: Tensor
+    gradients: Tensor
+    rotations: Tensor
+    momentum: Tensor
+
+
+def checkpointed_step(model: Simulator, batch: SceneBatch, state: SimState) -> Frame:
+    """A step of which the graph keeps the input only: it is computed once more in the backward pass.
+
+    It shares nothing with other steps, so that computing it again takes the same way; the running statistics of the
+    inputs do not count it twice.
+    """
+    normalisers, calls = normalisers_of(cast(nn.Module, model)), itertools.count()
+
+    def run(positions: Tensor, previous: Tensor) -> tuple[Tensor, ...]:
+        with gathering_nothing(normalisers) if next(calls) else nullcontext():
+            step = model.step(batch, SimState(positions, previous))
+        return step.positions, step.gradients, step.rotations, step.momentum
+
+    # No random numbers in a step, so no generator is to be put back.
+    return Frame(*torch_checkpoint(run, state.positions, state.previous, use_reentrant=False, preserve_rng_state=False))
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """What is drawn: T predicted frames of all members of a batch.
+
+    Attributes:
+        positions: kernel means [scene units].
+        gradients: accumulated deformation gradients of the units.
+        rotations: their rotations.
+    """
+
+    positions: Float[Tensor, "T K 3"]
+    gradients: Float[Tensor, "T N 3 3"]
+    rotations: Float[Tensor, "T N 3 3"]
+
+    @staticmethod
+    def of(steps: Sequence[PredictedStep]) -> States:
+        """Stacks the steps of a stretch."""
+        return States(
+            torch.stack([step.positions for step in steps]),
+            torch.stack([step.gradients for step in steps]),
+            torch.stack([step.rotations for step in steps]),
+        )
+
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The three of them."""
+        return self.positions, self.gradients, self.rotations
+
+
+class Looks:
+    """The appearance of every scene's foreground, made once and moved to the device on first use."""
+
+    def __init__(self, scenes: Sequence[GaussianScene]) -> None:
+        """Keeps the scenes."""
+        self._scenes = list(scenes)
+        self._made: dict[int, SceneAppearance] = {}
+
+    def of(self, scene_id: int, like: Tensor) -> SceneAppearance:
+        """The appearance of a scene, on the device and in the type of ``like``."""
+        if scene_id not in self._made:
+            scene = self._scenes[scene_id]
+            self._made[scene_id] = SceneAppearance.of(scene, scene.foreground)
+        self._made[scene_id] = self._made[scene_id].to(like)
+        return self._made[scene_id]
+
+
+def windows(
+    model: Simulator,
+    batch: SceneBatch,
+    initial: SimState,
+    steps: int,
+    length: int,
+    starts: Sequence[Callable[[SimState], SimState]] = (),
+    *,
+    checkpoint: bool = False,
+) -> Iterator[tuple[int, list[PredictedStep]]]:
+    """Rolls a batch ``steps`` frames forward, ``length`` at a time.
+
+    Gradients flow within a stretch and, from the first one, into the initial state; each stretch starts from detached
+    numbers, so a caller that calls backward after every stretch needs memory for one only.
+
+    Args:
+        model: predicts.
+        batch: the disjoint graph.
+        initial: x_0 and x_{-1} of all members.
+        steps: predicted frames.
+        length: of a stretch.
+        starts: applied, in this order, to the state that each stretch starts from.
+        checkpoint: keep of each step its input only and compute it once more in the backward pass.
+
+    Yields:
+        The number of frames predicted before the stretch, and its steps.
+    """
+    state = initial
+    for start in range(0, steps, length):
+        state = state.detach() if start else state
+        for change in starts:
+            state = change(state)
+        made: list[PredictedStep] = []
+        prepared = None if checkpoint else model.prepare(batch)
+        for _ in range(min(length, steps - start)):
+            if checkpoint:
+                step: PredictedStep = checkpointed_step(model, batch, state)
+            else:
+                step = model.step(batch, state, prepared=prepared)
+            state = following(step, state)
+            made.append(step)
+        yield start, made
+
+
+def following(step: PredictedStep, state: SimState) -> SimState:
+    """The state after a step: the step's own where a model carries more than positions (``step.state``)."""
+    own: SimState | None = getattr(step, "state", None)
+    return SimState(step.positions, state.positions) if own is None else own
+
+
+def after(steps: Sequence[PredictedStep], state: SimState) -> SimState:
+    """The state behind a stretch that began at ``state``, without history."""
+    for step in steps:
+        state = following(step, state)
+    return state.detach()
+
+
+def draw_rest(renderer: Renderer, look: SceneAppearance, rest: Float[Tensor, "K 3"], cameras: Cameras) -> Rendered:
+    """The rest state as one drawn state: the static prediction."""
+    identity = torch.eye(3, dtype=rest.dtype, device=rest.device)[None, None]
+    units = torch.zeros(rest.shape[0], dtype=torch.long, device=rest.device)
+    with torch.no_grad():
+        return draw(renderer, look, rest[None], identity, identity, units, cameras)
+
+
+class UnitNoise:
+    """Moves the units of a batch at random, as the errors of a longer rollout would.
+
+    Kernels of a unit move together: independent noise would average out in every barycentre that the network sees.
+    """
+
+    def __init__(
+        self,
+        batch: SceneBatch,
+        scenes: Sequence[GaussianScene],
+        deviation: Sequence[float],
+        seed: int,
+        places: Sequence[int],
+    ) -> None:
+        """Every member draws by itself, so that its noise does not depend on which rank computes it.
+
+        Args:
+            batch: whose units are moved.
+            scenes: all of them.
+            deviation: one standard deviation per scene [scene units].
+            seed: of the optimiser step.
+            places: of the members among all sequences of the step.
+        """
+        device = batch.rest.device  # numbers drawn on the host would have to be waited for
+        self._batch = batch
+        self._generators = [torch.Generator(device).manual_seed(hash_seed(seed, place)) for place in places]
+        self._scales = []
+        for member in batch.members:
+            scene = scenes[member.scene_id]
+            moves = (scene.simulated & ~scene.pinned).to(batch.rest)
+            self._scales.append(moves[:, None] * deviation[member.scene_id])
+
+    def __call__(self, state: SimState) -> SimState:
+        """The state with its latest positions moved."""
+        parts = []
+        for member, scale, own in zip(self._batch.members, self._scales, self._generators, strict=True):
+            count = member.units.stop - member.units.start
+            noise = torch.randn(count, 3, generator=own, device=scale.device).to(scale)
+            parts.append(noise[member.unit_of_kernel] * scale)
+        return SimState(state.positions + torch.cat(parts), state.previous)
+
+
+def reach(batch: SceneBatch, diagonals: Sequence[float], positions: Float[Tensor, "T K 3"]) -> Float[Tensor, "T S"]:
+    """Largest distance of a kernel from its rest position, per step and member [diagonals of the member's scene]."""
+    with torch.no_grad():
+        distance = (positions - batch.rest).norm(dim=-1)
+        columns = [distance[:, m.kernels].amax(1) / diagonals[m.scene_id] for m in batch.members]
+        return torch.stack(columns, 1)
+
+
+def check_reach(table: Sequence[Sequence[float]], start: int, samples: Sequence[SampleFacts]) -> float:
+    """The largest entry of what :func:`reach` found in a stretch.
+
+    Raises:
+        DivergenceError: a position is not finite; names the step and the sequence.
+    """
+    for t, row in enumerate(table):
+        for value, sample in zip(row, samples, strict=True):
+            if not value < float("inf"):
+                raise DivergenceError(describe(start + t, samples, sample, f"positions are {value}"))
+    return max(map(max, table))
+
+
+class Explosions:
+    """Ends a rollout at the stretch in which a kernel moves too far from rest; that stretch is not learned from.
+
+    It ends on all ranks at once, as it would for one rank with all sequences. Where reading a number does not make the
+    host wait, the loop simply stops. Else (``deferred``) it goes on from the rest state, without an influence on
+    anything, and how long the rollout lasted is read at the end of the step.
+    """
+
+    def __init__(
+        self,
+        batch: SceneBatch | None,
+        diagonals: Sequence[float],
+        samples: Sequence[SampleFacts],
+        limit: float,
+        *,
+        deferred: torch.device | None,
+        ranks: Ranks,
+    ) -> None:
+        """Begins a rollout.
+
+        Args:
+            batch: what this rank computes; None for one without sequences.
+            diagonals: of the scenes [scene units].
+            samples: the sequences of the step, over all ranks.
+            limit: what is too far [diagonals of the member's scene].
+            deferred: where reads are put off, the device; else None.
+            ranks: which take part.
+        """
+        self._batch, self._diagonals, self._samples = batch, diagonals, samples
+        self._limit, self._ranks = limit, ranks
+        self._lasts = None if deferred is None else torch.ones((), dtype=torch.bool, device=deferred)
+
+    @property
+    def _rest(self) -> Float[Tensor, "K 3"]:
+        assert self._batch is not None
+        return self._batch.rest
+
+    def end(self, positions: Float[Tensor, "T K 3"] | None, start: int, found: list[Tensor]) -> bool:
+        """Looks at a stretch; returns whether to stop, else adds its reach to ``found``.
+
+        A rank without sequences has no positions and learns what the others found.
+
+        Raises:
+            DivergenceError: a position is not finite (not when deferred).
+        """
+        extent = None
+        if self._batch is not None and positions is not None:
+            extent = reach(self._batch, self._diagonals, positions)
+        if self._lasts is not None:
+            calm = self._lasts if extent is None else self._lasts & (extent.amax() <= self._limit)
+            self._lasts = self._ranks.everywhere(calm)
+        else:
+            tables = self._ranks.gather([] if extent is None else extent.tolist())
+            whole = [interleave(rows) for rows in zip(*filter(None, tables), strict=True)]
+            if check_reach(whole, start, self._samples) > self._limit:
+                return True
+        if extent is not None:
+            found.append(extent)
+        return False
+
+    def spared(self, states: States) -> States:
+        """The states, or those of rest once the rollout has ended: they can be drawn whatever happened."""
+        if self._lasts is None:
+            return states
+        identity = torch.eye(3, dtype=states.gradients.dtype, device=states.gradients.device)
+        rests = (self._rest, identity, identity)
+        return States(*(torch.where(self._lasts, x, r) for x, r in zip(states.tensors(), rests, strict=True)))
+
+    def counted(self, values: Tensor) -> Tensor:
+        """The values, or zeros once the rollout has ended."""
+        return values if self._lasts is None else torch.where(self._lasts, values, torch.zeros_like(values))
+
+    def restart(self, state: SimState) -> SimState:
+        """The state, or that of rest once the rollout has ended."""
+        if self._lasts is None:
+            return state
+        return SimState(*(torch.where(self._lasts, x, self._rest) for x in (state.positions, state.previous)))
+
+
+def describe(step: int | None, samples: Sequence[SampleFacts], sample: SampleFacts | None, what: str) -> str:
+    """The message of a divergence: where, in which sequence and what broke."""
+    name = f"{sample.object_name}/{sample.sequence_name}" if sample is not None else ", ".join(
+        f"{s.object_name}/{s.sequence_name}" for s in samples
+    )  # fmt: skip
+    where = f"predicted step {step + 1} of {samples[0].steps}, " if step is not None else ""
+    return (
+        f"training diverged at {where}sequence {name}: {what}. Lower optimizer.network_lr or optimizer.initial_lr, or "
+        "let the curriculum grow more slowly; the last checkpoint is from before this step."
+    )

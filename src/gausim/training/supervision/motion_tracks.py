@@ -1,0 +1,184 @@
+"""Training on motion that is found in the videos first: see, then learn.
+
+A rollout can only show what its dynamics allow, so the gradient of its images mixes two questions: where is the object
+in this frame, and which forces bring it there. Here the first is answered alone. Each frame's coordinates in the
+model's smooth motions are those whose drawing agrees best with the frame,
+
+    q_t = argmin_q L(draw(X + sum_m q_m phi_m), frame_t) + prior |q|^2,    q_0 = 0,
+
+found by Adam from an extrapolation of the two frames before; no dynamics are assumed. The motions phi have sizes at
+which each costs the same elastic energy, so what no camera tells stays as it is at rest. Rollouts are then compared
+with the tracked kernels in 3D: every part of the object counts alike, however little texture it shows, and nothing is
+drawn.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import ConfigError, SmoothMotions
+from gausim.data.dataset import SequenceSample
+from gausim.data.images import composite
+from gausim.data.records import GroundTruth
+from gausim.ops.deformation import polar_rotation
+from gausim.render.draw import SceneAppearance, draw
+from gausim.training.supervision.comparison import channels
+from gausim.training.supervision.images import Sources
+from gausim.training.supervision.points import PointSupervision
+
+# Adam's moments: a frame is found in some tens of iterations, so they forget soon.
+BETAS = (0.8, 0.95)
+
+
+class MotionTracker:
+    """Finds the coordinates of a scene's smooth motions frame by frame."""
+
+    def __init__(
+        self,
+        sources: Sources,
+        *,
+        iterations: int = 40,
+        rate: float = 1.0,
+        momentum: float = 0.7,
+        prior: float = 1.0,
+    ) -> None:
+        """Keeps its settings.
+
+        Args:
+            sources: the scenes, their smooth motions, the renderer and the image loss.
+            iterations: of Adam per frame.
+            rate: its first step size, in sizes of the motions; it falls linearly to zero.
+            momentum: the share of the last step by which a frame is thought to go on.
+            prior: weight of the squared coordinates beside the image loss.
+
+        Raises:
+            ConfigError: a setting out of range.
+        """
+        if iterations < 1 or rate <= 0:
+            raise ConfigError(
+                f"supervision: expected iterations >= 1 and rate > 0, got iterations={iterations}, rate={rate}."
+            )
+        self._sources, self._iterations, self._rate = sources, iterations, rate
+        self._momentum, self._prior = momentum, prior
+        self._motions: dict[int, SmoothMotions] = {}
+        self._looks: dict[int, SceneAppearance] = {}
+
+    def motions(self, scene_id: int) -> SmoothMotions:
+        """The smooth motions of a scene.
+
+        Raises:
+            ConfigError: the model has none.
+        """
+        if scene_id not in self._motions:
+            found = self._sources.motions(scene_id)
+            if found is None:
+                raise ConfigError(
+                    "supervision: motion is tracked in the smooth motions that a model's template carries, and this "
+                    "model has none. Use supervision=images with it."
+                )
+            self._motions[scene_id] = found
+        return self._motions[scene_id]
+
+    def extend(self, known: Float[Tensor, "F M"] | None, sample: SequenceSample) -> Float[Tensor, "T M"]:
+        """Coordinates of all frames of a sample; those of its first F frames are ``known``.
+
+        A frame's coordinates depend on the frames before it and on nothing else, so in how many calls a sequence is
+        tracked makes no difference.
+        """
+        motions = self.motions(sample.scene_id)
+        if known is None:
+            known = motions.kernels.new_zeros(1, motions.count)
+        frames = list(known.to(sample.frames.device))
+        while len(frames) <= sample.steps:
+            guess = frames[-1]
+            if len(frames) > 1:
+                guess = guess + self._momentum * (frames[-1] - frames[-2])
+            frames.append(self._find(sample, len(frames), guess))
+        return torch.stack(frames)
+
+    def _find(self, sample: SequenceSample, frame: int, guess: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
+        loss, renderer = self._sources.loss, self._sources.renderer
+        motions, look = self.motions(sample.scene_id).to(guess), self._look(sample.scene_id).to(guess)
+        rest = self._sources.scenes[sample.scene_id].means.to(guess)
+        target = channels(*composite(sample.frames[frame : frame + 1]), loss)
+        place = guess.clone().requires_grad_()
+        optimizer = torch.optim.Adam([place], lr=self._rate, betas=BETAS)
+        for iteration in range(self._iterations):
+            optimizer.param_groups[0]["lr"] = self._rate * (1 - iteration / self._iterations)
+            gradients = motions.deformations(place[None])
+            rotations = polar_rotation(gradients.detach())
+            state = rest + motions.displacements(place[None]), gradients, rotations
+            drawn = draw(renderer, look, *state, motions.unit_of_kernel, sample.cameras)
+            optimizer.zero_grad()
+            error = loss(channels(drawn.rgb, drawn.alpha, loss), target).sum()
+            (error + self._prior * place.square().sum()).backward()
+            optimizer.step()
+        return place.detach()
+
+    def _look(self, scene_id: int) -> SceneAppearance:
+        if scene_id not in self._looks:
+            scene = self._sources.scenes[scene_id]
+            self._looks[scene_id] = SceneAppearance.of(scene, scene.foreground)
+        return self._looks[scene_id]
+
+
+class TrackSupervision(PointSupervision):
+    """Compares predicted kernels with where they are tracked in the videos.
+
+    Frames are tracked when a sample first holds them, so that what the curriculum does not show is not looked at.
+    """
+
+    def __init__(
+        self,
+        sources: Sources,
+        *,
+        velocity_weight: float = 0.0,
+        energy_weight: float = 0.3,
+        **tracking: Any,
+    ) -> None:
+        """Prepares the tracker with the settings of :class:`MotionTracker`; the weights are of the loss.
+
+        Raises:
+            ConfigError: the model has no smooth motions, or a setting is out of range.
+        """
+        super().__init__(sources, velocity_weight=velocity_weight, energy_weight=energy_weight)
+        self.tracker = MotionTracker(sources, **tracking)
+        for scene_id in range(len(sources.scenes)):
+            self.tracker.motions(scene_id)
+        self._sources = sources
+        self._coordinates: dict[int, Tensor] = {}
+
+    def motion(self, sample: SequenceSample) -> GroundTruth:
+        """The kernels that can move, where they are tracked."""
+        known = self._coordinates.get(sample.sequence_id)
+        if known is None or len(known) <= sample.steps:
+            with torch.enable_grad():
+                self._coordinates[sample.sequence_id] = self.tracker.extend(known, sample)
+        scene, motions = self._sources.scenes[sample.scene_id], self.tracker.motions(sample.scene_id)
+        free = scene.simulated & ~scene.pinned
+        moved = motions.displacements(self._coordinates[sample.sequence_id].to(motions.kernels))
+        return GroundTruth(scene.means[free], scene.means[free] + moved[:, free])
+
+    def state_dict(self) -> dict[int, Tensor]:
+        """Coordinates by sequence, for a resumed run."""
+        return dict(self._coordinates)
+
+    def load_state_dict(self, state: dict[int, Tensor]) -> None:
+        """Takes what a run had tracked."""
+        self._coordinates = dict(state)
+
+
+def tracks_or_images(sources: Sources, **settings: Any) -> TrackSupervision | None:
+    """Tracked motion where the model has smooth motions to track it in; else None, which means the images.
+
+    Args:
+        sources: what the run has at hand.
+        settings: of :class:`TrackSupervision`.
+    """
+    if any(sources.motions(scene_id) is None for scene_id in range(len(sources.scenes))):
+        return None
+    return TrackSupervision(sources, **settings)

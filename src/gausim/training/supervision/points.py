@@ -1,0 +1,156 @@
+"""Training on the true motion of points instead of images: the quick lane for trying out ideas about dynamics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gausim.core import DataError, GaussianScene
+from gausim.data.dataset import SequenceSample
+from gausim.data.records import GroundTruth
+from gausim.training.contracts import SceneBatch
+from gausim.training.rollout import States
+from gausim.training.supervision.images import Sources, StaticFigures
+
+# Motion energy below this share of the true one counts as this share: initial states begin at rest.
+STILL_SHARE = 0.05
+
+
+def attach_points(scene: GaussianScene, points: Float[Tensor, "P 3"]) -> Int[Tensor, " P"]:
+    """The nearest simulated kernel of every rest-space point, whose unit it follows."""
+    candidates = scene.simulated.nonzero()[:, 0]
+    chunks = points.to(scene.means).split(1024)
+    return torch.cat([candidates[torch.cdist(p, scene.means[candidates]).argmin(1)] for p in chunks])
+
+
+class PointSupervision:
+    """Compares predicted with true positions of the points whose motion a data set knows.
+
+    The loss of a frame is the mean over points of the squared distance, in (per cent of the scene's diagonal)^2.
+    Nothing is drawn. Only frames that the sample holds are looked at: those that training on images would see.
+    """
+
+    def __init__(
+        self,
+        sources: Sources,
+        *,
+        velocity_weight: float = 0.0,
+        energy_weight: float = 0.0,
+    ) -> None:
+        """Keeps its parts.
+
+        Args:
+            sources: the rest scenes and the true motion.
+            velocity_weight: of the same loss of the steps x_t - x_{t-1}, which counts fast motion more.
+            energy_weight: of the squared logarithm of predicted over true motion energy, its mean over the halves of a
+                stretch, times what the rest state scores: a motion that is out of step would else rather stop.
+        """
+        self._scenes, self._read = sources.scenes, sources.truth
+        self._velocity_weight, self._energy_weight = velocity_weight, energy_weight
+        self._known: dict[int, GroundTruth] = {}
+        self._attached: dict[int, Int[Tensor, " P"]] = {}
+
+    def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> _PointComparison:
+        """What compares the predictions of a batch."""
+        truths = [self.motion(sample) for sample in samples]
+        for sample, truth in zip(samples, truths, strict=True):
+            if sample.scene_id not in self._attached:
+                self._attached[sample.scene_id] = attach_points(self._scenes[sample.scene_id], truth.rest)
+        attached = [self._attached[sample.scene_id].to(batch.rest.device) for sample in samples]
+        scales = [self._scale(sample) for sample in samples]
+        weights = self._velocity_weight, self._energy_weight
+        return _PointComparison(batch, [_on(truth, batch.rest) for truth in truths], attached, scales, *weights)
+
+    def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
+        """Scores the rest state on frames ``first`` .. T of a sample."""
+        truth = self.motion(sample)
+        positions = truth.positions[first : sample.steps + 1]
+        motion = _squared(positions.diff(dim=0))
+        losses = _squared(positions - truth.rest) * (1 + self._energy_weight * math.log(1 + 1 / STILL_SHARE) ** 2)
+        if self._velocity_weight:
+            before = truth.positions[max(first - 1, 0) : sample.steps]
+            losses = losses + self._velocity_weight * _squared(
+                positions - torch.cat((before[:1], before))[-len(positions) :]
+            )
+        return StaticFigures((self._scale(sample) * losses).tolist(), (self._scale(sample) * motion).tolist())
+
+    def _scale(self, sample: SequenceSample) -> float:
+        return (100 / self._scenes[sample.scene_id].diagonal) ** 2
+
+    def motion(self, sample: SequenceSample) -> GroundTruth:
+        """The motion that a sample is compared with, in all of its frames at least.
+
+        Raises:
+            DataError: the data set does not know it.
+        """
+        if sample.sequence_id not in self._known:
+            truth = self._read(sample.sequence_id)
+            if truth is None:
+                raise DataError(
+                    f"{sample.object_name}/{sample.sequence_name}: its true motion is not known (ground_truth.npz and "
+                    "the object's rest points), so it cannot be trained on points. Use supervision=images."
+                )
+            self._known[sample.sequence_id] = truth
+        return self._known[sample.sequence_id]
+
+
+class _PointComparison:
+    """Compares the frames that a rollout predicts with the true points, stretch by stretch."""
+
+    def __init__(
+        self,
+        batch: SceneBatch,
+        truths: Sequence[GroundTruth],
+        attached: Sequence[Int[Tensor, " _"]],
+        scales: Sequence[float],
+        velocity_weight: float,
+        energy_weight: float,
+    ) -> None:
+        self._batch, self._truths, self._scales = batch, truths, scales
+        self._velocity_weight, self._energy_weight = velocity_weight, energy_weight
+        self._kernels, self._units, self._offsets = [], [], []
+        for member, truth, kernel in zip(batch.members, truths, attached, strict=True):
+            unit = member.unit_of_kernel.to(kernel.device)
+            self._kernels.append(kernel + member.kernels.start)
+            self._units.append(unit[kernel] + member.units.start)
+            self._offsets.append(truth.rest - batch.rest[self._kernels[-1]])
+        self._last = [truth.rest for truth in truths]
+
+    def __call__(self, states: States, start: int) -> tuple[Float[Tensor, "T S"], Float[Tensor, ""]]:
+        """Loss of each predicted frame and member, and the squared change of the predicted points (summed)."""
+        losses, motion = [], states.positions.new_zeros(())
+        for i, (truth, scale) in enumerate(zip(self._truths, self._scales, strict=True)):
+            turned = states.gradients[:, self._units[i]] @ self._offsets[i][..., None]
+            points = states.positions[:, self._kernels[i]] + turned[..., 0]
+            span = slice(start + 1, start + 1 + len(points))
+            steps = torch.cat((self._last[i][None], points)).diff(dim=0)
+            loss, true_steps = _squared(points - truth.positions[span]), truth.positions[start : span.stop].diff(dim=0)
+            if self._velocity_weight:
+                loss = loss + self._velocity_weight * _squared(steps - true_steps)
+            if self._energy_weight:
+                still, energies = _squared(truth.positions[span] - truth.rest), (_squared(steps), _squared(true_steps))
+                loss = loss + self._energy_weight * still * _energy_mismatch(*energies)
+            losses.append(scale * loss)
+            motion += scale * _squared(steps.detach()).sum()
+            self._last[i] = points[-1].detach()
+        return torch.stack(losses, 1), motion
+
+
+def _energy_mismatch(made: Float[Tensor, " T"], true: Float[Tensor, " T"]) -> Float[Tensor, ""]:
+    """Squared logarithm of predicted over true motion energy, the mean over the two halves of T frames."""
+    halves = [half for half in zip(made.tensor_split(2), true.tensor_split(2), strict=True) if len(half[0])]
+    energies = torch.stack([torch.stack((a.mean(), b.mean())) for a, b in halves])
+    least = STILL_SHARE * energies[:, 1].clamp_min(torch.finfo(true.dtype).tiny)
+    return ((energies[:, 0] + least) / (energies[:, 1] + least)).log().square().mean()
+
+
+def _squared(vectors: Float[Tensor, "T P 3"]) -> Float[Tensor, " T"]:
+    return vectors.square().sum(-1).mean(-1)
+
+
+def _on(truth: GroundTruth, like: Tensor) -> GroundTruth:
+    return GroundTruth(truth.rest.to(like), truth.positions.to(like))

@@ -1,0 +1,184 @@
+"""The viewer: a simulation, its page and the stages between them, which overlap and never queue up."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import UInt32
+
+from gausim.viewer.coloring import VIEW, Legend, Painter, highlighted
+from gausim.viewer.guard import Door, GuardedServer
+from gausim.viewer.hands import Hands
+from gausim.viewer.live import Live
+from gausim.viewer.page import Page
+from gausim.viewer.pipeline import Latest, Worker
+from gausim.viewer.shown import Shown
+from gausim.viewer.sights import Sights
+from gausim.viewer.splats import SIZE, Placing, pack
+from gausim.viewer.subject import Subject
+
+# Colours follow the camera so often while time stands [times per second].
+_VIEWS = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Painted:
+    shown: Shown
+    legend: Legend
+    buffer: UInt32[np.ndarray, "K 8"]
+    beside: UInt32[np.ndarray, "K2 8"] | None
+
+
+class Viewer:
+    """Serves one subject until it is stopped.
+
+    Attributes:
+        server: the guarded viser server.
+        live: the simulating thread.
+        hands: selections and drags.
+        page: the panel.
+        eye: position of the camera that moved last [page units].
+        workers: the stages after the simulation.
+    """
+
+    def __init__(self, subject: Subject, door: Door) -> None:
+        """Starts to listen; :meth:`start` begins to simulate.
+
+        Raises:
+            ConfigError: the door's settings are unsafe or wrong, or the address cannot be bound.
+        """
+        scene = subject.interaction.scene
+        self.server = GuardedServer(door, label="gausim")
+        self.placing = Placing.of(scene)
+        self._painter = Painter(scene, subject.interaction.units, subject.interaction.masses)
+        self._companion = subject.companion
+        self._painted: Latest[_Painted] = Latest()
+        self._simulated: Latest[Shown] = Latest()
+        self.live = Live(
+            subject.interaction, self._simulated.put, takes=subject.takes, companion=subject.companion,
+            watched=lambda: bool(self.server.get_clients()),
+        )  # fmt: skip
+        self.server.scene.set_up_direction(f"{'' if subject.up.startswith('-') else '+'}{subject.up}")  # type: ignore[arg-type]
+        self.server.scene.world_axes.visible = False
+        self.hands = Hands(self.server, self.live, self.placing, subject.interaction.units, subject.interaction.masses)
+        self.page = Page(
+            self.server, self.live, self.hands, modes=self._painter.modes, title=subject.title,
+            down=f"+{subject.up[1:]}" if subject.up.startswith("-") else f"-{subject.up}", sessions=subject.sessions,
+            repaint=self.repaint, forget_scales=self._painter.forget,
+        )  # fmt: skip
+        self.sights = Sights(self.server, self.placing, subject)
+        self.eye = torch.tensor(self.sights.first_position, dtype=torch.float32)
+        self._viewed = 0.0
+        self._place_beside(subject)
+        first = self._paint_now(self.live.shown())
+        self.server.traffic.frame_bytes = first.buffer.nbytes
+        self._splats = self._add("/splats", first.buffer)
+        self._beside = self._add("/beside", first.beside) if first.beside is not None else None
+        self.server.on_client_connect(self._connected)
+        self.workers = (
+            Worker("paint", self._simulated, self._paint), Worker("send", self._painted, self._send),
+        )  # fmt: skip
+
+    def _place_beside(self, subject: Subject) -> None:
+        if subject.companion is None:
+            return
+        other, offset = subject.companion.interaction, self.sights.aside
+        at = (float(offset[0]), float(offset[1]), float(offset[2]))
+        self._other_placing = Placing(self.placing.centre, self.placing.scale, at)
+        self._other_painter = Painter(other.scene, other.units, other.masses)
+        top = float((self._other_placing.to_page(other.scene.means.float()) @ self.sights.vertical).max())
+        above = offset + (top + 0.06 * SIZE) * self.sights.up
+        self.server.scene.add_label("/name_beside", subject.companion.name, position=above, anchor="bottom-center")
+
+    def _add(self, name: str, buffer: np.ndarray) -> Any:
+        """Splats of a packed buffer."""
+        count = len(buffer)
+        node = self.server.scene.add_gaussian_splats(
+            name, centers=np.zeros((count, 3)), covariances=np.tile(np.eye(3) * 1e-4, (count, 1, 1)),
+            rgbs=np.zeros((count, 3)), opacities=np.zeros((count, 1)),
+        )  # fmt: skip
+        node.buffer = buffer
+        return node
+
+    # ------------------------------------------------------------------------------------- running
+
+    @property
+    def url(self) -> str:
+        """What to open in the browser."""
+        return self.server.url
+
+    def start(self) -> None:
+        """Begins to simulate."""
+        for thread in (self.live, *self.workers):
+            thread.start()
+
+    def stop(self) -> None:
+        """Ends all threads and the server."""
+        self.live.stop()
+        for worker in self.workers:
+            worker.stop()
+        for thread in (self.live, *self.workers):
+            if thread.is_alive():
+                thread.join(5.0)
+        self.server.stop()
+
+    def repaint(self) -> None:
+        """Has the shown frame painted anew, also while time stands."""
+        if self.live.is_alive():
+            self.live.do(lambda: None)
+
+    def _connected(self, client: Any) -> None:
+        async def moved(camera: Any) -> None:
+            position = torch.tensor(np.asarray(camera.position, np.float64))
+            if not bool(torch.isfinite(position).all()):
+                return
+            self.eye = position.float()
+            now = time.monotonic()
+            if self.page.mode == VIEW and not self.live.playing and now - self._viewed > 1 / _VIEWS:
+                self._viewed = now
+                self.repaint()
+
+        client.camera.on_update(moved)
+        self.repaint()
+
+    # ------------------------------------------------------------------------------------- stages
+
+    @torch.no_grad()
+    def _paint_now(self, shown: Shown) -> _Painted:
+        mode = self.page.mode
+        eye = self.placing.to_scene(self.eye)
+        covars, rgb, legend = self._painter(shown.frame, shown.unit_of_kernel, shown.speed, mode, eye)
+        if self.page.highlight:
+            nobody = torch.zeros_like(self.hands.mask)
+            rgb = highlighted(rgb, self.hands.mask, nobody if shown.held is None else shown.held.cpu())
+        buffer = pack(shown.frame.positions.cpu(), covars, rgb, self._painter.opacities, self.placing)
+        return _Painted(shown, legend, buffer, self._paint_beside(shown, mode))
+
+    def _paint_beside(self, shown: Shown, mode: str) -> np.ndarray | None:
+        other = shown.beside
+        if other is None or self._companion is None:
+            return None
+        known = mode if mode in self._other_painter.modes else VIEW
+        eye = self._other_placing.to_scene(self.eye)
+        covars, rgb, _ = self._other_painter(other.frame, other.unit_of_kernel, other.speed, known, eye)
+        return pack(other.frame.positions.cpu(), covars, rgb, self._other_painter.opacities, self._other_placing)
+
+    def _paint(self, shown: Shown) -> None:
+        self._painted.put(self._paint_now(shown))
+
+    def _send(self, painted: _Painted) -> None:
+        with self.server.atomic():
+            self._splats.buffer = painted.buffer
+            if self._beside is not None:
+                self._beside.visible = painted.beside is not None
+                if painted.beside is not None:
+                    self._beside.buffer = painted.beside
+            self.hands.follow(painted.shown)
+        paused = not self.live.playing  # then this may be the last frame for long
+        displayed = 0.0 if paused else self.server.traffic.displayed
+        self.page.refresh(painted.shown, painted.legend, displayed, now=paused)
+        self.sights.refresh(painted.shown, now=paused)

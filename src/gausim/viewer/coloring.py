@@ -1,0 +1,157 @@
+"""What the kernels are coloured by: their own look, the hierarchy, strain, speed or mass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gausim.core import GaussianScene, SteppedFrame
+from gausim.kernels.compiled import fits
+from gausim.ops.covariance import transport_covariance
+from gausim.ops.spherical_harmonics import C0
+from gausim.render.cpu.appearance import deformed_appearance
+from gausim.render.draw import SceneAppearance, view_colors
+
+VIEW, BASE, STRAIN, SPEED, MASS = (
+    "As seen from the camera (SH)", "Base colour (DC)", "Strain", "Velocity", "Mass",
+)  # fmt: skip
+_SELECTED, _HELD = (1.0, 0.55, 0.1), (0.25, 0.5, 1.0)
+
+
+@dataclass(frozen=True)
+class Legend:
+    """What the colours say.
+
+    Attributes:
+        text: one line.
+        low: value of the first colour of the scale; None where there is no scale.
+        high: value of the last one.
+        unit: of these values.
+    """
+
+    text: str
+    low: float | None = None
+    high: float | None = None
+    unit: str = ""
+
+
+class Painter:
+    """Colours and covariances of the frames of one scene."""
+
+    def __init__(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]], masses: Float[Tensor, " K"]) -> None:
+        """Takes the scene, the unit of every kernel at levels 1, 2, ... and the masses."""
+        self._look = SceneAppearance.of(scene.to("cpu"))
+        self._units = [u.cpu() for u in units]
+        self._masses, self._diagonal = masses.float().cpu(), scene.diagonal
+        self._moving = (scene.simulated & ~scene.pinned).cpu()
+        self._highest: dict[str, float] = {}
+        self.opacities = self._look.opacities
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """What can be shown."""
+        levels = [self._level_name(i) for i in range(len(self._units))]
+        return (VIEW, BASE, *levels, STRAIN, SPEED, MASS)
+
+    def _level_name(self, index: int) -> str:
+        return f"Hierarchy, level {index + 1} ({int(self._units[index].max()) + 1} units)"
+
+    def forget(self) -> None:
+        """Scales begin anew."""
+        self._highest.clear()
+
+    def __call__(
+        self,
+        frame: SteppedFrame,
+        unit_of_kernel: Int[Tensor, " K"],
+        speed: Float[Tensor, " K"],
+        mode: str,
+        eye: Float[Tensor, " 3"],
+    ) -> tuple[Float[Tensor, "K 3 3"], Float[Tensor, "K 3"], Legend]:
+        """Covariances [scene units^2], colours in [0, 1] and what they say.
+
+        Args:
+            frame: positions, gradients and rotations.
+            unit_of_kernel: rows of the gradients.
+            speed: of the kernels [scene units / s].
+            mode: one of :attr:`modes`.
+            eye: where the camera is [scene units].
+        """
+        positions, gradients, rotations, unit = (
+            frame.positions.cpu(), frame.gradients.cpu(), frame.rotations.cpu(), unit_of_kernel.cpu()
+        )  # fmt: skip
+        look = self._look.to(positions)
+        if mode == VIEW and fits(positions, gradients, rotations, look.covars, look.sh):
+            covars, rgb = deformed_appearance(
+                positions[None], gradients[None], rotations[None], unit, look.covars, look.sh, eye[None].to(positions)
+            )
+            return covars[0], rgb[0, 0], Legend("spherical harmonics for the camera that moved last")
+        covars = transport_covariance(look.covars, gradients[unit])
+        if mode == VIEW:
+            rgb = view_colors(look, positions[None], rotations[None], unit, eye[None].to(positions))[0, 0]
+            return covars, rgb, Legend("spherical harmonics for the camera that moved last")
+        rgb, legend = self._value(gradients[unit], speed.cpu(), mode)
+        return covars, rgb, legend
+
+    def _value(self, gradients: Tensor, speed: Tensor, mode: str) -> tuple[Tensor, Legend]:
+        if mode == STRAIN:
+            stretch = torch.linalg.svdvals(gradients.double()).clamp_min(1e-12).log().abs().amax(-1).float()
+            return self._scaled(mode, stretch, "strain: largest |log| of the singular values of G", "")
+        if mode == SPEED:
+            return self._scaled(mode, speed / self._diagonal, "speed", "diagonals / s")
+        if mode == MASS:
+            weight = self._masses.clamp_min(1e-12).log10()
+            low, high = float(weight[self._moving].min()), float(weight[self._moving].max())
+            return _ramp((weight - low) / max(high - low, 1e-6)), Legend("mass, logarithm to base 10", low, high)
+        for index, units in enumerate(self._units):
+            if mode == self._level_name(index):
+                return hues(units), Legend(f"one colour per unit of level {index + 1}; grey: never simulated")
+        return (0.5 + C0 * self._look.sh[:, 0]).clamp(0, 1), Legend("base colours, the same from every side")
+
+    def _scaled(self, mode: str, value: Tensor, text: str, unit: str) -> tuple[Tensor, Legend]:
+        value = torch.where(self._moving, value, torch.zeros_like(value))
+        self._highest[mode] = high = max(self._highest.get(mode, 1e-3), float(value.max()))
+        return _ramp(value / high), Legend(f"{text} (scale: largest so far)", 0.0, high, unit)
+
+
+def highlighted(rgb: Float[Tensor, "K 3"], selected: Bool[Tensor, " K"], held: Bool[Tensor, " K"]) -> Tensor:
+    """Colours with what is selected in orange and what is pinned by hand in blue."""
+    rgb = rgb.clone()
+    for mask, color, share in ((selected, _SELECTED, 0.45), (held, _HELD, 0.6)):
+        rgb[mask] = rgb[mask] * (1 - share) + rgb.new_tensor(color) * share
+    return rgb
+
+
+def hues(units: Int[Tensor, " K"]) -> Float[Tensor, "K 3"]:
+    """Colours that tell neighbouring numbers apart: hues by the golden ratio; grey for -1."""
+    number = units.clamp_min(0).double()
+    hue, light = (number * 0.61803398875) % 1, 0.75 + 0.25 * ((number * 0.41421356) % 1)
+    offset = torch.tensor([5.0, 3.0, 1.0], dtype=torch.float64)
+    k = (offset + 6 * hue[:, None]) % 6
+    rgb = light[:, None] * (1 - 0.7 * torch.minimum(k, 4 - k).clamp(0, 1))
+    rgb[units < 0] = 0.5
+    return rgb.float()
+
+
+def _ramp(share: Float[Tensor, " K"]) -> Float[Tensor, "K 3"]:
+    table = torch.from_numpy(_table())
+    return table[(share.clamp(0, 1) * (len(table) - 1)).round().long()]
+
+
+@cache
+def _table() -> np.ndarray:
+    from matplotlib import colormaps
+
+    return np.asarray(colormaps["turbo"](np.linspace(0.02, 0.98, 256))[:, :3], np.float32)
+
+
+def gradient_css() -> str:
+    """The scale as a CSS gradient, for the legend."""
+    stops = [",".join(str(int(255 * v)) for v in _table()[i]) for i in range(0, 256, 51)]
+    return "linear-gradient(to right," + ",".join(f"rgb({stop})" for stop in stops) + ")"

@@ -1,0 +1,304 @@
+"""Hands in the browser: picking a part, brushing a region, dragging it with a force, letting go."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gausim.core import ConfigError
+from gausim.interaction.selections import Kernels, Selected, Unit, Whole
+from gausim.interaction.session import Force, Impulse, Release
+from gausim.viewer.handles import invisible_octahedron
+from gausim.viewer.live import Live
+from gausim.viewer.shown import Shown
+from gausim.viewer.splats import SIZE, Placing, unit_centres
+
+WHOLE = "The whole object"
+# Handles follow their parts so often [times per second].
+_FOLLOWS = 8.0
+# A drag with the control key pushes as long as this [s].
+_FLICK = 0.1
+
+
+class Hands:
+    """What pointers do to the object; callbacks run in the server's loop and only queue work for the simulation.
+
+    Attributes:
+        selection: what is chosen, or None.
+        mask: its kernels; none of them while nothing is chosen.
+        gain: force of a drag as long as the object's diagonal [weights].
+        notice: called when the selection changes.
+    """
+
+    def __init__(
+        self, server: Any, live: Live, placing: Placing, units: Sequence[Int[Tensor, " K"]], masses: Float[Tensor, " K"]
+    ) -> None:
+        """Puts a handle on every unit of the first level."""
+        self._server, self._live, self._placing = server, live, placing
+        scene = live.interaction.scene
+        self._free = (scene.simulated & ~scene.pinned).cpu()
+        self._units, self._masses = [u.cpu() for u in units], masses.float().cpu()
+        self._counts = [int(u.max()) + 1 for u in self._units]
+        self._shown_handles, self._moved = False, 0.0
+        self._pick: Any = None
+        self._lock = threading.Lock()
+        self._page: Tensor | None = None
+        self.selection: Selected | None = None
+        self.mask: Bool[Tensor, " K"] = torch.zeros_like(self._free)
+        self.gain = 8.0
+        self.notice: Callable[[], None] = lambda: None
+        self._label = server.scene.add_label("/weight", "", visible=False)
+        self.choose_level(self.first_level)
+        # What a ray may pass a kernel's centre by: the kernel's own size, and a little for the hand [page units].
+        self._reach = scene.log_scales.float().cpu().exp().amax(-1) * placing.scale + 0.004 * SIZE
+        server.scene.on_rect_select(modifier="shift")(self._brushed)
+        server.scene.on_click()(self._clicked)
+
+    @property
+    def level_names(self) -> tuple[str, ...]:
+        """What a click can pick."""
+        return (*(f"Level {i + 1}: {n} units" for i, n in enumerate(self._counts)), WHOLE)
+
+    @property
+    def first_level(self) -> str:
+        """What a click picks at first: the largest parts, if there are any."""
+        return self.level_names[max(0, len(self._counts) - 1)]
+
+    def choose_level(self, name: str) -> None:
+        """Handles for the units of another level.
+
+        Raises:
+            ConfigError: there is no such level.
+        """
+        if name not in self.level_names:
+            raise ConfigError(f"{name!r}: expected one of {', '.join(self.level_names)}.")
+        index = self.level_names.index(name)
+        with self._lock:
+            self._level = index if index < len(self._units) else None
+            free = torch.zeros(self._count, dtype=torch.bool)
+            free[self._index[self._free & (self._index >= 0)]] = True
+            self._movable = free.nonzero()[:, 0]
+            self._radii = self._handle_radii()
+            if self._pick is not None:
+                self._pick.remove()
+            self._pick = self._make_handles()
+        self._moved = 0.0
+
+    @property
+    def _index(self) -> Tensor:
+        """The handle of each kernel at the chosen level."""
+        return self._units[self._level] if self._level is not None else torch.where(self._free, 0, -1)
+
+    @property
+    def _count(self) -> int:
+        return self._counts[self._level] if self._level is not None else 1
+
+    def _centres(self, positions: Tensor) -> Tensor:
+        centres = unit_centres(positions.float().cpu(), self._index, self._masses, self._count)
+        return self._placing.to_page(centres)[self._movable]
+
+    def _handle_radii(self) -> Tensor:
+        """Handles as wide as their units, so that a unit is hit where it is seen [page units]."""
+        rest = self._live.interaction.scene.means.float().cpu()
+        centres = unit_centres(rest, self._index, self._masses, self._count)
+        inside = self._index >= 0
+        away = (rest[inside] - centres[self._index[inside]]).norm(dim=-1)
+        widest = torch.zeros(self._count).scatter_reduce(0, self._index[inside], away, "amax")
+        return (0.8 * widest * self._placing.scale).clamp(0.008 * SIZE, 0.2 * SIZE)[self._movable]
+
+    def _make_handles(self) -> Any:
+        # What is picked must stand before the old handles are gone: the index an event carries is one of these.
+        count = len(self._movable)
+        centres = self._centres(self._live.interaction.scene.means).numpy()
+        handle = self._server.scene.add_batched_glb(
+            "/handles", invisible_octahedron(), np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)), centres,
+            batched_scales=self._radii.numpy(), lod="off", cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        self._dots = self._server.scene.add_point_cloud(
+            "/dots", centres, (255, 120, 0), point_size=0.012 * SIZE, point_shape="circle",
+            visible=self._shown_handles,
+        )  # fmt: skip
+        # No click on the handles: viser outlines what can be clicked. Clicks are found along their ray instead.
+        handle.on_drag("left")(self._dragged)
+        handle.on_drag("left", modifier="cmd/ctrl")(self._flicked)
+        return handle
+
+    def show_handles(self, visible: bool) -> None:
+        """Makes the handles visible, or invisible as they are."""
+        self._shown_handles = visible
+        with self._lock:
+            self._dots.visible = visible
+
+    def follow(self, shown: Shown) -> None:
+        """Moves the handles to their parts."""
+        self._page = self._placing.to_page(shown.frame.positions.float().cpu())
+        now = time.monotonic()
+        if now - self._moved < 1 / _FOLLOWS:
+            return
+        self._moved = now
+        with self._lock:
+            self._pick.batched_positions = centres = self._centres(shown.frame.positions).numpy()
+            if self._shown_handles:
+                self._dots.points = centres
+
+    # ------------------------------------------------------------------------------------- selecting
+
+    def select(self, on: Selected | None) -> None:
+        """Chooses a part, or nothing.
+
+        Raises:
+            ConfigError: the selection is of no kernel.
+        """
+        scene = self._live.interaction.scene
+        self.mask = torch.zeros_like(self._free) if on is None else on.mask(scene, self._units).cpu() & self._free
+        self.selection = on
+        self.notice()
+
+    def described(self) -> str:
+        """The selection in words."""
+        count = int(self.mask.sum())
+        match self.selection:
+            case None:
+                return "nothing: click a part, or hold Shift and draw a rectangle"
+            case Unit():
+                return f"unit {self.selection.index} of level {self.selection.level}, {count} kernels that can move"
+            case Whole():
+                return f"the whole object, {count} kernels that can move"
+        return f"{count} kernels"
+
+    def _selected_by(self, instance: int | None) -> Selected | None:
+        if instance is None or not 0 <= instance < len(self._movable):
+            return None
+        return Whole() if self._level is None else Unit(self._level + 1, int(self._movable[instance]))
+
+    async def _clicked(self, event: Any) -> None:
+        if self._page is None:
+            return
+        kernel = first_hit(self._page, self._reach, event.ray_origin, event.ray_direction, self._free)
+        if kernel is None:
+            self.select(None)
+        elif self._level is None:
+            self.select(Whole())
+        elif int(self._index[kernel]) >= 0:
+            self.select(Unit(self._level + 1, int(self._index[kernel])))
+
+    async def _brushed(self, event: Any) -> None:
+        if self._page is None:
+            return
+        inside = in_rectangle(self._page, event.client.camera, event.screen_min, event.screen_max) & self._free
+        numbers = inside.nonzero()[:, 0].tolist()
+        self.select(Kernels(tuple(numbers)) if numbers else None)
+
+    # ------------------------------------------------------------------------------------- dragging
+
+    def _grasp(self, event: Any) -> None:
+        """A drag that begins on what is not selected selects it."""
+        chosen = self._selected_by(event.instance_index)
+        if chosen is None:
+            return
+        mask = chosen.mask(self._live.interaction.scene, self._units).cpu() & self._free
+        if not bool((mask & self.mask).any()):
+            self.select(chosen)
+
+    def pull(self, start: Sequence[float], end: Sequence[float]) -> tuple[tuple[float, float, float], float]:
+        """Direction and size [weights] of the force of a drag between two points of the page."""
+        x, y, z = (float(b) - float(a) for a, b in zip(start, end, strict=True))
+        weights = self.gain * math.hypot(x, y, z) / SIZE
+        return (x, y, z), min(weights, self._live.interaction.most_force)
+
+    async def _dragged(self, event: Any) -> None:
+        name = f"drag-{event.client_id}"
+        if event.phase == "start":
+            self._grasp(event)
+        direction, weights = self.pull(event.start_position, event.end_position)
+        on = self.selection
+        if event.phase == "end" or on is None:
+            self._hide()
+            self._live.do(lambda: self._live.act(Release(name)))
+        elif weights > 1e-4:
+            self._point(event, f"{weights:.2f} x weight")
+            self._live.do(lambda: self._live.act(Force(on, direction, weights, name=name)))
+
+    async def _flicked(self, event: Any) -> None:
+        if event.phase == "start":
+            self._grasp(event)
+        direction, weights = self.pull(event.start_position, event.end_position)
+        amount = min(weights * _FLICK, self._live.interaction.most_force / self._live.interaction.fps)
+        on = self.selection
+        if event.phase == "end":
+            self._hide()
+            if on is not None and weights > 1e-4:
+                self._live.do(lambda: self._live.act(Impulse(on, direction, amount)))
+        elif on is not None:
+            self._point(event, f"{amount:.3f} weight s")
+
+    def _point(self, event: Any, text: str) -> None:
+        with self._server.atomic():
+            self._label.position = event.end_position
+            self._label.text = text
+            self._label.visible = True
+
+    def _hide(self) -> None:
+        self._label.visible = False
+
+
+def first_hit(
+    points: Float[Tensor, "K 3"],
+    reach: Float[Tensor, " K"],
+    origin: Sequence[float],
+    direction: Sequence[float],
+    among: Bool[Tensor, " K"],
+) -> int | None:
+    """The first of some kernels that a ray passes, or None.
+
+    Args:
+        points: centres of all kernels.
+        reach: how far from a centre still counts.
+        origin: where the ray begins.
+        direction: where it leads; of any length but zero.
+        among: only these kernels.
+    """
+    along = points.new_tensor([float(v) for v in direction])
+    if not float(along.norm()) > 0:
+        return None
+    away = points - points.new_tensor([float(v) for v in origin])
+    depth = away @ (along / along.norm())
+    passed = (away - depth[:, None] * along / along.norm()).norm(dim=-1)
+    hit = (among & (depth > 0) & (passed <= reach)).nonzero()[:, 0]
+    return int(hit[depth[hit].argmin()]) if len(hit) else None
+
+
+def in_rectangle(
+    points: Float[Tensor, "K 3"], camera: Any, low: Sequence[float], high: Sequence[float]
+) -> Bool[Tensor, " K"]:
+    """Points that a viser camera sees within a rectangle.
+
+    Args:
+        points: on the page.
+        camera: a viser camera: world pose (wxyz, position), vertical field of view [rad], aspect (width / height).
+        low: left upper corner, in 0..1 of the picture.
+        high: right lower corner.
+    """
+    w, x, y, z = (float(v) for v in camera.wxyz)
+    rotation = points.new_tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    seen = (points - points.new_tensor([float(v) for v in camera.position])) @ rotation
+    half = math.tan(float(camera.fov) / 2)
+    depth = seen[:, 2].clamp_min(1e-6)
+    across = 0.5 + 0.5 * seen[:, 0] / (depth * half * float(camera.aspect))
+    down = 0.5 + 0.5 * seen[:, 1] / (depth * half)
+    inside = (across >= low[0]) & (across <= high[0]) & (down >= low[1]) & (down <= high[1])
+    return inside & (seen[:, 2] > 0)

@@ -1,0 +1,354 @@
+"""The panel beside the picture: every control, and what it does. Values from the browser are checked here again."""
+
+from __future__ import annotations
+
+import html
+import math
+import time
+from collections.abc import Callable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from gausim.core import GausSimError
+from gausim.interaction.session import Event, Gravity, Impulse, Pin, Release, Unpin, Wind, parse_session, save_session
+from gausim.viewer.coloring import VIEW, Legend, gradient_css
+from gausim.viewer.hands import Hands
+from gausim.viewer.live import Live
+from gausim.viewer.shown import LIVE, Shown
+
+AXES = {
+    "+x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "+y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
+    "+z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0),
+}  # fmt: skip
+# Said while forces act in part only.
+_AT_LIMIT = "At the limit of what was learned: the forces act only in part. Pull less for what would really happen."
+# Files that one run of the viewer writes at most.
+_MOST_FILES = 200
+# The panel is brought up to date so often [times per second].
+_REFRESHES = 4.0
+
+
+class Page:
+    """The controls of one viewer.
+
+    Attributes:
+        mode: what kernels are coloured by.
+        highlight: whether the selection is shown in orange.
+        saved: sessions written, in order.
+    """
+
+    def __init__(
+        self,
+        server: Any,
+        live: Live,
+        hands: Hands,
+        *,
+        modes: tuple[str, ...],
+        title: str,
+        down: str = "-z",
+        sessions: Path,
+        repaint: Callable[[], None],
+        forget_scales: Callable[[], None],
+    ) -> None:
+        """Builds the panel.
+
+        Args:
+            server: the viser server.
+            live: what is controlled.
+            hands: selections and drags.
+            modes: what kernels can be coloured by.
+            title: what is shown, one line.
+            down: axis along which gravity pulls at first.
+            sessions: folder that saved sessions go to.
+            repaint: called when colours change.
+            forget_scales: called when colour scales begin anew.
+        """
+        self._server, self._live, self._hands, self._sessions = server, live, hands, sessions
+        self._repaint, self._forget_scales, self._down = repaint, forget_scales, down
+        self.mode, self.highlight, self.saved = VIEW, True, list[Path]()
+        self._refreshed, self._modes, self._note = 0.0, modes, ""
+        self._last_status = self._last_legend = ""
+        gui = server.gui
+        self._status = gui.add_html("")
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Play"):
+            self._play_tab(gui, title)
+        with tabs.add_tab("Push"):
+            self._push_tab(gui)
+        with tabs.add_tab("Look"):
+            self._look_tab(gui)
+        with tabs.add_tab("Session"):
+            self._session_tab(gui)
+        hands.notice = self._selected
+
+    # ------------------------------------------------------------------------------------- building
+
+    def _play_tab(self, gui: Any, title: str) -> None:
+        gui.add_html(f"<div style='padding:0 .6em;font-size:.85em'><b>{html.escape(title)}</b></div>")
+        sources = (LIVE, *(take.name for take in self._live.takes))
+        self._source = gui.add_dropdown("Shows", sources, initial_value=LIVE, hint="Recordings cannot be pushed.")
+        self._on_choice(self._source, sources, lambda name: self._do(lambda: self._live.choose(name)))
+        works = {
+            "Play": self._live.play, "Pause": self._live.pause, "Step": self._live.step_once, "Reset": self._reset,
+        }  # fmt: skip
+        time_group = gui.add_button_group("Time", tuple(works))
+        self._on_press_of(time_group, works)
+        self._pace = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0, hint="1 is real time")
+        self._on_number(self._pace, 0.1, 4.0, lambda v: self._do(lambda: self._live.set_pace(v)))
+        self._timeline = gui.add_slider("Frame", 0, 1, 1, 0, hint="The timeline; moving it stops time.")
+        self._on_number(self._timeline, 0, 1 << 20, lambda v: self._do(lambda: self._live.scrub(int(v))))
+
+    def _push_tab(self, gui: Any) -> None:
+        hands = self._hands
+        gui.add_html(_small("Drag a part to pull at it; with Ctrl to flick it. Shift and drag brushes a region."))
+        level = gui.add_dropdown("Picks", hands.level_names, initial_value=hands.first_level)
+        self._on_choice(level, hands.level_names, lambda name: self._now(lambda: hands.choose_level(name)))
+        self._chosen = gui.add_html("")
+        self._selected()
+        gain = gui.add_slider("Pull", 0.5, 20.0, 0.5, hands.gain, hint="Weights of the part per diagonal of drag")
+        self._on_number(gain, 0.5, 20.0, lambda v: setattr(hands, "gain", v))
+        works = {"Pin": lambda: self._on_selection(Pin), "Unpin": lambda: self._on_selection(Unpin)}
+        self._on_press_of(gui.add_button_group("Selection", tuple(works)), works)
+        self._on_press(gui.add_button("Let go of everything"), self._let_go)
+        with gui.add_folder("Impulse", expand_by_default=False):
+            self._amount = gui.add_slider("Weight s", 0.0, 0.3, 0.01, 0.1, hint="1 gives the speed of 1 s of weight")
+            self._toward = gui.add_dropdown("Towards", tuple(AXES), initial_value="+x")
+            self._on_press(gui.add_button("Push once"), self._push_once)
+        self._strength: dict[str, tuple[Any, Any]] = {}
+        for name, axis, kind in (("Wind", "+x", Wind), ("Gravity", self._down, Gravity)):
+            with gui.add_folder(name, expand_by_default=False):
+                strength = gui.add_slider(f"{name} [weights]", 0.0, 3.0, 0.05, 0.0)
+                toward = gui.add_dropdown(f"{name} towards", tuple(AXES), initial_value=axis)
+                self._strength[name] = (strength, toward)
+                self._steady(strength, toward, kind)
+
+    def _look_tab(self, gui: Any) -> None:
+        choice = gui.add_dropdown("Colours", self._modes, initial_value=self.mode)
+        self._on_choice(choice, self._modes, self._recolour)
+        self._legend = gui.add_html("")
+        handles = gui.add_checkbox("Show the handles", False, hint="What is picked: one per part")
+        self._on_switch(handles, self._hands.show_handles)
+        highlight = gui.add_checkbox("Selection in orange", True)
+        self._on_switch(highlight, self._mark)
+
+    def _session_tab(self, gui: Any) -> None:
+        gui.add_html(_small("Everything done to the object is recorded and can be replayed bit for bit."))
+        self._on_press(gui.add_button("Save the session"), None, direct=self._save)
+        upload = gui.add_upload_button("Load and play a session", mime_type="application/json")
+        upload.on_upload(self._load)
+        self._on_press(gui.add_button("Begin a new session"), self._begin)
+        self._saved_text = gui.add_html("")
+
+    # ------------------------------------------------------------------------------------- callbacks
+
+    def _do(self, command: Callable[[], None]) -> None:
+        self._live.do(command)
+
+    def _now(self, work: Callable[[], None]) -> None:
+        """Does something that is not the simulation's; what is wrong with it is said on the page."""
+        try:
+            work()
+            self._note = ""
+        except GausSimError as error:
+            self._note = str(error)
+
+    def _on_press(
+        self, button: Any, work: Callable[[], None] | None, *, direct: Callable[[Any], None] | None = None
+    ) -> None:
+        async def pressed(event: Any) -> None:
+            if direct is not None:
+                self._do(lambda: direct(event))
+            elif work is not None:
+                self._do(work)
+
+        button.on_click(pressed)
+
+    def _on_press_of(self, group: Any, works: dict[str, Callable[[], None]]) -> None:
+        async def pressed(event: Any) -> None:
+            if group.value in works:
+                self._do(works[group.value])
+
+        group.on_click(pressed)
+
+    @staticmethod
+    def _on_number(handle: Any, low: float, high: float, work: Callable[[float], None]) -> None:
+        good = [handle.value]
+
+        async def moved(event: Any) -> None:
+            if event.client is None:
+                return  # set by this program
+            value = handle.value
+            if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+                handle.value = good[0]
+                return
+            good[0] = value
+            work(value)
+
+        handle.on_update(moved)
+
+    @staticmethod
+    def _on_choice(handle: Any, known: tuple[str, ...], work: Callable[[str], None]) -> None:
+        good = [handle.value]
+
+        async def chosen(event: Any) -> None:
+            if event.client is None:
+                return
+            if handle.value not in known:
+                handle.value = good[0]
+                return
+            good[0] = handle.value
+            work(handle.value)
+
+        handle.on_update(chosen)
+
+    @staticmethod
+    def _on_switch(handle: Any, work: Callable[[bool], None]) -> None:
+        async def switched(event: Any) -> None:
+            if event.client is not None:
+                work(bool(handle.value))
+
+        handle.on_update(switched)
+
+    def _steady(self, strength: Any, toward: Any, kind: type[Wind] | type[Gravity]) -> None:
+        def blow(_: object) -> None:
+            value, axis = float(strength.value), toward.value
+            if math.isfinite(value) and 0 <= value <= 3 and axis in AXES:
+                self._do(lambda: self._live.act(kind(AXES[axis], value)))
+
+        self._on_number(strength, 0.0, 3.0, blow)
+        self._on_choice(toward, tuple(AXES), blow)
+
+    # ------------------------------------------------------------------------------------- what they do
+
+    def _reset(self) -> None:
+        self._live.reset()
+        self._calm()
+
+    def _begin(self) -> None:
+        self._live.begin()
+        self._source.value = LIVE
+        self._calm()
+
+    def _let_go(self) -> None:
+        self._live.act(Release())
+        for kind in (Wind, Gravity):
+            self._live.act(kind((0.0, 0.0, -1.0), 0.0))
+        self._live.act(Unpin())
+        self._calm()
+
+    def _calm(self) -> None:
+        """Sliders show that nothing acts."""
+        self._forget_scales()
+        for strength, _ in self._strength.values():
+            strength.value = 0.0
+
+    def _on_selection(self, kind: Callable[[Any], Event]) -> None:
+        if self._hands.selection is None:
+            self._live.message = "Nothing is selected: click a part first."
+            return
+        self._live.act(kind(self._hands.selection))
+
+    def _push_once(self) -> None:
+        amount, axis = float(self._amount.value), self._toward.value
+        if self._hands.selection is None:
+            self._live.message = "Nothing is selected: click a part first."
+        elif 0 < amount <= 0.3 and axis in AXES:
+            most = self._live.interaction.most_force / self._live.interaction.fps
+            self._live.act(Impulse(self._hands.selection, AXES[axis], min(amount, most)))
+
+    def _recolour(self, mode: str) -> None:
+        self.mode = mode
+        self._forget_scales()
+        self._repaint()
+
+    def _mark(self, on: bool) -> None:
+        self.highlight = on
+        self._repaint()
+
+    def _selected(self) -> None:
+        self._chosen.content = _small(f"Selected: {self._hands.described()}.")
+        self._repaint()
+
+    def _save(self, event: Any) -> None:
+        if len(self.saved) >= _MOST_FILES:
+            self._live.message = f"{_MOST_FILES} sessions were saved already; start the viewer again to save more."
+            return
+        session = self._live.interaction.session()
+        name = f"session_{datetime.now():%Y%m%d_%H%M%S}_{len(self.saved):03d}.json"
+        path = self._sessions / name
+        try:
+            save_session(session, path)
+        except OSError as error:
+            self._live.message = f"{path}: {error.strerror}. Start with another --sessions folder."
+            return
+        self.saved.append(path)
+        self._saved_text.content = _small(f"Saved {path} ({session.steps} frames, {len(session.entries)} events).")
+        if event.client is not None:
+            event.client.send_file_download(name, path.read_bytes(), save_immediately=True)
+
+    async def _load(self, event: Any) -> None:
+        file = event.target.value
+
+        def load() -> None:
+            try:
+                text = file.content.decode("utf-8")
+            except UnicodeDecodeError:
+                self._live.message = "The file is no text in UTF-8; expected a session that gausim saved."
+                return
+            self._live.replay(parse_session(text, "the file"))
+            self._source.value = LIVE
+            self._calm()
+
+        self._do(load)
+
+    # ------------------------------------------------------------------------------------- bringing up to date
+
+    def refresh(self, shown: Shown, legend: Legend, displayed: float, *, now: bool = False) -> None:
+        """Shows rates, the frame number, messages and the legend; a few times a second is enough."""
+        moment = time.monotonic()
+        if not now and moment - self._refreshed < 1 / _REFRESHES:
+            return
+        self._refreshed = moment
+        if shown.last > 0:
+            self._timeline.max = max(shown.last, 1)
+            self._timeline.value = shown.number
+        self._write(shown, displayed)
+        if (text := _legend(legend)) != self._last_legend:
+            self._legend.content = self._last_legend = text
+
+    def _write(self, shown: Shown, displayed: float) -> None:
+        live = self._live
+        simulated = live.rate.per_second if shown.source == LIVE and live.playing else 0.0
+        state = "playing" if live.playing else "paused"
+        beside = live.companion.message if live.companion is not None else ""
+        limit = _AT_LIMIT if shown.source == LIVE and live.interaction.resisting else ""
+        problems = [text for text in (live.message, self._note, beside, limit) if text]
+        acting = ", ".join(live.interaction.acting) if shown.source == LIVE else ""
+        text = (
+            f"<div style='padding:.3em .6em;font-size:.85em'>{state} | frame {shown.number} of {shown.last}<br>"
+            f"simulated {simulated:.1f} / s | displayed {displayed:.1f} / s"
+            + f"<br>acting: {html.escape(acting[:60] or 'nothing')}"
+            + "".join(
+                f"<div style='margin-top:.3em;padding:.3em;background:#fff3cd;color:#664d03;border-radius:3px'>"
+                f"{html.escape(problem[:600])}</div>" for problem in problems
+            )
+            + "</div>"
+        )  # fmt: skip
+        if text != self._last_status:
+            self._status.content = self._last_status = text
+
+
+def _small(text: str) -> str:
+    return f"<div style='padding:0 .6em;font-size:.8em;opacity:.8'>{html.escape(text)}</div>"
+
+
+def _legend(legend: Legend) -> str:
+    text = _small(f"Colours: {legend.text}.")
+    if legend.low is None or legend.high is None:
+        return text
+    ends = f"<span>{legend.low:.3g}</span><span>{legend.high:.3g} {html.escape(legend.unit)}</span>"
+    return text + (
+        f"<div style='margin:.2em .6em;height:.8em;background:{gradient_css()}'></div>"
+        f"<div style='margin:0 .6em;font-size:.75em;display:flex;justify-content:space-between'>{ends}</div>"
+    )

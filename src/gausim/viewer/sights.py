@@ -1,0 +1,181 @@
+"""Cameras of the data set: where one looks from at first, the list to jump to, and the videos they recorded."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from gausim.core import Cameras, GausSimError
+from gausim.viewer.shown import LIVE, Shown
+from gausim.viewer.splats import SIZE, Placing
+
+if TYPE_CHECKING:
+    from gausim.viewer.subject import Subject
+
+_UP = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
+_FREE = "Free"
+# Video frames are drawn so often at most [times per second].
+_PICTURES = 6.0
+_HEIGHT_OF_VIEW = 0.8
+# Two objects side by side stand this many widths apart.
+_APART = 1.25
+
+
+class Sights:
+    """The cameras of one viewer.
+
+    Attributes:
+        up: vertical direction.
+        vertical: the same as a tensor.
+        forward: where one looks at first.
+        first_position: from where [page units].
+        aside: where a companion stands from the object [page units]; zero without one.
+    """
+
+    def __init__(self, server: Any, placing: Placing, subject: Subject) -> None:
+        """Adds frustums, the list of cameras and the panel of videos, as far as the subject has them."""
+        self._server, self._placing, self._films = server, placing, subject.films
+        self._cameras = subject.cameras
+        self._takes = {take.name: take.sequence for take in subject.takes}
+        self.up = np.array(_UP[subject.up], float)
+        self.vertical = torch.tensor(self.up, dtype=torch.float32)
+        self.first_position, target, fov = self._first()
+        self.forward = (target - self.first_position) / np.linalg.norm(target - self.first_position)
+        self.aside = np.zeros(3)
+        if subject.companion is not None:
+            self.aside = self._aside(subject)
+            target = target + self.aside / 2
+            self.first_position = target - self.forward * (1.8 * np.linalg.norm(self.first_position - target))
+        camera = server.initial_camera
+        camera.position, camera.look_at, camera.up = self.first_position, target, self.up
+        camera.fov = fov
+        self._drawn = 0.0
+        self._frustums: list[Any] = []
+        if self._cameras is not None:
+            self._add_cameras(self._cameras)
+        if self._films is not None:
+            self._add_films(self._films)
+
+    def _aside(self, subject: Subject) -> np.ndarray:
+        """To the right as one looks at first, by a little more than the object is wide."""
+        right = np.cross(self.forward, self.up)
+        right /= max(float(np.linalg.norm(right)), 1e-9)
+        scene = subject.interaction.scene
+        across = self._placing.to_page(scene.means[scene.foreground].float().cpu()).double().numpy() @ right
+        offset: np.ndarray = right * max(_APART * float(np.ptp(across)), 0.3 * SIZE)
+        return offset
+
+    def _first(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Position, target and vertical field of view of the first look."""
+        if self._cameras is not None:
+            position, _, forward, _, fov = self._pose(self._cameras, 0)
+            return position, position + forward * max(float(-position @ forward), 0.1), fov
+        side = np.array([1.0, 0.0, 0.0]) if abs(self.up[0]) < 0.5 else np.array([0.0, 1.0, 0.0])
+        away = np.cross(side, self.up)
+        return 1.5 * SIZE * (0.35 * side - away + 0.35 * self.up) / 1.12, np.zeros(3), _HEIGHT_OF_VIEW
+
+    def _pose(self, cameras: Cameras, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]:
+        """Position on the page, quaternion w x y z, forward, up and vertical field of view of a camera."""
+        view = cameras.viewmats[index].double().cpu()
+        rotation = view[:3, :3].T.numpy()
+        position = self._placing.to_page(cameras.centers[index].float().cpu()).double().numpy()
+        fov = 2 * math.atan(cameras.height / 2 / float(cameras.Ks[index, 1, 1]))
+        return position, quaternion(rotation), rotation[:, 2], -rotation[:, 1], fov
+
+    def _add_cameras(self, cameras: Cameras) -> None:
+        gui = self._server.gui
+        with gui.add_folder("Cameras of the data set", expand_by_default=False):
+            choice = gui.add_dropdown("Look from", (_FREE, *cameras.names), initial_value=_FREE)
+            frustums = gui.add_checkbox("Show them", False)
+        for index in range(len(cameras.names)):
+            position, wxyz, _, _, fov = self._pose(cameras, index)
+            self._frustums.append(
+                self._server.scene.add_camera_frustum(
+                    f"/cameras/{index}",
+                    fov=fov,
+                    aspect=cameras.width / cameras.height,
+                    scale=0.12 * SIZE,
+                    wxyz=wxyz,
+                    position=position,
+                    color=(60, 110, 200),
+                    visible=False,
+                )  # fmt: skip
+            )
+
+        async def chosen(event: Any) -> None:
+            if event.client is not None and choice.value in cameras.names:
+                self.look_from(event.client, cameras, cameras.names.index(choice.value))
+
+        async def switched(event: Any) -> None:
+            if event.client is not None:
+                for frustum in self._frustums:
+                    frustum.visible = bool(frustums.value)
+
+        choice.on_update(chosen)
+        frustums.on_update(switched)
+
+    def look_from(self, client: Any, cameras: Cameras, index: int) -> None:
+        """Moves one browser's view to a camera of the data set."""
+        position, _, forward, up, fov = self._pose(cameras, index)
+        with client.atomic():
+            client.camera.up_direction = up
+            client.camera.position = position
+            client.camera.look_at = position + forward * max(float(-position @ forward), 0.1)
+            client.camera.fov = fov
+
+    # ------------------------------------------------------------------------------------- videos
+
+    def _add_films(self, films: Any) -> None:
+        gui = self._server.gui
+        with gui.add_folder("Recorded video", expand_by_default=False):
+            self._on = gui.add_checkbox("Compare with the video", False, hint="While a recording is shown")
+            self._view = gui.add_dropdown("Camera", films.views, initial_value=films.views[0])
+            self._said = gui.add_html("")
+            blank = np.zeros((8, 16, 3), np.uint8)
+            self._picture = gui.add_image(blank, label="recorded | shown", format="png", visible=False)
+
+    def refresh(self, shown: Shown, *, now: bool = False) -> None:
+        """Draws the recorded and the shown frame of the chosen camera, where the shown one was recorded."""
+        if self._films is None:
+            return
+        moment = time.monotonic()
+        if not now and moment - self._drawn < 1 / _PICTURES:
+            return
+        self._drawn = moment
+        sequence = self._takes.get(shown.source) if shown.source != LIVE else None
+        view = self._view.value
+        on = bool(self._on.value) and sequence is not None and view in self._films.views
+        self._picture.visible = on
+        if not on or sequence is None:
+            hint = "Choose a recording under Play to compare." if self._on.value else ""
+            self._say(hint)
+            return
+        try:
+            truth = self._films.truth(sequence, view, shown.number)
+            drawn = self._films.drawn(sequence, view, shown)
+        except GausSimError as error:
+            self._say(str(error))
+            return
+        self._say("" if truth is not None else "The recording is over.")
+        left = truth if truth is not None else np.zeros_like(drawn)
+        line = np.full((drawn.shape[0], 2, 3), 255, np.uint8)
+        self._picture.image = np.concatenate((left, line, drawn), 1)
+
+    def _say(self, text: str) -> None:
+        import html
+
+        content = f"<div style='padding:0 .6em;font-size:.8em'>{html.escape(text)}</div>" if text else ""
+        if self._said.content != content:
+            self._said.content = content
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """Unit quaternion w x y z of a rotation matrix."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
+    return np.array([w, x, y, z])

@@ -1,0 +1,38 @@
+"""What the viewer is about."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gausim.core import Cameras
+from gausim.interaction.interaction import Interaction
+from gausim.viewer.companion import Companion
+from gausim.viewer.films import Films
+from gausim.viewer.live import Take
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What the viewer is about.
+
+    Attributes:
+        title: one line for the page.
+        interaction: what is simulated.
+        takes: recordings that can be played.
+        companion: another method beside it, or None.
+        films: the recorded videos, or None.
+        cameras: of the data set, or None.
+        up: vertical axis: x, y, z, -x, -y or -z.
+        sessions: folder that saved sessions go to.
+    """
+
+    title: str
+    interaction: Interaction
+    takes: Sequence[Take] = ()
+    companion: Companion | None = None
+    films: Films | None = None
+    cameras: Cameras | None = None
+    up: str = "z"
+    sessions: Path = field(default_factory=lambda: Path("sessions"))

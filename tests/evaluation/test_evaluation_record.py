@@ -1,0 +1,199 @@
+"""What an evaluation records beside its figures: costs, sources, pictures, absent metrics."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from helpers import toy_object
+
+import gausim
+from gausim.compose.predict import RunObject, TrainedPrediction
+from gausim.core import Rendered
+from gausim.data.objects import ObjectData
+from gausim.evaluation.evaluation import default_metrics, evaluate_object, no_lpips, write_evaluation
+from gausim.evaluation.recorder import PictureRecorder
+from gausim.metrics.lpips import expected_shapes
+from gausim.models.hierarchy.clusters import build_hierarchy
+from gausim.render.reference import ReferenceRenderer
+from gausim.results.pictures import load_pictures
+from gausim.runs import cost
+from gausim.runs.cost import CostMeter
+from gausim.runs.memory import keep_freed_memory
+from gausim.runs.provenance import code_provenance, data_provenance, file_hash
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory):
+    return toy_object.write_toy_object(tmp_path_factory.mktemp("data") / "toy")
+
+
+class Oracle:
+    levels = {"counts": [36, 4], "predicted": [1], "predictions": 3, "kernels": 36}
+
+    def __init__(self, toy) -> None:
+        self.toy = toy
+
+    def __call__(self, record):
+        return self.toy.truth(record.name)
+
+
+def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path):
+    methods = {"oracle": Oracle(toy), "bare": lambda record: toy.truth(record.name)}
+    curves = evaluate_object(ObjectData(toy.root), toy.scene, methods, ReferenceRenderer())
+    summary = write_evaluation(tmp_path, [curves], {"name": "toy"})
+    assert summary["provenance"]["gausim"] == gausim.__version__
+    entry = json.loads((tmp_path / "metrics.json").read_text())["objects"]["toy"]
+    efficiency = entry["efficiency"]
+    assert efficiency["oracle"]["levels"] == Oracle.levels and efficiency["bare"]["levels"] is None
+    assert efficiency["oracle"]["frames"] == 38 and efficiency["oracle"]["seconds_per_frame"]["mean"] > 0
+    assert efficiency["oracle"]["seconds_per_image"] > 0 and entry["absent"] == {"lpips": "no weights"}
+    for key, name in (("scene", "scene.ply"), ("manifest", "dataset.json")):
+        expected = hashlib.sha256((toy.root / name).read_bytes()).hexdigest()
+        assert entry["sources"][key] == {"file": name, "sha256": expected}
+    (pictures,) = load_pictures(tmp_path / "pictures.npz")
+    assert (pictures.sequence, pictures.views, pictures.heldout_views) == ("seq_000", toy_object.VIEWS, ("cam_2",))
+    difference = pictures.truth.astype(int) - pictures.predictions["oracle"]
+    assert pictures.truth.shape == (20, 3, 32, 32, 4) and np.abs(difference).max() <= 2
+    assert pictures.background is None and "flip" in entry["metrics"] and "lpips" not in entry["metrics"]
+
+
+def test_lpips_is_measured_where_its_weights_are(monkeypatch, tmp_path):
+    from safetensors.torch import save_file
+
+    assert [m.key for m in default_metrics()] == ["l2", "l2_foreground", "psnr", "psnr_foreground", "ssim", "flip"]
+    save_file({n: torch.ones(s) for n, s in expected_shapes().items()}, tmp_path / "w.safetensors")
+    monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(tmp_path / "w.safetensors"))
+    assert [m.key for m in default_metrics()][-1] == "lpips" and no_lpips(31) == ""
+    assert "lpips" not in [m.key for m in default_metrics(30)] and no_lpips(30) == "images under 31 pixels"
+
+
+def test_levels_of_a_trained_prediction(toy):
+    hierarchy = build_hierarchy(toy.scene, radii=[0.3])
+    model = SimpleNamespace(hierarchies=[hierarchy], predicted_levels=(1,))
+    run = SimpleNamespace(module=SimpleNamespace(model=model))
+    item = RunObject(0, ObjectData(toy.root), 0)
+    counts = [level.count for level in hierarchy.levels]
+    expected = {"counts": counts, "predicted": [1], "predictions": hierarchy.predictions([1]), "kernels": 36}
+    assert TrainedPrediction(run, item).levels == expected and 0 < expected["predictions"] < 36
+    model.hierarchies = None
+    assert TrainedPrediction(run, item).levels is None
+
+
+def test_the_first_sequence_warms_up(monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    meter = CostMeter()
+
+    def takes(seconds: float) -> str:
+        now[0] += seconds
+        return "made"
+
+    assert [meter.predict(lambda s=s: takes(s), 10) for s in (50.0, 1.0, 3.0)] == ["made"] * 3
+    meter.draw(lambda: takes(6.0), 12)
+    found = meter.summary()
+    assert found["seconds_per_frame"] == pytest.approx({"mean": 0.2, "std": 0.1})
+    assert found["frames"] == 30 and found["seconds_per_image"] == 0.5
+    only = CostMeter()
+    only.predict(lambda: takes(50.0), 10)
+    assert only.summary()["seconds_per_frame"]["mean"] == 5.0
+
+
+@pytest.mark.skipif(not cost._RESET.exists() or torch.cuda.is_available(), reason="needs Linux's /proc, without CUDA")
+def test_memory_that_a_prediction_takes_is_seen():
+    meter = CostMeter()
+    meter.predict(lambda: np.ones(30_000_000).sum(), 1)  # 240 MB, let go at once
+    memory = meter.summary()["memory"]
+    assert 200e6 < memory["added_bytes"] < 400e6 and memory["peak_bytes"] > memory["added_bytes"]
+
+
+@pytest.mark.skipif(not cost._RESET.exists() or torch.cuda.is_available(), reason="needs Linux's /proc, without CUDA")
+def test_memory_that_was_freed_before_hides_nothing():
+    def blocks(count: int) -> float:
+        return float(sum(x.sum() for x in [np.ones(125_000) for _ in range(count)]))  # 1 MB each
+
+    assert keep_freed_memory()
+    blocks(200)
+    meter = CostMeter()
+    for count in (150, 60, 80):
+        meter.predict(lambda count=count: blocks(count), 1)
+    memory = meter.summary()["memory"]
+    assert 130e6 < memory["first_added_bytes"] < 200e6 and 65e6 < memory["added_bytes"] < 110e6
+
+
+def test_memory_is_unknown_where_nothing_tells(monkeypatch, tmp_path):
+    monkeypatch.setattr(cost, "_RESET", tmp_path / "missing" / "clear_refs")
+    meter = CostMeter()
+    meter.predict(lambda: 0, 1)
+    assert meter.summary()["memory"] is None
+
+
+def git(folder: Path, *arguments: str) -> str:
+    identity = ["-c", "user.name=t", "-c", "user.email=t@example.org"]
+    command = ["git", "-C", str(folder), *identity, *arguments]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def test_the_commit_of_the_package_and_whether_it_was_changed(tmp_path):
+    package = tmp_path / "src" / "gausim"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text("")
+    assert code_provenance(package)["commit"] is None
+    git(tmp_path, "init", "-q")
+    assert code_provenance(package)["commit"] is None  # in a repository that does not hold it
+    git(tmp_path, "add", ".")
+    git(tmp_path, "commit", "-q", "-m", "first")
+    found = code_provenance(package)
+    assert (found["commit"], found["modified"]) == (git(tmp_path, "rev-parse", "HEAD"), False)
+    (package / "__init__.py").write_text("x = 1")
+    assert code_provenance(package)["modified"] is True
+
+
+def test_a_store_manifest_counts_before_the_facts(toy, tmp_path):
+    root = tmp_path / "object"
+    root.mkdir()
+    (root / "dataset.json").write_bytes((toy.root / "dataset.json").read_bytes())
+    assert data_provenance(ObjectData(root))["scene"]["sha256"] is None
+    (root / "manifest.json").write_text("{}")
+    found = data_provenance(ObjectData(root))["manifest"]
+    assert found == {"file": "manifest.json", "sha256": file_hash(root / "manifest.json")}
+
+
+def recorded(frames: int = 2, size: int = 8) -> torch.Tensor:
+    """Straight alpha; the left half is the object, red; behind it the wall is blue, and grey where nothing ever is."""
+    pixels = torch.zeros(frames, 3, size, size, 4, dtype=torch.uint8)
+    pixels[..., 2] = 200
+    pixels[..., : size // 2, :] = torch.tensor([255, 0, 0, 255], dtype=torch.uint8)
+    return pixels
+
+
+def test_pictures_keep_the_background_that_was_seen(toy):
+    recorder = PictureRecorder(ObjectData(toy.root), "seq_000", toy_object.VIEWS)
+    first, second = recorded(), recorded()
+    second[:, :, :, 2:4] = torch.tensor([0, 0, 100, 0], dtype=torch.uint8)  # the object uncovers two columns
+    drawn = {"ours": Rendered(torch.full((2, 3, 8, 8, 3), 0.5), torch.full((2, 3, 8, 8), 0.5))}
+    recorder.add(first, drawn)
+    recorder.add(second, drawn)
+    pictures = recorder.finish()
+    assert pictures.truth.shape == (4, 3, 8, 8, 4) and pictures.truth[0, 0, 0, 0].tolist() == [255, 0, 0, 255]
+    assert pictures.truth[0, 0, 0, 7].tolist() == [0, 0, 0, 0]  # premultiplied
+    assert pictures.predictions["ours"][3, 2, 0, 0].tolist() == [128] * 4
+    blue = pictures.background[0, 0, :, 2].tolist()
+    # Covered throughout: the mean of what was seen, weighted by how often; uncovered: 100; always free: 200.
+    assert blue[2:] == [100, 100, 200, 200, 200, 200] and blue[0] == blue[1] == round((2 * 100 * 2 + 4 * 200 * 4) / 20)
+
+
+def test_recordings_without_background_have_none_and_large_ones_shrink(toy, monkeypatch):
+    recorder = PictureRecorder(ObjectData(toy.root), "seq_000", ["cam_2", "cam_0"])
+    pixels = torch.zeros(1, 2, 240, 480, 4, dtype=torch.uint8)
+    recorder.add(pixels, {})
+    pictures = recorder.finish()
+    assert pictures.background is None and pictures.truth.shape == (1, 2, 96, 192, 4)
+    assert pictures.views == ("cam_2", "cam_0") and pictures.heldout_views == ("cam_2",)

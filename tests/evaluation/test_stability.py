@@ -1,0 +1,56 @@
+"""The largest eigenvalue of the linearised step: the template's own matrices, growth of a small motion."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from helpers import toy_object
+
+import gausim.evaluation.stability as stability
+from gausim.core import SimState
+from gausim.models.step.simulator import GausSim
+from gausim.models.template.elastic import ElasticTemplate
+
+
+def _model(**options: object) -> GausSim:
+    torch.manual_seed(0)
+    template = partial(ElasticTemplate, modes=9, neighbours=6, hidden=0)
+    settings = {"radii": (0.3, 0.7), "hidden": 8, "layers": 1, "edges": "rest", "template": template}
+    return GausSim([toy_object.toy_scene()], [24.0], **(settings | options))
+
+
+def test_without_a_network_it_is_that_of_the_template_s_matrices() -> None:
+    model = _model(zero_output=True)
+    with torch.no_grad():
+        model.template.scenes[0].damping.fill_(-0.5)
+        now, before, _ = model.template.scenes[0].matrices()
+    step = torch.cat((torch.cat((now, -before), 1), torch.eye(9, 18)))
+    expected = float(torch.linalg.eigvals(step).abs().max())
+    assert expected < 0.9999
+    assert stability.largest_eigenvalue(model, 0) == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("output_scale", [0.05, 0.3])
+def test_it_is_the_growth_of_a_small_motion(output_scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = _model(output_scale=output_scale, anchor=True).train()
+    batch = model.batch([0])
+    with torch.no_grad():
+        model.step(batch, SimState(batch.rest, batch.rest))  # gathers statistics of the inputs
+    found = stability.largest_eigenvalue(model, 0)
+    assert model.training
+    monkeypatch.setattr(stability, "DENSE", 0)
+    assert stability.largest_eigenvalue(model, 0) == pytest.approx(found, abs=1e-4)
+    model.eval()
+    state = SimState(batch.rest, batch.rest + 1e-4 * torch.randn(batch.rest.shape))
+    logs, small = [], 1e-4
+    with torch.no_grad():
+        for _ in range(300):
+            after = model.step(batch, state).positions
+            factor = small / float(torch.stack((after - batch.rest, state.positions - batch.rest)).abs().max())
+            state = SimState(
+                batch.rest + factor * (after - batch.rest), batch.rest + factor * (state.positions - batch.rest)
+            )
+            logs.append(-torch.tensor(factor).log())
+    assert float(torch.stack(logs[100:]).mean().exp()) == pytest.approx(found, abs=5e-3)

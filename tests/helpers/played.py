@@ -1,0 +1,51 @@
+"""A small run of an elastic toy, as `load_run` gives it back, without training: for commands that push it."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import torch
+
+from gausim.data.objects import ObjectData
+from gausim.models.initial_state import ModalInitialStates
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.step.simulator import GausSim
+from gausim.models.template.elastic import ElasticTemplate
+from gausim.render.reference import ReferenceRenderer
+from helpers import toy_object
+
+
+def played_run(folder: Path) -> SimpleNamespace:
+    """Two sequences of one object; the network has random weights, the template a firm block."""
+    toy = toy_object.write_toy_object(folder / "data" / "toy")
+    torch.manual_seed(0)
+    template = partial(ElasticTemplate, modes=6, geometric=1.0)
+    model = GausSim(
+        [toy.scene], [toy.fps], radii=(0.3, 0.7), graph_radii=(0.9, 0.5), max_neighbours=6, hidden=8, layers=1,
+        template=template, output_scale=0.005, passive_frames=6,
+    ).eval()  # fmt: skip
+    states = ModalInitialStates(model, [0, 0])
+    with torch.no_grad():
+        for number, velocity in enumerate(states.velocity):
+            velocity[0] = 0.05 * (number + 1)
+
+    def foresee(sequence: int, steps: int):
+        from gausim.core import SimState
+
+        with torch.no_grad():
+            return SceneDynamics(model).rollout(SimState(toy.scene.means, states.previous(sequence)), steps)
+
+    module = SimpleNamespace(
+        model=model, simulator=model, initial_states=states, foresee=foresee, method_name="gausim", footnotes=None
+    )
+    directory = folder / "demo" / "seed_0"
+    directory.mkdir(parents=True)
+    torch.save({"state_dict": {}, "gausim": {}, "epoch": 1, "global_step": 1}, directory / "last.ckpt")
+    (directory / "FINISHED").write_text("{}")
+    (directory / "config.yaml").write_text("name: toy\n")
+    return SimpleNamespace(
+        config={"name": "toy", "seed": 0, "model": {"modes": 6}}, module=module, objects=[ObjectData(toy.root)],
+        renderer=ReferenceRenderer(), run_dir=directory,
+    )  # fmt: skip

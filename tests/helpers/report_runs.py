@@ -1,0 +1,121 @@
+"""Run directories as `gausim train` and `gausim evaluate` leave them, with numbers that are easy to recompute."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from gausim.results.curves import ImageMetricInfo, ObjectCurves, ObjectFacts, save_curves
+from gausim.results.pictures import Pictures, save_pictures
+from gausim.results.summary import write_summary
+
+FRAMES, FIRST_UNSEEN = 60, 16
+SEQUENCES, VIEWS = ("a", "b"), ("x", "y")
+METRICS = (ImageMetricInfo("l2", "l2", 1e3, "1e-3", False), ImageMetricInfo("ssim", "SSIM", 10.0, "1e-1", True))
+CONFIG: dict[str, Any] = {
+    "data": {"root": "/data/toy", "names": None, "seed": 0},
+    "model": {"simulator": {"conserve_mass": True, "conserve_momentum": True, "predicted_levels": [2, 1]}},
+    "optimizer": {"network_lr": 0.001},
+    "ablation": {"name": "none"},
+    "experiment": {"name": "toy"},
+    "seed": 0,
+    "name": "toy",
+    "paths": {"output_root": "out"},
+}
+
+
+def config(seed: int = 0, name: str = "toy", **simulator: Any) -> dict[str, Any]:
+    made = copy.deepcopy(CONFIG)
+    made |= {"seed": seed, "name": name}
+    made["model"]["simulator"] |= simulator
+    return made
+
+
+def write_run(
+    folder: Path, settings: dict[str, Any], *, model: str | None = "gausim", finished: bool = True, epochs: int = 3
+) -> Path:
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text(yaml.safe_dump(settings, sort_keys=False))
+    (folder / "epochs.csv").write_text("epoch,step\n" + "".join(f"{e},{4 * e}\n" for e in range(1, epochs + 1)))
+    if model is not None:
+        (folder / ".hydra").mkdir()
+        hydra = {"hydra": {"runtime": {"choices": {"model": model, "ablation": "none"}}}}
+        (folder / ".hydra" / "hydra.yaml").write_text(yaml.safe_dump(hydra))
+    if finished:
+        (folder / "FINISHED").write_text("{}")
+    return folder
+
+
+def make_curves(
+    error: float = 1.0, *, name: str = "toy_bunny", static: float = 4.0, frames: int = FRAMES
+) -> ObjectCurves:
+    """l2 of 1e-3 and 3e-3 (by sequence) times ``error`` in seen frames, five times that in unseen ones."""
+    facts = ObjectFacts(
+        name=name, fps=24.0, sequences=SEQUENCES, frames=(frames,) * 2, views=VIEWS, train_views=VIEWS[:1],
+        first_unseen=FIRST_UNSEEN, methods=("gausim",), metrics=METRICS, mean_color=(0.3, 0.0, 0.4), max_l2=0.9,
+    )  # fmt: skip
+    late = 1 + 4.0 * (np.arange(frames) >= FIRST_UNSEEN)
+    l2 = 1e-3 * np.array([1.0, 3.0])[:, None, None] * late[None, :, None] * np.ones(2)
+    energy = np.ones((2, frames))
+    energy[:, 0] = np.nan
+    images = np.stack((energy, energy), -1)
+    values = {
+        "gausim": {"l2": error * l2, "ssim": 1 - error * l2, "error_3d": 100 * error * l2[..., 0],
+                   "point_energy": energy / (1 + error), "image_energy": images / (1 + error)},
+        "static": {"l2": static * l2, "ssim": 1 - static * l2, "error_3d": 100 * static * l2[..., 0],
+                   "point_energy": 0 * energy, "image_energy": 0 * images},
+        "truth": {"point_energy": energy, "image_energy": images},
+    }  # fmt: skip
+    record = {
+        "efficiency": {"gausim": {
+            "seconds_per_frame": {"mean": 0.01 * error, "std": 0.001}, "frames": 118, "seconds_per_image": 0.002,
+            "device": "cpu", "threads": 1, "memory": {
+                "kind": "process, resident", "peak_bytes": 2.1e9, "added_bytes": 3e6 * error, "first_added_bytes": 2e7},
+            "levels": {"counts": [200, 20, 4], "predicted": [2, 1], "predictions": 20, "kernels": 200}}},
+        "sources": {"root": "/data/toy", "scene": {"file": "scene.ply", "sha256": "5ce7e" * 12},
+                    "manifest": {"file": "dataset.json", "sha256": "da7a" * 16}},
+        "absent": {"lpips": "no weights"},
+        "footnotes": {"gausim": {"extrapolates": True, "notes": [], "fit": {
+            "seconds": 90.0 * error, "cpu_seconds": 60.0 * error, "peak_bytes": 1.5e9}}},
+    }  # fmt: skip
+    return ObjectCurves(facts, values, record, make_pictures(name, shift=round(2 * error)))
+
+
+def make_pictures(name: str = "toy_bunny", *, shift: int = 1, background: bool = True, frames: int = 20) -> Pictures:
+    """A bright square that moves to the right; predicted some pixels off."""
+    truth = np.zeros((frames, 2, 24, 32, 4), np.uint8)
+    predicted = truth.copy()
+    for f in range(frames):
+        truth[f, :, 8:14, f % 20 : f % 20 + 6] = (120, 90, 60, 255)
+        predicted[f, :, 8:14, f % 20 + shift : f % 20 + shift + 6] = (120, 90, 60, 255)
+    plate = np.full((2, 24, 32, 3), (10, 200, 30), np.uint8) if background else None
+    return Pictures(
+        object=name, sequence="a", fps=24.0, first_unseen=8, views=VIEWS, heldout_views=VIEWS[1:], truth=truth,
+        predictions={"gausim": predicted}, background=plate,
+    )  # fmt: skip
+
+
+def evaluate(run: Path, *curves: ObjectCurves, finished: bool = True, commit: str | None = "c0ffee" * 6) -> Path:
+    folder = run / "evaluation"
+    folder.mkdir()
+    state = {"name": "toy", "finished": finished, "epoch": 2, "updates": 12}
+    provenance = {"gausim": "0.1.0", "torch": "2", "python": "3", "commit": commit, "modified": False}
+    write_summary(folder / "metrics.json", list(curves), state, provenance=provenance)
+    save_curves(folder / "metrics.npz", list(curves))
+    save_pictures(folder / "pictures.npz", [c.pictures for c in curves if c.pictures is not None])
+    return run
+
+
+def write_sweep(root: Path) -> Path:
+    """Full method with two seeds, three ablations: one measured, one failed, one killed."""
+    for seed, error in ((0, 1.0), (1, 1.2)):
+        evaluate(write_run(root / "full" / f"seed_{seed}", config(seed)), make_curves(error))
+    evaluate(write_run(root / "no_mass" / "seed_0", config(conserve_mass=False)), make_curves(1.5))
+    failed = write_run(root / "no_hierarchy" / "seed_0", config(predicted_levels=[0]), finished=False)
+    (failed / "FAILED").write_text("Traceback\nRuntimeError: out of memory\n")
+    write_run(root / "no_momentum" / "seed_0", config(conserve_momentum=False), finished=False)
+    return root

@@ -1,0 +1,113 @@
+"""The smallest simulator that can be trained, on the toy object: what tests of training share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import torch
+from torch import Tensor, nn
+
+from gausim.core import GaussianScene, Rendered, SimState
+from gausim.data.dataset import SequenceSample
+from gausim.losses import Objective
+from gausim.render.reference import ReferenceRenderer
+from gausim.training.module import GausSimModule
+from gausim.training.optimizers import OptimizerSettings
+from helpers import toy_object
+
+
+class Sway(nn.Module):
+    """x' = x + c (x - x_prev) + s z^2 e_x with one drift s per scene and one shared c: the smallest simulator."""
+
+    def __init__(self, scenes: list[GaussianScene]) -> None:
+        super().__init__()
+        self.scenes = scenes
+        self.keep = nn.Parameter(torch.tensor(0.5))
+        self.drift = nn.ParameterList(torch.zeros(()) for _ in scenes)
+        self.poison: float | None = None
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        return {"network": [self.keep], "scene": list(self.drift)}
+
+    def shared(self) -> dict[str, nn.Module]:
+        return {}
+
+    def own(self, scene_id: int) -> tuple[str, ...]:
+        return (f"drift.{scene_id}",)
+
+    def freeze(self, *, scenes: bool = False) -> None:
+        (self if scenes else self.keep).requires_grad_(False)
+
+    def batch(self, scene_ids: list[int]) -> SimpleNamespace:
+        members, start = [], 0
+        for n, i in enumerate(scene_ids):
+            count = self.scenes[i].count
+            units = torch.zeros(count, dtype=torch.long)
+            rows = slice(start, start + count)
+            members.append(SimpleNamespace(scene_id=i, kernels=rows, units=slice(n, n + 1), unit_of_kernel=units))
+            start += count
+        return SimpleNamespace(rest=torch.cat([self.scenes[i].means for i in scene_ids]), members=tuple(members))
+
+    def prepare(self, batch: SimpleNamespace) -> None:
+        return None
+
+    def step(
+        self, batch: SimpleNamespace, state: SimState, force: Tensor | None = None, prepared: None = None
+    ) -> SimpleNamespace:
+        drift = torch.cat([self.drift[m.scene_id].expand(m.kernels.stop - m.kernels.start) for m in batch.members])
+        push = torch.zeros_like(batch.rest)
+        push[:, 0] = drift * batch.rest[:, 2] ** 2
+        positions = state.positions + self.keep * (state.positions - state.previous) + push
+        if self.poison is not None:
+            positions = positions * self.poison
+        identity = torch.eye(3).expand(len(batch.members), 3, 3)
+        momentum = (self.keep * drift.mean()).square()
+        return SimpleNamespace(positions=positions, gradients=identity, rotations=identity, momentum=momentum)
+
+
+class Previous(nn.Module):
+    def __init__(self, model: Sway, scene_of_sequence: tuple[int, ...]) -> None:
+        super().__init__()
+        self.values = nn.ParameterList(model.scenes[i].means.clone() for i in scene_of_sequence)
+
+    def previous(self, sequence_id: int) -> Tensor:
+        return self.values[sequence_id]
+
+
+SCENE_OF_SEQUENCE = (0, 0, 1)
+
+
+def sample(sequence: int, steps: int = 3, amplitude: float = 0.4) -> SequenceSample:
+    toy = toy_object.ToyObject(Path("unused"), toy_object.toy_scene(), amplitudes={"a": amplitude})
+    frames = toy_object.rgba(toy.scene, toy.truth("a", steps + 1))
+    return SequenceSample(
+        scene_id=SCENE_OF_SEQUENCE[sequence], object_name="toy", sequence_id=sequence, sequence_name=f"seq_{sequence}",
+        frames=frames, cameras=toy_object.cameras(), fps=24.0)  # fmt: skip
+
+
+def sway_module(objective: Objective | None = None, **settings: float) -> GausSimModule:
+    model = Sway([toy_object.toy_scene(), toy_object.toy_scene()])
+    return GausSimModule(
+        model=model,
+        initial_states=Previous(model, SCENE_OF_SEQUENCE),
+        scene_of_sequence=SCENE_OF_SEQUENCE,
+        renderer=ReferenceRenderer(),
+        objective=objective or Objective(),
+        optimizer=OptimizerSettings(**settings),  # type: ignore[arg-type]
+    )
+
+
+def blobs(means: Tensor, covars: Tensor, colors: Tensor, opacities: Tensor, viewmats: Tensor, Ks: Tensor,
+          size: tuple[int, int], *, background: Tensor | None = None, depth: bool = False) -> Rendered:  # fmt: skip
+    """A renderer of a few operations that never reads a number: the sum of Gaussians of a fixed width."""
+    camera = torch.einsum("bvij,bkj->bvki", viewmats[..., :3, :3], means) + viewmats[..., None, :3, 3]
+    pixel = torch.einsum("bvij,bvkj->bvki", Ks, camera)
+    pixel = pixel[..., :2] / pixel[..., 2:].clamp_min(0.1)
+    x, y = (torch.arange(n, device=means.device) + 0.5 for n in size)
+    rows, columns = (torch.exp(-0.5 * (axis - pixel[..., i, None]) ** 2) for i, axis in ((1, y), (0, x)))
+    weight = (
+        opacities[:, None, :, None] * colors * (1 + 0.1 * covars.diagonal(dim1=-2, dim2=-1).sum(-1))[:, None, :, None]
+    )
+    rgb = torch.einsum("bvkh,bvkw,bvkc->bvhwc", rows, columns, weight).tanh()
+    return Rendered(rgb, rgb.amax(-1))

@@ -1,0 +1,312 @@
+"""Stepping is the rollout, forces do what they say, what is recorded is replayed bit for bit, and divergence stops."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gausim.core import ConfigError, DataError, DivergenceError, SimState, Steppable, SteppedFrame, Stepper
+from gausim.interaction.interaction import Interaction, replay
+from gausim.interaction.selections import Ball, Kernels, Unit, Whole
+from gausim.interaction.session import Force, Gravity, Impulse, MadeWith, Pin, Release, Reset, Unpin, Wind
+from gausim.models.rollout.dynamics import SceneDynamics
+
+X, Y, UP = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+
+
+def same(a, b) -> bool:
+    names = ("positions", "gradients", "rotations", "unit_of_kernel")
+    return all(torch.equal(getattr(a, n), getattr(b, n)) for n in names) and a.fps == b.fps
+
+
+@pytest.mark.parametrize("passive", [0, 6])
+def test_stepping_is_the_rollout_bit_for_bit(make_column, make_simulator, passive) -> None:
+    scene = make_column()
+    dynamics = SceneDynamics(make_simulator(scene, passive=passive))
+    assert isinstance(dynamics, Steppable)
+    initial = SimState(scene.means, scene.means - torch.tensor([0.004, 0, 0]) * scene.means[:, 2:])
+    force = torch.randn(scene.count, 3, generator=torch.Generator().manual_seed(0))
+    whole = dynamics.rollout(initial, 12, forces=lambda n: force if 3 <= n < 5 else None)
+    stepper = dynamics.stepper(initial)
+    assert isinstance(stepper, Stepper) and torch.equal(stepper.frame.positions, initial.positions)
+    for n in range(12):
+        frame = stepper.step(force if 3 <= n < 5 else None)
+        assert torch.equal(frame.positions, whole.positions[n + 1])
+        assert torch.equal(frame.gradients, whole.gradients[n + 1])
+        assert torch.equal(frame.rotations, whole.rotations[n + 1])
+    assert torch.equal(stepper.state.previous, whole.positions[11])
+    assert float((whole.positions[-1] - scene.means).abs().max()) > 1e-3
+
+
+def test_an_interaction_without_events_is_the_rollout(make_column, make_simulator) -> None:
+    scene = make_column()
+    model = make_simulator(scene)
+    initial, dynamics = SimState(scene.means, scene.means * 0.999), SceneDynamics(model)
+    live = Interaction(
+        scene, dynamics, dynamics.masses, initial, made_with=MadeWith.of(scene, model, initial), keep=None
+    )
+    for _ in range(10):
+        live.step()
+    assert same(live.trajectory(), dynamics.rollout(initial, 10))
+    assert live.tick == live.frame_number == 10 and live.session().entries == ()
+
+
+def play(live: Interaction) -> None:
+    """Every kind of event, a divergence excepted."""
+    todo = {
+        0: [Force(Ball((0.3, 0.3, 1.2), 0.3), X, 2.0, name="drag"), Gravity((0.0, -1.0, 0.0), 0.3)],
+        2: [Force(Unit(1, 0), (0.3, 1.0, 0.0), 1.5, frames=3, name="tap"), Wind(Y, 0.7, gusts=0.8)],
+        4: [Release("drag"), Impulse(Whole(), (-1.0, 0.2, 0.0), 0.05)],
+        6: [Pin(Kernels(tuple(range(60, 70)))), Force(Kernels((61, 80, 81, 85)), UP, 3.0)],
+        9: [Unpin(), Release()],
+        12: [Reset(), Impulse(Unit(2, 0), X, 0.1)],
+    }
+    for tick in range(16):
+        for event in todo.get(tick, ()):
+            live.act(event)
+        live.step()
+    live.act(Gravity(X, 0.0))
+
+
+def test_a_session_is_replayed_bit_for_bit(make_interaction) -> None:
+    live = make_interaction(keep=None, seed=3)
+    play(live)
+    recorded, session = live.trajectory(), live.session()
+    assert recorded.frames == 17 and len(session.entries) == 13 and session.steps == 16
+    assert len({e.event.__class__ for e in session.entries}) == 8
+    fresh = make_interaction(seed=3)
+    assert same(replay(fresh, session), recorded)
+    assert fresh.session() == session
+    assert same(replay(live, session), recorded)  # the same one again
+    moved = (recorded.positions - recorded.positions[0]).norm(dim=-1).amax(1)
+    assert float(moved[3]) > 1e-3 and float(moved[13]) < float(moved[12])
+
+
+def test_replay_wants_what_the_session_was_made_with(make_interaction) -> None:
+    live = make_interaction()
+    live.act(Force(Whole(), X, 1.0))
+    live.step()
+    session = live.session()
+    other = replace(session, made_with=replace(session.made_with, model_hash="0", run="elsewhere"))
+    with pytest.raises(DataError, match="another method or training .run 'elsewhere'"):
+        replay(live, other)
+    assert same(replay(live, other, other_model=True), replay(live, session))
+    for changed in (
+        replace(session, made_with=replace(session.made_with, scene_hash="0", scene="cup")),
+        replace(session, fps=30.0),
+    ):
+        with pytest.raises(DataError, match="another scene, 'cup' and not 'column'|30 frames per second and not 24"):
+            replay(live, changed, other_model=True)
+    assert make_interaction(seed=1).made_with.model_hash != session.made_with.model_hash
+    live.frame = replace(live.frame, positions=torch.zeros(1, 1).expand(1 << 30, 3))
+    with pytest.raises(DataError, match="frames take 12 GiB, expected at most 8"):
+        replay(live, session)
+
+
+def test_a_force_is_a_multiple_of_the_weight(make_column) -> None:
+    """On free matter, f = w m g for n steps moves it as w g does in n frames: Verlet's x, exactly."""
+    scene = make_column()
+
+    class Free:
+        fps, unit_of_kernel, takes_forces, limited = 24.0, torch.zeros(scene.count, dtype=torch.long), True, 0
+
+        def __init__(self, initial: SimState) -> None:
+            self.state, self._eye = initial, torch.eye(3)[None]
+            self.frame = SteppedFrame(initial.positions, self._eye, self._eye)
+
+        def step(self, force=None, *, held=None):
+            x, before = self.state.positions, self.state.previous
+            shift = torch.zeros_like(x) if force is None else force / (2 * masses[:, None] * self.fps**2)
+            new = 2 * (x + shift) - before
+            new = torch.where(held[:, None], x, new) if held is not None else new
+            self.state = SimState(new, x)
+            self.frame = SteppedFrame(new, self._eye, self._eye)
+            return self.frame
+
+        def settle(self) -> None: ...
+
+        def stepper(self, initial: SimState):
+            return Free(initial)
+
+        def rollout(self, initial, steps, *, forces=None):
+            raise NotImplementedError
+
+    masses = torch.linspace(0.5, 2, scene.count)
+    initial = SimState(scene.means, scene.means)
+    made = MadeWith.of(scene, None, initial)
+    live = Interaction(scene, Free(initial), masses, initial, made_with=made, gravity=2.0)
+    free = scene.simulated & ~scene.pinned
+    dt = 1 / 24
+
+    def shift() -> torch.Tensor:
+        return live.frame.positions - scene.means
+
+    live.act(Force(Whole(), (0.0, 3.0, 4.0), 1.5, frames=2))
+    for _ in range(3):
+        live.step()
+    a = 1.5 * 2.0 * torch.tensor([0.0, 0.6, 0.8])
+    # after steps 1, 2 (pushed) and 3 (free): a dt^2 (1 + 2 + 2)
+    assert torch.allclose(shift()[free], (5 * a * dt**2).expand(int(free.sum()), 3), rtol=1e-3, atol=1e-6)
+    assert torch.equal(shift()[~free], torch.zeros(int((~free).sum()), 3)) and live.acting == ()
+
+    live.reset()
+    live.act(Impulse(Whole(), X, 0.1))
+    for _ in range(4):
+        live.step()
+    assert torch.allclose(shift()[free][:, 0], torch.tensor(4 * 0.1 * 2.0 * dt), rtol=1e-3)
+
+    live.reset()
+    live.act(Wind(X, 0.5))
+    live.act(Gravity((0.0, 0.0, -1.0), 2.0))
+    live.step()
+    mass = masses * free
+    mean = (mass[:, None] * shift()).sum(0) / mass.sum()
+    assert torch.allclose(mean, torch.tensor([0.5, 0.0, -2.0]) * 2.0 * dt**2, rtol=1e-3, atol=1e-7)
+    assert float(shift()[free][:, 0].std()) > 1e-5  # small kernels are blown further
+
+    live.reset()
+    on = Kernels((50, 51))
+    for name in "abcde":
+        live.act(Force(on, X, 9.0, name=name))
+    live.step()  # the sum is cut at ten weights
+    assert torch.allclose(shift()[50], torch.tensor([10 * 2.0 * dt**2, 0, 0]), rtol=1e-3, atol=1e-6)
+    live.act(Force(on, X, 0.0, name="a"))
+    live.act(Release("e"))
+    assert live.acting == ("a", "b", "c", "d")
+
+    live.reset()
+    live.act(Pin(on))
+    live.act(Force(Whole(), X, 1.0))
+    live.step()
+    assert torch.equal(shift()[50:52], torch.zeros(2, 3)) and float(shift()[52].norm()) > 0
+    live.act(Unpin(Kernels((50,))))
+    live.step()
+    assert float(shift()[50].norm()) > 0 and torch.equal(shift()[51], torch.zeros(3))
+
+
+def test_pinned_kernels_never_move(make_interaction) -> None:
+    live = make_interaction()
+    pinned, held = live.scene.pinned | ~live.scene.simulated, Kernels(tuple(range(70, 80)))
+    live.act(Gravity(X, 1.0))
+    for _ in range(4):
+        live.step()
+    live.act(Pin(held))
+    where = live.frame.positions[70:80].clone()
+    live.act(Force(Whole(), Y, 3.0))
+    for _ in range(8):
+        live.step()
+        assert torch.equal(live.frame.positions[70:80], where)
+        assert torch.equal(live.frame.positions[pinned], live.scene.means[pinned])
+    assert float((where - live.scene.means[70:80]).norm(dim=-1).median()) > 1e-3
+
+
+def test_what_cannot_be_done_is_refused_and_not_recorded(make_interaction) -> None:
+    live = make_interaction()
+    foot = Kernels(tuple(live.scene.pinned.nonzero()[:, 0].tolist()))
+    for event, message in (
+        (Force(foot, X, 1.0), "expected kernels that can move, got only pinned"),
+        (Force(Whole(), X, 10.5), "'weights': expected at most 10 "),
+        (Impulse(Whole(), X, 0.42), r"'weight_seconds': expected at most 0.416667"),
+        (Gravity(X, 11.0), "at most 10"),
+        (Wind(X, 11.0), "at most 10"),
+        (Pin(Kernels((90,))), "kernel 90: 'column' has kernels 0 to 89"),
+        (Force(Unit(3, 0), X, 1.0), "level 3: 'column' has levels 0 to 2"),
+        (Force(Unit(1, 999), X, 1.0), "unit 999: level 1 of 'column' has units 0 to"),
+        (Force(Ball((9.0, 9.0, 9.0), 0.1), X, 1.0), "no kernel of 'column' lies within 0.1 diagonals"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            live.act(event)
+    assert live.session().entries == () and live.acting == ()
+
+
+@pytest.mark.parametrize("options", [{"gravity": 0.0}, {"most_force": math.nan}, {"farthest": -1.0}])
+def test_numbers_out_of_range_are_refused(make_interaction, options) -> None:
+    with pytest.raises(ConfigError, match="expected a number > 0"):
+        make_interaction(**options)
+
+
+def test_it_says_that_forces_act_in_part(make_interaction) -> None:
+    live = make_interaction(ceiling=1e-5)
+    live.act(Force(Whole(), (1.0, 0.0, 0.0), 0.01, frames=2))
+    live.step()
+    assert live.limited == 0 and not live.resisting
+    live.act(Force(Whole(), (1.0, 0.0, 0.0), 10.0, frames=8))
+    for _ in range(8):
+        live.step()
+    assert 0 < live.limited <= 8 and live.resisting
+    for _ in range(24):
+        live.step()
+    live.reset()
+    assert live.limited == 0 and not live.resisting
+
+
+class Broken:
+    """Breaks in the second step, in one of several ways."""
+
+    takes_forces, fps, limited = True, 24.0, 0
+
+    def __init__(self, live: Interaction, how: str) -> None:
+        self._inner, self._how, self._steps = live._stepper, how, 0
+        self.unit_of_kernel = live.unit_of_kernel
+
+    @property
+    def state(self) -> SimState:
+        return self._inner.state
+
+    @property
+    def frame(self):
+        return self._inner.frame
+
+    def step(self, force=None, *, held=None):
+        frame, self._steps = self._inner.step(force, held=held), self._steps + 1
+        if self._steps < 2:
+            return frame
+        positions, gradients = frame.positions.clone(), frame.gradients.clone()
+        if self._how == "nan":
+            positions[33, 1] = math.nan
+        elif self._how == "far":
+            positions[33, 1] += 20
+        else:
+            gradients[self.unit_of_kernel[33]] *= torch.tensor([1.0, 1.0, 0.0 if self._how == "flat" else math.inf])
+        return replace(frame, positions=positions, gradients=gradients)
+
+    def settle(self) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("nan", "column: kernel 33 is nan diagonals from rest at frame 2"),
+        ("far", "column: kernel 33 is .* diagonals from rest at frame 2, expected at most 10"),
+        ("flat", "covariance of kernel .* is no longer positive definite at frame 2"),
+        ("inf", "covariance of kernel .* is no longer positive definite at frame 2"),
+    ],
+)
+def test_divergence_stops_until_a_reset(make_interaction, how, message) -> None:
+    live = make_interaction(keep=None)
+    live._stepper = Broken(live, how)
+    live.step()
+    good = live.frame
+    for _ in range(2):
+        with pytest.raises(DivergenceError, match=message):
+            live.step()
+    assert live.broken is not None and live.tick == 1 and live.frame is good
+    live.reset()
+    assert live.broken is None and live.frame_number == 0
+    live.step()
+    assert live.trajectory().frames == 3 and torch.isfinite(live.trajectory().positions).all()
+    assert same(replay(make_interaction(), live.session()), live.trajectory())
+
+
+def test_only_the_latest_frames_are_kept(make_interaction) -> None:
+    live = make_interaction(keep=4)
+    live.act(Gravity(X, 1.0))
+    for _ in range(9):
+        live.step()
+    kept = live.trajectory()
+    assert kept.frames == 4 and torch.equal(kept.positions[-1], live.frame.positions)
+    live.restart()
+    assert live.trajectory().frames == 1 and live.tick == 0 and live.session().entries == ()

@@ -1,0 +1,176 @@
+"""Files of sessions: read and written without loss, and refused with the field's name where they are wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from gausim.core import ConfigError, DataError
+from gausim.interaction import session as sessions
+from gausim.interaction.selections import Ball, Kernels, Unit, Whole, parse_kernels
+from gausim.interaction.session import (
+    Entry,
+    Force,
+    ForceSession,
+    Gravity,
+    Impulse,
+    MadeWith,
+    Pin,
+    Release,
+    Reset,
+    Unpin,
+    Wind,
+    load_session,
+    parse_session,
+    save_session,
+)
+
+MADE = MadeWith("cup", "a1", "b2", "c3", "seq_000", "demo/seed_0")
+ENTRIES = (
+    Entry(0, Force(Unit(1, 7), (0.1, 1 / 3, -2e-7), 0.30000000000000004, frames=12, name="drag")),
+    Entry(0, Force(Kernels((9, 3, 4, 5, 3, 100)), (1, 0, 0), 2)),
+    Entry(3, Impulse(Ball((0.1, 0.2, -0.3), 0.05), (0.0, 0.0, 1.0), 0.2)),
+    Entry(3, Wind((1.0, 1.0, 0.0), 0.5, gusts=0.25)),
+    Entry(4, Gravity((0.0, 0.0, -1.0), 1.0)),
+    Entry(5, Pin(Whole())),
+    Entry(8, Unpin()),
+    Entry(8, Release("drag")),
+    Entry(9, Release()),
+    Entry(20, Reset()),
+)
+SESSION = ForceSession(MADE, 23.976, 20, ENTRIES, 9.81, seed=4)
+
+
+def test_what_is_written_is_read_back_exactly(tmp_path: Path) -> None:
+    save_session(SESSION, tmp_path / "a" / "s.json")
+    read = load_session(tmp_path / "a" / "s.json")
+    assert read == SESSION and [p.name for p in (tmp_path / "a").iterdir()] == ["s.json"]
+    text = (tmp_path / "a" / "s.json").read_text()
+    assert len(text.splitlines()) == 10 + len(ENTRIES)  # one event a line
+    assert '"kernels": "3-5, 9, 100"' in text and '"frames": 12' in text
+    empty = ForceSession(MADE, 24.0, 0, (), 9.81)
+    save_session(empty, tmp_path / "e.json")
+    assert load_session(tmp_path / "e.json") == empty
+
+
+def edited(tmp_path: Path, change) -> str:
+    save_session(SESSION, tmp_path / "s.json")
+    value = json.loads((tmp_path / "s.json").read_text())
+    change(value)
+    return json.dumps(value)
+
+
+def put(*path_and_value):
+    *path, value = path_and_value
+
+    def change(target) -> None:
+        for key in path[:-1]:
+            target = target[key]
+        target[path[-1]] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (put("format", "gausim.session/9"), "field 'format': expected 'gausim.session/1', got 'gausim.session/9'"),
+        (put("fps", 0), "field 'fps': expected a number > 0"),
+        (put("fps", True), "field 'fps'"),
+        (put("fps", float("nan")), "expected finite numbers, got NaN"),
+        (put("gravity", float("inf")), "expected finite numbers, got Infinity"),
+        (put("gravity", "9.81"), "field 'gravity'"),
+        (put("steps", 1.5), "field 'steps'"),
+        (put("steps", 10**9), "field 'steps': expected 0 to 100000"),
+        (put("steps", 10), "event 9: field 'at': expected 9 to 10, got 20"),
+        (put("seed", -1), "field 'seed'"),
+        (put("extra", 1), "unknown: ..extra.."),
+        (lambda v: v.pop("seed"), "missing: ..seed.."),
+        (put("made_with", 3), "field 'made_with'"),
+        (put("made_with", "scene", 3), "'made_with.scene': expected a text"),
+        (put("made_with", "host", "x"), "unknown: ..host.."),
+        (put("events", {}), "field 'events': expected a list"),
+        (put("events", [3]), "event 0: expected an object"),
+        (put("events", 4, "at", 2), "event 4: field 'at': expected 3 to 20, got 2"),
+        (put("events", 0, "at", -1), "event 0: field 'at'"),
+        (put("events", 0, "at", 0.0), "event 0: field 'at'"),
+        (put("events", 0, "do", "explode"), "event 0: field 'do': expected one of force, release"),
+        (put("events", 0, "do", ["force"]), "event 0: field 'do'"),
+        (put("events", 0, "direction", [0, 0, 0]), "event 0: field 'direction': expected a vector that is not zero"),
+        (put("events", 0, "direction", [0, 1]), "event 0: field 'direction': expected three numbers"),
+        (put("events", 0, "direction", [0, 1, "1"]), "event 0: field 'direction'"),
+        (put("events", 0, "direction", [1e300, 1e300, 1e300]), "event 0: field 'direction'"),
+        (put("events", 0, "weights", -1), "event 0: field 'weights': expected a number >= 0, got -1"),
+        (put("events", 0, "weights", None), "event 0: field 'weights'"),
+        (put("events", 0, "frames", 0), "event 0: field 'frames'"),
+        (put("events", 0, "frames", 2.0), "event 0: field 'frames'"),
+        (put("events", 0, "name", None), "event 0: field 'name': expected a text of at most"),
+        (put("events", 0, "name", ""), "event 0: field 'name'"),
+        (put("events", 0, "name", "x" * 1000), "event 0: field 'name'"),
+        (put("events", 0, "__class__", "x"), "event 0: .*unknown: ..__class__.."),
+        (put("events", 0, "on", {"level": 1}), "event 0: field 'on': expected"),
+        (put("events", 0, "on", {"level": 1, "unit": -2}), "event 0: selection: expected level and unit >= 0"),
+        (put("events", 0, "on", {"level": True, "unit": 2}), "event 0: field 'level': expected a whole number"),
+        (put("events", 0, "on", {"whole": False}), "event 0: field 'on'"),
+        (put("events", 0, "on", None), "event 0: field 'on'"),
+        (put("events", 1, "on", {"kernels": "0-999999999"}), "event 1: field 'kernels': .*at most 10000000 kernels"),
+        (put("events", 1, "on", {"kernels": "9-3"}), "event 1: field 'kernels'"),
+        (put("events", 1, "on", {"kernels": ""}), "event 1: field 'kernels'"),
+        (put("events", 1, "on", {"kernels": [1, 2]}), "event 1: field 'kernels'"),
+        (put("events", 2, "on", {"centre": [0, 0, 0], "radius": 0}), "event 2: selection: field 'radius'"),
+        (put("events", 3, "gusts", 2), "event 3: field 'gusts'"),
+    ],
+)
+def test_wrong_fields_are_named(tmp_path: Path, change, message: str) -> None:
+    with pytest.raises(DataError, match=f"bad.json: .*{message}"):
+        parse_session(edited(tmp_path, change), "bad.json")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "bad.json: Expecting value"),
+        ("[]", "field 'format'"),
+        ("[" * 200_000, "nested too deeply"),
+        ('{"format": "gausim.session/1", "format": 2}', "a field stands there twice"),
+        ('{"format": ' + "9" * 5000 + "}", "at most 20 digits"),
+        ('{"format": 1e999}', "field 'format'"),
+    ],
+)
+def test_what_is_no_session_is_refused(text: str, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        parse_session(text, "bad.json")
+
+
+def test_overflowing_numbers_are_not_finite(tmp_path: Path) -> None:
+    text = edited(tmp_path, put("events", 0, "weights", 0.125)).replace("0.125", "1e999")
+    with pytest.raises(DataError, match="event 0: field 'weights'"):
+        parse_session(text)
+
+
+def test_files_that_cannot_be_read(tmp_path: Path, monkeypatch) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        load_session(tmp_path / "none.json")
+    with pytest.raises(DataError, match="expected a session"):
+        load_session(tmp_path)
+    (tmp_path / "b.json").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(DataError, match="cannot be read as text"):
+        load_session(tmp_path / "b.json")
+    save_session(SESSION, tmp_path / "s.json")
+    monkeypatch.setattr(sessions, "MOST_BYTES", 100)
+    with pytest.raises(DataError, match="got [0-9]+ bytes"):
+        load_session(tmp_path / "s.json")
+
+
+def test_too_many_events_are_refused(monkeypatch) -> None:
+    monkeypatch.setattr(sessions, "MOST_EVENTS", 3)
+    with pytest.raises(ConfigError, match="field 'events': expected at most 3, got 4"):
+        ForceSession(MADE, 24.0, 20, tuple(Entry(0, Reset()) for _ in range(4)), 9.81)
+
+
+def test_kernels_as_ranges() -> None:
+    assert parse_kernels(" 4, 0 - 2,9").numbers == (0, 1, 2, 4, 9)
+    with pytest.raises(ConfigError, match="at least one kernel"):
+        Kernels(())

@@ -1,0 +1,342 @@
+"""Static reconstruction on a tiny scene that our own renderer drew, and the parts it is made of."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gausim.cli.main import main
+from gausim.core import Cameras, ConfigError, DataError, GaussianScene
+from gausim.data.images import write_rgba
+from gausim.io.ply import load_scene
+from gausim.io.transforms import write_transforms
+from gausim.ops.spherical_harmonics import evaluate_sh
+from gausim.reconstruction.reconstruction import Reconstruction, ReconstructionOptions, reconstruct
+from gausim.reconstruction.splat_start import PointCloud
+from gausim.reconstruction.splats import LearningRates, Splats
+from gausim.reconstruction.state import Partial, identity
+from gausim.reconstruction.stills import ImageSet, draw_rest, measure, reduced
+from gausim.render.cpu import CpuRenderer
+from gausim.render.draw import draw
+
+SIZE = 40
+TINY = ReconstructionOptions(kernels=160, iterations=400, hull_resolution=24, rounds=4, rates=LearningRates(means=1e-3))
+
+
+def cameras_around(count: int) -> Cameras:
+    viewmats = []
+    for i in range(count):
+        z = torch.tensor(0.9 - 1.6 * i / count)
+        angle = torch.tensor(2.39996 * i)
+        ring = (1 - z * z).sqrt()
+        away = torch.stack((angle.cos() * ring, angle.sin() * ring, z))
+        right = torch.nn.functional.normalize(torch.linalg.cross(-away, torch.tensor([0.0, 0.0, 1.0])), dim=0)
+        viewmat = torch.eye(4)
+        viewmat[:3, :3] = torch.stack((right, torch.linalg.cross(-away, right), -away))
+        viewmat[2, 3] = 3.0
+        viewmats.append(viewmat)
+    K = torch.tensor([[50.0, 0, SIZE / 2], [0, 50.0, SIZE / 2], [0, 0, 1]])
+    names = tuple(f"still/{i}.png" for i in range(count))
+    return Cameras(torch.stack(viewmats), K.repeat(count, 1, 1), SIZE, SIZE, names)
+
+
+def true_scene() -> GaussianScene:
+    """Two coloured balls of kernels, one above the other."""
+    g = torch.Generator().manual_seed(3)
+    direction = torch.nn.functional.normalize(torch.randn(150, 3, generator=g), dim=-1)
+    upper = torch.arange(150) < 60
+    means = torch.where(upper[:, None], 0.3 * direction + torch.tensor([0.1, 0, 0.5]), 0.5 * direction)
+    colors = torch.where(upper[:, None], torch.tensor([0.9, 0.3, 0.2]), torch.tensor([0.2, 0.5, 0.8]))
+    colors = (colors + 0.15 * means).clamp(0, 1)
+    return GaussianScene.create(
+        means=means,
+        log_scales=torch.full((150, 3), -2.7),
+        quats=torch.tensor([1.0, 0, 0, 0]).expand(150, 4),
+        opacity_logits=torch.full((150,), 4.0),
+        sh=((colors - 0.5) / 0.28209479)[:, None],
+    )
+
+
+@pytest.fixture(scope="module")
+def stills() -> ImageSet:
+    """Straight-alpha stills of the true scene."""
+    scene, cameras = true_scene(), cameras_around(24)
+    identity, unit = torch.eye(3)[None, None], torch.zeros(scene.count, dtype=torch.int64)
+    drawn = draw(CpuRenderer(threads=1), scene, scene.means[None], identity, identity, unit, cameras)
+    rgb, alpha = drawn.rgb[0], drawn.alpha[0][..., None]
+    alpha = torch.where(alpha < 0.02, 0.0, alpha)
+    rgba = torch.cat((rgb / alpha.clamp_min(0.02), alpha), -1).clamp(0, 1)
+    return ImageSet("stills", (rgba * 255).round().to(torch.uint8), cameras)
+
+
+@pytest.fixture(scope="module")
+def fitted(stills: ImageSet) -> GaussianScene:
+    return reconstruct([stills.select(range(20))], CpuRenderer(threads=1), TINY, name="balls")
+
+
+def test_stills_left_out_are_met(stills: ImageSet, fitted: GaussianScene) -> None:
+    left_out, renderer = stills.select(range(20, 24)), CpuRenderer(threads=1)
+    start = reconstruct([stills.select(range(20))], renderer, ReconstructionOptions(kernels=160, iterations=1))
+    before, after = measure(start, renderer, left_out), measure(fitted, renderer, left_out)
+    assert after["psnr"] > 28 and after["psnr"] > before["psnr"] + 5
+    assert after["psnr_foreground"] > 24
+    assert after["ssim"] > before["ssim"]
+
+
+def test_kernels_stay_within_the_budget_and_the_object(fitted: GaussianScene) -> None:
+    assert 100 < fitted.count <= 160
+    assert fitted.sh_degree == 1 and fitted.sh[:, 1:].abs().max() > 0
+    distance = torch.minimum(
+        (fitted.means - torch.tensor([0.1, 0, 0.5])).norm(dim=-1) - 0.3, fitted.means.norm(dim=-1) - 0.5
+    )
+    assert float(distance.max()) < 0.35  # the hull of twenty masks, a fifth wider than the body, plus one voxel
+    assert fitted.simulated.all() and fitted.foreground.all() and not fitted.pinned.any()
+    ratio = (fitted.log_scales.amax(-1) - fitted.log_scales.amin(-1)).exp()
+    assert float(ratio.quantile(0.9)) < 6
+
+
+def test_same_seed_same_scene(stills: ImageSet) -> None:
+    short = ReconstructionOptions(kernels=60, iterations=25, hull_resolution=16, rounds=3)
+    other = ReconstructionOptions(kernels=60, iterations=25, hull_resolution=16, rounds=3, seed=1)
+    first, again, third = (reconstruct([stills], CpuRenderer(threads=1), o) for o in (short, short, other))
+    assert torch.equal(first.means, again.means) and torch.equal(first.sh, again.sh)
+    assert first.means.shape != third.means.shape or not torch.equal(first.means, third.means)
+
+
+def test_given_points_replace_the_hull_as_start(stills: ImageSet) -> None:
+    options = ReconstructionOptions(kernels=40, iterations=1, hull_resolution=16, start_share=1.0, rounds=1)
+    points = true_scene().means[::2]
+    scene = reconstruct([stills], CpuRenderer(threads=1), options, cloud=PointCloud(points))
+    assert torch.cdist(scene.means, points).amin(1).max() < 0.02
+
+
+def test_empty_hull_is_refused(stills: ImageSet) -> None:
+    images = stills.images.clone()
+    images[3, ..., 3] = 0
+    with pytest.raises(DataError, match="visual hull of 24 masks is empty"):
+        reconstruct([ImageSet("stills", images, stills.cameras)], CpuRenderer(threads=1), TINY)
+
+
+def test_masks_that_miss_a_part_are_outvoted(stills: ImageSet) -> None:
+    images = stills.images.clone()
+    images[3, ..., 3] = 0
+    allowed = replace(TINY, missing_masks=0.05, iterations=1)
+    scene = reconstruct([ImageSet("stills", images, stills.cameras)], CpuRenderer(threads=1), allowed)
+    whole = reconstruct([stills], CpuRenderer(threads=1), allowed)
+    assert scene.count > 50
+    assert (scene.means.amin(0) - whole.means.amin(0)).abs().max() < 0.1
+
+
+def test_points_outside_of_all_masks_are_refused(stills: ImageSet) -> None:
+    far = PointCloud(torch.rand(9, 3) + 20)
+    with pytest.raises(DataError, match="0 of 9 points lie in the visual hull"):
+        reconstruct([stills], CpuRenderer(threads=1), TINY, cloud=far)
+
+
+def walled(stills: ImageSet) -> ImageSet:
+    """The same stills with something behind the object: all of the image counts."""
+    rgb, alpha = stills.images[..., :3].float(), stills.images[..., 3:].float() / 255
+    wall = torch.tensor([40.0, 90.0, 60.0])
+    pixels = (rgb * alpha + wall * (1 - alpha)).round()
+    return ImageSet("photos", torch.cat((pixels, torch.full_like(alpha, 255)), -1).to(torch.uint8), stills.cameras)
+
+
+def shell() -> PointCloud:
+    """Points of the two balls and of a far sphere around everything."""
+    g = torch.Generator().manual_seed(5)
+    around = 6 * torch.nn.functional.normalize(torch.randn(700, 3, generator=g), dim=-1)
+    near = evaluate_sh(true_scene().sh[::2], torch.tensor([0.0, 0.0, 1.0]).expand(75, 3))
+    far = (torch.tensor([40.0, 90.0, 60.0]) / 255).expand(700, 3)
+    return PointCloud(torch.cat((true_scene().means[::2], around)), torch.cat((near, far)))
+
+
+def test_an_open_scene_grows_from_its_points(stills: ImageSet) -> None:
+    photos, renderer = walled(stills), CpuRenderer(threads=1)
+    options = ReconstructionOptions(
+        kernels=1000, iterations=250, extent="scene", rounds=6, minimum_opacity=0.01, anisotropy_limit=10.0
+    )
+    train, left_out = photos.select(range(20)), photos.select(range(20, 24))
+    scene = reconstruct([train], renderer, options, cloud=shell())
+    figures = measure(scene, renderer, left_out)
+    assert 775 < scene.count <= 1000
+    assert figures["psnr"] > 28 and figures["psnr"] == pytest.approx(figures["psnr_foreground"])
+    assert (scene.means.norm(dim=-1) > 3).any()  # what lies behind is there too
+    with pytest.raises(ConfigError, match="starts from points"):
+        reconstruct([train], renderer, options)
+    with pytest.raises(DataError, match="need colours"):
+        reconstruct([train], renderer, options, cloud=PointCloud(shell().points))
+
+
+def test_error_is_blamed_on_the_kernels_under_it(stills: ImageSet) -> None:
+    """Against the sum over pixels of the kernel's weight times the error, its weight found by drawing it alone."""
+    run = Reconstruction([stills], CpuRenderer(threads=1), TINY, cloud=None, name="balls")
+    error, black = torch.zeros(SIZE, SIZE), torch.zeros(3)
+    error[18:22, 18:22] = 0.5
+    drawable = run.splats.drawable(stills.cameras.centers[0])
+    run._blame(stills, 0, black, drawable, error)
+    means, covars, colors, opacities = (x.detach() for x in drawable)
+    for k in run.splats.error.topk(3).indices.tolist():
+        lit = torch.zeros_like(colors)
+        lit[k] = 1.0
+        rgb, _ = run._render(stills, 0, black, (means, covars, lit, opacities))
+        assert float(run.splats.error[k]) == pytest.approx(float((rgb.mean(-1) * error).sum()), rel=1e-3)
+    assert (run.splats.error == 0).any()
+
+
+def test_an_interrupted_reconstruction_goes_on_bit_by_bit(stills: ImageSet, tmp_path: Path) -> None:
+    options = ReconstructionOptions(kernels=60, iterations=30, hull_resolution=16, rounds=3)
+    whole = reconstruct([stills], CpuRenderer(threads=1), options)
+    partial = Partial(tmp_path / "scene.ply", identity([stills], options, None))
+    assert partial.read() is None
+
+    def stop_at_half(run: Reconstruction) -> None:
+        if run.done == 17:
+            partial.write(run.state())
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct([stills], CpuRenderer(threads=1), options, progress=stop_at_half)
+    begun = partial.read()
+    assert begun is not None and int(begun["done"]) == 17
+    scene = reconstruct([stills], CpuRenderer(threads=1), options, begun=begun)
+    for name in ("means", "log_scales", "quats", "opacity_logits", "sh"):
+        assert torch.equal(getattr(scene, name), getattr(whole, name)), name
+    for other in (replace(options, seed=1), replace(options, kernels=61)):
+        assert Partial(tmp_path / "scene.ply", identity([stills], other, None)).read() is None
+    assert Partial(tmp_path / "scene.ply", identity([stills.select(range(23))], options, None)).read() is None
+    partial.path.write_bytes(b"torn")
+    assert partial.read() is None
+    partial.remove()
+    assert not list(tmp_path.iterdir())
+
+
+def test_it_stops_where_more_steps_do_not_help(stills: ImageSet) -> None:
+    still = LearningRates(means=0, log_scales=0, quats=0, opacity=0, color=0, color_rest=0)
+    options = replace(TINY, iterations=100, rounds=2, patience=2, rates=still, random_background=False)
+    steps: list[int] = []
+    reconstruct([stills.select([0])], CpuRenderer(threads=1), options, progress=lambda run: steps.append(run.done))
+    assert steps[-1] == 71 + 3 * 5  # the first look, and two that are not better
+    steps.clear()
+    patient = replace(options, patience=0)
+    reconstruct([stills.select([0])], CpuRenderer(threads=1), patient, progress=lambda run: steps.append(run.done))
+    assert steps[-1] == 100
+
+
+@pytest.mark.parametrize("change", [{"kernels": 0}, {"iterations": 0}, {"sh_degree": 4}, {"missing_masks": 1.0}])
+def test_options_out_of_range_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(change))):
+        ReconstructionOptions(**change)
+
+
+def test_reduced_images_show_the_same_scene(stills: ImageSet) -> None:
+    half = reduced(stills, (SIZE // 2, SIZE // 2), share=0.3)
+    assert half.images.shape == (24, SIZE // 2, SIZE // 2, 4) and half.share == 0.3
+    renderer, scene = CpuRenderer(threads=1), true_scene()
+    large = draw_rest(scene, renderer, stills.cameras).reshape(24, SIZE // 2, 2, SIZE // 2, 2, 3).mean((2, 4))
+    alpha = half.images[..., 3:].float() / 255
+    assert (half.images[..., :3].float() / 255 * alpha - large).abs().max() < 0.02
+    # The pixel filter is the same in pixels, so the small rendering is softer; a wrong K would give 0.1 and more.
+    assert (draw_rest(scene, renderer, half.cameras) - large).abs().mean() < 0.04
+
+
+def test_split_and_keep_carry_parameters_and_moments() -> None:
+    g = torch.Generator().manual_seed(0)
+    splats = Splats(
+        torch.randn(6, 3, generator=g),
+        torch.rand(6, 3, generator=g),
+        torch.full((6,), 0.1),
+        sh_degree=1,
+        opacity=0.5,
+        rates=LearningRates(),
+        extent=1.0,
+    )
+    with torch.no_grad():
+        splats["log_scales"][2, 1] += 1.0
+    (splats["means"] * torch.arange(1.0, 7.0)[:, None]).sum().backward()
+    splats.step({"": 1.0})
+    before = splats["means"].detach().clone()
+    moments = splats.optimizer.state[splats["means"]]["exp_avg"].clone()
+    assert splats.seen.all()
+    splats.split(torch.tensor([2]))
+    assert splats.count == 7
+    means = splats["means"].detach()
+    assert torch.allclose((means[2] + means[6]) / 2, before[2], atol=1e-6)
+    assert torch.allclose((means[2] - means[6]).abs(), torch.tensor([0.0, 1.2 * 0.1 * 2.71828, 0.0]), atol=1e-3)
+    assert torch.allclose(splats["log_scales"][2].detach(), splats["log_scales"][6].detach())
+    state = splats.optimizer.state[splats["means"]]["exp_avg"]
+    assert torch.equal(state[:6], moments) and not state[6].any()
+    splats.keep(torch.arange(7) != 0)
+    assert splats.count == 6 and torch.equal(splats["means"].detach()[0], before[1])
+    assert torch.equal(splats.optimizer.state[splats["means"]]["exp_avg"][:5], moments[1:])
+    (splats["means"] ** 2).sum().backward()
+    splats.step({"": 1.0})
+    assert not torch.equal(splats["means"].detach()[0], before[1])
+
+
+def test_command_writes_scene_masks_figures_and_picture(
+    stills: ImageSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "images").mkdir()
+    for i, image in enumerate(stills.images):
+        write_rgba(tmp_path / "images" / f"{i:02d}.png", image)
+    entries = [{"file_path": f"images/{i:02d}.png"} for i in range(24)]
+    write_transforms(tmp_path / "transforms.json", stills.cameras, entries)
+    command = ["reconstruct", "--transforms", str(tmp_path / "transforms.json")]
+    command += ["--out", str(tmp_path / "out" / "s.ply")]
+    assert main([*command, "--kernels", "80", "--iterations", "40", "--pin-below", "z=-0.2"]) == 0
+    scene = load_scene(tmp_path / "out" / "s.ply")
+    assert torch.equal(scene.pinned, scene.means[:, 2] < -0.2) and scene.pinned.any()
+    record = json.loads((tmp_path / "out" / "s.json").read_text())
+    assert record["measured"]["stills left out"]["images"] == 2
+    assert record["kernels"] == scene.count and record["options"]["iterations"] == 40
+    assert (tmp_path / "out" / "s.png").stat().st_size > 1000
+    assert "stills left out" in capsys.readouterr().out
+    assert main([*command, "--kernels", "80", "--iterations", "20", "--pin-below", "z=-9"]) == 2
+    assert "holds none of" in capsys.readouterr().err
+
+
+def test_command_takes_photos_without_masks_as_a_scene(
+    stills: ImageSet, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "images").mkdir()
+    for i, image in enumerate(walled(stills).images):
+        bgr = np.ascontiguousarray(image[..., :3].flip(-1).numpy())
+        assert cv2.imwrite(str(tmp_path / "images" / f"{i:02d}.png"), bgr)
+    write_transforms(
+        tmp_path / "transforms.json", stills.cameras, [{"file_path": f"images/{i:02d}.png"} for i in range(24)]
+    )
+    command = ["reconstruct", "--transforms", str(tmp_path / "transforms.json"), "--iterations", "30"]
+    assert main([*command]) == 2
+    assert "got 40x40 RGB" in capsys.readouterr().err
+    assert main([*command, "--extent", "scene"]) == 2
+    assert "starts from points" in capsys.readouterr().err
+    points, colors = shell().points.numpy(), (255 * shell().colors).to(torch.uint8).numpy()
+    np.savez(tmp_path / "points.npz", points=points, colors=colors)
+    assert main([*command, "--extent", "scene", "--leave-out", "12", "--longest", "30", "--kernels", "900"]) == 0
+    measured = json.loads((tmp_path / "scene.json").read_text())["measured"]
+    assert measured["stills left out"]["images"] == 2 and measured["stills to train on"]["images"] == 22
+    assert not list(tmp_path.glob(".*"))
+    np.savez(tmp_path / "points.npz", points=points, colors=colors[:3])
+    assert main([*command, "--extent", "scene"]) == 2
+    assert "'colors' must be (775, 3)" in capsys.readouterr().err
+
+
+def test_command_needs_one_source(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reconstruct"]) == 2
+    assert "either ROOT" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_real_stills_are_met(data_root: Path, tmp_path: Path) -> None:
+    out = tmp_path / "scene.ply"
+    command = ["reconstruct", str(data_root / "bunny"), "--out", str(out), "--iterations", "1500"]
+    assert main([*command, "--pin-below", "z=0.33"]) == 0
+    figures = json.loads(out.with_suffix(".json").read_text())["measured"]["stills left out"]
+    assert figures["psnr"] > 30 and figures["psnr_foreground"] > 26

@@ -1,0 +1,260 @@
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+
+from gausim.core import GaussianScene, RunError
+from gausim.runs.checkpoint import (
+    RESUME_FORMAT,
+    AtomicCheckpointIO,
+    WeightAverage,
+    check_scenes,
+    digest,
+    fingerprints,
+    load_weights,
+    read_checkpoint,
+)
+from gausim.runs.directory import RunDirectory
+
+
+def scene(shift: float = 0.0) -> GaussianScene:
+    means = torch.arange(12.0).reshape(4, 3) + shift
+    return GaussianScene.create(
+        means=means, log_scales=torch.zeros(4, 3), quats=torch.ones(4, 4), opacity_logits=torch.zeros(4),
+        sh=torch.zeros(4, 1, 3), pinned=means[:, 0] < 1, name="block",
+    )  # fmt: skip
+
+
+def checkpoint(value: float = 1.0) -> dict:
+    own: dict = {"format": RESUME_FORMAT, "scenes": fingerprints([scene()])}
+    own["average"] = WeightAverage(0.0).state_dict()
+    return {"state_dict": {"weight": torch.full((2, 3), value)}, "gausim": own}
+
+
+def test_written_and_read_without_running_code(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "last.ckpt"
+    AtomicCheckpointIO().save_checkpoint(checkpoint(2.0), path)
+    assert float(torch.load(path, weights_only=True)["state_dict"]["weight"].sum()) == 12.0
+    assert [p.name for p in path.parent.iterdir()] == ["last.ckpt"]
+
+
+@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+@pytest.mark.parametrize("failing", ["os.fsync", "os.replace", "os.open", "pathlib.Path.open"])
+def test_a_failed_save_is_an_error_and_keeps_the_last_good_file(
+    failing: str, reason: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "last.ckpt"
+    AtomicCheckpointIO().save_checkpoint(checkpoint(2.0), path)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(reason, os.strerror(reason))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(failing, refuse)
+        with pytest.raises(RunError, match=rf"last\.ckpt: .* could not be written .*{os.strerror(reason)}"):
+            AtomicCheckpointIO().save_checkpoint(checkpoint(3.0), path)
+    # Only where the name was taken already, and its entry in the directory could not be flushed, is it the new one.
+    assert float(read_checkpoint(path)["state_dict"]["weight"][0, 0]) == (3.0 if failing == "os.open" else 2.0)
+    assert list(tmp_path.glob(".*")) == []
+
+
+@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="permissions do not bind the superuser")
+def test_a_directory_that_became_read_only_stops_the_save(tmp_path: Path) -> None:
+    path = tmp_path / "last.ckpt"
+    AtomicCheckpointIO().save_checkpoint(checkpoint(2.0), path)
+    tmp_path.chmod(0o555)
+    try:
+        with pytest.raises(RunError, match="Permission denied"):
+            AtomicCheckpointIO().save_checkpoint(checkpoint(3.0), path)
+    finally:
+        tmp_path.chmod(0o755)
+    assert float(read_checkpoint(path)["state_dict"]["weight"][0, 0]) == 2.0
+
+
+def test_the_last_checkpoint_leaves_its_predecessor_and_others_do_not(tmp_path: Path) -> None:
+    for value in (1.0, 2.0, 3.0):
+        for name in ("last.ckpt", "epoch_0001.ckpt"):
+            AtomicCheckpointIO().save_checkpoint(checkpoint(value), tmp_path / name)
+    kept = {p.name: float(read_checkpoint(p)["state_dict"]["weight"][0, 0]) for p in tmp_path.iterdir()}
+    assert kept == {"last.ckpt": 3.0, "last.previous.ckpt": 2.0, "epoch_0001.ckpt": 3.0}
+
+
+def test_without_hard_links_the_predecessor_is_kept_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EPERM, "no hard links here")
+
+    monkeypatch.setattr(os, "link", refuse)
+    for value in (1.0, 2.0):
+        AtomicCheckpointIO().save_checkpoint(checkpoint(value), tmp_path / "last.ckpt")
+    assert float(read_checkpoint(tmp_path / "last.previous.ckpt")["state_dict"]["weight"][0, 0]) == 1.0
+
+
+def test_what_reads_back_differently_is_not_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "last.ckpt"
+    AtomicCheckpointIO().save_checkpoint(checkpoint(2.0), path)
+    save = torch.save
+    monkeypatch.setattr(torch, "save", lambda obj, file: save(checkpoint(9.0), file))
+    with pytest.raises(RunError, match="other contents"):
+        AtomicCheckpointIO().save_checkpoint(checkpoint(3.0), path)
+    assert float(read_checkpoint(path)["state_dict"]["weight"][0, 0]) == 2.0
+
+
+def test_what_would_need_code_to_read_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match=r"could not be written \(checkpoint\['module'\] holds a Linear"):
+        AtomicCheckpointIO().save_checkpoint({**checkpoint(), "module": nn.Linear(2, 2)}, tmp_path / "last.ckpt")
+    assert list(tmp_path.iterdir()) == []
+
+
+class Payload:
+    """Makes a directory when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple:
+        return os.mkdir, (str(self.path),)
+
+
+@pytest.mark.parametrize("kind", ["archive", "pickle"])
+def test_a_malicious_checkpoint_executes_nothing(kind: str, tmp_path: Path) -> None:
+    run, executed = RunDirectory(tmp_path / "run"), tmp_path / "executed"
+    run.prepare({"seed": 0})
+    content = {**checkpoint(), "payload": Payload(executed)}
+    if kind == "archive":
+        torch.save(content, run.checkpoint)
+    else:
+        run.checkpoint.write_bytes(pickle.dumps(content, protocol=2))
+    with pytest.raises(RunError, match="nothing in it was executed") as caught:
+        run.prepare({"seed": 0})
+    with pytest.raises(RunError, match="nothing in it was executed"):
+        AtomicCheckpointIO().load_checkpoint(run.checkpoint)
+    assert "weights_only" not in str(caught.value)
+    assert not executed.exists()
+    with contextlib.suppress(Exception):
+        torch.load(run.checkpoint, weights_only=False)
+    assert executed.is_dir() or kind == "pickle"  # the payload was live
+    pickle.loads(pickle.dumps(Payload(tmp_path / "live")))
+    assert (tmp_path / "live").is_dir()
+
+
+def damage(path: Path, how: str) -> None:
+    whole = path.read_bytes()
+    weight = whole.index(torch.full((2, 3), 3.0).numpy().tobytes())
+    flipped = whole[: weight + 5] + bytes([whole[weight + 5] ^ 1]) + whole[weight + 6 :]
+    halves = {"truncated": whole[:-300], "empty": b"", "garbage": bytes(range(256)) * 40, "flipped": flipped}
+    path.write_bytes(halves[how])
+
+
+@pytest.mark.parametrize("how", ["truncated", "empty", "garbage", "flipped"])
+def test_a_damaged_checkpoint_is_told_and_the_one_before_it_serves(how: str, tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    run.prepare({"seed": 0})
+    for value in (2.0, 3.0):
+        AtomicCheckpointIO().save_checkpoint(checkpoint(value), run.checkpoint)
+    damage(run.checkpoint, how)
+    with pytest.raises(RunError, match=r"last\.ckpt: cannot be read as a checkpoint"):
+        read_checkpoint(run.checkpoint)
+    names = r"(?s)last\.ckpt: cannot be read.*Resuming from .*last\.previous\.ckpt.*last\.damaged\.ckpt"
+    with pytest.warns(UserWarning, match=names):
+        resume = run.prepare({"seed": 0})
+    assert resume == tmp_path / "last.previous.ckpt"
+    assert float(read_checkpoint(resume)["state_dict"]["weight"][0, 0]) == 2.0
+    # The next save must not put the damaged file in the good one's place.
+    AtomicCheckpointIO().save_checkpoint(checkpoint(4.0), run.checkpoint)
+    assert float(read_checkpoint(resume)["state_dict"]["weight"][0, 0]) == 2.0
+    for path in (run.checkpoint, resume):
+        path.write_bytes(b"")
+    with pytest.raises(RunError, match=r"(?s)no checkpoint here is whole.*last\.ckpt.*last\.previous\.ckpt.*overwrite"):
+        run.prepare({"seed": 0})
+
+
+@pytest.mark.parametrize("lacks", ["digest", "format"])
+def test_a_checkpoint_of_another_version_is_read_but_not_resumed(lacks: str, tmp_path: Path) -> None:
+    run, other = RunDirectory(tmp_path), checkpoint(5.0)
+    run.prepare({"seed": 0})
+    if lacks == "format":
+        del other["gausim"]["format"]
+        AtomicCheckpointIO().save_checkpoint(other, run.checkpoint)
+    else:
+        torch.save(other, run.checkpoint)
+    assert float(read_checkpoint(run.checkpoint)["state_dict"]["weight"][0, 0]) == 5.0
+    with pytest.raises(RunError, match="another version"):
+        run.prepare({"seed": 0})
+
+
+def test_foreign_and_missing_files_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "last.ckpt"
+    with pytest.raises(RunError, match="no such checkpoint"):
+        read_checkpoint(path)
+    torch.save({"state_dict": {}}, path)
+    with pytest.raises(RunError, match="expected a checkpoint of gausim"):
+        read_checkpoint(path)
+
+
+def test_the_digest_sees_every_difference() -> None:
+    one = {"a": [1, 2.0, None], "b": torch.zeros(2, 3), "c": {"x": (True, "t")}}
+    others = [
+        {**one, "a": [1, 2, None]}, {**one, "a": (1, 2.0, None)}, {**one, "b": torch.zeros(3, 2)},
+        {**one, "b": torch.zeros(2, 3).double()}, {**one, "b": -torch.zeros(2, 3)}, {**one, "c": {"y": (True, "t")}},
+        {**one, "c": {"x": (1, "t")}}, {"b": one["b"], "a": one["a"], "c": one["c"]},
+    ]  # fmt: skip
+    assert len({digest(x) for x in [one, *others]}) == 1 + len(others)
+    assert digest(one) == digest({**one, "b": torch.zeros(3, 2).T.contiguous()})
+    nan = torch.tensor([float("nan")])
+    assert digest([nan, float("nan")]) == digest([nan.clone(), float("nan")])
+
+
+def test_a_second_process_is_kept_out_and_leftovers_of_a_killed_one_are_removed(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "run")
+    with run.writing():
+        with pytest.raises(RunError, match=rf"another process \(process {os.getpid()}\) is training here"):
+            with RunDirectory(tmp_path / "run").writing():
+                pytest.fail("two processes in one directory")
+        (run.path / ".last.ckpt.4711.tmp").write_bytes(b"torn")
+        (run.path / ".notes.tmp").write_bytes(b"mine")
+        run.prepare({"seed": 0})
+    assert sorted(p.name for p in run.path.iterdir()) == [".lock", ".notes.tmp", "config.yaml", "events.jsonl"]
+    with RunDirectory(tmp_path / "run").writing():
+        pass
+
+
+def test_errors_of_the_disk_become_named_and_others_stay(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "run")
+    for error in (OSError(errno.ENOSPC, "No space left"), OSError(f"{run.path}/panels/x.png: cannot be written")):
+        with pytest.raises(RunError, match="run: cannot be written or read"):
+            with run.writing():
+                raise error
+    with pytest.raises(ConnectionResetError):
+        with run.writing():
+            raise ConnectionResetError(errno.ECONNRESET, "not the disk")
+
+
+def test_another_scene_is_refused_naming_both() -> None:
+    check_scenes(checkpoint(), [scene()], "run/last.ckpt")
+    other = replace(scene(shift=0.5), name="vase")
+    with pytest.raises(RunError, match=r"run/last\.ckpt was trained on 'block'.*'vase'"):
+        check_scenes(checkpoint(), [other], "run/last.ckpt")
+
+
+def test_the_average_follows_the_weights_and_is_what_loads() -> None:
+    module = nn.Linear(3, 2)
+    average = WeightAverage(0.9)
+    for value in (0.0, 1.0, 1.0, 1.0):
+        nn.init.constant_(module.weight, value)
+        average.update(module)
+    saved = {"state_dict": module.state_dict(), "gausim": {"average": average.state_dict()}}
+    averaged, plain = nn.Linear(3, 2), nn.Linear(3, 2)
+    load_weights(averaged, saved)
+    load_weights(plain, saved, averaged=False)
+    assert 0.5 < float(averaged.weight[0, 0].detach()) < 1.0
+    assert float(plain.weight[0, 0].detach()) == 1.0
+    with pytest.raises(RunError, match="does not fit"):
+        load_weights(nn.Linear(4, 2), saved)

@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from gausim.core import ConfigError, RunError
+from gausim.runs.checkpoint import RESUME_FORMAT, AtomicCheckpointIO
+from gausim.runs.directory import RunDirectory, changed_keys
+from gausim.training.callbacks.resume import RunCheckpoint
+from gausim.training.callbacks.time_budget import TimeBudget
+from gausim.training.trainer import make_trainer
+
+CONFIG = {
+    "seed": 0,
+    "loss": {"balance": 0.9},
+    "trainer": {"max_epochs": 3, "threads": 1},
+    "paths": {"output_root": "o"},
+}
+
+
+def test_a_fresh_and_an_interrupted_run(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "a")
+    assert run.prepare(CONFIG) is None
+    assert run.config() == CONFIG
+    AtomicCheckpointIO().save_checkpoint({"state_dict": {}, "gausim": {"format": RESUME_FORMAT}}, run.checkpoint)
+    assert run.prepare(CONFIG) == run.checkpoint
+
+
+def test_changed_keys_are_named_and_free_ones_are_not(tmp_path: Path) -> None:
+    changed = {**CONFIG, "seed": 1, "paths": {"output_root": "p"}, "trainer": {"max_epochs": 4, "threads": 2}}
+    assert changed_keys(CONFIG, changed) == ["seed", "trainer.max_epochs"]
+    assert changed_keys(CONFIG, {**CONFIG, "extra": None}) == ["extra"]
+    run = RunDirectory(tmp_path)
+    run.prepare(CONFIG)
+    run.prepare(changed)  # nothing was learned yet
+    run.checkpoint.write_bytes(b"x")
+    with pytest.raises(RunError, match=r"changed: seed, trainer\.max_epochs\."):
+        run.prepare(CONFIG)
+
+
+def test_a_finished_run_is_refused_and_overwriting_keeps_foreign_files(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    run.prepare(CONFIG)
+    run.checkpoint.write_bytes(b"x")
+    (tmp_path / "panels").mkdir()
+    (tmp_path / "notes.txt").write_text("mine")
+    run.finish({"epochs": 3})
+    with pytest.raises(RunError, match="this run is finished"):
+        run.prepare(CONFIG)
+    assert run.prepare(CONFIG, overwrite=True) is None
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["config.yaml", "events.jsonl", "notes.txt"]
+    assert "finished" not in (tmp_path / "events.jsonl").read_text()
+
+
+def test_no_run_here_is_told(tmp_path: Path) -> None:
+    with pytest.raises(RunError, match="no run here"):
+        RunDirectory(tmp_path).config()
+    (tmp_path / "config.yaml").write_text("- 1")
+    with pytest.raises(RunError, match="expected a mapping"):
+        RunDirectory(tmp_path).config()
+
+
+def test_settings_out_of_range_are_refused() -> None:
+    with pytest.raises(ConfigError, match="clock"):
+        TimeBudget(minutes=1, clock="sun")
+    for wrong in ({"every_epochs": 0}, {"every_minutes": -1.0}, {"every_steps": -1}, {"snapshot_every": -1}):
+        with pytest.raises(ConfigError, match="every_epochs"):
+            RunCheckpoint(**wrong)
+    with pytest.raises(ConfigError, match=r"trainer\.devices"):
+        make_trainer(max_epochs=1, devices=2)
+
+
+def test_an_error_leaves_its_last_line_and_is_gone_when_tried_again(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    with pytest.raises(ZeroDivisionError), run.noting_failure():
+        1 / 0  # noqa: B018
+    assert not run.has_failed  # nothing was begun
+    run.prepare(CONFIG)
+    with pytest.raises(ZeroDivisionError), run.noting_failure():
+        1 / 0  # noqa: B018
+    assert run.has_failed and run.failure() == "ZeroDivisionError: division by zero"
+    assert "Traceback" in (tmp_path / "FAILED").read_text()
+    with pytest.raises(RunError), run.noting_failure():
+        raise RunError("two\nlines")
+    assert run.failure() == "RunError: two lines" and "Traceback" not in (tmp_path / "FAILED").read_text()
+    with pytest.raises(KeyboardInterrupt), run.noting_failure():
+        run.prepare(CONFIG)
+        raise KeyboardInterrupt
+    assert not run.has_failed
+    events = [json.loads(line)["event"] for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    assert events == ["started", "failed", "failed", "started"]
+
+
+def test_what_a_finished_run_says_is_checked(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path)
+    with pytest.raises(RunError, match="FINISHED"):
+        run.facts()
+    run.finish({"epochs": 3, "last_epoch": {"steps": 2.0}})
+    assert run.facts() == {"epochs": 3, "last_epoch": {"steps": 2.0}}
+    for wrong in ("[]", '{"epochs": 3}', "{"):
+        (tmp_path / "FINISHED").write_text(wrong)
+        with pytest.raises(RunError, match="FINISHED: expected facts of a finished run"):
+            run.facts()

@@ -1,0 +1,162 @@
+"""Several ranks do together what one rank does with all sequences (see rank_checks.py for what runs in them)."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gausim.core import ConfigError
+from gausim.training.ranks.launch import Crew
+from gausim.training.ranks.layout import Layout, Place
+from gausim.training.ranks.ranks import interleave, is_lost_connection
+from gausim.training.trainer import make_trainer
+
+PROGRAM = [sys.executable, str(Path(__file__).parents[1] / "helpers" / "rank_checks.py")]
+# Noise, the static loss and more than one step: all that could depend on which rank computes a sequence.
+ALL = {"static_probability": 1.0, "input_noise": 0.01}
+
+Ask = Callable[..., list[Any]]
+
+
+@pytest.fixture(scope="module")
+def ask() -> Iterator[Ask]:
+    """Asks for a check in so many ranks; returns what each found."""
+    with subprocess.Popen(PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdin is not None and server.stdout is not None
+
+        def order(check: str, ranks: int, **options: Any) -> list[Any]:
+            server.stdin.write(json.dumps({"check": check, "ranks": ranks, "options": options}) + "\n")
+            server.stdin.flush()
+            return json.loads(server.stdout.readline())
+
+        yield order
+        server.stdin.close()
+
+
+def distance(found: dict[str, Any], expected: dict[str, Any]) -> float:
+    """Norm of the difference over the norm of what is expected; both lack the same entries."""
+    assert {n for n, v in found.items() if v is None} == {n for n, v in expected.items() if v is None}
+    pairs = [(np.array(found[n]), np.array(v)) for n, v in expected.items() if v is not None]
+    return float(np.sqrt(sum(((a - b) ** 2).sum() for a, b in pairs) / sum((b**2).sum() for _, b in pairs)))
+
+
+def assert_as_one(found: list[Any], alone: Any, tolerance: float, rounding: float = 1e-4) -> None:
+    assert all(isinstance(answer, dict) for answer in (*found, alone)), (found, alone)
+    for name in ("weights", "average", "stats", "statistics", "yards"):
+        assert all(rank[name] == found[0][name] for rank in found), f"{name} differ between ranks"
+    assert distance(found[0]["grads"], alone["grads"]) <= tolerance
+    assert distance(found[0]["statistics"], alone["statistics"]) <= tolerance
+    assert found[0]["yards"] == alone["yards"]
+    for mine, theirs in zip(found[0]["stats"], alone["stats"], strict=True):
+        assert mine == pytest.approx(theirs, rel=rounding, abs=1e-12)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 1e-6), ("float64", 1e-12)])
+def test_the_gradient_of_a_step_is_that_of_one_rank(ask: Ask, dtype: str, tolerance: float) -> None:
+    alone = ask("train", 1, count=5, dtype=dtype, objective=ALL)[0]
+    assert alone["grads"]["initial_states.offset.5"] is None and alone["grads"]["initial_states.offset.4"] is not None
+    for ranks in (2, 4):
+        assert_as_one(ask("train", ranks, count=5, dtype=dtype, objective=ALL), alone, tolerance)
+
+
+def test_steps_follow_each_other_as_on_one_rank(ask: Ask) -> None:
+    options = {"count": 5, "dtype": "float64", "times": 3, "objective": {**ALL, "backprop_steps": 2}}
+    assert_as_one(ask("train", 2, **options), ask("train", 1, **options)[0], 1e-9)
+
+
+def test_ranks_without_a_sequence_take_part(ask: Ask) -> None:
+    options = {"count": 1, "dtype": "float64", "times": 2, "objective": ALL}
+    assert_as_one(ask("train", 3, **options), ask("train", 1, **options)[0], 1e-9)
+
+
+@pytest.mark.parametrize("objective", [{"checkpoint_steps": True, "backprop_steps": 0}, {"momentum_weight": 0.0}])
+def test_other_objectives(ask: Ask, objective: dict[str, Any]) -> None:
+    options = {"count": 3, "dtype": "float64", "objective": objective}
+    assert_as_one(ask("train", 2, **options), ask("train", 1, **options)[0], 1e-11)
+
+
+@pytest.mark.parametrize("deferred", [False, True])
+@pytest.mark.parametrize(("limit", "ends"), [(0.3, "in between"), (1e-4, "at once")])
+def test_a_rollout_ends_on_all_ranks_where_it_ends_on_one(ask: Ask, limit: float, ends: str, deferred: bool) -> None:
+    options = {"count": 3, "dtype": "float64", "steps": 5, "wild": 2.2, "deferred": deferred,
+               "objective": {"explosion": limit, "static_probability": 1.0}}  # fmt: skip
+    alone = ask("train", 1, **options)[0]
+    assert alone["stats"][0]["exploded"] == 1.0
+    assert ("loss_image" in alone["stats"][0]) == (ends != "at once")
+    assert_as_one(ask("train", 2, **options), alone, 1e-9)
+
+
+def test_a_divergence_is_named_on_all_ranks(ask: Ask) -> None:
+    expected = r"training diverged at predicted step 1 of 3, sequence toy/seq_0: positions are nan"
+    for deferred in (False, True):
+        found = ask("train", 2, count=3, wild=1e30, deferred=deferred)
+        assert all(expected in answer["error"] for answer in found) and found[0] == found[1]
+
+
+def test_metrics_of_an_uneven_set_are_those_of_all_of_it(ask: Ask) -> None:
+    (alone,) = ask("metrics", 1, count=5)
+    for ranks in (2, 4, 6):  # of six, one has no image
+        assert ask("metrics", ranks, count=5) == [pytest.approx(alone, rel=1e-12)] * ranks
+
+
+def test_a_rank_that_dies_ends_the_others(ask: Ask) -> None:
+    found = ask("fail", 3)
+    assert found[1] is None and all("gloo" in answer for answer in (found[0], found[2]))
+    assert is_lost_connection(RuntimeError(found[0])) and not is_lost_connection(ConfigError(found[0]))
+
+
+def test_what_the_first_rank_finds_the_others_hear(ask: Ask) -> None:
+    value, other = ask("first", 2)
+    assert value.startswith("one answer; ValueError: from ") and other.startswith(
+        "one answer; RunError: rank 1: the first rank"
+    )
+
+
+def test_weights_that_drift_apart_are_noticed(ask: Ask) -> None:
+    found = ask("drifted", 4)
+    assert all("weights: expected the same on all ranks" in text and "ranks [2, 3]" in text for text in found)
+
+
+def test_shares_are_put_back_in_order() -> None:
+    for count in (1, 4, 7):
+        for ranks in (1, 2, 3, 5):
+            order = list(range(count))
+            assert interleave([order[r::ranks] for r in range(ranks)]) == order
+
+
+def test_wrong_layouts_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    for wrong in ({"devices": 0}, {"num_nodes": 0}, {"timeout_minutes": 0.0}):
+        with pytest.raises(ConfigError, match=r"trainer: expected devices >= 1"):
+            Layout(**wrong)
+    with pytest.raises(ConfigError, match=r"trainer.devices: expected 1, got 2"):
+        make_trainer(max_epochs=1, devices=2)
+    with (
+        pytest.raises(ConfigError, match=r"num_nodes: 2 machines need a scheduler"),
+        Crew(Layout(num_nodes=2, accelerator="cpu")),
+    ):
+        pass
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    with (
+        pytest.raises(ConfigError, match=r"2 ranks need as many GPUs, this machine has 1"),
+        Crew(Layout(2, accelerator="gpu")),
+    ):
+        pass
+    for name, value in {"SLURM_NTASKS": "3", "SLURM_NTASKS_PER_NODE": "3", "SLURM_JOB_NAME": "train"}.items():
+        monkeypatch.setenv(name, value)
+    with (
+        pytest.raises(ConfigError, match=r"the scheduler started 3 ranks, expected devices x num_nodes = 2 x 1"),
+        Crew(Layout(2, accelerator="cpu")),
+    ):
+        pass
+
+
+def test_a_place_survives_a_command_line() -> None:
+    place = Place(3, 4, 1234, "gloo", 2.5)
+    assert Place.parse(place.argv()) == place

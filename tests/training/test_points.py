@@ -1,0 +1,211 @@
+"""Training on true points against plain formulas and the numbers of the evaluation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from helpers import sway, toy_object
+from torch import Tensor
+
+from gausim.core import DataError, GaussianScene, Trajectory
+from gausim.data.records import GroundTruth
+from gausim.losses import ImageLoss, Objective
+from gausim.metrics import point_error
+from gausim.render.reference import ReferenceRenderer
+from gausim.training.module import GausSimModule
+from gausim.training.rollout import States
+from gausim.training.supervision.images import Sources
+from gausim.training.supervision.points import PointSupervision, attach_points
+
+sample = sway.sample
+SCENE = toy_object.toy_scene()
+
+
+def truth(frames: int = 6) -> GroundTruth:
+    generator = torch.Generator().manual_seed(3)
+    rest = SCENE.means[::3] + 0.01 * torch.randn(SCENE.means[::3].shape, generator=generator)
+    moved = rest + 0.05 * torch.randn(frames, *rest.shape, generator=generator).cumsum(0)
+    moved[0] = rest
+    return GroundTruth(rest, moved)
+
+
+def sources(truth: Callable[[int], GroundTruth | None], scenes: Sequence[GaussianScene] = (SCENE,)) -> Sources:
+    return Sources(scenes, truth, lambda scene_id: None, ReferenceRenderer(), ImageLoss())
+
+
+def batch(members: int) -> SimpleNamespace:
+    """Members of two units each, of which every other kernel belongs to the second."""
+    count, unit = SCENE.count, torch.arange(SCENE.count) % 2
+    rows = [
+        SimpleNamespace(
+            scene_id=0,
+            kernels=slice(i * count, (i + 1) * count),
+            units=slice(2 * i, 2 * i + 2),
+            unit_of_kernel=unit,
+        )
+        for i in range(members)
+    ]
+    return SimpleNamespace(rest=SCENE.means.repeat(members, 1), members=tuple(rows))
+
+
+def states(steps: int, members: int) -> States:
+    g = torch.Generator().manual_seed(4)
+    positions = SCENE.means.repeat(members, 1) + 0.1 * torch.randn(steps, members * SCENE.count, 3, generator=g)
+    gradients = torch.eye(3) + 0.3 * torch.randn(steps, 2 * members, 3, 3, generator=g)
+    return States(positions.requires_grad_(), gradients.requires_grad_(), torch.eye(3).expand_as(gradients))
+
+
+def plain(known: GroundTruth, made: States, member: int) -> Tensor:
+    """Positions of the points as the evaluation carries them."""
+    rows, units = slice(member * SCENE.count, (member + 1) * SCENE.count), slice(2 * member, 2 * member + 2)
+    trajectory = Trajectory(
+        made.positions[:, rows], made.gradients[:, units], made.rotations[:, units], torch.arange(SCENE.count) % 2, 24.0
+    )
+    return trajectory.carry(known.rest, attach_points(SCENE, known.rest), SCENE.means)
+
+
+def test_losses_are_squared_distances_in_percent_and_reach_positions_and_gradients() -> None:
+    known, made = truth(), states(4, 2)
+    work = PointSupervision(sources(lambda number: known)).comparison([sample(0, 5), sample(1, 5)], batch(2))
+    losses, motion = work(made, 0)
+    assert losses.shape == (4, 2) and not motion.requires_grad
+    expected, moved = [], 0.0
+    for member in range(2):
+        points = plain(known, made, member)
+        distance = 100 * (points - known.positions[1:5]).norm(dim=-1) / SCENE.diagonal
+        expected.append(distance.square().mean(1))
+        before = torch.cat((known.rest[None], points[:-1]))
+        moved += float((100 * (points.detach() - before.detach()).norm(dim=-1) / SCENE.diagonal).square().mean(1).sum())
+    torch.testing.assert_close(losses, torch.stack(expected, 1))
+    assert float(motion) == pytest.approx(moved, rel=1e-5)
+    ours = torch.autograd.grad(losses.sum(), [made.positions, made.gradients])
+    for gradient, other in zip(
+        ours, torch.autograd.grad(torch.stack(expected).sum(), [made.positions, made.gradients]), strict=True
+    ):
+        assert float(other.norm()) > 0
+        torch.testing.assert_close(gradient, other)
+
+
+def test_stretches_continue_where_the_last_one_ended() -> None:
+    known, made = truth(), states(5, 1)
+    supervision = PointSupervision(sources(lambda number: known))
+    whole, motion = supervision.comparison([sample(0, 5)], batch(1))(made, 0)
+    work = supervision.comparison([sample(0, 5)], batch(1))
+    parts = [work(States(*(x[s] for x in made.tensors())), s.start) for s in (slice(0, 2), slice(2, 5))]
+    torch.testing.assert_close(torch.cat([p[0] for p in parts]), whole)
+    assert float(sum(p[1] for p in parts)) == pytest.approx(float(motion), rel=1e-6)
+
+
+def test_the_rest_state_scores_the_true_displacement_and_only_of_the_samples_frames() -> None:
+    known = truth(frames=9)
+    poisoned = GroundTruth(known.rest, known.positions.clone())
+    poisoned.positions[4:] = torch.nan  # frames that the sample does not hold
+    supervision = PointSupervision(sources(lambda number: poisoned))
+    losses, motion = supervision.static(sample(0, 3), SCENE.means, 0)
+    assert losses[0] == 0 and len(losses) == 4 and len(motion) == 3
+    percent = 100 * (known.positions[:4] - known.rest).norm(dim=-1) / SCENE.diagonal
+    assert losses == pytest.approx(percent.square().mean(1).tolist(), rel=1e-5)
+    # The same measure as the evaluation's, but squared before the mean.
+    assert torch.all(torch.tensor(losses).sqrt() >= point_error(known.rest.expand(4, -1, -1), known.positions[:4],
+                                                                SCENE.diagonal) - 1e-5)  # fmt: skip
+    step = 100 * known.positions[:4].diff(dim=0).norm(dim=-1) / SCENE.diagonal
+    assert motion == pytest.approx(step.square().mean(1).tolist(), rel=1e-5)
+    assert supervision.static(sample(0, 3), SCENE.means, 2).losses == losses[2:]
+
+
+def test_unknown_motion_is_refused_by_name() -> None:
+    supervision = PointSupervision(sources(lambda number: None))
+    with pytest.raises(DataError, match=r"toy/seq_0: its true motion is not known.*supervision=images"):
+        supervision.static(sample(0), SCENE.means, 0)
+
+
+def test_a_module_learns_from_points_and_draws_nothing() -> None:
+    model = sway.Sway([toy_object.toy_scene(), toy_object.toy_scene()])
+    with torch.no_grad():  # a truth that this simulator can follow
+        model.drift[0].fill_(0.02)
+    known = []
+    for _ in range(3):
+        state, frames = SCENE.means, [SCENE.means]
+        before = state
+        for _ in range(3):
+            push = torch.zeros_like(state)
+            push[:, 0] = 0.02 * SCENE.means[:, 2] ** 2
+            state, before = state + 0.5 * (state - before) + push, state
+            frames.append(state)
+        known.append(GroundTruth(SCENE.means, torch.stack(frames)))
+    with torch.no_grad():
+        model.drift[0].zero_()
+
+    def refuse(*args: object, **options: object) -> object:
+        raise AssertionError("drawn")
+
+    module = GausSimModule(
+        model=model,
+        initial_states=sway.Previous(model, (0, 0, 0)),
+        scene_of_sequence=(0, 0, 0),
+        renderer=refuse,  # type: ignore[arg-type]
+        objective=Objective(static_weight=0.0, momentum_weight=0.0, backprop_steps=0),
+        optimizer=replace(sway.OptimizerSettings(), network_lr=1e-3, scene_lr=1e-3, initial_lr=1e-4),
+        supervision=PointSupervision(sources(lambda number: known[number], model.scenes)),
+    )
+    optimizer, draws = module.configure_optimizers(), torch.Generator().manual_seed(0)
+    found = [module.optimise([sample(0), sample(1)], optimizer, draws) for _ in range(60)]
+    assert found[0]["ratio_static"] == pytest.approx(1.0) and found[0]["motion_energy"] < 1e-6
+    assert found[-1]["ratio_static"] < 0.1 and 0.6 < found[-1]["motion_energy"] < 1.4
+    assert float(model.drift[0].detach()) == pytest.approx(0.02, rel=0.3)
+
+
+def test_velocities_count_as_much_as_they_are_weighted() -> None:
+    known, made = truth(), states(4, 1)
+    plain_loss, weighted = (
+        PointSupervision(sources(lambda number: known), velocity_weight=w).comparison([sample(0, 5)], batch(1))
+        for w in (0.0, 3.0)
+    )
+    points = torch.cat((known.rest[None], plain(known, made, 0)))
+    off = 100 * (points.diff(dim=0) - known.positions[:5].diff(dim=0)).norm(dim=-1) / SCENE.diagonal
+    expected = plain_loss(made, 0)[0][:, 0] + 3 * off.square().mean(1)
+    torch.testing.assert_close(weighted(made, 0)[0][:, 0], expected)
+    work = PointSupervision(sources(lambda number: known), velocity_weight=3.0).comparison([sample(0, 5)], batch(1))
+    parts = [work(States(*(x[s] for x in made.tensors())), s.start)[0] for s in (slice(0, 2), slice(2, 4))]
+    torch.testing.assert_close(torch.cat(parts)[:, 0], expected)  # across the border of two stretches
+    still = PointSupervision(sources(lambda number: known), velocity_weight=3.0)
+    percent = (100 / SCENE.diagonal) ** 2
+    true = percent * (known.positions - known.rest).square().sum(-1).mean(1)
+    steps = percent * known.positions.diff(dim=0).square().sum(-1).mean(1)
+    assert still.static(sample(0, 4), SCENE.means, 0).losses[1:] == pytest.approx((true[1:5] + 3 * steps[:4]).tolist())
+    assert still.static(sample(0, 4), SCENE.means, 3).losses == pytest.approx((true[3:5] + 3 * steps[2:4]).tolist())
+
+
+def test_energy_of_each_half_counts_by_its_logarithm_in_units_of_the_rest_state() -> None:
+    known, made = truth(), states(5, 1)
+    plain_loss, weighted = (
+        PointSupervision(sources(lambda number: known), energy_weight=w).comparison([sample(0, 5)], batch(1))(made, 0)[
+            0
+        ]
+        for w in (0.0, 2.0)
+    )
+    percent = (100 / SCENE.diagonal) ** 2
+    points = torch.cat((known.rest[None], plain(known, made, 0)))
+    energy, true = (x.diff(dim=0).square().sum(-1).mean(1) for x in (points, known.positions[:6]))
+    mismatch = []
+    for half in (slice(0, 3), slice(3, 5)):
+        least = 0.05 * true[half].mean()
+        mismatch.append(((energy[half].mean() + least) / (true[half].mean() + least)).log().square())
+    still = percent * (known.positions[1:6] - known.rest).square().sum(-1).mean(1)
+    torch.testing.assert_close(weighted - plain_loss, (2 * still * sum(mismatch) / 2)[:, None])
+
+
+def test_energy_of_a_motion_that_has_not_begun_has_a_gradient() -> None:
+    known = truth()
+    still = SCENE.means.repeat(3, 1, 1).requires_grad_()
+    identity = torch.eye(3).expand(3, 2, 3, 3)
+    supervision = PointSupervision(sources(lambda number: known), energy_weight=1.0)
+    losses = supervision.comparison([sample(0, 3)], batch(1))(States(still, identity, identity), 0)[0]
+    losses.sum().backward()
+    assert bool(torch.isfinite(still.grad).all())
+    expected = torch.tensor(supervision.static(sample(0, 3), SCENE.means, 0).losses[1:])
+    torch.testing.assert_close(losses[:, 0].detach(), expected, rtol=1e-3, atol=0)  # points lie off their kernels

@@ -1,0 +1,174 @@
+"""The parts of an exact resume, each by itself."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch import LightningModule, Trainer
+
+from gausim.runs.randomness import random_state, restore_random_state
+from gausim.training.callbacks.epoch_table import EpochTable
+from gausim.training.callbacks.progress import EpochSummary
+from gausim.training.callbacks.resume import RunCheckpoint
+from gausim.training.callbacks.time_budget import TimeBudget
+from gausim.training.loggers.files import CsvLog, Resumable, TensorBoardLog
+from gausim.training.loggers.wandb import WandbLog
+from gausim.training.module import GausSimModule
+
+MODULE = LightningModule()
+
+
+def draws() -> list[float]:
+    own = [random.random(), random.gauss(0, 1), float(np.random.rand()), float(np.random.randn())]
+    return [*own, *torch.rand(2).tolist(), float(torch.randn(()))]
+
+
+def test_rows_of_epochs_done_again_and_torn_ones_are_dropped(tmp_path: Path) -> None:
+    table = EpochTable(tmp_path / "rows.csv", ("epoch", "object", "value"))
+    for epoch in (10, 10, 20, 30):
+        table.append({"epoch": epoch, "object": "a", "value": 1 / 3, "unknown": 5})
+    with (tmp_path / "rows.csv").open("a") as file:
+        file.write("4x,")
+    table.resume_at(20)
+    table.append({"epoch": 30, "object": "b"})
+    assert (tmp_path / "rows.csv").read_text().splitlines() == [
+        "epoch,object,value", "10,a,0.33333", "10,a,0.33333", "20,a,0.33333", "30,b,",
+    ]  # fmt: skip
+
+
+def test_random_generators_go_on_where_they_were(tmp_path: Path) -> None:
+    outside = random_state()
+    try:
+        random.gauss(0, 1), np.random.randn()  # each keeps a second number back
+        torch.save(random_state(), tmp_path / "state.pt")
+        expected = draws()
+        assert draws() != expected
+        restore_random_state(torch.load(tmp_path / "state.pt", weights_only=True))
+        assert draws() == expected
+    finally:
+        restore_random_state(outside)
+
+
+def test_the_table_forgets_later_steps_and_torn_rows(tmp_path: Path) -> None:
+    first = CsvLog(tmp_path)
+    first.resume_at(0)
+    for step in (1, 2, 3, 4):
+        first.log_metrics({"loss": step / 3}, step=step)
+    first.log_metrics({"extra": 7.0}, step=4)
+    with first.path.open("a") as file:
+        file.write("5,0.")
+    second = CsvLog(tmp_path)
+    second.resume_at(3)
+    second.log_metrics({"loss": 0.5, "late": 1.0}, step=4)
+    lines = second.path.read_text().splitlines()
+    assert lines[0] == "step,loss,extra,late" and len(lines) == 5
+    assert lines[3] == f"3,{3 / 3},," and lines[4] == "4,0.5,,1.0"
+    third = CsvLog(tmp_path)
+    third.resume_at(0)  # a run that begins anew
+    assert third.path.read_text().splitlines() == ["step"]
+    assert isinstance(third, Resumable) and isinstance(TensorBoardLog(tmp_path), Resumable)
+
+
+def test_one_dashboard_id_per_run_directory(tmp_path: Path) -> None:
+    made = [WandbLog(tmp_path / run) for run in ("a", "a", "b")]
+    assert made[0].version == made[1].version == (tmp_path / "a" / "wandb_id").read_text()
+    assert made[2].version != made[0].version
+
+
+def trainer_at(step: int, *, epoch: int = 0, last: bool = False, folder: Path = Path()) -> Any:
+    """A trainer as callbacks see it, without the machinery (whose properties cannot be set)."""
+    saved: list[int] = []
+    seen = {
+        "global_step": step, "is_last_batch": last, "should_stop": False, "current_epoch": epoch, "max_epochs": 9,
+        "loggers": [], "default_root_dir": str(folder), "strategy": SimpleNamespace(broadcast=lambda x: x),
+        "is_global_zero": True, "saved": saved, "save_checkpoint": lambda *_, **__: saved.append(step),
+    }  # fmt: skip
+    return object.__new__(type("StandIn", (Trainer,), seen))
+
+
+def test_saves_come_by_steps_and_by_minutes_within_an_epoch(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+
+    def steps_saved(callback: RunCheckpoint, *, last: int | None = None) -> list[int]:
+        now[0] = 0.0
+        callback.on_train_start(trainer_at(0), MODULE)
+        found = []
+        for step in range(1, 13):
+            now[0] += 20.0
+            trainer = trainer_at(step, last=step == last)
+            callback.on_train_batch_end(trainer, MODULE, None, None, 0)
+            found += trainer.saved
+        return found
+
+    assert steps_saved(RunCheckpoint()) == [3, 6, 9, 12]  # a minute
+    assert steps_saved(RunCheckpoint(every_minutes=0)) == []
+    assert steps_saved(RunCheckpoint(every_minutes=0, every_steps=5)) == [5, 10]
+    assert steps_saved(RunCheckpoint(every_minutes=0, every_steps=5), last=5) == [6, 11]  # the epoch's end saves that
+
+
+def test_what_was_logged_is_on_the_disk_before_the_checkpoint_is(tmp_path: Path) -> None:
+    trainer, order = trainer_at(4, last=False), []
+    stand_in = type(trainer)
+    stand_in.loggers = [SimpleNamespace(save=lambda: order.append("rows"))]  # type: ignore[attr-defined, misc]
+    stand_in.save_checkpoint = lambda *_, **__: order.append("checkpoint")  # type: ignore[assignment]
+    RunCheckpoint(every_steps=4).on_train_batch_end(trainer, MODULE, None, None, 0)
+    assert order == ["rows", "checkpoint"]
+
+
+def test_a_resumed_run_has_the_learning_rate_of_the_time_it_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1000.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    module = object.__new__(GausSimModule)
+    torch.nn.Module.__init__(module)
+    module.time_fraction = 0.0
+
+    def step(budget: TimeBudget, trainer: Trainer) -> float:
+        now[0] += 15.0
+        budget.on_train_batch_end(trainer, module, None, None, 0)
+        return module.time_fraction
+
+    whole, trainer = TimeBudget(minutes=1), trainer_at(0)
+    whole.on_train_start(trainer, module)
+    assert [step(whole, trainer) for _ in range(2)] == [0.25, 0.5]
+    state, module.time_fraction = whole.state_dict(), 0.0
+    now[0] += 500.0  # nobody trains
+    resumed = TimeBudget(minutes=1)
+    resumed.load_state_dict(state)
+    resumed.on_train_start(trainer, module)
+    assert module.time_fraction == 0.5  # what the next step's learning rate follows
+    assert [step(resumed, trainer) for _ in range(2)] == [0.75, 1.0] and trainer.should_stop
+
+
+def test_an_epoch_cut_in_two_counts_both_parts_seconds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    now = [100.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    first, trainer = EpochSummary(console=False), trainer_at(0, folder=tmp_path)
+    first.on_train_epoch_start(trainer, MODULE)
+    now[0] += 7.0
+    state = first.state_dict()
+    now[0] += 1000.0
+    second = EpochSummary(console=False)
+    second.load_state_dict(state)
+    second.on_train_start(trainer, MODULE)
+    now[0] += 3.0
+    assert second.state_dict() == {"elapsed": 10.0}
+
+
+def test_rows_of_epochs_that_are_done_again_go(tmp_path: Path) -> None:
+    path = tmp_path / "epochs.csv"
+    path.write_text("epoch,step,lr\r\n1,4,0.5\r\n2,8,0.25\r\n3,12,0.125\r\n4,1")
+    trainer = trainer_at(8, folder=tmp_path)
+    trainer.current_epoch = 2
+    EpochSummary(console=False).on_train_start(trainer, MODULE)
+    lines = path.read_text().splitlines()
+    assert lines[0].startswith("epoch,step,") and [line.split(",")[:2] for line in lines[1:]] == [
+        ["1", "4"],
+        ["2", "8"],
+    ]

@@ -1,0 +1,60 @@
+"""Stages as data: which one, how many frames and what rate at any time; what a plan refuses."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gausim.core import ConfigError
+from gausim.losses.mixed import MixedLoss
+from gausim.training.fitted.stages import FitPlan, Stage, StagedCurriculum
+from gausim.training.optimizers import ExponentialSchedule, HalvingSchedule, LinearSchedule
+
+
+def stage(iterations: int = 10, **options: object) -> Stage:
+    return Stage(iterations, {"a": 0.1}, MixedLoss(l1=1.0), **options)  # type: ignore[arg-type]
+
+
+def test_epochs_walk_through_the_stages() -> None:
+    plan = FitPlan({"first": stage(10), "left": None, "second": stage(20)}, round=5)
+    assert plan.shows == 5 and plan.epochs == 6
+    places = [(name, done) for name, _, done in (plan.place(e) for e in (0, 1, 1.5, 2, 5, 6, 7))]
+    assert places == [("first", 0), ("first", 5), ("first", 7.5), ("second", 0), ("second", 15),
+                      ("second", 20), ("second", 20)]  # fmt: skip
+    assert FitPlan({"short": stage(3), "long": stage(7)}, round=5).shows == 3
+
+
+def test_the_window_grows_from_the_first_to_the_last_epoch_of_a_stage() -> None:
+    plan = FitPlan({"few": stage(5, frames=[2, 2]), "more": stage(20, frames=[4, 0])}, round=5)
+    curriculum = StagedCurriculum(t_start=1, t_max=10, plan=plan)
+    seen = []
+    for epoch in range(5):
+        curriculum.enter(float(epoch))
+        seen.append(curriculum.steps(epoch))
+    assert seen == [2, 4, 6, 8, 10]
+    other = StagedCurriculum(t_start=1, t_max=10, plan=plan)
+    other.load_state_dict(curriculum.state_dict())
+    assert other.steps(0) == 10 and other.position == 4
+    assert StagedCurriculum(t_start=1, t_max=3, plan=FitPlan()).steps(0) == 3
+
+
+def test_rates_follow_their_groups_schedule() -> None:
+    schedules = {"default": HalvingSchedule(100, 100), "b": ExponentialSchedule(0.01)}
+    made = Stage(300, {"a": 1e-3, "b": 1e-2}, MixedLoss(l1=1.0), schedules=schedules)
+    assert [made.rate("a", i) for i in (0, 99, 100, 250)] == [1e-3, 1e-3, 5e-4, 2.5e-4]
+    assert made.rate("b", 150) == pytest.approx(1e-3) and made.rate("b", 300) == pytest.approx(1e-4)
+    assert made.rate("c", 0) == 0
+    assert [LinearSchedule(0.5).factor(i, 10) for i in (0, 5, 20)] == [1, 0.75, 0.5]
+
+
+def test_wrong_stages_are_refused() -> None:
+    with pytest.raises(ConfigError, match="iterations >= 1"):
+        stage(0)
+    with pytest.raises(ConfigError, match="frames as two numbers"):
+        stage(frames=[3])
+    with pytest.raises(ConfigError, match=r"stages\.only\.rates: \['a'\] asked for; the method has \['b'\]"):
+        FitPlan({"only": stage()}).check({"b": [torch.nn.Parameter(torch.zeros(1))]}, [])
+    with pytest.raises(ConfigError, match=r"stages\.only\.penalties: \['rough'\]"):
+        FitPlan({"only": stage(penalties={"rough": 1.0})}).check({"a": []}, ["smooth"])
+    with pytest.raises(ConfigError, match="model.plan.round"):
+        FitPlan({}, round=0)

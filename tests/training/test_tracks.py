@@ -1,0 +1,139 @@
+"""Motion tracked in images against the motion that they were drawn from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import pytest
+import torch
+from helpers import sway, toy_object
+from torch import Tensor
+
+from gausim.core import ConfigError
+from gausim.data.dataset import SequenceSample
+from gausim.losses import ImageLoss
+from gausim.models.initial_state import ModalInitialStates
+from gausim.models.step.simulator import GausSim
+from gausim.models.template.elastic import ElasticTemplate
+from gausim.ops.deformation import polar_rotation
+from gausim.render.cpu import CpuRenderer
+from gausim.render.draw import draw
+from gausim.training.module import GausSimModule
+from gausim.training.supervision.images import Sources
+from gausim.training.supervision.motion_tracks import MotionTracker, TrackSupervision, tracks_or_images
+from gausim.training.supervision.points import PointSupervision
+
+SCENE = toy_object.toy_scene()
+FRAMES, MODES = 5, 6
+
+
+@pytest.fixture(scope="module")
+def model() -> GausSim:
+    template = partial(ElasticTemplate, modes=MODES, neighbours=6, hidden=0)
+    torch.manual_seed(0)
+    return GausSim([SCENE], [24.0], radii=(0.2, 0.5), graph_radii=(2.0, 0.6), hidden=8, layers=1, template=template)
+
+
+@pytest.fixture
+def sources(model: GausSim) -> Sources:
+    return Sources([SCENE], lambda number: None, model.smooth_motions, CpuRenderer(), ImageLoss(balance=0.5))
+
+
+@pytest.fixture(scope="module")
+def coordinates() -> Tensor:
+    """A motion of several modes, one tenth of the object's diagonal wide."""
+    t = torch.arange(FRAMES)[:, None] * torch.linspace(0.4, 1.1, MODES)
+    return t.sin() * torch.tensor([8.0, -6.0, 5.0, 3.0, -3.0, 2.0])
+
+
+@pytest.fixture(scope="module")
+def filmed(model: GausSim, coordinates: Tensor) -> SequenceSample:
+    motions = model.smooth_motions(0)
+    assert motions is not None
+    gradients = motions.deformations(coordinates)
+    state = SCENE.means + motions.displacements(coordinates), gradients, polar_rotation(gradients)
+    drawn = draw(CpuRenderer(), SCENE, *state, motions.unit_of_kernel, toy_object.cameras())
+    straight = drawn.rgb / drawn.alpha.clamp_min(1e-6)[..., None]
+    rgba = (torch.cat((straight, drawn.alpha[..., None]), -1).clamp(0, 1) * 255).round().to(torch.uint8)
+    return replace(sway.sample(0, FRAMES - 1), frames=rgba)
+
+
+def test_motion_of_several_modes_is_found_in_the_images(
+    model: GausSim, sources: Sources, filmed: SequenceSample, coordinates: Tensor
+) -> None:
+    found = MotionTracker(sources).extend(None, filmed)
+    motions = model.smooth_motions(0)
+    assert motions is not None and found.shape == (FRAMES, MODES)
+    true, made = motions.displacements(coordinates), motions.displacements(found)
+    error = (made - true).norm(dim=-1).mean(1)[1:] / true.norm(dim=-1).mean(1)[1:]
+    assert float(true.norm(dim=-1).max()) > 0.1 * SCENE.diagonal
+    assert float(error.max()) < 0.1, error
+
+
+def test_tracking_in_two_calls_gives_the_same_bits(sources: Sources, filmed: SequenceSample) -> None:
+    tracker = MotionTracker(sources, iterations=5)
+    whole = tracker.extend(None, filmed)
+    part = tracker.extend(None, replace(filmed, frames=filmed.frames[:3]))
+    assert torch.equal(tracker.extend(part, filmed), whole)
+    later = filmed.frames.clone()
+    later[3:] = 0  # frames that come after have no say
+    assert torch.equal(tracker.extend(None, replace(filmed, frames=later))[:3], whole[:3])
+
+
+def test_losses_are_those_of_the_tracked_kernels(model: GausSim, sources: Sources, filmed: SequenceSample) -> None:
+    supervision = TrackSupervision(sources, iterations=5)
+    known = supervision.motion(filmed)
+    free = SCENE.simulated & ~SCENE.pinned
+    assert known.positions.shape == (FRAMES, int(free.sum()), 3)
+    assert torch.equal(known.positions[0], SCENE.means[free])
+    plain = PointSupervision(replace(sources, truth=lambda number: known), energy_weight=0.3)
+    assert supervision.static(filmed, SCENE.means, 0) == plain.static(filmed, SCENE.means, 0)
+    assert supervision.static(filmed, SCENE.means, 0).losses[-1] > 0
+
+
+def test_what_was_tracked_is_not_tracked_again(
+    sources: Sources, filmed: SequenceSample, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = TrackSupervision(sources, iterations=2)
+    known = first.motion(filmed)
+    resumed = TrackSupervision(sources, iterations=2)
+    resumed.load_state_dict(first.state_dict())
+    monkeypatch.setattr(MotionTracker, "extend", lambda *unused: pytest.fail("tracked again"))
+    assert torch.equal(resumed.motion(filmed).positions, known.positions)
+    shorter = replace(filmed, frames=filmed.frames[:3])
+    assert torch.equal(resumed.motion(shorter).positions, known.positions)
+
+
+def test_a_few_steps_of_training_come_nearer_and_keep_the_tracks(
+    model: GausSim, sources: Sources, filmed: SequenceSample
+) -> None:
+    module = GausSimModule(
+        model=model,
+        initial_states=ModalInitialStates(model, [0]),
+        scene_of_sequence=[0],
+        renderer=CpuRenderer(),
+        optimizer=replace(sway.OptimizerSettings(), template_lr=1e-2, initial_lr=2e-2),
+        supervision=TrackSupervision(sources, iterations=20),
+    )
+    optimizer, draws = module.configure_optimizers(), torch.Generator().manual_seed(0)
+    found = [module.optimise([filmed], optimizer, draws) for _ in range(40)]
+    assert found[-1]["excess_static"] < 0.5 * found[0]["excess_static"]
+    checkpoint: dict[str, object] = {}
+    module.on_save_checkpoint(checkpoint)
+    assert checkpoint["gausim"]["tracks"][0].shape == (FRAMES, MODES)
+
+
+def test_a_model_without_smooth_motions_is_refused_or_shown_images(sources: Sources) -> None:
+    paper = GausSim([SCENE], [24.0], radii=(0.2, 0.5), graph_radii=(2.0, 0.6), hidden=8, layers=1)
+    without = replace(sources, motions=paper.smooth_motions)
+    with pytest.raises(ConfigError, match="this model has none. Use supervision=images"):
+        TrackSupervision(without)
+    assert tracks_or_images(without, energy_weight=0.1) is None
+    assert isinstance(tracks_or_images(sources, energy_weight=0.1), TrackSupervision)
+
+
+@pytest.mark.parametrize("wrong", [{"iterations": 0}, {"rate": 0.0}])
+def test_settings_out_of_range_are_named(sources: Sources, wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match="expected iterations >= 1 and rate > 0"):
+        TrackSupervision(sources, **wrong)

@@ -1,0 +1,284 @@
+from __future__ import annotations
+
+import math
+import re
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from helpers import sway, toy_object
+from lightning.pytorch import Trainer
+from torch import Tensor, nn
+
+from gausim.core import ConfigError, DivergenceError, SimState
+from gausim.data.dataset import SequenceSample
+from gausim.data.images import composite
+from gausim.losses import ImageLoss, Objective
+from gausim.models.initial_state import FreeInitialStates, ModalInitialStates
+from gausim.models.step.simulator import GausSim
+from gausim.models.template.elastic import ElasticTemplate
+from gausim.render.cpu import CpuRenderer
+from gausim.render.draw import draw
+from gausim.render.reference import ReferenceRenderer
+from gausim.training.module import GausSimModule
+from gausim.training.optimizers import CosineSchedule, HalvingSchedule, OptimizerSettings, StableDecaySchedule
+from gausim.training.trainer import make_trainer
+
+SCENE_OF_SEQUENCE = sway.SCENE_OF_SEQUENCE
+sample, sway_module = sway.sample, sway.sway_module
+
+
+def fit(module: GausSimModule, batches: list[list[SequenceSample]], tmp_path: Path, epochs: int = 1) -> Trainer:
+    trainer = make_trainer(max_epochs=epochs, accelerator="cpu", progress=False, run_dir=tmp_path, log_every_n_steps=1)
+    loader = torch.utils.data.DataLoader(batches, batch_size=None, collate_fn=lambda x: x)  # type: ignore[arg-type]
+    trainer.fit(module, loader)
+    return trainer
+
+
+def snapshot(module: GausSimModule) -> dict[str, Tensor]:
+    return {name: p.detach().clone() for name, p in module.named_parameters()}
+
+
+def test_absent_sequences_and_scenes_do_not_move_in_twenty_steps(tmp_path: Path) -> None:
+    module = sway_module(network_lr=1e-2)
+    fit(module, [[sample(0), sample(1), sample(2)]] * 3, tmp_path / "a")  # every Adam moment is warm
+    before = snapshot(module)
+    fit_again = module.configure_optimizers()
+    assert fit_again is not None
+    trained = [[sample(0)]] * 20
+    warm = [[sample(0), sample(1), sample(2)]] * 3
+    whole = sway_module(network_lr=1e-2)
+    seen: list[dict[str, Tensor]] = []
+    recorded = whole.training_step
+
+    def record(samples: list[SequenceSample], batch_idx: int) -> None:
+        recorded(samples, batch_idx)
+        seen.append(snapshot(whole))
+
+    whole.training_step = record  # type: ignore[method-assign]
+    fit(whole, warm + trained, tmp_path / "b")
+    after_warm, end = seen[2], seen[-1]
+    for name in ("initial_states.values.1", "initial_states.values.2", "model.drift.1"):
+        assert not torch.equal(after_warm[name], snapshot(sway_module())[name])  # it can move
+        torch.testing.assert_close(end[name], after_warm[name], rtol=0, atol=0)
+    for name in ("initial_states.values.0", "model.drift.0", "model.keep"):
+        assert not torch.equal(end[name], after_warm[name])
+    for name, value in before.items():
+        torch.testing.assert_close(value, after_warm[name], rtol=0, atol=0)  # same seed, same steps
+
+
+def gradients(module: GausSimModule, samples: list[SequenceSample], tmp_path: Path) -> dict[str, Tensor]:
+    """Gradients of the first optimiser step."""
+    kept: dict[str, Tensor] = {}
+
+    def keep(*_: object) -> dict[str, Tensor]:
+        kept.update({n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None})
+        return {"network": torch.zeros(())}
+
+    object.__setattr__(module.settings, "clip", keep)
+    fit(module, [samples], tmp_path)
+    return kept
+
+
+@pytest.mark.parametrize("backprop_steps", [1, 2, 0])
+def test_windows_stop_gradients_and_nothing_else(backprop_steps: int, tmp_path: Path) -> None:
+    objective = Objective(backprop_steps=backprop_steps, static_weight=0.0, momentum_weight=0.0)
+    ours = gradients(sway_module(objective), [sample(0), sample(2)], tmp_path)
+    module = sway_module(objective)
+    samples = [sample(0), sample(2)]
+    batch = module.model.batch([0, 1])
+    state, total = module.initial(samples, batch), torch.zeros(())
+    for t in range(3):
+        if t and backprop_steps and t % backprop_steps == 0:
+            state = state.detach()
+        step = module.model.step(batch, state)
+        state = SimState(step.positions, state.positions)
+        for i, s in enumerate(samples):
+            member = batch.members[i]
+            scene, moved = module.simulator.scenes[s.scene_id], step.positions[member.kernels][None]
+            same = torch.eye(3)[None, None]
+            images = draw(ReferenceRenderer(), scene, moved, same, same, member.unit_of_kernel, s.cameras)
+            total = total + ImageLoss()(images.rgb, composite(s.frames[t + 1 : t + 2])[0]).sum() / 6
+    total.backward()
+    assert set(ours) == {n for n, p in module.named_parameters() if p.grad is not None}
+    for name, parameter in module.named_parameters():
+        if parameter.grad is not None:
+            torch.testing.assert_close(ours[name], parameter.grad, rtol=1e-3, atol=1e-3 * float(ours[name].abs().max()))
+
+
+def test_memory_of_one_window_learns_the_drift(tmp_path: Path) -> None:
+    module = sway_module(network_lr=0.0, scene_lr=5e-3, initial_lr=0.0)
+    fit(module, [[sample(0)]] * 40, tmp_path)
+    assert module.model.drift[0] > 0.02
+    assert module.summary["excess_static"] < 1.0
+    assert 0.0 < module.summary["motion_energy"] < 3.0
+
+
+@pytest.mark.parametrize("poison", [math.nan, math.inf])
+def test_positions_that_break_are_named(poison: float, tmp_path: Path) -> None:
+    module = sway_module()
+    module.model.poison = poison
+    with pytest.raises(DivergenceError, match=r"predicted step 1 of 3, sequence toy/seq_0: positions"):
+        fit(module, [[sample(0)]], tmp_path)
+
+
+def test_a_gradient_that_breaks_is_named_and_nothing_moves(tmp_path: Path) -> None:
+    module = sway_module()
+    module.model.keep.register_hook(lambda grad: grad * math.nan)
+    before = snapshot(module)
+    with pytest.raises(DivergenceError, match=r"gradient of group 'network'"):
+        fit(module, [[sample(0)]], tmp_path)
+    assert all(torch.equal(before[n], p) for n, p in module.named_parameters())
+
+
+def test_an_explosion_ends_the_rollout_and_is_counted(tmp_path: Path) -> None:
+    module = sway_module(Objective(explosion=0.01, static_weight=0.0))
+    with torch.no_grad():
+        module.model.drift[0] += 0.02
+    fit(module, [[sample(0, steps=6)]], tmp_path)
+    assert module.summary["exploded"] == 1.0
+
+
+def test_twenty_barren_batches_are_a_divergence(tmp_path: Path) -> None:
+    module = sway_module(Objective(explosion=1e-3, static_weight=0.0))
+    with torch.no_grad():
+        module.model.drift[0] += 1.0
+    with pytest.raises(DivergenceError, match="20 batches in a row"):
+        fit(module, [[sample(0)]] * 25, tmp_path)
+
+
+def test_a_collapse_is_warned_of_once(tmp_path: Path) -> None:
+    module = sway_module(Objective(static_weight=0.0), network_lr=0.0, scene_lr=0.0, initial_lr=0.0)
+    with pytest.warns(UserWarning, match="collapsed to the rest state") as caught:
+        fit(module, [[sample(0, steps=1)]] * 50, tmp_path, epochs=4)
+    assert sum("collapsed" in str(w.message) for w in caught) == 1
+
+
+def test_noise_moves_only_free_kernels_and_depends_on_the_seed() -> None:
+    from gausim.training.rollout import UnitNoise
+
+    module = sway_module()
+    batch = module.model.batch([0, 1])
+    pinned = torch.cat([s.pinned for s in module.simulator.scenes])
+    made = []
+    for seed in (0, 0, 1):
+        noise = UnitNoise(batch, module.simulator.scenes, [0.1, 0.1], seed, [0, 1])
+        made.append(noise(SimState(batch.rest, batch.rest)).positions - batch.rest)
+    assert float(made[0][pinned].abs().max()) == 0.0 and float(made[0][~pinned].abs().min()) > 0.0
+    assert torch.equal(made[0], made[1]) and not torch.equal(made[0], made[2])
+
+
+def test_schedules() -> None:
+    halving = HalvingSchedule(first=16, every=2)
+    assert [halving.factor(e, 25) for e in (0, 15.9, 16, 17.5, 18, 24)] == [1, 1, 0.5, 0.5, 0.25, 0.5**5]
+    cosine = CosineSchedule(warmup=0.1, final=0.1)
+    values = [cosine.factor(e, 100) for e in (1, 10, 55, 100)]
+    assert values == pytest.approx([0.1, 1.0, 0.55, 0.1])
+    stable = StableDecaySchedule(warmup=2.0, decay=0.25, final=0.1)
+    assert [stable.factor(e, 100) for e in (1, 2, 75, 87.5, 100)] == pytest.approx([0.5, 1.0, 1.0, 0.55, 0.1])
+    assert stable.factor(75, 80) < 0.5  # an end that comes earlier brings the fall forward
+
+
+def test_clipping_by_group_and_altogether() -> None:
+    for per_group, expected in ((True, (1.0, 1.0)), (False, (0.6, 0.8))):
+        a, b = nn.Parameter(torch.zeros(2)), nn.Parameter(torch.zeros(2))
+        settings = OptimizerSettings(clip_per_group=per_group)
+        optimizer = settings.build({"network": [a], "scene": [b]})
+        a.grad, b.grad = torch.tensor([30.0, 0.0]), torch.tensor([0.0, 40.0])
+        norms = settings.clip(optimizer)
+        assert {k: float(v) for k, v in norms.items()} == {"network": 30.0, "scene": 40.0}
+        assert (float(a.grad.norm()), float(b.grad.norm())) == pytest.approx(expected, rel=1e-4)
+
+
+def test_absent_sequences_and_scenes_do_not_move_in_the_real_model(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    scenes = [toy_object.toy_scene(), toy_object.toy_scene()]
+    template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=4)
+    model = GausSim(scenes, [24.0, 24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
+    module = GausSimModule(
+        model=model, initial_states=ModalInitialStates(model, SCENE_OF_SEQUENCE), scene_of_sequence=SCENE_OF_SEQUENCE,
+        renderer=CpuRenderer(threads=1), optimizer=OptimizerSettings(),
+    )  # fmt: skip
+    seen: list[dict[str, Tensor]] = []
+    recorded = module.training_step
+
+    def record(samples: list[SequenceSample], batch_idx: int) -> None:
+        recorded(samples, batch_idx)
+        seen.append(snapshot(module))
+
+    module.training_step = record  # type: ignore[method-assign]
+    fit(module, [[sample(0), sample(1), sample(2)]] * 2 + [[sample(0)]] * 20, tmp_path)
+    own = re.compile(r"initial_states\.velocity\.[12]|.*(log_density|attributes)\.1|model\.template\.scenes\.1\..*")
+    absent = [name for name in seen[0] if own.fullmatch(name)]
+    assert len(absent) > 4
+    for name in absent:
+        torch.testing.assert_close(seen[-1][name], seen[1][name], rtol=0, atol=0)
+    assert not torch.equal(seen[-1]["initial_states.velocity.0"], seen[1]["initial_states.velocity.0"])
+
+
+def test_mixing_counts_in_units_of_the_rest_states_loss() -> None:
+    """Two steps from the same weights differ in the template's mixing alone, by the derivative of the term."""
+    found = []
+    for weight in (0.0, 0.5):
+        torch.manual_seed(0)
+        template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=0, inertia="trained")
+        model = GausSim([toy_object.toy_scene()], [24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
+        with torch.no_grad():
+            for name, p in model.template.named_parameters():
+                if "mixing" in name:
+                    p.normal_(std=0.1)
+        module = GausSimModule(
+            model=model, initial_states=ModalInitialStates(model, [0]), scene_of_sequence=[0],
+            renderer=CpuRenderer(threads=1), optimizer=OptimizerSettings(clip_norm=0.0),
+            objective=Objective(mixing_weight=weight, backprop_steps=0, static_weight=0.0),
+        )  # fmt: skip
+        module.optimise([sample(0)], module.configure_optimizers(), torch.Generator().manual_seed(0), lambda: None)
+        found.append((module, {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}))
+    (_, without), (module, with_it) = found
+    mixing = module.model.mixing(0)
+    scored = module.yardsticks.of(sample(0), module.simulator.scenes[0].means).static
+    names = [n for n in with_it if "mixing" in n]
+    expected = torch.autograd.grad(0.5 * sum(scored) / len(scored) * mixing, [module.get_parameter(n) for n in names])
+    assert len(names) == 3 and all(float(e.abs().max()) > 0 for e in expected)
+    for name, gradient in zip(names, expected, strict=True):
+        torch.testing.assert_close(with_it[name] - without.get(name, 0), gradient, rtol=1e-3, atol=1e-4)
+    others = [n for n in without if n not in names]
+    assert others and all(torch.equal(without[n], with_it[n]) for n in others)
+
+
+@pytest.mark.slow
+def test_overfitting_one_sequence_drives_its_loss_down_tenfold(tmp_path: Path) -> None:
+    scene = toy_object.toy_scene()
+    torch.manual_seed(0)
+    model = GausSim([scene], [24.0], radii=(0.3, 0.7), hidden=16, layers=2, output_scale=0.05, rest_inputs=True)
+    module = GausSimModule(
+        model=model, initial_states=FreeInitialStates(model, [0]), scene_of_sequence=[0],
+        renderer=CpuRenderer(threads=1), objective=Objective(backprop_steps=0, static_weight=0.0),
+        optimizer=OptimizerSettings(network_lr=3e-3, initial_lr=3e-3, clip_per_group=True, schedule=CosineSchedule()),
+    )  # fmt: skip
+    losses: list[float] = []
+    recorded = module.training_step
+
+    def record(samples: list[SequenceSample], batch_idx: int) -> None:
+        recorded(samples, batch_idx)
+        losses.append(module.last_stats["loss_image"])
+
+    module.training_step = record  # type: ignore[method-assign]
+    fit(module, [[sample(0, steps=5)]] * 300, tmp_path)
+    assert sum(losses[-10:]) / 10 < 0.1 * losses[0]
+
+
+def test_decay_takes_matrices_and_initial_states_of_its_groups_and_nothing_else() -> None:
+    matrix, vector, other, state = (nn.Parameter(torch.ones(*shape)) for shape in ((2, 2), (2,), (2, 2), (2,)))
+    settings = OptimizerSettings(template_lr=0.1, network_lr=0.1, initial_lr=0.1, decay={"template": 0.5, "initial": 1})
+    optimizer = settings.build({"template": [matrix, vector], "network": [other], "initial": [state]})
+    for parameter in (matrix, vector, other, state):
+        parameter.grad = torch.zeros_like(parameter)
+    optimizer.step()
+    assert matrix[0, 0].item() == pytest.approx(0.95) and vector[0].item() == other[0, 0].item() == 1
+    assert state[0].item() == pytest.approx(0.9)
+    assert {group["name"] for group in optimizer.param_groups} == {"template", "network", "initial"}
+    assert len(settings.clip(optimizer)) == 3  # groups are clipped by name
+    with pytest.raises(ConfigError, match=r"decay.*\['nothing'\]"):
+        OptimizerSettings(decay={"nothing": 1.0})

@@ -1,0 +1,206 @@
+"""What the graph of a training step holds, and what the host waits for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+import torch
+from helpers import toy_object
+from helpers.sway import blobs, sample, sway_module
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from gausim.benchmark.train import peak_saved_bytes
+from gausim.core import DivergenceError
+from gausim.losses import Objective
+from gausim.models.initial_state import FreeInitialStates
+from gausim.models.step.simulator import GausSim
+from gausim.render.reference import ReferenceRenderer
+from gausim.training.module import GausSimModule
+from gausim.training.optimizers import OptimizerSettings
+from gausim.training.supervision import comparison
+
+
+def real_module(objective: Objective) -> GausSimModule:
+    torch.manual_seed(0)
+    model = GausSim(
+        [toy_object.toy_scene()], [24.0], radii=(0.3, 0.7), edges="rest", hidden=8, layers=2, output_scale=0.1
+    )
+    return GausSimModule(
+        model=model, initial_states=FreeInitialStates(model, [0]), scene_of_sequence=[0], renderer=blobs,
+        objective=objective, optimizer=OptimizerSettings(), share_every=0,
+    )  # fmt: skip
+
+
+def optimise(module: GausSimModule, steps: int = 3, times: int = 1) -> dict[str, float]:
+    optimizer = module.configure_optimizers()
+    stats: dict[str, float] = {}
+    for number in range(times):
+        stats = module.optimise([sample(0, steps=steps)], optimizer, torch.Generator().manual_seed(number))
+    return stats
+
+
+def parameters(module: torch.nn.Module) -> dict[str, Tensor]:
+    return {name: value.detach().clone() for name, value in module.state_dict().items()}
+
+
+@pytest.fixture
+def one_state_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(comparison, "CPU_PIXELS", 1)
+
+
+def held(objective: Objective, steps: int) -> int:
+    return peak_saved_bytes(lambda: optimise(real_module(objective), steps))
+
+
+def test_memory_does_not_grow_with_the_rollout_where_gradients_stop(one_state_at_once: None) -> None:
+    stopped = Objective(backprop_steps=1, static_weight=0.0)
+    assert held(stopped, 16) == held(stopped, 4) > 0
+    whole = Objective(backprop_steps=0, static_weight=0.0)
+    assert held(whole, 32) > 2 * held(whole, 4)
+
+
+def test_checkpointing_the_steps_keeps_the_gradients_and_the_statistics() -> None:
+    whole, kept = (real_module(Objective(backprop_steps=0, checkpoint_steps=c)) for c in (False, True))
+    first, second = optimise(whole, steps=4), optimise(kept, steps=4)
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        assert second[name] == pytest.approx(value, rel=1e-5, abs=1e-9), name
+    for (name, a), (_, b) in zip(whole.named_parameters(), kept.named_parameters(), strict=True):
+        assert (a.grad is None) == (b.grad is None), name
+        if a.grad is not None:
+            torch.testing.assert_close(b.grad, a.grad, rtol=1e-3, atol=1e-5 * float(a.grad.abs().max()))
+    after = parameters(kept)
+    for name, value in parameters(whole).items():
+        if "normaliser" in name:
+            torch.testing.assert_close(after[name], value, rtol=1e-6, atol=1e-9)
+    # The first statistics, one step of the static loss and four of the rollout on two levels, each counted once.
+    carried, units = "loss_static" in first, sum(level.count for level in kept.model.batch([0]).levels)
+    assert int(kept.model.node_normaliser.count) == units * (1 + 4 + carried)
+
+
+def test_checkpointing_the_steps_makes_the_graph_small(one_state_at_once: None) -> None:
+    def grown(*, checkpoint: bool) -> int:
+        objective = Objective(backprop_steps=0, static_weight=0.0, checkpoint_steps=checkpoint)
+        return held(objective, 12) - held(objective, 4)
+
+    assert 0 <= grown(checkpoint=True) < 0.1 * grown(checkpoint=False)
+
+
+# ------------------------------------------------------------------------------------------------ reads put off
+
+
+def pair(objective: Objective, drift: float) -> tuple[GausSimModule, GausSimModule]:
+    """The same module twice; the second one puts its reads off as on a GPU."""
+    made = [sway_module(objective, network_lr=1e-2, scene_lr=1e-2, initial_lr=1e-2) for _ in range(2)]
+    for module in made:
+        with torch.no_grad():
+            module.model.drift[0] += drift
+    made[1]._defers = lambda device: True  # type: ignore[method-assign]
+    return made[0], made[1]
+
+
+@pytest.mark.parametrize("backprop_steps", [1, 2, 0])
+@pytest.mark.parametrize(("drift", "lasts"), [(0.02, (6,)), (0.2, (1, 2, 3, 4, 5, 0)), (5.0, (0,))])
+def test_reads_put_off_change_nothing(backprop_steps: int, drift: float, lasts: tuple[int, ...]) -> None:
+    now, later = pair(Objective(backprop_steps=backprop_steps, explosion=0.6, static_weight=0.0), drift)
+    stats = [optimise(module, steps=6) for module in (now, later)]
+    assert stats[0].keys() == stats[1].keys() and stats[0]["exploded"] == float(lasts != (6,))
+    for name, value in stats[0].items():
+        assert stats[1][name] == pytest.approx(value, rel=1e-5, abs=1e-12), name
+    for name, value in parameters(now).items():
+        torch.testing.assert_close(parameters(later)[name], value, rtol=1e-5, atol=1e-8)
+
+
+def test_a_rollout_cut_short_in_the_middle_was_among_them() -> None:
+    now, _ = pair(Objective(backprop_steps=1, explosion=0.6, static_weight=0.0), 0.2)
+    lengths = []
+    inner = now._descend
+    now._descend = lambda losses, *a, **k: (lengths.append(len(losses)), inner(losses, *a, **k))  # type: ignore
+    optimise(now, steps=6)
+    assert 0 < sum(lengths) < 6
+
+
+@pytest.mark.parametrize("poison", [float("nan"), float("inf")])
+def test_positions_that_break_are_named_when_reads_are_put_off(poison: float) -> None:
+    _, later = pair(Objective(static_weight=0.0), 0.0)
+    later.model.poison = poison
+    before = parameters(later)
+    with pytest.raises(DivergenceError, match=r"predicted step 1 of 3, sequence toy/seq_0: positions"):
+        optimise(later)
+    assert all(torch.equal(before[name], value) for name, value in parameters(later).items())
+
+
+class Reads(TorchDispatchMode):
+    """Counts operations that bring a number to the host."""
+
+    NAMES = ("_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "unique")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if any(func.overloadpacket.__name__.startswith(name) for name in self.NAMES):
+            self.found.append(str(func))
+        return func(*args, **(kwargs or {}))
+
+
+@contextmanager
+def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    with Reads() as reads, monkeypatch.context() as patch:
+        for name in ("tolist", "cpu", "numpy", "item"):
+            inner = getattr(Tensor, name)
+            patch.setattr(Tensor, name, lambda *a, n=name, f=inner, **k: (reads.found.append(n), f(*a, **k))[1])
+        yield reads.found
+
+
+@pytest.mark.parametrize("backprop_steps", [1, 0])
+def test_one_read_per_optimiser_step(backprop_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    from gausim.kernels.compiled import torch_only
+
+    _, module = pair(Objective(backprop_steps=backprop_steps, input_noise=0.01), 0.01)
+    module.images.renderer = blobs
+    module.settings = OptimizerSettings(optimizer=torch.optim.SGD, ema_decay=0.9)  # Adam counts steps on the host
+    optimizer, batch = module.configure_optimizers(), [sample(0), sample(1)]
+    module.optimise(batch, optimizer, torch.Generator().manual_seed(0))  # cameras and yardsticks are read once
+    draws = torch.Generator().manual_seed(1)
+    monkeypatch.setattr(module, "_static", lambda *a: None)  # whether to is drawn on the host, and never leaves it
+    with torch_only(), watched(monkeypatch) as found:
+        module.optimise(batch, optimizer, draws)
+    assert found == ["tolist"]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("backprop_steps", [1, 0])
+def test_the_device_is_not_waited_for(backprop_steps: int) -> None:
+    module = sway_module(Objective(backprop_steps=backprop_steps, static_weight=0.0)).cuda()
+    module.model.scenes = [scene.to("cuda") for scene in module.model.scenes]
+    module.images.renderer = blobs
+    samples, optimizer = [sample(0).to("cuda"), sample(1).to("cuda")], module.configure_optimizers()
+    draws, facts = torch.Generator().manual_seed(0), [s.facts for s in samples]
+    module.optimise(samples, optimizer, draws)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        optimizer.zero_grad(set_to_none=True)
+        tally = module._rollout(samples, facts, draws)
+        norms = module.settings.clip(optimizer)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert len(tally.fetch(norms).numbers(facts, 3.0).images) == 3
+
+
+@pytest.mark.gpu
+def test_a_step_on_the_device_is_that_of_the_cpu() -> None:
+    found = []
+    for device in ("cpu", "cuda"):
+        module = sway_module(Objective(backprop_steps=0, static_weight=0.0)).to(device)
+        module.model.scenes = [scene.to(device) for scene in module.model.scenes]
+        module.images.renderer = ReferenceRenderer()
+        optimizer = module.configure_optimizers()
+        found.append(module.optimise([sample(0).to(device)], optimizer, torch.Generator().manual_seed(0)))
+    for name, value in found[0].items():
+        assert found[1][name] == pytest.approx(value, rel=1e-3, abs=1e-6), name

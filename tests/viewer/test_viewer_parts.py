@@ -1,0 +1,442 @@
+"""The viewer's parts without a browser: packing, colours, picking, queues, the simulating thread, recordings."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("viser", reason="the extra 'view' is not installed")
+
+import msgspec
+import zstandard
+
+from gausim.core import ConfigError, DataError, DivergenceError, GaussianScene, SteppedFrame, Trajectory
+from gausim.interaction.interaction import Interaction, replay
+from gausim.interaction.selections import Ball, Unit, Whole
+from gausim.interaction.session import Force, Gravity, Impulse, Pin, Release, Reset, Wind
+from gausim.io.ply import load_scene
+from gausim.ops.covariance import covariance_from_scales
+from gausim.ops.spherical_harmonics import spherical_harmonics_basis
+from gausim.viewer.coloring import BASE, MASS, SPEED, STRAIN, VIEW, Painter, highlighted, hues
+from gausim.viewer.companion import Companion
+from gausim.viewer.hands import first_hit, in_rectangle
+from gausim.viewer.live import Live, Take
+from gausim.viewer.messages import MessageChecker, MessageError
+from gausim.viewer.pipeline import Latest, Rate, Worker
+from gausim.viewer.recording import record
+from gausim.viewer.shown import LIVE, Shown
+from gausim.viewer.splats import SIZE, Placing, half_covariances, pack, unit_centres
+
+# ----------------------------------------------------------------------------------------------------------- packing
+
+
+def eigenvalues(packed: np.ndarray) -> np.ndarray:
+    xx, xy, xz, yy, yz, zz = packed.astype(np.float64).T
+    return np.linalg.eigvalsh(np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], -1).reshape(-1, 3, 3))
+
+
+@pytest.mark.parametrize("spread", [0.0, 1.0, 4.0])
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_rounded_covariances_stay_positive_definite(size: float, spread: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    scales = np.log(size) + spread * torch.randn(4000, 3, generator=generator)
+    covars = covariance_from_scales(scales, torch.randn(4000, 4, generator=generator))
+    packed = half_covariances(covars)
+    assert packed.dtype == np.float16 and np.isfinite(packed).all()
+    assert eigenvalues(packed).min() > 0
+
+
+def test_real_splats_keep_their_covariances(data_root: Path) -> None:
+    scene = load_scene(data_root / "splats" / "playbot_lod3.ply")
+    covars = covariance_from_scales(scene.log_scales, scene.quats) * Placing.of(scene).scale ** 2
+    packed = half_covariances(covars)
+    assert eigenvalues(packed).min() > 0
+    largest = covars.diagonal(dim1=-2, dim2=-1).amax(-1)
+    upper = covars.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+    error = (torch.from_numpy(packed.astype(np.float32)) - upper).abs().amax(-1)
+    assert float((error / largest.clamp_min(1e-4)).max()) < 0.006
+
+
+def test_a_packed_kernel_reads_as_viser_writes_it(make_column: Callable[..., GaussianScene]) -> None:
+    scene = make_column()
+    placing = Placing.of(scene)
+    covars = covariance_from_scales(scene.log_scales, scene.quats)
+    rgb = torch.rand(scene.count, 3, generator=torch.Generator().manual_seed(1))
+    opacities = torch.sigmoid(scene.opacity_logits)
+    buffer = pack(scene.means, covars, rgb, opacities, placing)
+    assert buffer.shape == (scene.count, 8) and buffer.dtype == np.uint32
+    assert torch.equal(torch.from_numpy(buffer[:, :3].copy().view(np.float32)), placing.to_page(scene.means))
+    rgba = buffer[:, 7:].copy().view(np.uint8)
+    assert np.abs(rgba[:, :3] - rgb.numpy() * 255).max() <= 0.51 and (rgba[:, 3] == 128).all()
+    assert (buffer[:, 3] == 0).all()
+
+
+def test_the_object_is_shown_in_one_size_and_points_come_back(make_column: Callable[..., GaussianScene]) -> None:
+    scene = make_column()
+    big = replace(scene, means=scene.means * 1000 + 50)
+    for one in (scene, big):
+        placing = Placing.of(one, (1.0, 2.0, 3.0))
+        shown = placing.to_page(one.means[one.simulated])
+        assert float((shown.amax(0) - shown.amin(0)).norm()) == pytest.approx(SIZE, rel=1e-4)
+        assert torch.allclose(
+            placing.to_scene(placing.to_page(one.means)), one.means, rtol=1e-4, atol=1e-4 * one.diagonal
+        )
+
+
+def test_centres_of_units_are_centres_of_mass() -> None:
+    positions = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 5, 5], [9, 9, 9]])
+    centres = unit_centres(positions, torch.tensor([0, 0, 1, -1]), torch.tensor([1.0, 3.0, 2.0, 7.0]), 2)
+    assert torch.allclose(centres, torch.tensor([[0.75, 0, 0], [5, 5, 5]]))
+
+
+# ----------------------------------------------------------------------------------------------------------- colours
+
+
+@pytest.fixture
+def painter(make_interaction: Callable[..., Interaction]) -> tuple[Painter, Interaction]:
+    interaction = make_interaction()
+    return Painter(interaction.scene, interaction.units, interaction.masses), interaction
+
+
+def painted(painter: Painter, interaction: Interaction, mode: str, eye: Tensor) -> tuple[Tensor, Tensor]:
+    frame, still = interaction.frame, torch.zeros(interaction.scene.count)
+    covars, rgb, legend = painter(frame, interaction.unit_of_kernel, still, mode, eye)
+    assert legend.text and torch.isfinite(rgb).all() and rgb.shape == (interaction.scene.count, 3)
+    return covars, rgb
+
+
+def test_every_mode_colours_every_kernel(painter: tuple[Painter, Interaction]) -> None:
+    paint, interaction = painter
+    assert {VIEW, BASE, STRAIN, SPEED, MASS} <= set(paint.modes) and len(paint.modes) == 5 + len(interaction.units)
+    eye = torch.tensor([0.0, -3.0, 1.0])
+    scene = interaction.scene
+    rest = covariance_from_scales(scene.log_scales, scene.quats)
+    seen = {}
+    for mode in paint.modes:
+        covars, seen[mode] = painted(paint, interaction, mode, eye)
+        assert torch.allclose(covars, rest, atol=1e-7)
+        assert float(seen[mode].min()) >= 0
+    away = torch.nn.functional.normalize(scene.means - eye, dim=-1)
+    basis = spherical_harmonics_basis(1, away)
+    expected = (torch.einsum("kb,kbc->kc", basis, scene.sh) + 0.5).clamp_min(0)
+    assert torch.allclose(seen[VIEW], expected, atol=1e-5)
+    other = painted(paint, interaction, VIEW, -eye)[1]
+    assert not torch.allclose(other, seen[VIEW], atol=1e-3)
+    assert torch.equal(painted(paint, interaction, BASE, -eye)[1], seen[BASE])
+
+
+def test_hierarchy_has_one_colour_per_unit(painter: tuple[Painter, Interaction]) -> None:
+    paint, interaction = painter
+    for level, units in enumerate(interaction.units):
+        rgb = painted(paint, interaction, paint.modes[2 + level], torch.ones(3))[1]
+        for unit in range(int(units.max()) + 1):
+            assert len(rgb[units == unit].unique(dim=0)) == 1
+    table = hues(torch.arange(60))
+    assert float(torch.pdist(table).min()) > 0.01 and torch.equal(hues(torch.tensor([-1]))[0], torch.full((3,), 0.5))
+
+
+def test_strain_is_the_largest_logarithm_of_a_stretch(painter: tuple[Painter, Interaction]) -> None:
+    paint, interaction = painter
+    gradients = interaction.frame.gradients.clone()
+    unit = int(interaction.unit_of_kernel[interaction.scene.simulated & ~interaction.scene.pinned][0])
+    gradients[unit] = torch.diag(torch.tensor([1.0, 0.5, 1.5]))
+    frame = SteppedFrame(interaction.frame.positions, gradients, interaction.frame.rotations)
+    still = torch.zeros(interaction.scene.count)
+    _, rgb, legend = paint(frame, interaction.unit_of_kernel, still, STRAIN, torch.ones(3))
+    assert legend.high == pytest.approx(np.log(2.0), rel=1e-5)
+    strained = interaction.unit_of_kernel == unit
+    assert not torch.allclose(rgb[strained][0], rgb[~strained][0])
+
+
+def test_selected_and_pinned_kernels_stand_out() -> None:
+    rgb = torch.zeros(3, 3)
+    out = highlighted(rgb, torch.tensor([True, False, False]), torch.tensor([False, True, False]))
+    assert float(out[0].sum()) > 0.5 and float(out[1, 2]) > 0.5 and torch.equal(out[2], rgb[2])
+
+
+# ----------------------------------------------------------------------------------------------------------- picking
+
+
+def camera() -> SimpleNamespace:
+    """At (0, -5, 0), looking along +y, up +z: x right, z up."""
+    half = float(np.sqrt(0.5))
+    return SimpleNamespace(wxyz=(half, -half, 0.0, 0.0), position=(0.0, -5.0, 0.0), fov=np.pi / 2, aspect=2.0)
+
+
+def test_a_rectangle_takes_what_is_seen_in_it() -> None:
+    points = torch.tensor([[0.0, 0, 0], [2.0, 0, 0], [-9.0, 0, 0], [0, 0, 2.0], [0, -9.0, 0]])
+    everything = in_rectangle(points, camera(), (0.0, 0.0), (1.0, 1.0))
+    assert everything.tolist() == [True, True, True, True, False]
+    right = in_rectangle(points, camera(), (0.55, 0.4), (1.0, 0.6))
+    assert right.tolist() == [False, True, False, False, False]
+    above = in_rectangle(points, camera(), (0.4, 0.0), (0.6, 0.45))
+    assert above.tolist() == [False, False, False, True, False]
+
+
+def test_a_ray_takes_the_first_kernel_it_passes() -> None:
+    points = torch.tensor([[0.0, 3, 0], [0.05, 1, 0], [0.0, -2, 0], [1.0, 1, 0]])
+    reach, free = torch.full((4,), 0.1), torch.ones(4, dtype=torch.bool)
+    assert first_hit(points, reach, (0, 0, 0), (0, 2, 0), free) == 1
+    assert first_hit(points, reach, (0, 0, 0), (0, 2, 0), torch.tensor([True, False, True, True])) == 0
+    assert first_hit(points, reach, (0, 0, 0), (0, 0, 1), free) is None
+    assert first_hit(points, reach, (0, 0, 0), (0, 0, 0), free) is None
+
+
+# ----------------------------------------------------------------------------------------------------------- queues
+
+
+def test_only_the_newest_item_waits() -> None:
+    slot: Latest[int] = Latest()
+    for number in range(100):
+        slot.put(number)
+    assert slot.take(0.0) == 99 and slot.dropped == 99 and slot.take(0.0) is None
+
+
+def test_a_worker_outlives_an_error() -> None:
+    slot: Latest[int] = Latest()
+    done = threading.Event()
+
+    def work(number: int) -> None:
+        if number == 0:
+            raise ValueError("one bad frame")
+        done.set()
+
+    worker = Worker("test", slot, work)
+    worker.start()
+    slot.put(0)
+    while worker.failures == 0:
+        time.sleep(0.01)
+    slot.put(1)
+    assert done.wait(10) and worker.failures == 1
+    worker.stop()
+    worker.join(5)
+    assert not worker.is_alive()
+
+
+def test_a_rate_counts_what_is_recent() -> None:
+    rate = Rate(window=0.2)
+    rate.count(10)
+    assert rate.per_second == pytest.approx(50)
+    time.sleep(0.25)
+    assert rate.per_second == 0
+
+
+# ----------------------------------------------------------------------------------------------------------- messages
+
+
+def test_messages_of_the_page_pass_and_others_do_not() -> None:
+    checker, encode = MessageChecker(), msgspec.msgpack.encode
+    good = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": 1}}
+    assert checker.check(encode(good)) == encode(good)
+    for value in ("text", True, None, 1.5, [1, 2.5]):
+        checker.check(encode(good | {"updates": {"value": value}}))
+    for wrong in (
+        {"updates": {"props": 1}}, {"updates": {"value": {"a": 1}}}, {"updates": {"value": float("inf")}},
+        {"updates": {"value": "nan"}}, {"updates": {"value": " -Infinity"}}, {"updates": {}}, {"uuid": 5}, {"more": 1},
+        {"type": "ShareUrlRequest"}, {"updates": {"value": "x" * 5000}}, {"updates": {"value": [0] * 99}},
+    ):  # fmt: skip
+        with pytest.raises(MessageError):
+            checker.check(encode(good | wrong))
+    with pytest.raises(MessageError):
+        checker.check("text")
+    with pytest.raises(MessageError):
+        checker.check(b"\x00" * (1 << 21))
+
+
+# ----------------------------------------------------------------------------------------------------------- live
+
+
+@pytest.fixture
+def live(make_interaction: Callable[..., Interaction]) -> tuple[Live, list[Shown]]:
+    shown: list[Shown] = []
+    return Live(make_interaction(keep=None), shown.append), shown
+
+
+def test_what_was_done_is_played_back_bit_for_bit(live: tuple[Live, list[Shown]]) -> None:
+    one, _ = live
+    for number in range(12):
+        if number == 2:
+            one.act(Force(Unit(1, 3), (1.0, 0, 0), 2.0, name="drag-0"))
+        if number == 5:
+            one.act(Release("drag-0"))
+            one.act(Wind((0.0, 1.0, 0.0), 0.5, gusts=0.5))
+        if number == 8:
+            one.act(Pin(Unit(1, 0)))
+            one.act(Impulse(Whole(), (0.0, 0.0, 1.0), 0.05))
+        one.advance()
+    recorded, session = one.interaction.trajectory(), one.interaction.session()
+    one.replay(session)
+    with pytest.raises(ConfigError, match="played back"):
+        one.act(Reset())
+    while one.playing:
+        one.advance()
+    assert "over" in one.message
+    again = one.interaction.trajectory()
+    assert torch.equal(again.positions, recorded.positions) and torch.equal(again.gradients, recorded.gradients)
+    assert one.interaction.session() == session
+    assert torch.equal(replay(one.interaction, session).positions, recorded.positions)
+
+
+def test_the_timeline_goes_back_and_play_goes_on_from_the_end(live: tuple[Live, list[Shown]]) -> None:
+    one, _ = live
+    one.act(Gravity((1.0, 0.0, 0.0), 1.0))
+    for _ in range(6):
+        one.advance()
+    last = one.interaction.frame.positions
+    one.scrub(2)
+    assert not one.playing and one.shown().number == 2 and one.shown().last == 6
+    assert not torch.equal(one.shown().frame.positions, last)
+    one.play()
+    assert torch.equal(one.shown().frame.positions, last)
+    one.reset()
+    assert one.shown().last == 0 and torch.equal(one.shown().frame.positions, one.interaction.scene.means)
+    for wrong in (-5, 10**6):
+        one.scrub(wrong)
+        assert one.shown().number == 0
+
+
+def test_divergence_stops_the_simulation_with_a_message_and_a_reset_helps(
+    make_interaction: Callable[..., Interaction],
+) -> None:
+    shown: list[Shown] = []
+    one = Live(make_interaction(farthest=1e-4), shown.append)
+    one.act(Gravity((1.0, 0.0, 0.0), 2.0))
+    one.start()
+    while one.playing:
+        time.sleep(0.01)
+    assert "stopped" in one.message and "kernel" in one.message
+    one.do(one.play)
+    time.sleep(0.2)
+    assert one.is_alive() and not one.playing
+    one.do(one.reset)
+    while one.message:
+        time.sleep(0.01)
+    one.do(one.play)
+    while one.interaction.frame_number < 3:
+        time.sleep(0.01)
+    assert one.interaction.broken is None
+    one.stop()
+    one.join(5)
+
+
+def test_too_many_commands_let_everything_go(live: tuple[Live, list[Shown]]) -> None:
+    one, _ = live
+    one.act(Force(Whole(), (1.0, 0, 0), 1.0))
+    for _ in range(5000):
+        one.do(lambda: None)
+    assert one._commands.qsize() <= 1024
+    one._take_commands(0.0)
+    assert not one.interaction.acting and "let go" in one.message
+
+
+def test_time_stands_while_nobody_looks(make_interaction: Callable[..., Interaction]) -> None:
+    watched = threading.Event()
+    one = Live(make_interaction(), lambda _: None, watched=watched.is_set)
+    one.start()
+    time.sleep(0.4)
+    assert one.interaction.tick == 0
+    watched.set()
+    while one.interaction.tick < 2:
+        time.sleep(0.01)
+    one.stop()
+    one.join(5)
+
+
+def test_takes_are_played_in_their_own_time_and_cannot_be_pushed(make_interaction: Callable[..., Interaction]) -> None:
+    interaction = make_interaction()
+    trajectory = make_interaction()._dynamics.rollout(interaction.state, 5)
+    one = Live(interaction, lambda _: None, takes=[Take("Predicted: a", lambda: trajectory, "a")])
+    one.choose("Predicted: a")
+    with pytest.raises(ConfigError, match=LIVE):
+        one.act(Reset())
+    for number in range(1, 8):
+        one.advance()
+        assert one.shown().number == number % 6 and one.shown().last == 5
+    assert interaction.tick == 0
+    with pytest.raises(ConfigError, match="expected"):
+        one.choose("nonsense")
+    for pace in (0.0, float("nan"), 99.0):
+        with pytest.raises(ConfigError, match="speed"):
+            one.set_pace(pace)
+
+
+def test_a_companion_feels_the_same(make_interaction: Callable[..., Interaction]) -> None:
+    leader, follower = make_interaction(), make_interaction()
+    other = Companion("the same again", follower)
+    one = Live(leader, lambda _: None, companion=other)
+    for event in (Force(Unit(2, 0), (1.0, 0, 0), 1.0), Impulse(Ball((0.3, 0.3, 1.0), 0.3), (0.0, 1.0, 0.0), 0.05)):
+        one.act(event)
+        for _ in range(3):
+            one.advance()
+    assert torch.equal(leader.frame.positions, follower.frame.positions)
+    assert float((leader.frame.positions - leader.scene.means).abs().max()) > 0
+    beside = one.shown().beside
+    assert beside is not None and torch.equal(beside.frame.positions, follower.frame.positions)
+    one.reset()
+    assert torch.equal(follower.frame.positions, follower.scene.means)
+
+
+# ----------------------------------------------------------------------------------------------------------- recording
+
+
+def still(scene: GaussianScene, frames: int) -> Trajectory:
+    identity = torch.eye(3).expand(frames, 1, 3, 3)
+    unit = torch.zeros(scene.count, dtype=torch.long)
+    positions = scene.means.expand(frames, -1, -1).clone()
+    positions += 0.01 * torch.arange(frames)[:, None, None]
+    return Trajectory(positions, identity, identity, unit, 10.0)
+
+
+def test_a_recording_holds_every_frame(make_column: Callable[..., GaussianScene], tmp_path: Path) -> None:
+    scene = make_column()
+    path = record(scene, still(scene, 5), tmp_path / "a.viser", kind="viser")
+    data = path.read_bytes()
+    inner = zstandard.ZstdDecompressor().decompress(data[8:], max_output_size=int.from_bytes(data[:8], "little"))
+    length = int.from_bytes(inner[:8], "little")
+    facts = msgspec.msgpack.decode(inner[8 : 8 + length])
+    assert facts["durationSeconds"] == pytest.approx(0.5)
+    updates = [m for m in facts["messages"] if m[1]["type"] == "SceneNodeUpdateMessage"]
+    times = sorted({round(m[0], 6) for m in updates if "buffer" in m[1]["updates"]})
+    assert times == [0.0, 0.1, 0.2, 0.3, 0.4]
+    offset = 8 + length
+    wanted = Placing.of(scene).to_page(still(scene, 5).positions[4])
+    found = False
+    for size in facts["binaryBufferLengths"]:
+        offset += -offset % 8
+        if size == 32 * scene.count:
+            rows = np.frombuffer(inner[offset : offset + size], np.uint32).reshape(-1, 8)
+            found |= bool(torch.equal(torch.from_numpy(rows[:, :3].copy().view(np.float32)), wanted))
+        offset += size
+    assert found, "the last frame's positions are not in the file"
+
+
+def test_a_page_names_the_object_and_refuses_the_network(
+    make_column: Callable[..., GaussianScene], tmp_path: Path
+) -> None:
+    scene = replace(make_column(), name="<b>evil & co</b>")
+    text = record(scene, still(scene, 2), tmp_path / "a.html").read_text()
+    assert "<title>&lt;b&gt;evil &amp; co&lt;/b&gt; - gausim</title>" in text
+    assert text.index("Content-Security-Policy") < text.index("<script")
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_what_cannot_be_recorded_is_said(make_column: Callable[..., GaussianScene], tmp_path: Path) -> None:
+    scene, path = make_column(), tmp_path / "a.html"
+    with pytest.raises(DataError, match="kernels"):
+        record(make_column(80), still(scene, 2), path)
+    with pytest.raises(DataError, match="every"):
+        record(scene, still(scene, 2), path, every=0)
+    broken = still(scene, 3)
+    broken.positions[1, 4] = float("nan")
+    with pytest.raises(DivergenceError, match="frame 1"):
+        record(scene, broken, path)
+    assert not path.exists()
