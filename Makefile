@@ -43,7 +43,7 @@ test-notebooks: install ## Execute the notebooks on the embedded synthetic data
 	$(ONE_THREAD) $(BIN)/python -m pytest --nbmake --nbmake-timeout=600 notebooks
 
 fuzz: install ## Feed 20,000 damaged files to the readers: make fuzz ARGS="--count 1000 --seed 7"
-	PYTHONPATH=. $(ONE_THREAD) $(BIN)/python tests/fuzz/run.py $(ARGS)
+	PYTHONPATH=.:tests $(ONE_THREAD) $(BIN)/python tests/fuzz/run.py $(ARGS)
 
 lint: install ## Check style, formatting, types and import directions
 	$(BIN)/ruff check .

@@ -26,7 +26,9 @@ from gausim.training.ranks.layout import Layout, LocalRanks, RanksStrategy
 
 # Values for what a file leaves to the user (`???`), by "group/option".
 MANDATORY: dict[str, list[str]] = {}
-FILES = sorted(path.relative_to(conf_dir()).with_suffix("") for path in conf_dir().rglob("*.yaml"))
+FILES = sorted(
+    path.relative_to(conf_dir()).with_suffix("") for path in conf_dir().rglob("*.yaml") if path.parent.name != "base"
+)
 ROOTS = [path.as_posix() for path in FILES if len(path.parts) == 1]
 OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1]
 # They set keys of other groups or of Hydra, and so build nothing of their own under their name.
@@ -149,7 +151,7 @@ def test_a_sweep_gives_every_seed_its_directory(tmp_path: Path, monkeypatch: pyt
 @pytest.mark.parametrize(
     "swept",
     [
-        ["model.simulator.layers=2,3"],
+        ["model.simulator.network.layers=2,3"],
         ["loss=default,paper", "seed=3,4"],
         ["trainer.max_minutes=1,2", "ablation=none,no_mass", "model=gausim,gausim_paper"],
         ["data.root=a/b,a/../b,a_b"],

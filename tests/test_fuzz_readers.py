@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def fuzz(*arguments: str) -> dict:
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests"), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, str(ROOT / "tests" / "fuzz" / "run.py"), *arguments]
     done = subprocess.run(command, env={**os.environ, "PYTHONPATH": paths}, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr[-3000:]
@@ -54,7 +54,7 @@ corpus.readers = lambda folder: [corpus.Reader(f"r{{i}}", path, "binary", r, 1) 
 sys.argv = ["run.py", "--count", "4"]
 runpy.run_path({str(ROOT / "tests" / "fuzz" / "run.py")!r}, run_name="__main__")
 """
-    paths = os.pathsep.join([str(ROOT), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])
+    paths = os.pathsep.join([str(ROOT), str(ROOT / "tests"), str(ROOT / "src"), os.environ.get("PYTHONPATH", "")])
     done = subprocess.run([sys.executable, "-c", program], env={**os.environ, "PYTHONPATH": paths}, capture_output=True,
                           text=True)  # fmt: skip
     assert done.returncode == 1, done.stderr[-2000:]

@@ -32,8 +32,10 @@ def test_the_model_is_the_default_one() -> None:
     trained = instantiate(compose("model/gausim").model.simulator)(scenes=[scene], fps=[interact.FPS])
     shapes = [{name: value.shape for name, value in m.state_dict().items()} for m in (model, trained)]
     assert shapes[0] == shapes[1] and scene.sh_degree == 3
-    for name in ("passive_frames", "predicted_levels", "output_scale", "options", "conserve_mass", "knows_energy"):
+    for name in ("predicted_levels", "rollout", "conserve_momentum", "knows_energy"):
         assert getattr(model, name) == getattr(trained, name), name
+    for name in ("features", "head"):
+        assert getattr(model.predictor, name) == getattr(trained.predictor, name), name
     state = SimState(scene.means, scene.means * 0.999)
     model.load_state_dict(trained.state_dict())
     first, second = (SceneDynamics(m).rollout(state, 3).positions for m in (model, trained))

@@ -1,13 +1,11 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
-import yaml
 
 from gausim.benchmark import step
 from gausim.benchmark.harness import Options
+from gausim.compose.config import compose, instantiate
 from gausim.models.hierarchy.clusters import build_hierarchy
 
 
@@ -46,21 +44,20 @@ def test_radii_are_found_that_give_the_units_wanted() -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "settings"),
+    ("file", "settings", "template"),
     [
-        ("gausim_paper", step.PAPER),
-        ("gausim", {**step.DEFAULT, "template": step.TEMPLATE}),
-        ("gausim_elastic", {**step.ELASTIC, "template": step.ELASTIC_TEMPLATE}),
+        ("gausim_paper", step.PAPER, {}),
+        ("gausim", step.DEFAULT, step.TEMPLATE),
+        ("gausim_elastic", step.ELASTIC, step.ELASTIC_TEMPLATE),
     ],
 )
-def test_settings_are_those_of_the_configuration(file, settings) -> None:
-    text = (Path(__file__).parents[2] / f"conf/model/{file}.yaml").read_text()
-    simulator = yaml.safe_load(text)["simulator"]
-    for name, value in settings.items():
-        expected = simulator[name]
-        if isinstance(value, dict):
-            expected = {key: expected[key] for key in value}
-        assert (list(value) if isinstance(value, tuple) else value) == expected, name
-    ablation = yaml.safe_load((Path(__file__).parents[2] / "conf/ablation/no_hierarchy.yaml").read_text())
-    for name, value in ablation["model"]["simulator"].items():
-        assert list(step.NO_HIERARCHY[name]) == value
+def test_settings_are_those_of_the_configuration(file, settings, template) -> None:
+    config = compose(f"model/{file}").model.simulator
+    made = step.simulator(step.cloud(300, "toy"), 24.0, (0.13, 0.4), settings)
+    configured = instantiate(config, scenes=made.scenes, fps=[24.0])()
+    assert [h.levels[-1].count for h in made.hierarchies] == [h.levels[-1].count for h in configured.hierarchies]
+    assert made.predictor.features == configured.predictor.features and made.predictor.head == configured.predictor.head
+    assert made.rollout == configured.rollout and vars(made.predictor.edges) == vars(configured.predictor.edges)
+    shapes = [{n: tuple(p.shape) for n, p in m.predictor.named_parameters()} for m in (made, configured)]
+    assert shapes[0] == shapes[1]
+    assert template == {key: config.template[key] for key in template}

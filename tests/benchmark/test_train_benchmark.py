@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import toy_object
+from helpers.simulators import gausim
 
 from gausim.benchmark.harness import Options
 from gausim.benchmark.train import peak_saved_bytes, run
@@ -13,7 +14,6 @@ from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
 from gausim.losses import Objective
 from gausim.models.initial_state import ModalInitialStates
-from gausim.models.step.simulator import GausSim
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.render.cpu import CpuRenderer
 from gausim.training.module import GausSimModule
@@ -39,7 +39,7 @@ def test_rows_of_the_training_benchmark(backprop_steps: int, tmp_path: Path) -> 
     data = ReadyDataModule(toy.root, curriculum=Curriculum(t_max=3), batch_size=2)
     scenes = [item.scene() for item in data.objects]
     template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=4)
-    model = GausSim(scenes, [24.0], radii=(0.3, 0.7), edges="rest", hidden=8, layers=1, template=template)
+    model = gausim(scenes, [24.0], radii=(0.3, 0.7), edges="rest", hidden=8, layers=1, template=template)
     module = GausSimModule(
         model=model, initial_states=ModalInitialStates(model, (0, 0)), scene_of_sequence=(0, 0),
         renderer=CpuRenderer(threads=1), objective=Objective(backprop_steps=backprop_steps),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.simulators import LEVELS, change_head, silence
 from helpers.toy_object import write_toy_object
 
 from gausim.compose.build import build
@@ -19,7 +20,7 @@ from gausim.training.module import GausSimModule
 ABLATIONS = sorted(path.stem for path in (conf_dir() / "ablation").glob("*.yaml"))
 MODELS = ["gausim", "gausim_paper"]
 TINY = (
-    "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]", "render=reference",
+    "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS, "render=reference",
     "data.curriculum.t_max=3", "data.batch_size=2", "seed=1", "loss.explosion=1000",
     "optimizer.decay.network=0",  # what only fades has not learned
 )  # fmt: skip
@@ -49,10 +50,10 @@ def random_step(module: GausSimModule):
     simulator = module.model
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
-        for name, p in simulator.network.named_parameters():
+        for name, p in simulator.predictor.network.named_parameters():
             if "decoder" in name:  # it may start at zero, and layers of random weights hand little on
                 p.add_(torch.randn(p.shape, generator=generator))
-    simulator.output_scale, simulator.lever_head = 1.0, 0.3 * (simulator.lever_head > 0)
+    change_head(simulator, output_scale=1.0, lever=0.3 * (simulator.predictor.head.lever > 0))
     batch = simulator.batch([0])
     shift = 0.05 * torch.randn(2, *batch.rest.shape, generator=generator)
     return simulator.step(batch, SimState(batch.rest + shift[0], batch.rest + shift[1]))
@@ -68,7 +69,7 @@ def test_every_ablation_can_be_trained_in_both_models(toy: Path, ablation: str, 
     assert compose("train", [f"ablation={ablation}"]).ablation.name == ablation
     moved = {n for n, p in module.named_parameters() if not torch.equal(p, start[n])}
     assert any(n.startswith("initial_states.") for n in moved) or (ablation, model) == ("no_network", "gausim_paper")
-    assert any(n.startswith("model.network.") for n in moved) == (ablation != "no_network")
+    assert any(n.startswith("model.predictor.network.") for n in moved) == (ablation != "no_network")
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -79,7 +80,7 @@ def test_no_mass_leaves_det_F_free_in_the_head_and_in_the_template(toy: Path, mo
         step = random_step(module)
         own = max(float((torch.linalg.det(f.detach()) - 1).abs().max()) for f in step.predicted)
         errors[ablation] = own, float((torch.linalg.det(step.gradients.detach()) - 1).abs().max())
-        module.model.output_scale = module.model.lever_head = 0.0  # what is left is the template's
+        silence(module.model)  # what is left is the template's
         errors[ablation] += (float((torch.linalg.det(random_rest(module)) - 1).abs().max()),)
     for ablation in ("none", "no_hierarchy"):
         assert max(errors[ablation]) < 1e-4, errors

@@ -76,7 +76,7 @@ def test_only_initial_states_are_learned_and_the_result_is_a_run(trained: Path, 
     assert ratios(out)[-1] < 0.9 * ratios(out)[0]
     rows = json.loads((out / "evaluation" / "metrics.json").read_text())["objects"]["toy"]["rows"]
     assert rows["gausim"]["seen"]["train"]["l2"]["mean"] > 0
-    assert simulate.main([str(out), "--out", str(tmp_path / "videos"), "--steps", "2"]) == 0
+    assert simulate.main([str(out), "--out", str(tmp_path / "videos"), "--frames", "2"]) == 0
 
 
 def test_the_second_scene_of_a_joint_run_keeps_its_own_weights(

@@ -33,8 +33,8 @@ from gausim.cli.main import COMMANDS, main
         ("train model=gausim_", {"model=gausim_elastic", "model=gausim_paper"}),
         ("train mod", {"model=", "model."}),
         ("train model=spring_mass model.", {"model.method.", "model.plan."}),
-        ("train model=gausim model.simulator.anc", {"model.simulator.anchor="}),
-        ("train model.simulator.anc", set()),  # the default model has none
+        ("train model=gausim model.simulator.template.spac", {"model.simulator.template.spacing="}),
+        ("train model.simulator.template.spac", set()),  # the default model has none
         ("train -m ablation=none,no_mass_no_h", {"ablation=none,no_mass_no_hierarchy"}),
         ("train trainer.progress=", {"trainer.progress=true", "trainer.progress=false"}),
         ("train hydra/swee", {"hydra/sweeper="}),

@@ -70,10 +70,14 @@ def test_composed_configurations_fit_the_schema(model: str, schema) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "told"),
     [
-        ("model.simulator.layer", 3, "model.simulator"),
+        ("model.simulator.network.layer", 3, "model.simulator.network"),
         ("model.simulator.template.mode", 3, "model.simulator.template"),
         ("trainer.max_epochs", "ten", "trainer.max_epochs"),
-        ("model.simulator.radii", [0.1, "wide"], "model.simulator.radii[1]"),
+        (
+            "model.simulator.hierarchy.levels",
+            [{"diameter": "wide", "edge_length": 1.0}],
+            "model.simulator.hierarchy.levels[0].diameter",
+        ),
         ("callbacks.progess", {"refresh_rate": 2}, "callbacks.progess"),
         ("optimiser", {}, "$"),
         ("sweep.retry", True, "sweep"),
@@ -106,9 +110,9 @@ def test_arguments_are_those_of_the_signatures(schema) -> None:
     arguments = {*inspect.signature(pkgutil.resolve_name(target)).parameters}
     assert arguments - offered == {"scenes", "fps"}  # training gives it these
     assert offered - arguments == {"_target_", "_partial_", "_recursive_", "_convert_", "_args_"}
-    radii = schema["definitions"]["model.simulator"]["else"]["properties"]["radii"]
-    assert "fractions of the object's diagonal" in radii["description"]
-    assert radii["else"] == {"type": "array", "items": radii["else"]["items"]}
+    levels = schema["definitions"]["model.simulator.hierarchy"]["else"]["properties"]["levels"]
+    assert "fractions of the object's diagonal" in levels["description"]
+    assert levels["else"] == {"type": "array", "items": levels["else"]["items"]}
     assert "of every random generator" in schema["properties"]["seed"]["description"]
 
 
@@ -132,7 +136,12 @@ def test_a_file_of_conf_is_what_its_group_chooses(once, capsys) -> None:
 def test_a_file_beside_conf_is_composed_as_with_config_dir(once, tmp_path, capsys) -> None:
     own = tmp_path / "my conf" / "experiment" / "mine.yaml"
     own.parent.mkdir(parents=True)
-    lines = ["# @package _global_", "defaults:", "- override /model: gausim", "model: {simulator: {anchor: false}}"]
+    lines = [
+        "# @package _global_",
+        "defaults:",
+        "- override /model: gausim",
+        "model: {simulator: {head: {anchor: false}}}",
+    ]
     own.write_text("\n".join(lines))
     assert main(["config", "validate", str(own)]) == 0
     own.write_text("\n".join(lines).replace("anchor", "achor"))
@@ -140,17 +149,18 @@ def test_a_file_beside_conf_is_composed_as_with_config_dir(once, tmp_path, capsy
     assert main(["config", "validate", str(own), "sed=1"]) == 1
     assert capsys.readouterr().out.splitlines() == [
         "sed: unknown key. Did you mean 'seed'?",
-        "model.simulator.achor: unknown key of gausim.models.step.simulator.GausSim. Did you mean 'anchor'?",
+        "model.simulator.head.achor: unknown key of gausim.models.step.head.Head. Did you mean 'anchor'?",
     ]
 
 
 def test_every_wrong_override_is_named_with_the_nearest_right_key(once, capsys) -> None:
-    wrong = ["sed=1", "model.simulator.achor=true", "trainer.max_epoch=3", "render=nope", "seed=x", "freeze=5"]
+    wrong = ["sed=1", "model.simulator.template.spaicng=1", "trainer.max_epoch=3", "render=nope", "seed=x", "freeze=5"]
     assert main(["config", "validate", *wrong, "model=gausim", "trainer.max_minutes=soon"]) == 1
     told = capsys.readouterr()
     for expected in (
         "sed: unknown key. Did you mean 'seed'?",
-        "model.simulator.achor: unknown key. Did you mean 'model.simulator.anchor'?",  # which only this model has
+        # Which only this model has.
+        "model.simulator.template.spaicng: unknown key. Did you mean 'model.simulator.template.spacing'?",
         "trainer.max_epoch: unknown key. Did you mean 'trainer.max_epochs'?",
         "Available options in 'render': auto cpu gsplat reference",
         "seed=x: Value 'x' of type 'str' could not be converted to Integer",
@@ -161,10 +171,18 @@ def test_every_wrong_override_is_named_with_the_nearest_right_key(once, capsys) 
 
 
 def test_keys_that_hydra_merges_silently_are_named(once, capsys) -> None:
-    wrong = ["+model.simulator.layer=3", "+callbacks.progess.refresh_rate=3", "+model.plan=null", "+model.plans=null"]
+    wrong = [
+        "+model.simulator.network.layer=3",
+        "+callbacks.progess.refresh_rate=3",
+        "+model.plan=null",
+        "+model.plans=null",
+    ]
     assert main(["config", "validate", *wrong]) == 1
     told = capsys.readouterr().out
-    assert "model.simulator.layer: unknown key of gausim.models.step.simulator.GausSim. Did you mean 'layers'?" in told
+    assert (
+        "model.simulator.network.layer: unknown key of gausim.nn.meshgraphnet.MeshGraphNet. Did you mean 'layers'?"
+        in told
+    )
     assert "callbacks.progess: expected a node with `_target_`" in told and "Did you mean 'progress'?" in told
     assert "model.plans: unknown key. Did you mean 'plan'?" in told and told.count("\n") == 3
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import toy_object
+from helpers.simulators import LEVELS
 
 from gausim.cli import train
 from gausim.compose.build import load_run
@@ -19,8 +20,8 @@ from gausim.interaction.session import Event, Force, Gravity, Impulse, Pin, Rele
 from gausim.ops.covariance import covariance_from_scales
 
 TINY = (
-    "model.simulator.radii=[0.3,0.7]", "model.simulator.template.modes=8", "model.simulator.template.solid=null",
-    "model.simulator.hidden=8", "data.curriculum.t_max=3", "data.repeats=1", "data.batch_size=2",
+    LEVELS, "model.simulator.template.modes=8", "model.simulator.template.solid=null",
+    "model.simulator.network.hidden=8", "data.curriculum.t_max=3", "data.repeats=1", "data.batch_size=2",
     "trainer.max_epochs=4", "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1",
     "render=reference",
     "callbacks.panels=null", "logger=none", "name=toy",

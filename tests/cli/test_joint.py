@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import toy_object
+from helpers.simulators import LEVELS
 from torch import Tensor
 
 from gausim.cli import evaluate
@@ -17,13 +18,13 @@ from gausim.core import Cameras, ConfigError, GaussianScene, RunError
 from gausim.runs.checkpoint import read_checkpoint
 
 TINY = (
-    "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
+    "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
     "data.curriculum.t_start=2", "data.curriculum.t_max=2", "data.repeats=1", "trainer.max_epochs=2",
     "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1", "render=reference",
     "callbacks.panels=null", "logger=none",
     "doctor=false",
 )  # fmt: skip
-SHARED = ("model.network.", "model.node_normaliser.", "model.edge_normaliser.")
+SHARED = ("model.predictor.",)
 
 
 def other_object(root: Path) -> Path:
@@ -106,16 +107,16 @@ def test_a_frozen_network_stays_bit_by_bit_and_a_free_one_learns(
 ) -> None:
     new, source = other_object(tmp_path / "new"), weights(joint[model])
     shared = [name for name in source if name.startswith(SHARED)]
-    assert {name.split(".")[1] for name in shared} == {"network", "node_normaliser", "edge_normaliser"}
+    assert {name.split(".")[2] for name in shared} == {"network", "node_normaliser", "edge_normaliser"}
     start = tune(new, joint[model], tmp_path / "start", "optimizer.network_lr=0", "trainer.max_epochs=1")
     frozen = tune(new, joint[model], tmp_path / "frozen", "freeze=network")
     free = tune(new, joint[model], tmp_path / "free")
     for name in shared:
         assert torch.equal(frozen[name], source[name]), name
-        if name.startswith("model.network."):
+        if name.startswith("model.predictor.network."):
             assert torch.equal(start[name], source[name]), name
-    assert any(not torch.equal(free[n], source[n]) for n in shared if n.startswith("model.network."))
-    assert float(free["model.node_normaliser.count"]) > float(source["model.node_normaliser.count"])
+    assert any(not torch.equal(free[n], source[n]) for n in shared if n.startswith("model.predictor.network."))
+    assert float(free["model.predictor.node_normaliser.count"]) > float(source["model.predictor.node_normaliser.count"])
     own = [name for name in frozen if name.startswith(("model.attributes", "model.log_density", "initial_states."))]
     assert len(own) == 2 + 3 and all(bool(frozen[name].any()) for name in own)  # of one scene and its three sequences
 
@@ -147,10 +148,10 @@ def test_a_network_of_another_shape_is_refused_by_name(joint: dict[str, Path], t
         r"there, of shape \(8,\) here.*config\.yaml has it; what differs: model\.simulator\.hidden\."
     )
     with pytest.raises(ConfigError, match=message):
-        tune(new, joint["gausim"], tmp_path / "wide", "model.simulator.hidden=16")
+        tune(new, joint["gausim"], tmp_path / "wide", "model.simulator.network.hidden=16")
     assert not (tmp_path / "wide" / "seed_0" / "last.ckpt").exists()
     with pytest.raises(ConfigError, match=r"network\.processor\.1\.\w+\.\w+ is absent there, of shape"):
-        tune(new, joint["gausim"], tmp_path / "deep", "model.simulator.layers=2")
+        tune(new, joint["gausim"], tmp_path / "deep", "model.simulator.network.layers=2")
 
 
 def test_nothing_to_start_from_is_said(stores: tuple[Path, Path], tmp_path: Path) -> None:

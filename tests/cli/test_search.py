@@ -21,7 +21,7 @@ from gausim.core import ConfigError
 RATES = (
     "hydra/sweeper=optuna",
     "optimizer.network_lr=tag(log,interval(1e-4,1e-1))",
-    "model.simulator.layers=range(1,3)",
+    "model.simulator.network.layers=range(1,3)",
 )
 FINISH = "gausim.runs.directory.RunDirectory.finish"
 STEP = "gausim.training.module.GausSimModule.training_step"
@@ -69,7 +69,7 @@ def test_a_killed_search_goes_on_with_what_it_would_have_tried(do: Do) -> None:
     # Nothing is left; more trials are; another search in the same storage is refused.
     status, output = do("cut", *few)
     assert status == 0 and "nothing left to do" in output
-    status, output = do("cut", *few, "model.simulator.layers=range(1,4)")
+    status, output = do("cut", *few, "model.simulator.network.layers=range(1,4)")
     assert status == 2 and "changed: model.simulator.layers" in output
     status, output = do("cut", *few, "loss.static_weight=2")
     assert status == 2 and "changed: fixed" in output and len(tried(do, "cut")) == 4

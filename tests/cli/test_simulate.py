@@ -53,10 +53,3 @@ def test_all_sequences_and_what_is_not_there(run):
         simulate.main([str(run.run_dir), "--view", "cam_9"])
     with pytest.raises(ConfigError, match="--background mauve"):
         simulate.main([str(run.run_dir), "--background", "mauve"])
-
-
-def test_run_and_scene_exclude_each_other(capsys):
-    for argv in ([], ["run", "--scene", "a.ply"]):
-        with pytest.raises(SystemExit):
-            simulate.main(argv)
-        assert "either a RUN or --scene" in capsys.readouterr().err

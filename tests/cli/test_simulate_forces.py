@@ -13,7 +13,7 @@ from helpers import played
 from gausim.cli import main
 from gausim.cli.simulate import command as simulate
 from gausim.compose import build as _run
-from gausim.core import ConfigError, DataError
+from gausim.core import DataError
 from gausim.interaction import words as _force_words
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
 from gausim.interaction.session import Force, Impulse, load_session, save_session
@@ -139,11 +139,6 @@ def test_parts_and_directions(run) -> None:
     assert tip.radius == 0.2 and tip.centre[2] == pytest.approx(1.05)
     impulse = _force_words.entry_of("impulse", ["weight_seconds=.1", "direction=1,2,-3"], scene).event
     assert impulse == Impulse(Whole(), (1.0, 2.0, -3.0), 0.1)
-
-
-def test_forces_and_a_bare_scene_exclude_each_other(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="forces act on a RUN only"):
-        simulate.main(["--scene", "a.ply", "--wind", "weights=1", "direction=x"])
 
 
 def test_help_says_the_words(capsys) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.simulators import LEVELS
 from helpers.toy_object import write_toy_object
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -20,7 +21,7 @@ from gausim.training.module import GausSimModule
 TESTS = Path(__file__).parents[1]
 FakeWandb = runpy.run_path(str(TESTS / "training" / "test_dashboards.py"))["FakeWandb"]
 TINY = (
-    "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
+    "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
     "data.curriculum.t_max=2", "data.curriculum.t_start=1", "data.repeats=1", "data.batch_size=2",
     "trainer.max_epochs=2", "trainer.accelerator=cpu",
     "trainer.progress=false", "trainer.threads=1", "trainer.log_every_n_steps=1", "render=reference", "name=toy",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.simulators import LEVELS
 from helpers.toy_object import write_toy_object
 
 from gausim.cli import evaluate
@@ -16,7 +17,7 @@ from gausim.core import ConfigError, RunError
 from gausim.runs.checkpoint import read_checkpoint
 
 TINY = (
-    "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
+    "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
     "data.curriculum.t_max=2", "data.curriculum.t_start=1", "data.repeats=1", "data.batch_size=2",
     "trainer.max_epochs=2", "trainer.accelerator=cpu",
     "trainer.progress=false", "trainer.threads=1", "render=reference", "doctor=false", "name=toy",

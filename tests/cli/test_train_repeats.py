@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.simulators import LEVELS
 from helpers.toy_object import write_toy_object
 
 from gausim.runs.checkpoint import read_checkpoint
@@ -21,7 +22,7 @@ def test_the_process_that_compiles_trains_to_the_same_bits_as_one_that_loads_fro
         command = [
             sys.executable, "-m", "gausim.cli.main", "train", f"data.root={toy}", "render=cpu", "trainer.threads=1",
             "trainer.accelerator=cpu", "trainer.max_epochs=2", "trainer.progress=false", "data.curriculum.t_max=3",
-            "data.repeats=1", "data.batch_size=2", "model.simulator.radii=[0.3,0.7]",
+            "data.repeats=1", "data.batch_size=2", LEVELS,
             "logger=none", f"hydra.run.dir={tmp_path / run}",
         ]  # fmt: skip
         done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)

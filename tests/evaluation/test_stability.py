@@ -7,6 +7,7 @@ from functools import partial
 import pytest
 import torch
 from helpers import toy_object
+from helpers.simulators import gausim
 
 import gausim.evaluation.stability as stability
 from gausim.core import SimState
@@ -18,7 +19,7 @@ def _model(**options: object) -> GausSim:
     torch.manual_seed(0)
     template = partial(ElasticTemplate, modes=9, neighbours=6, hidden=0)
     settings = {"radii": (0.3, 0.7), "hidden": 8, "layers": 1, "edges": "rest", "template": template}
-    return GausSim([toy_object.toy_scene()], [24.0], **(settings | options))
+    return gausim([toy_object.toy_scene()], [24.0], **(settings | options))
 
 
 def test_without_a_network_it_is_that_of_the_template_s_matrices() -> None:

@@ -1,6 +1,6 @@
 """Feeds damaged files to every reader: each must be refused in words, or read as finite numbers of the right shape.
 
-    PYTHONPATH=. python tests/fuzz/run.py --count 20000
+    PYTHONPATH=.:tests python tests/fuzz/run.py --count 20000
 
 A fault is any error that is no GausSimError, an error that does not name the file, NaN or infinity in what was read,
 more memory than the file could need, a crash, or a file that keeps its reader busy for a minute. Case N of a seed is

@@ -14,6 +14,7 @@ from gausim.interaction.session import MadeWith
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.step.simulator import GausSim
 from gausim.models.template.elastic import ElasticTemplate
+from helpers.simulators import gausim
 
 
 def _scene(count: int = 90, *, seed: int = 0, spare: int = 5) -> GaussianScene:
@@ -35,9 +36,9 @@ def _scene(count: int = 90, *, seed: int = 0, spare: int = 5) -> GaussianScene:
 
 def _model(scene: GaussianScene, *, seed: int = 0, passive: int = 6) -> GausSim:
     torch.manual_seed(seed)
-    model = GausSim(
+    model = gausim(
         [scene], [24.0], radii=(0.2, 0.5), graph_radii=(0.8, 0.35), max_neighbours=6, hidden=16, layers=2,
-        template=partial(ElasticTemplate, modes=8, geometric=1.0), output_scale=0.01, passive_frames=passive,
+        template=partial(ElasticTemplate, modes=8, geometric=1.0), output_scale=0.01, energy_guard_frames=passive,
     )  # fmt: skip
     with torch.no_grad():
         for parameter in (*model.log_density, *model.attributes):

@@ -11,10 +11,10 @@ import torch
 from gausim.data.objects import ObjectData
 from gausim.models.initial_state import ModalInitialStates
 from gausim.models.rollout.dynamics import SceneDynamics
-from gausim.models.step.simulator import GausSim
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.render.reference import ReferenceRenderer
 from helpers import toy_object
+from helpers.simulators import gausim
 
 
 def played_run(folder: Path) -> SimpleNamespace:
@@ -22,9 +22,9 @@ def played_run(folder: Path) -> SimpleNamespace:
     toy = toy_object.write_toy_object(folder / "data" / "toy")
     torch.manual_seed(0)
     template = partial(ElasticTemplate, modes=6, geometric=1.0)
-    model = GausSim(
+    model = gausim(
         [toy.scene], [toy.fps], radii=(0.3, 0.7), graph_radii=(0.9, 0.5), max_neighbours=6, hidden=8, layers=1,
-        template=template, output_scale=0.005, passive_frames=6,
+        template=template, output_scale=0.005, energy_guard_frames=6,
     ).eval()  # fmt: skip
     states = ModalInitialStates(model, [0, 0])
     with torch.no_grad():

@@ -20,13 +20,14 @@ from typing import Any
 import torch
 from torch import distributed as dist
 
+from helpers.simulators import gausim
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from gausim.core import DivergenceError
 from gausim.data.dataset import SequenceSample
 from gausim.losses import Objective
 from gausim.metrics.psnr import PSNR
 from gausim.models.initial_state import FreeInitialStates
-from gausim.models.step.simulator import GausSim
 from gausim.render.reference import ReferenceRenderer
 from gausim.runs.checkpoint import digest
 from gausim.training.module import GausSimModule
@@ -49,7 +50,7 @@ def cast(record: Any, dtype: torch.dtype) -> Any:
 def real_module(objective: Objective, dtype: torch.dtype, settings: OptimizerSettings) -> GausSimModule:
     torch.manual_seed(0)
     scenes = [cast(toy_object.toy_scene(), dtype) for _ in range(2)]
-    model = GausSim(scenes, (24.0, 24.0), layers=1, hidden=8, radii=(0.3, 0.7), clustering="ball", output_scale=0.02)
+    model = gausim(scenes, (24.0, 24.0), layers=1, hidden=8, radii=(0.3, 0.7), clustering="ball", output_scale=0.02)
     module = GausSimModule(
         model=model,
         initial_states=FreeInitialStates(model, SCENES),

@@ -10,11 +10,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from helpers.simulators import LEVELS
 from helpers.toy_object import write_toy_object
 
 TESTS = Path(__file__).parents[1]
 TINY = (
-    "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
+    "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
     "data.curriculum.t_max=2", "data.curriculum.t_start=1", "data.repeats=2", "data.batch_size=1",
     "trainer=cpu", "trainer.threads=1", "trainer.max_epochs=2",
     "trainer.progress=false", "render=reference", "callbacks.panels=null", "logger=none",

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.simulators import gausim
 from torch import Tensor
 
 from gausim.core import GaussianScene, SimState
@@ -36,7 +37,7 @@ def _model(scenes: GaussianScene | Sequence[GaussianScene], *, seed: int = 0, **
     scenes = [scenes] if isinstance(scenes, GaussianScene) else list(scenes)
     torch.manual_seed(seed)
     settings = {"radii": (0.2, 0.5), "graph_radii": (0.8, 0.35), "max_neighbours": 6, "hidden": 16, "layers": 2}
-    model = GausSim(scenes, [24.0 + 6 * i for i in range(len(scenes))], **(settings | options))
+    model = gausim(scenes, [24.0 + 6 * i for i in range(len(scenes))], **(settings | options))
     model.to(scenes[0].means.dtype)
     with torch.no_grad():
         for parameter in (*model.log_density, *model.attributes):

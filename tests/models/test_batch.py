@@ -60,11 +60,11 @@ def test_kernels_follow_their_unit_and_held_ones_the_identity(
     last = member.units.stop - 1
     assert torch.equal(step.gradients[last], torch.eye(3)) and torch.equal(step.rotations[last], torch.eye(3))
     assert bool((member.unit_of_kernel[held] == last).all()) and not bool((member.unit_of_kernel[~held] == last).any())
-    finest = hierarchy.ancestor(0, predicted[-1])
+    finest = hierarchy.ancestor(0, model.predicted_levels[-1])
     free = ~hierarchy.levels[0].pinned
     assert torch.equal(member.unit_of_kernel[hierarchy.kernels[free]], finest[free])
     assert len(step.predicted) == len(predicted)
-    assert [len(f) for f in step.predicted] == [hierarchy.levels[n].count for n in predicted]
+    assert [len(f) for f in step.predicted] == [hierarchy.levels[n].count for n in model.predicted_levels]
 
 
 def test_batches_are_cached_and_edges_stay_within_members(make_scene, make_model) -> None:

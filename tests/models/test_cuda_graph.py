@@ -149,7 +149,7 @@ def test_step_asks_its_device_nothing(
     model, state = bound(template, edges=edges, coarse_inputs=edges == "union", rest_inputs=edges == "union")
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # which such tensors do not know
     monkeypatch.setattr(torch, "is_autocast_enabled", lambda _: False)
-    monkeypatch.setattr(model, "_fixes_shapes", lambda _: edges != "rest")  # as on CUDA
+    monkeypatch.setattr(model.predictor, "_fixes_shapes", lambda _: edges != "rest")  # as on CUDA
     tables = [level.rest_table for level in model.batch((0, 1)).levels]
     model.to("meta")
     for level, table in zip(model.batch((0, 1)).levels, tables, strict=True):
@@ -207,7 +207,7 @@ def test_gpu_replays_equal_the_steps(bound: Callable, template: str, edges: str)
     for _ in range(2):  # the first time records
         assert_same(roll(graphed, state, force, 8), expected, 1e-5)
     with torch.no_grad():
-        model.network.decoder[-1].bias.add_(0.05)  # in place: replays read the new weights
+        model.predictor.network.decoder[-1].bias.add_(0.05)  # in place: replays read the new weights
     changed = roll(step_of(model), state, force, 8)
     assert float((changed[0].gradients - expected[0].gradients).abs().max()) > 1e-3
     assert_same(roll(graphed, state, force, 8), changed, 1e-5)

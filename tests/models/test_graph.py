@@ -10,6 +10,12 @@ from gausim.models.hierarchy.edges import EdgeSet
 from gausim.ops.neighbours import radius_edges
 
 
+def units_of(model, batch, state) -> list[torch.Tensor]:
+    """Centres of mass of every predicted level."""
+    prepared = model.prepare(batch)
+    return prepared.per_level(prepared.finest(state.positions))
+
+
 def _pairs(edges: torch.Tensor) -> set[tuple[int, int]]:
     return {(int(s), int(d)) for s, d in edges.T}
 
@@ -25,7 +31,7 @@ def test_rules_are_set_operations_within_members(make_scene, make_model, make_st
     scene = make_scene(90)
     model = make_model(scene, graph_radii=(0.8, 0.25))
     batch, state = _moved(scene, model, make_state, join_states)
-    units = model.prepare(batch).aggregate(state.positions)
+    units = units_of(model, batch, state)
     radii = [fraction * model.hierarchies[0].diagonal for fraction in (0.8, 0.25)]
     rest, current = set(), set()
     level, positions = batch.levels[1], units[1]
@@ -50,7 +56,7 @@ def test_fixed_edges_are_the_same_edges_and_dummies_behind_them(
     counts = set()
     for amount in (0.02, 0.3):
         batch, state = _moved(scene, model, make_state, join_states, amount)
-        for level, positions in zip(batch.levels, model.prepare(batch).aggregate(state.positions), strict=True):
+        for level, positions in zip(batch.levels, units_of(model, batch, state), strict=True):
             exact, fixed = edges.of(level, positions), edges.fixed(level, positions)
             assert torch.equal(fixed[:, : exact.shape[1]], exact)
             assert bool((fixed[:, exact.shape[1] :] == level.count).all())
@@ -65,10 +71,12 @@ def test_dummy_edges_change_nothing_for_real_units(make_scene, make_model, make_
         make_model(scene, graph_radii=(0.8, 0.25), coarse_inputs=coarse, output_scale=3.0, edge_bucket=bucket)
         for bucket in (0, 0, 37)
     ]
-    models[1]._fixes_shapes = lambda positions: True  # as on CUDA in evaluation mode
+    models[1].predictor._fixes_shapes = lambda positions: True  # as on CUDA in evaluation mode
     seen: list[tuple[int, int]] = []
     for model in models:
-        model.network.register_forward_pre_hook(lambda _, inputs: seen.append((len(inputs[0]), inputs[2].shape[1])))
+        model.predictor.network.register_forward_pre_hook(
+            lambda _, inputs: seen.append((len(inputs[0]), inputs[2].shape[1]))
+        )
     results = []
     for model in models:
         batch, state = _moved(scene, model, make_state, join_states, 0.05)

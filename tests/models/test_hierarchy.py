@@ -41,7 +41,9 @@ def test_masses_add_up_level_by_level_with_random_densities(make_scene, make_mod
     assert torch.allclose(mass, batch.volume * log_density.exp())
     positions = batch.rest + torch.randn(batch.rest.shape, generator=torch.Generator().manual_seed(2)).to(batch.rest)
     prepared = model.prepare(batch)
-    for level, unit, centre in zip(batch.levels, prepared.levels, prepared.aggregate(positions), strict=True):
+    for level, unit, centre in zip(
+        batch.levels, prepared.levels, prepared.per_level(prepared.finest(positions)), strict=True
+    ):
         assert torch.allclose(unit.mass.sum(), mass.sum(), rtol=1e-12)
         assert torch.allclose(level.volume.sum(), batch.volume.sum(), rtol=1e-12)
         for c in range(level.count):

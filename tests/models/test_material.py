@@ -9,6 +9,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
+from helpers.simulators import silence
 
 from gausim.core import SimState
 from gausim.evaluation.stability import _LinearStep
@@ -20,7 +21,7 @@ from gausim.models.template.solid import solid_body
 SETTINGS = {"modes": 9, "spacing": 0.2, "links": 4, "hidden": 8}
 TEMPLATE = partial(MaterialTemplate, **SETTINGS)
 NEURAL = {
-    "template": TEMPLATE, "rest_inputs": True, "velocity_inputs": False, "lever_head": 0.02, "anchor": True,
+    "template": TEMPLATE, "rest_inputs": True, "velocities": False, "lever": 0.02, "anchor": True,
     "body_frame": True, "edges": "rest", "attributes": 3,
 }  # fmt: skip
 
@@ -149,7 +150,7 @@ def test_the_step_is_implicit_in_the_slope_of_the_force(neural) -> None:
 
 @torch.no_grad()
 def test_the_template_keeps_its_energy_without_damping_and_loses_it_with_it(neural) -> None:
-    model = neural(lever_head=0.0, output_scale=0.0)
+    model = neural(lever=0.0, output_scale=0.0)
     batch, scene = model.batch((0,)), model.scenes[0]
     body = model.template.body(0)
     start = model.smooth_motions(0).kernels @ torch.linspace(1, 0.2, 9, dtype=torch.float64)
@@ -265,20 +266,20 @@ def test_the_network_reads_only_what_the_modes_carry(neural) -> None:
     """A state is nine modal coordinates and their step; what the network does at rest is part of the Jacobian."""
     model = neural()
     with torch.no_grad():
-        for weights in model.network.decoder.parameters():
+        for weights in model.predictor.network.decoder.parameters():
             weights.normal_(generator=torch.Generator().manual_seed(3))
     step = _LinearStep(model, 0)
     blocks = step.rows()
     alone = np.linalg.svd(blocks, compute_uv=False)
     assert step.count == 45 and (alone > 1e-6 * alone[0]).sum() == 18
-    model.output_scale = model.lever_head = 0.0
+    silence(model)
     assert np.abs(step.rows() - blocks).max() > 1e-3 * np.abs(blocks).max()
 
 
 @torch.no_grad()
 def test_stiff_bodies_do_not_tremble_ever_more_after_a_large_displacement(neural) -> None:
     """Modes far too fast for the frames, and links that turn far: explicit forces at full size make them grow."""
-    model = neural(lever_head=0.0, output_scale=0.0)
+    model = neural(lever=0.0, output_scale=0.0)
     model.template.stiffness.fill_(0.35)  # thirty times as stiff
     batch, scene = model.batch((0,)), model.scenes[0]
     prepared = model.prepare(batch)

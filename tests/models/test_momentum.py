@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.simulators import feed
 
 from gausim.ops.covariance import kernel_volumes
 
@@ -10,13 +11,13 @@ def _feed(model, *, top: float, below: float) -> None:
     """Random gradients of these sizes instead of the network's; pinned units keep the identity."""
     generator = torch.Generator().manual_seed(0)
 
-    def predict(level, unit, above, target, *, position, share, still):
+    def predict(level, unit, above, target, position):
         size = below if position else top
         noise = torch.randn(level.count, 3, 3, generator=generator, dtype=torch.float64)
         value = torch.eye(3) + size * noise * ~level.pinned[:, None, None]
-        return torch.zeros(0), value, value
+        return value, value
 
-    model._predict = predict
+    feed(model, predict)
 
 
 @torch.no_grad()
@@ -76,4 +77,4 @@ def test_gradient_reaches_the_network(make_scene, make_model, make_state) -> Non
     scene = make_scene(70)
     model = make_model(scene)
     model.step(model.batch((0,)), make_state(scene)).momentum.backward()
-    assert float(model.network.decoder[-1].weight.grad.abs().max()) > 0
+    assert float(model.predictor.network.decoder[-1].weight.grad.abs().max()) > 0

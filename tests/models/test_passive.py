@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -20,7 +21,7 @@ MakeModel, MakeScene, MakeState = Callable[..., GausSim], Callable[..., Gaussian
 def _model(make_model: MakeModel, scene: GaussianScene, *, frames: int = FRAMES, scale: float = 0.05) -> GausSim:
     """A network with random weights of a size that feeds the motion of an elastic template."""
     template = partial(ElasticTemplate, modes=8, geometric=1.0)
-    return make_model(scene, template=template, output_scale=scale, passive_frames=frames).eval()
+    return make_model(scene, template=template, output_scale=scale, energy_guard_frames=frames).eval()
 
 
 def _energies(model: GausSim, positions: torch.Tensor) -> list[float]:
@@ -66,7 +67,7 @@ def test_a_push_raises_the_limit_by_its_work(make_scene: MakeScene, make_model: 
         return torch.full_like(scene.means, 1.0) * SceneDynamics(model).masses[:, None] if frame in (3, 4) else None
 
     guarded = SceneDynamics(model).rollout(still, 20, forces=push)
-    model.passive_frames = 0
+    model.rollout = replace(model.rollout, energy_guard_frames=0)
     assert torch.equal(guarded.positions, SceneDynamics(model).rollout(still, 20, forces=push).positions)
     assert float((guarded.positions[8] - scene.means).norm(dim=-1).max()) > 1e-4
 
@@ -103,10 +104,10 @@ def test_a_held_back_step_takes_the_share_of_its_formula(
 
 def test_a_template_without_energy_has_no_guard(make_scene: MakeScene, make_model: MakeModel) -> None:
     scene = make_scene()
-    model = make_model(scene, passive_frames=FRAMES).eval()
+    model = make_model(scene, energy_guard_frames=FRAMES).eval()
     assert not model.knows_energy
     moved = SceneDynamics(model).rollout(SimState(scene.means, scene.means), 3)
-    model.passive_frames = 0
+    model.rollout = replace(model.rollout, energy_guard_frames=0)
     assert torch.equal(moved.positions, SceneDynamics(model).rollout(SimState(scene.means, scene.means), 3).positions)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from helpers.simulators import feed
 from torch import Tensor
 
 from gausim.core import SimState
@@ -22,14 +23,14 @@ def test_positions_equal_the_corrected_sum_over_three_levels(make_scene, make_mo
     turns: dict[int, Tensor] = {}
     order = iter(levels)
 
-    def random_gradients(level, unit, above, target, *, position, share, still):
+    def random_gradients(level, unit, above, target, position):
         number = next(order)
         generator = torch.Generator().manual_seed(number)
         own[number] = torch.eye(3) + 0.4 * torch.randn(level.count, 3, 3, generator=generator, dtype=torch.float64)
         turns[number] = quaternion_to_matrix(torch.randn(level.count, 4, generator=generator, dtype=torch.float64))
-        return torch.zeros(0), own[number], turns[number]
+        return own[number], turns[number]
 
-    model._predict = random_gradients
+    feed(model, random_gradients)
     with torch.no_grad():
         step = model.step(model.batch((0,)), make_state(scene))
 
@@ -96,12 +97,12 @@ def test_rotating_the_scene_and_the_gradients_rotates_everything(make_scene, mak
         model = make_model(current, radii=radii, clustering="complete_linkage")
         calls = iter((0, 1))
 
-        def fed(level, unit, above, target, *, position, share, still, rotation=rotation, calls=calls):
+        def fed(level, unit, above, target, position, rotation=rotation, calls=calls):
             output = torch.where(level.pinned[:, None], 0.0, _field(unit.rest @ rotation, next(calls)))
             gradient, turn = gradient_from_output(output, conserve_mass=False)
-            return torch.zeros(0), rotation @ gradient @ rotation.T, rotation @ turn @ rotation.T
+            return rotation @ gradient @ rotation.T, rotation @ turn @ rotation.T
 
-        model._predict = fed
+        feed(model, fed)
         moved = SimState(state.positions @ rotation.T, state.previous @ rotation.T)
         with torch.no_grad():
             step = model.step(model.batch((0,)), moved)
@@ -133,11 +134,11 @@ def test_turning_everything_about_the_root_carries_the_whole_body(make_scene, ma
     model = make_model(scene)
     r = quaternion_to_matrix(torch.tensor([[0.9, 0.1, -0.4, 0.2]], dtype=torch.float64))[0]
 
-    def turn_the_top(level, unit, above, target, *, position, share, still):
+    def turn_the_top(level, unit, above, target, position):
         value = (r if position == 0 else torch.eye(3, dtype=torch.float64)).expand(level.count, 3, 3)
-        return torch.zeros(0), value, value
+        return value, value
 
-    model._predict = turn_the_top
+    feed(model, turn_the_top)
     with torch.no_grad():
         step = model.step(model.batch((0,)), make_state(scene))
     hierarchy = model.hierarchies[0]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.simulators import gausim
 
 from gausim.core import SimState
 from gausim.models.hierarchy.clusters import build_hierarchy
-from gausim.models.step.simulator import GausSim
 from gausim.models.template import solid
 from gausim.models.template.elastic import ElasticTemplate
 
@@ -138,7 +138,7 @@ def test_the_template_carries_solid_modes_and_the_simulator_steps_with_them(make
     z = torch.randn(4, 9)
     moved = torch.einsum("sm,ndm->snd", z, own.modes)
     torch.testing.assert_close(moved.flatten(1) @ own.projection.flatten(0, 1), z, atol=1e-3, rtol=1e-3)
-    model = GausSim([scene], [24.0], radii=(0.2, 0.5), hidden=8, layers=1, zero_output=True,
+    model = gausim([scene], [24.0], radii=(0.2, 0.5), hidden=8, layers=1, zero_output=True,
                     template=partial(ElasticTemplate, modes=9, solid=0.15, hidden=0, geometric=1.0))  # fmt: skip
     batch = model.batch([0])
     step = model.step(batch, SimState(batch.rest, batch.rest))

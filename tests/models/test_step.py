@@ -86,13 +86,13 @@ def test_force_displaces_free_kernels_by_half_f_dt_squared_over_m(make_scene, ma
     scene = make_scene(dtype=torch.float64)
     model = make_model(scene, predicted_levels=(0,), graph_radii=(0.3,))
     seen = []
-    plain = model._predict
+    plain = model.predictor.forward
 
     def spy(level, unit, *args, **kwargs):
         seen.append(unit)
         return plain(level, unit, *args, **kwargs)
 
-    model._predict = spy
+    model.predictor.forward = spy
     state = make_state(scene)
     force = torch.randn(scene.count, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     with torch.no_grad():

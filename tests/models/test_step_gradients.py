@@ -37,7 +37,7 @@ def test_gradcheck_of_the_whole_step(make_scene, make_model, make_state, coarse)
     model = make_model(
         scene, radii=(0.3, 0.6), edges="union", rest_inputs=coarse, coarse_inputs=coarse, attributes=2, output_scale=2.0
     )
-    names = ["model.log_density.0", "model.attributes.0", "model.network.decoder.4.weight"]
+    names = ["model.log_density.0", "model.attributes.0", "model.predictor.network.decoder.4.weight"]
     _gradcheck(model, scene, make_state(scene), names, outputs=(0, 1, 2, 3))
 
 

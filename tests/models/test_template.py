@@ -8,6 +8,22 @@ import torch
 from gausim.models.template.template import Template, TemplateState
 
 
+class _Fixed:
+    """The same state, whatever the motion."""
+
+    def __init__(self, state) -> None:
+        self.state = state
+
+    def __call__(self, motion):
+        return self.state
+
+    def carried(self, motion):
+        return motion
+
+    def energy(self, motion):
+        raise NotImplementedError
+
+
 class _Given(Template):
     """A fixed random configuration of the finest units."""
 
@@ -19,7 +35,7 @@ class _Given(Template):
         self.state = TemplateState(level.rest + 0.1 * noise[..., 3], torch.eye(3) + 0.2 * noise[..., :3])
 
     def prepare(self, batch, units):
-        return lambda motion: self.state
+        return _Fixed(self.state)
 
 
 @torch.no_grad()
@@ -58,7 +74,7 @@ def test_coarse_template_positions_are_the_centres_of_mass_of_their_children(
         seen.append((unit, target))
         return torch.zeros(level.count, 11, dtype=torch.float64)
 
-    model._output = nothing
+    model.predictor.forward = nothing
     model.step(model.batch((0,)), make_state(scene))
     (coarse, target), (fine, finest) = seen
     assert torch.equal(finest, model.template.state.positions)
@@ -74,8 +90,8 @@ def test_the_network_sees_accelerations_and_velocities_in_diagonals(make_scene, 
     scene, gravity = make_scene(90, dtype=torch.float64), torch.tensor([0.5, 0.0, -4.0], dtype=torch.float64)
     model = make_model(scene, coarse_inputs=coarse, gravity=gravity.tolist(), output_scale=5.0, edges="rest")
     nodes, edges = [], []
-    model.node_normaliser.register_forward_pre_hook(lambda _, inputs: nodes.append(inputs[0]))
-    model.edge_normaliser.register_forward_pre_hook(lambda _, inputs: edges.append(inputs[0]))
+    model.predictor.node_normaliser.register_forward_pre_hook(lambda _, inputs: nodes.append(inputs[0]))
+    model.predictor.edge_normaliser.register_forward_pre_hook(lambda _, inputs: edges.append(inputs[0]))
     state = make_state(scene)
     step = model.step(model.batch((0,)), state)
 

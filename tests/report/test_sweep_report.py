@@ -21,7 +21,7 @@ OFF = {
 
 
 def job(root: Path, ablation: str, seed: int, layers: int = 2) -> Path:
-    folder = root / ablation / "gausim" / f"experiment=tiny,model.simulator.layers={layers}" / f"seed_{seed}"
+    folder = root / ablation / "gausim" / f"experiment=tiny,model.simulator.network.layers={layers}" / f"seed_{seed}"
     settings = config(seed, layers=layers, **OFF[ablation])
     settings["ablation"] = {"name": ablation}
     return write_run(folder, settings, finished=False)
@@ -84,7 +84,7 @@ def test_failures_are_told_and_every_number_links_to_its_runs(sweep: Path, tmp_p
 
 def test_efficiency_stands_side_by_side_with_and_without_hierarchy(sweep: Path) -> None:
     for seed in (1, 2):
-        run = sweep / "no_hierarchy" / "gausim" / "experiment=tiny,model.simulator.layers=2" / f"seed_{seed}"
+        run = sweep / "no_hierarchy" / "gausim" / "experiment=tiny,model.simulator.network.layers=2" / f"seed_{seed}"
         (run / "FAILED").unlink()
         (run / "FINISHED").write_text("{}")
         evaluate(run, make_curves(4.0))

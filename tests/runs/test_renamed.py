@@ -6,9 +6,11 @@ import importlib
 
 import pytest
 import yaml
+from helpers.toy_object import toy_scene
 
+from gausim.compose.config import instantiate
 from gausim.runs.directory import CONFIG, RunDirectory
-from gausim.runs.renamed import MOVED
+from gausim.runs.renamed import MOVED, with_present_names, with_present_weights
 
 
 @pytest.mark.parametrize("new", sorted(MOVED.values()))
@@ -20,16 +22,38 @@ def test_every_new_name_exists(new: str) -> None:
         importlib.import_module(new)
 
 
+OLD = {
+    "model": {
+        "simulator": {
+            "_target_": "gausim.models.simulator.GausSim", "_partial_": True, "radii": [0.2, 0.5],
+            "predicted_levels": [2, 1], "graph_radii": [2.0, 0.4], "hidden": 8, "lever_head": 0.1,
+            "passive_frames": 4, "conserve_mass": False,
+        }
+    },
+    "callbacks": [{"_target_": "gausim.engine.callbacks.Progress"}, {"_target_": "torch.nn.Module"}],
+}  # fmt: skip
+
+
 def test_a_configuration_of_before_is_read_by_present_names(tmp_path) -> None:
-    old = {
-        "model": {"simulator": {"_target_": "gausim.models.simulator.GausSim", "hidden": 8}},
-        "callbacks": [{"_target_": "gausim.engine.callbacks.Progress"}, {"_target_": "torch.nn.Module"}],
-    }
-    (tmp_path / CONFIG).write_text(yaml.safe_dump(old))
-    assert RunDirectory(tmp_path).config() == {
-        "model": {"simulator": {"_target_": "gausim.models.step.simulator.GausSim", "hidden": 8}},
-        "callbacks": [
-            {"_target_": "gausim.training.callbacks.progress.Progress"},
-            {"_target_": "torch.nn.Module"},
-        ],
-    }
+    (tmp_path / CONFIG).write_text(yaml.safe_dump(OLD))
+    found = RunDirectory(tmp_path).config()
+    assert [c["_target_"] for c in found["callbacks"]] == [
+        "gausim.training.callbacks.progress.Progress", "torch.nn.Module",
+    ]  # fmt: skip
+    simulator = found["model"]["simulator"]
+    assert simulator["_target_"] == "gausim.models.step.simulator.GausSim" and simulator["conserve_mass"] is False
+    assert simulator["hierarchy"]["levels"] == [
+        {"diameter": 0.5, "edge_length": 2.0}, {"diameter": 0.2, "edge_length": 0.4},
+    ]  # fmt: skip
+    assert simulator["head"]["lever"] == 0.1 and simulator["rollout"]["energy_guard_frames"] == 4
+    model = instantiate(simulator, scenes=[toy_scene()], fps=[24.0])()
+    assert model.predicted_levels == (2, 1)
+    assert with_present_names(found) == found
+
+
+def test_weights_of_before_are_read_by_present_names() -> None:
+    old = {"model.network.decoder.0.weight": 1, "model.log_density.0": 2, "model.node_normaliser.mean": 3}
+    assert with_present_weights(old) == {
+        "model.predictor.network.decoder.0.weight": 1, "model.log_density.0": 2,
+        "model.predictor.node_normaliser.mean": 3,
+    }  # fmt: skip

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import toy_object
+from helpers.simulators import LEVELS, silence
 
 from gausim.cli import train as command
 from gausim.compose.build import load_run
@@ -18,7 +19,7 @@ from gausim.runs.checkpoint import read_checkpoint
 from gausim.training.callbacks.convergence import Convergence, foresee_frames, verdict
 
 TINY = (
-    "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
+    "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
     "data.curriculum.t_max=3", "data.repeats=2", "trainer.accelerator=cpu", "trainer.progress=false",
     "trainer.threads=1", "trainer.convergence.held_back=1", "trainer.convergence.window=4", "render=cpu",
     "doctor=false", "callbacks.panels=null", "callbacks.motion=null", "logger=none", "evaluate=false",
@@ -112,7 +113,7 @@ def test_the_forecast_is_one_for_a_still_object_and_none_for_the_truth(toy: Path
     module = run.module
     for p in module.initial_states.parameters():
         p.data.zero_()
-    module.model.output_scale = 0.0  # nothing moves a body at rest
+    silence(module.model)  # nothing moves a body at rest
     still = foresee_frames(module, samples, 2)
     assert still.error == pytest.approx(1.0, abs=1e-3) and 0.1 < still.moving < 1.0
     frames = [s.frames for s in samples]

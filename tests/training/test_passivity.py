@@ -10,12 +10,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 from helpers import sway, toy_object
+from helpers.simulators import gausim
 from torch import Tensor
 
 from gausim.core import ConfigError, SimState
 from gausim.losses import Objective
 from gausim.models.initial_state import FreeInitialStates
-from gausim.models.step.simulator import GausSim
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.models.template.template import RestTemplate, Template
 from gausim.render.cpu import CpuRenderer
@@ -90,7 +90,7 @@ def test_what_explodes_is_not_learned_from() -> None:
 def _module(objective: Objective, template: Callable[..., Template]) -> GausSimModule:
     torch.manual_seed(0)
     scenes = [toy_object.toy_scene(), toy_object.toy_scene()]
-    model = GausSim(scenes, [24.0, 24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
+    model = gausim(scenes, [24.0, 24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
     states = FreeInitialStates(model, SCENE_OF_SEQUENCE)
     for offset in states.offset:
         torch.nn.init.normal_(offset, std=1e-3)

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from helpers import toy_object
+from helpers.simulators import LEVELS
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gausim.compose.build import load_run
@@ -21,7 +22,7 @@ from gausim.runs.checkpoint import digest, read_checkpoint
 
 TESTS = Path(__file__).parents[1]
 TINY = (
-    "model=gausim_paper", "model.simulator.layers=1", "model.simulator.hidden=8", "model.simulator.radii=[0.3,0.7]",
+    "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
     "data.repeats=2", "data.curriculum.t_max=3", "data.curriculum.t_start=1", "trainer.convergence.held_back=1",
     "trainer.convergence.window=2", "optimizer.schedule.warmup=0.5", "data.batch_size=1",
     "render=reference", "optimizer.ema_decay=0.9", "loss.input_noise=0.001", "trainer=cpu", "trainer.threads=1",

@@ -8,6 +8,7 @@ from functools import partial
 import pytest
 import torch
 from helpers import sway, toy_object
+from helpers.simulators import gausim
 from torch import Tensor
 
 from gausim.core import ConfigError
@@ -32,7 +33,7 @@ FRAMES, MODES = 5, 6
 def model() -> GausSim:
     template = partial(ElasticTemplate, modes=MODES, neighbours=6, hidden=0)
     torch.manual_seed(0)
-    return GausSim([SCENE], [24.0], radii=(0.2, 0.5), graph_radii=(2.0, 0.6), hidden=8, layers=1, template=template)
+    return gausim([SCENE], [24.0], radii=(0.2, 0.5), graph_radii=(2.0, 0.6), hidden=8, layers=1, template=template)
 
 
 @pytest.fixture
@@ -125,7 +126,7 @@ def test_a_few_steps_of_training_come_nearer_and_keep_the_tracks(
 
 
 def test_a_model_without_smooth_motions_is_refused_or_shown_images(sources: Sources) -> None:
-    paper = GausSim([SCENE], [24.0], radii=(0.2, 0.5), graph_radii=(2.0, 0.6), hidden=8, layers=1)
+    paper = gausim([SCENE], [24.0], radii=(0.2, 0.5), graph_radii=(2.0, 0.6), hidden=8, layers=1)
     without = replace(sources, motions=paper.smooth_motions)
     with pytest.raises(ConfigError, match="this model has none. Use supervision=images"):
         TrackSupervision(without)

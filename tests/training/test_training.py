@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import sway, toy_object
+from helpers.simulators import gausim
 from lightning.pytorch import Trainer
 from torch import Tensor, nn
 
@@ -16,7 +17,6 @@ from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.losses import ImageLoss, Objective
 from gausim.models.initial_state import FreeInitialStates, ModalInitialStates
-from gausim.models.step.simulator import GausSim
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import draw
@@ -195,7 +195,7 @@ def test_absent_sequences_and_scenes_do_not_move_in_the_real_model(tmp_path: Pat
     torch.manual_seed(0)
     scenes = [toy_object.toy_scene(), toy_object.toy_scene()]
     template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=4)
-    model = GausSim(scenes, [24.0, 24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
+    model = gausim(scenes, [24.0, 24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
     module = GausSimModule(
         model=model, initial_states=ModalInitialStates(model, SCENE_OF_SEQUENCE), scene_of_sequence=SCENE_OF_SEQUENCE,
         renderer=CpuRenderer(threads=1), optimizer=OptimizerSettings(),
@@ -223,7 +223,7 @@ def test_mixing_counts_in_units_of_the_rest_states_loss() -> None:
     for weight in (0.0, 0.5):
         torch.manual_seed(0)
         template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=0, inertia="trained")
-        model = GausSim([toy_object.toy_scene()], [24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
+        model = gausim([toy_object.toy_scene()], [24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
         with torch.no_grad():
             for name, p in model.template.named_parameters():
                 if "mixing" in name:
@@ -251,7 +251,7 @@ def test_mixing_counts_in_units_of_the_rest_states_loss() -> None:
 def test_overfitting_one_sequence_drives_its_loss_down_tenfold(tmp_path: Path) -> None:
     scene = toy_object.toy_scene()
     torch.manual_seed(0)
-    model = GausSim([scene], [24.0], radii=(0.3, 0.7), hidden=16, layers=2, output_scale=0.05, rest_inputs=True)
+    model = gausim([scene], [24.0], radii=(0.3, 0.7), hidden=16, layers=2, output_scale=0.05, rest_inputs=True)
     module = GausSimModule(
         model=model, initial_states=FreeInitialStates(model, [0]), scene_of_sequence=[0],
         renderer=CpuRenderer(threads=1), objective=Objective(backprop_steps=0, static_weight=0.0),

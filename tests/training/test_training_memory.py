@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from helpers import toy_object
+from helpers.simulators import gausim
 from helpers.sway import blobs, sample, sway_module
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -17,7 +18,6 @@ from gausim.benchmark.train import peak_saved_bytes
 from gausim.core import DivergenceError
 from gausim.losses import Objective
 from gausim.models.initial_state import FreeInitialStates
-from gausim.models.step.simulator import GausSim
 from gausim.render.reference import ReferenceRenderer
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
@@ -26,7 +26,7 @@ from gausim.training.supervision import comparison
 
 def real_module(objective: Objective) -> GausSimModule:
     torch.manual_seed(0)
-    model = GausSim(
+    model = gausim(
         [toy_object.toy_scene()], [24.0], radii=(0.3, 0.7), edges="rest", hidden=8, layers=2, output_scale=0.1
     )
     return GausSimModule(
@@ -79,7 +79,7 @@ def test_checkpointing_the_steps_keeps_the_gradients_and_the_statistics() -> Non
             torch.testing.assert_close(after[name], value, rtol=1e-6, atol=1e-9)
     # The first statistics, one step of the static loss and four of the rollout on two levels, each counted once.
     carried, units = "loss_static" in first, sum(level.count for level in kept.model.batch([0]).levels)
-    assert int(kept.model.node_normaliser.count) == units * (1 + 4 + carried)
+    assert int(kept.model.predictor.node_normaliser.count) == units * (1 + 4 + carried)
 
 
 def test_checkpointing_the_steps_makes_the_graph_small(one_state_at_once: None) -> None:

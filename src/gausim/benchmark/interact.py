@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gausim.benchmark.harness import Options, Row, medians, torch_threads
-from gausim.benchmark.step import CLUSTERING, DEFAULT, TEMPLATE, Bound, cloud
+from gausim.benchmark.step import DEFAULT, TEMPLATE, Bound, cloud, simulator
 from gausim.core import GaussianScene, SimState
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.selections import Ball
@@ -48,8 +48,7 @@ def build(count: int) -> tuple[GaussianScene, GausSim]:
         means=scene.means, log_scales=scene.log_scales, quats=scene.quats, opacity_logits=scene.opacity_logits,
         sh=colors, pinned=scene.pinned, name=scene.name,
     )  # fmt: skip
-    settings = {**DEFAULT, "template": partial(MaterialTemplate, **TEMPLATE), "passive_frames": 36}
-    model = GausSim([scene], [FPS], radii=(0.13, 0.4), clustering=CLUSTERING, **settings)
+    model = simulator(scene, FPS, (0.13, 0.4), DEFAULT, template=partial(MaterialTemplate, **TEMPLATE))
     return scene, model.eval()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,36 +19,40 @@ from gausim.kernels.compiled import torch_only
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.rollout.cuda_graph import GraphedStep
-from gausim.models.step.features import network_inputs
+from gausim.models.settings import HierarchySettings, RolloutSettings
+from gausim.models.step.features import FeatureOptions, network_inputs
+from gausim.models.step.head import Head
 from gausim.models.step.prepared import Prepared
 from gausim.models.step.recursion import Solved, Units, advance, inherit
 from gausim.models.step.simulator import GausSim
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.models.template.material import MaterialTemplate
-from gausim.models.template.template import Motion, Template
+from gausim.models.template.template import Motion, RestTemplate, Template
+from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.ops.deformation import gradient_from_output
 
 CLUSTERING = "agglomerative"
 # The simulators of conf/model/gausim_paper.yaml, of conf/ablation/no_hierarchy.yaml with it, of gausim.yaml and of
-# gausim_elastic.yaml.
-PAPER: dict[str, Any] = {
-    "predicted_levels": (2, 1), "graph_radii": (2.0, 0.4), "max_neighbours": 16, "edges": "union", "hidden": 128,
-    "layers": 16, "norm": "joint",
-}  # fmt: skip
-NO_HIERARCHY: dict[str, Any] = {**PAPER, "predicted_levels": (0,), "graph_radii": (0.1,)}
-DEFAULT: dict[str, Any] = {
-    "predicted_levels": (2, 1), "graph_radii": (2.0, 0.4), "max_neighbours": 8, "edges": "rest", "rest_inputs": True,
-    "attributes": 8, "hidden": 48, "layers": 3, "output_scale": 0.1, "zero_output": True, "velocity_inputs": False,
-    "lever_head": 0.02, "anchor": True, "body_frame": True,
-}  # fmt: skip
-TEMPLATE: dict[str, Any] = {
-    "modes": 48, "spacing": 0.12, "links": 12, "hidden": 48, "period": 8.0, "damping": 0.02,
-}  # fmt: skip
-ELASTIC: dict[str, Any] = {
-    "predicted_levels": (2, 1), "graph_radii": (2.0, 0.4), "max_neighbours": 8, "edges": "rest", "rest_inputs": True,
-    "hidden": 32, "layers": 2, "output_scale": 0.01, "zero_output": True,
-}  # fmt: skip
-ELASTIC_TEMPLATE: dict[str, Any] = {
+# gausim_elastic.yaml: their parts as far as these are not the constructors' defaults. Diameters are found by count.
+Settings = dict[str, Any]
+PAPER: Settings = {"network": {"hidden": 128, "layers": 16, "norm": "joint"}}
+DEFAULT: Settings = {
+    "hierarchy": {"max_neighbours": 8, "edges": "rest", "body_frame": True},
+    "features": {"rest_inputs": True, "velocities": False, "attributes": 8},
+    "network": {"hidden": 48, "layers": 3},
+    "head": {"output_scale": 0.1, "zero_output": True, "lever": 0.02, "anchor": True},
+    "rollout": {"energy_guard_frames": 36},
+}
+TEMPLATE: Settings = {"modes": 48, "spacing": 0.12, "links": 12, "hidden": 48, "period": 8.0, "damping": 0.02}
+ELASTIC: Settings = {
+    "hierarchy": {"max_neighbours": 8, "edges": "rest"},
+    "features": {"rest_inputs": True},
+    "network": {"hidden": 32, "layers": 2},
+    "head": {"output_scale": 0.01, "zero_output": True},
+    "rollout": {"energy_guard_frames": 12},
+}
+EDGE_LENGTHS, KERNEL_EDGE_LENGTH = (2.0, 0.4), 0.1
+ELASTIC_TEMPLATE: Settings = {
     "modes": 48, "solid": 0.12, "geometric": 1.0, "neighbours": 24, "damping": "full", "inertia": "trained",
     "period": 8.0, "hidden": 0, "amplitude": 0.02,
 }  # fmt: skip
@@ -123,11 +127,47 @@ def find_radii(scene: GaussianScene, units: Sequence[int]) -> tuple[float, ...]:
     return found
 
 
+def simulator(
+    scene: GaussianScene,
+    fps: float,
+    diameters: Sequence[float],
+    settings: Settings,
+    *,
+    network: Mapping[str, int] | None = None,
+    template: Callable[..., Template] = RestTemplate,
+) -> GausSim:
+    """A simulator with the settings of a configuration.
+
+    Args:
+        scene: what it simulates.
+        fps: its frame rate.
+        diameters: of its units, fine to coarse [diagonals]; none is without hierarchy.
+        settings: by part.
+        network: overrides of the network's.
+        template: what it deforms.
+    """
+    lengths = EDGE_LENGTHS if diameters else (KERNEL_EDGE_LENGTH,)
+    levels = [
+        {"diameter": diameter, "edge_length": length}
+        for diameter, length in zip(tuple(reversed(diameters)) or (0.0,), lengths, strict=True)
+    ]
+    return GausSim(
+        [scene],
+        [fps],
+        hierarchy=HierarchySettings(levels=levels, clustering=CLUSTERING, **settings.get("hierarchy", {})),
+        features=FeatureOptions(**settings.get("features", {})),
+        network=functools.partial(MeshGraphNet, **{**settings["network"], **(network or {})}),
+        head=Head(**settings.get("head", {})),
+        rollout=RolloutSettings(**settings.get("rollout", {})),
+        template=template,
+    )
+
+
 def _paper(size: Size, options: Options) -> list[Row]:
     scene = cloud(size.kernels, "paper")
     radii = find_radii(scene, size.units)
     network = dict(size.network)
-    bound = Bound(GausSim([scene], [24.0], radii=radii, clustering=CLUSTERING, **{**PAPER, **network}), 1, options)
+    bound = Bound(simulator(scene, 24.0, radii, PAPER, network=network), 1, options)
     counts = " + ".join(str(level.count) for level in reversed(bound.batch.levels))
     case = f"step, {size.kernels} kernels, {counts} units"
     rows = [Row(case, "edges", float(bound.edges()), "1")]
@@ -142,7 +182,7 @@ def _paper(size: Size, options: Options) -> list[Row]:
     kept = float(saved_bytes(bound.differentiable))
     rows.append(Row(case, "kept for the backward pass", kept / 2**20, "MiB"))
     rows += [Row(case, f"forward, {name}", 1e3 * t, "ms") for name, t in medians(bound.parts(), options).items()]
-    without = GausSim([scene], [24.0], radii=radii, clustering=CLUSTERING, **{**NO_HIERARCHY, **network})
+    without = simulator(scene, 24.0, (), PAPER, network=network)
     return rows + _without(Bound(without, 1, options), bound, forward["step"], both["step"], kept, size, options)
 
 
@@ -174,8 +214,7 @@ def _training(size: Size, options: Options) -> list[Row]:
     radii = find_radii(scene, size.bunny_units)
 
     def bind(settings: dict[str, Any], template: Callable[..., Template]) -> Bound:
-        own = {**settings, **dict(size.network), "template": template}
-        model = GausSim([scene], [24.0], radii=radii, clustering=CLUSTERING, **own)
+        model = simulator(scene, 24.0, radii, settings, network=dict(size.network), template=template)
         return Bound(model, size.batch, options, steps=size.steps)
 
     bound = bind(DEFAULT, functools.partial(MaterialTemplate, **TEMPLATE))
@@ -241,7 +280,7 @@ class Bound:
 
     def _seen_by_the_network(self) -> list[tuple[Tensor, Tensor, Tensor]]:
         seen: list[tuple[Tensor, Tensor, Tensor]] = []
-        handle = self.model.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs))
+        handle = self.model.predictor.network.register_forward_pre_hook(lambda _, inputs: seen.append(inputs))
         with torch.no_grad():
             self.model.eval().step(self.batch, self.state)
         handle.remove()
@@ -278,14 +317,16 @@ class Bound:
     def network_forward(self) -> None:
         """The network of one step alone."""
         for inputs in self._inputs:
-            self.model.network(*inputs)
+            self.model.predictor.network(*inputs)
 
     def network_both(self) -> None:
         """The network of one step alone, with gradients of its inputs and weights."""
         self.model.zero_grad()
         total = []
         for nodes, edges, index in self._inputs:
-            total.append(self.model.network(nodes.clone().requires_grad_(), edges.clone().requires_grad_(), index))
+            total.append(
+                self.model.predictor.network(nodes.clone().requires_grad_(), edges.clone().requires_grad_(), index)
+            )
         torch.cat(total).sum().backward()
 
     def replay(self) -> Callable[[], object]:
@@ -302,11 +343,12 @@ class Bound:
         with torch.no_grad():
             prepared = model.prepare(batch)
             unit, above = _finest(prepared, self.state)
-            index = model.edges.of(level, unit.now)
-            target, gravity = unit.rest, model.gravity.to(unit.rest)
+            index = model.predictor.edges.of(level, unit.now)
+            target, gravity = unit.rest, model.predictor.gravity.to(unit.rest)
+            choices = model.predictor.features
 
             def features() -> tuple[Tensor, Tensor]:
-                return network_inputs(unit, target, above, index, level.length, level.dt, gravity, model.options)
+                return network_inputs(unit, target, above, index, level.length, level.dt, gravity, choices)
 
             nodes, edges = features()
             output = torch.zeros(level.count, 11).to(unit.rest)
@@ -319,14 +361,14 @@ class Bound:
 
         parts: dict[str, Callable[[], object]] = {
             "constants": functools.partial(model.prepare, batch),
-            "aggregation": lambda: (prepared.aggregate(self.state.positions), prepared.aggregate(self.state.previous)),
+            "aggregation": lambda: (prepared.finest(self.state.positions), prepared.finest(self.state.previous)),
             "template": lambda: prepared.template(Motion(unit.rest, unit.now, unit.before)),
             "edges": lambda: [
-                model.edges.of(one, x)
-                for one, x in zip(batch.levels, prepared.aggregate(self.state.positions), strict=True)
+                model.predictor.edges.of(one, x)
+                for one, x in zip(batch.levels, prepared.per_level(prepared.finest(self.state.positions)), strict=True)
             ],
             "features": features,
-            "normalisers": lambda: (model.node_normaliser(nodes), model.edge_normaliser(edges)),
+            "normalisers": lambda: (model.predictor.node_normaliser(nodes), model.predictor.edge_normaliser(edges)),
             "network": self.network_forward,
             "recursion and kernels": recursion,
         }
@@ -335,7 +377,7 @@ class Bound:
 
 def _finest(prepared: Prepared, state: SimState) -> tuple[Units, Solved]:
     """Units of the finest level, and the level above (or the roots) as if it had not moved."""
-    now, before = prepared.units(state.positions), prepared.units(state.previous)
+    now, before = (prepared.per_level(prepared.finest(x)) for x in (state.positions, state.previous))
     fixed, level = prepared.levels[-1], prepared.batch.levels[-1]
     unit = Units(fixed.rest, now[-1], before[-1], fixed.mass, fixed.log_density, fixed.attributes)
     if len(now) == 1:

@@ -14,6 +14,7 @@ from gausim.compose.root import conf_dir
 ROOT_FILE, GLOBAL_PACKAGE = "train", "# @package _global_"
 # The defaults list composes; the node `hydra` is Hydra's own.
 _NOT_OURS = ("defaults", "hydra")
+BASE = "base"  # what files of groups inherit from; no group to choose from
 
 
 @dataclass
@@ -49,7 +50,7 @@ def choices() -> dict[str, list[str]]:
     """The groups of conf/ and the names of their files, e.g. `{"model": ["gausim", ...], "hydra/sweeper": [...]}`."""
     found: dict[str, list[str]] = {}
     for path in _files():
-        if path.parent != conf_dir():
+        if path.parent != conf_dir() and path.parent.name != BASE:
             found.setdefault(path.parent.relative_to(conf_dir()).as_posix(), []).append(path.stem)
     return found
 

@@ -145,7 +145,7 @@ class MeshGraphNet(nn.Module):
             ("activation", activation, tuple(ACTIVATIONS)),
         ):
             if given not in known:
-                raise ConfigError(f"model.simulator.{name} is '{given}'; expected one of {', '.join(known)}.")
+                raise ConfigError(f"model.simulator.network.{name} is '{given}'; expected one of {', '.join(known)}.")
         self.precision, self.checkpointed, self.compiled = precision, checkpoint, compile
         ends = "relu" if norm == "joint" else activation
         self.node_encoder = mlp((node_features, hidden, hidden), ends)
@@ -216,13 +216,13 @@ def _compile(layers: Sequence[nn.Module], device: torch.device) -> None:
     compiler = os.environ.get("CXX") or "g++"
     if device.type == "cpu" and shutil.which(compiler) is None:
         raise ConfigError(
-            f"model.simulator.compile is true, but the C++ compiler '{compiler}' was not found. Install it, name "
-            "another in the environment variable CXX, or set model.simulator.compile=false."
+            f"model.simulator.network.compile is true, but the C++ compiler '{compiler}' was not found. Install it, "
+            "name another in the environment variable CXX, or set model.simulator.network.compile=false."
         )
     if device.type == "cuda" and importlib.util.find_spec("triton") is None:
         raise ConfigError(
-            "model.simulator.compile is true, but triton is not installed. Install it, or set "
-            "model.simulator.compile=false."
+            "model.simulator.network.compile is true, but triton is not installed. Install it, or set "
+            "model.simulator.network.compile=false."
         )
     for layer in pending:
         layer.compile(dynamic=True)

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from gausim.core import GaussianScene, RunError
 from gausim.io.files import write_durably
+from gausim.runs.renamed import with_present_weights
 
 LAST_CHECKPOINT, PREVIOUS_CHECKPOINT = "last.ckpt", "last.previous.ckpt"
 BEFORE_THE_END = "before_the_end.ckpt"  # of a run that was cut short: more time goes on from it
@@ -219,7 +220,7 @@ class WeightAverage:
 
 def averaged_weights(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
     """The weights of a checkpoint by name, the averaged ones where there are any."""
-    return {**checkpoint["state_dict"], **checkpoint["gausim"]["average"]["values"]}
+    return with_present_weights({**checkpoint["state_dict"], **checkpoint["gausim"]["average"]["values"]})
 
 
 def load_weights(module: nn.Module, checkpoint: dict[str, Any], *, averaged: bool = True) -> None:
@@ -228,7 +229,7 @@ def load_weights(module: nn.Module, checkpoint: dict[str, Any], *, averaged: boo
     Raises:
         RunError: the checkpoint has other parameters than the module.
     """
-    weights = averaged_weights(checkpoint) if averaged else dict(checkpoint["state_dict"])
+    weights = averaged_weights(checkpoint) if averaged else with_present_weights(checkpoint["state_dict"])
     try:
         module.load_state_dict(weights)
     except RuntimeError as error:

@@ -1,7 +1,8 @@
-"""Modules that have moved since runs were made whose configurations name them; for one version."""
+"""What has moved since runs were made: modules, settings of the simulator, names of weights. Kept for one version."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 MOVED = {
@@ -30,10 +31,45 @@ MOVED = {
 }
 
 
+SIMULATOR = "gausim.models.step.simulator.GausSim"
+# Where the arguments of the simulator went, and the names they have there.
+PARTS: dict[str, tuple[str, dict[str, str]]] = {
+    "hierarchy": (
+        "gausim.models.settings.HierarchySettings",
+        {
+            "clustering": "clustering", "max_neighbours": "max_neighbours", "edges": "edges",
+            "edge_bucket": "edge_bucket", "share_levels": "share_network", "body_frame": "body_frame",
+        },
+    ),
+    "features": (
+        "gausim.models.step.features.FeatureOptions",
+        {
+            "angle": "angle", "rest_inputs": "rest_inputs", "coarse_inputs": "coarse_inputs",
+            "velocity_inputs": "velocities", "attributes": "attributes", "gravity": "gravity",
+            "normaliser_floor": "normaliser_floor",
+        },
+    ),
+    "network": (
+        "gausim.nn.meshgraphnet.MeshGraphNet",
+        {k: k for k in ("hidden", "layers", "norm", "activation", "precision", "checkpoint", "compile")},
+    ),
+    "head": (
+        "gausim.models.step.head.Head",
+        {"output_scale": "output_scale", "zero_output": "zero_output", "lever_head": "lever", "anchor": "anchor"},
+    ),
+    "rollout": (
+        "gausim.models.settings.RolloutSettings",
+        {"cuda_graph": "cuda_graph", "passive_frames": "energy_guard_frames"},
+    ),
+}  # fmt: skip
+WEIGHTS = ("network.", "node_normaliser.", "edge_normaliser.")
+
+
 def with_present_names(config: Any) -> Any:
     """A configuration whose `_target_`s are where they are now; what never moved stays as it is."""
     if isinstance(config, dict):
-        return {k: _present(v) if k == "_target_" else with_present_names(v) for k, v in config.items()}
+        found = {k: _present(v) if k == "_target_" else with_present_names(v) for k, v in config.items()}
+        return _in_parts(found) if found.get("_target_") == SIMULATOR and "hierarchy" not in found else found
     return [with_present_names(v) for v in config] if isinstance(config, list) else config
 
 
@@ -42,3 +78,27 @@ def _present(target: Any) -> Any:
         if isinstance(target, str) and (target == old or target.startswith(f"{old}.")):
             return new + target[len(old) :]
     return target
+
+
+def _in_parts(old: Mapping[str, Any]) -> dict[str, Any]:
+    """The simulator's arguments by part; what an old configuration leaves out has the default that it had."""
+    gone = {"radii", "predicted_levels", "graph_radii", *(name for _, names in PARTS.values() for name in names)}
+    new = {name: value for name, value in old.items() if name not in gone}
+    for part, (target, names) in PARTS.items():
+        new[part] = {"_target_": target, **{names[k]: old[k] for k in names if k in old}}
+    new["network"]["_partial_"] = True
+    diameters, lengths = (0.0, *old.get("radii", (0.1, 0.35))), old.get("graph_radii", (2.0, 0.4))
+    predicted = old.get("predicted_levels", (2, 1))
+    new["hierarchy"]["levels"] = [
+        {"diameter": diameters[level], "edge_length": length} for level, length in zip(predicted, lengths, strict=True)
+    ]
+    return new
+
+
+def with_present_weights(weights: Mapping[str, Any]) -> dict[str, Any]:
+    """Weights by the names that they have now."""
+    old = tuple(f"model.{name}" for name in WEIGHTS)
+    return {
+        f"model.predictor.{name.removeprefix('model.')}" if name.startswith(old) else name: value
+        for name, value in weights.items()
+    }

@@ -22,6 +22,7 @@ from gausim.nn.mode import evaluating
 from gausim.render.draw import draw
 from gausim.runs.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes, fingerprints
 from gausim.runs.cost import TrainingCost
+from gausim.runs.renamed import with_present_weights
 from gausim.training.baseline_metrics import Yardsticks
 from gausim.training.contracts import InitialVelocities, Mixing, SceneBatch, Simulator
 from gausim.training.exchange import Exchange
@@ -434,9 +435,10 @@ class GausSimModule(LightningModule):
             RunError: naming both scenes.
         """
         check_scenes(checkpoint, self.simulator.scenes, "the checkpoint")
+        checkpoint["state_dict"] = with_present_weights(checkpoint["state_dict"])
         self.take_notes(checkpoint)
         own = checkpoint["gausim"]
-        self.average.load_state_dict(own["average"])
+        self.average.load_state_dict({**own["average"], "values": with_present_weights(own["average"]["values"])})
         epoch = own["epoch"]
         self._sums, self.summary = epoch["sums"], epoch["summary"]
         self._warned, self._barren = epoch["warned"], epoch["barren"]

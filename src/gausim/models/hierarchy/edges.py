@@ -32,9 +32,9 @@ class EdgeSet:
             ConfigError: an option is out of range.
         """
         if rule not in EDGE_RULES:
-            raise ConfigError(f"model.edges is '{rule}'; expected one of {', '.join(EDGE_RULES)}.")
+            raise ConfigError(f"model.simulator.hierarchy.edges is '{rule}'; expected one of {', '.join(EDGE_RULES)}.")
         if bucket < 0:
-            raise ConfigError(f"model.edge_bucket is {bucket}; expected 0 (no filling) or more.")
+            raise ConfigError(f"model.simulator.hierarchy.edge_bucket is {bucket}; expected 0 (no filling) or more.")
         self.rule, self.bucket = rule, bucket
 
     def of(self, level: LevelBatch, positions: Float[Tensor, "N 3"]) -> Int[Tensor, "2 E"]:

@@ -20,7 +20,7 @@ class FixedUnits:
     Attributes:
         rest: centres of mass X [scene units].
         mass: m_c = sum of m_i.
-        share: m_c over the mass of its parent among the predicted levels; at the top level over itself.
+        mass_fraction: m_c over the mass of its parent among the predicted levels; at the top level over itself.
         log_density: log of m_c / V_c.
         attributes: plain mean over the kernels.
         scale: mass of the whole scene times its diagonal, the unit of momenta per step [mass scene units].
@@ -28,33 +28,33 @@ class FixedUnits:
 
     rest: Float[Tensor, "N 3"]
     mass: Float[Tensor, " N"]
-    share: Float[Tensor, " N"]
+    mass_fraction: Float[Tensor, " N"]
     log_density: Float[Tensor, " N"]
     attributes: Float[Tensor, "N A"]
     scale: Float[Tensor, "N 1"]
 
 
-def per_level(batch: SceneBatch, shares: Sequence[Tensor], finest: Float[Tensor, "N 3"]) -> list[Tensor]:
+def per_level(batch: SceneBatch, fractions: Sequence[Tensor], finest: Float[Tensor, "N 3"]) -> list[Tensor]:
     """Positions of every predicted level, coarse to fine: coarser units are the centres of mass of the finer."""
     found = [finest]
     for position in range(len(batch.levels) - 1, 0, -1):
         level, count = batch.levels[position], batch.levels[position - 1].count
-        found.insert(0, weighted_sum(found[0], shares[position], level.parent, count))
+        found.insert(0, weighted_sum(found[0], fractions[position], level.parent, count))
     return found
 
 
 def fixed_units(
     batch: SceneBatch, mass: Float[Tensor, " M"], attributes: Float[Tensor, "M A"]
 ) -> tuple[Float[Tensor, " K"], tuple[FixedUnits, ...]]:
-    """Share of every kernel in its finest unit, and the constants of every predicted level (METHOD section 1)."""
+    """Mass of every kernel over that of its finest unit, and constants of every predicted level (METHOD section 1)."""
     levels = batch.levels
     totals = [mass.new_zeros(level.count).index_add(0, level.unit_of_kernel, mass) for level in levels]
     within = mass / totals[-1].index_select(0, levels[-1].unit_of_kernel)
-    share = mass.new_zeros(len(batch.rest)).index_copy(0, batch.simulated, within)
-    shares = [torch.ones_like(totals[0])]
+    fraction = mass.new_zeros(len(batch.rest)).index_copy(0, batch.simulated, within)
+    fractions = [torch.ones_like(totals[0])]
     for above, total, level in zip(totals, totals[1:], levels[1:], strict=False):
-        shares.append(total / above.index_select(0, level.parent))
-    rest = per_level(batch, shares, weighted_sum(batch.rest, share, batch.finest, levels[-1].count))
+        fractions.append(total / above.index_select(0, level.parent))
+    rest = per_level(batch, fractions, weighted_sum(batch.rest, fraction, batch.finest, levels[-1].count))
     units = []
     for i, level in enumerate(levels):
         ones = torch.ones_like(mass)
@@ -63,5 +63,5 @@ def fixed_units(
         log_density = torch.log(totals[i] / level.volume)
         whole = mass.new_zeros(len(level.spans)).index_add(0, level.member, totals[i])
         scale = whole.index_select(0, level.member)[:, None] * level.length
-        units.append(FixedUnits(rest[i], totals[i], shares[i], log_density, mean, scale))
-    return share, tuple(units)
+        units.append(FixedUnits(rest[i], totals[i], fractions[i], log_density, mean, scale))
+    return fraction, tuple(units)

@@ -56,7 +56,8 @@ class GraphedStep:
         """
         if capture and rest.device.type != "cuda":
             raise ConfigError(
-                f"model.simulator.cuda_graph: expected the model on a CUDA device, got {rest.device}. Set it to false."
+                "model.simulator.rollout.cuda_graph: expected the model on a CUDA device, got "
+                f"{rest.device}. Set it to false."
             )
         self._step, self._capture = step, capture
         self._state = SimState(torch.zeros_like(rest), torch.zeros_like(rest))
@@ -107,8 +108,9 @@ class GraphedStep:
                 result = self._compute(pushed)
         except RuntimeError as error:
             raise ConfigError(
-                f"model.simulator.cuda_graph: the step cannot be captured ({str(error).splitlines()[0]}). Something in "
-                "it waits for the device or has a shape that depends on values; set it to false."
+                "model.simulator.rollout.cuda_graph: the step cannot be captured "
+                f"({str(error).splitlines()[0]}). Something in it waits for the device "
+                "or has a shape that depends on values; set it to false."
             ) from error
         return graph, result
 

@@ -13,7 +13,7 @@ from gausim.models.step.prepared import Prepared
 from gausim.models.step.simulator import GausSim
 from gausim.ops.deformation import polar_rotation
 
-# Shares of a force that are tried where all of it would pass the ceiling.
+# Parts of a force that are tried where all of it would pass the ceiling.
 WEAKER = (0.5, 0.25, 0.125, 0.0625, 0.0)
 # Halvings with which a step is cut short: to the thousandth part.
 BISECTIONS = 10
@@ -24,17 +24,17 @@ class EnergyGuard:
 
     Frame by frame the network may give back what it took, move energy between vibrations, or make up for damping; the
     peaks of E over ``frames`` frames can only fall. So a motion that nothing pushes stays bounded for ever, however
-    long it is predicted. Where a step would pass the limit it is made again with the share
+    long it is predicted. Where a step would pass the limit it is made again with the part
 
         s = (limit - E_0) / (E_1 - E_0)
 
     of the network's output, E_0 and E_1 being the energies with none and all of it. E is convex in the state, so that
-    of the share stays below the limit as far as the state is linear in s; where it does not, and where the template
+    of that part stays below the limit as far as the state is linear in s; where it does not, and where the template
     alone passes the limit (springs beyond the linear are taken explicitly), the template's own step is taken.
 
     Far beyond the motion that training shows those explicit springs are unstable: what forces have carried there would
-    fly apart. A ``ceiling`` ends that. A force that would pass it acts with a share only; a step that passes it all the
-    same is cut short, to the longest share of it that does not. So forces bend nothing further than that energy does.
+    fly apart. A ``ceiling`` ends that. A force that would pass it acts in part only; a step that passes it all the
+    same is cut short, to the longest part of it that does not. So forces bend nothing further than that energy does.
     """
 
     def __init__(self, model: GausSim, prepared: Prepared, frames: int, *, ceiling: float | None = None) -> None:
@@ -84,48 +84,48 @@ class EnergyGuard:
         return result
 
     def _weakened(self, state: SimState, force: Tensor, ceiling: float) -> tuple[Predicted, float]:
-        """The template's step with the largest of some shares of the force that stays below the ceiling, or none."""
-        for share in WEAKER:
-            made, energy = self._shared(state, share * force if share else None, 0.0)
+        """The template's step with the largest part of the force that stays below the ceiling, or none."""
+        for scale in WEAKER:
+            made, energy = self._corrected(state, scale * force if scale else None, 0.0)
             if energy <= ceiling:
                 break
         return made, energy
 
     def _cut_short(self, made: Predicted, state: SimState, ceiling: float) -> tuple[Predicted, float]:
-        """The longest share of a step below the ceiling, by bisection; none where even standing still is above it.
+        """The longest part of a step below the ceiling, by bisection; none where even standing still is above it.
 
         Below means in motion and if it stopped at once: E looks at the middle of a step, which its end may overtop.
         """
         limit = max(ceiling, self._energy(SimState(state.positions, state.positions)))
         low, high = 0.0, 1.0
         for _ in range(BISECTIONS):
-            share = (low + high) / 2
-            x = self._part(made, state, share).positions
+            scale = (low + high) / 2
+            x = self._part(made, state, scale).positions
             needed = max(self._energy(SimState(x, state.positions)), self._energy(SimState(x, x)))
-            low, high = (share, high) if needed <= limit else (low, share)
+            low, high = (scale, high) if needed <= limit else (low, scale)
         part = self._part(made, state, low)
         return part, self._energy(_after(part, state))
 
-    def _part(self, made: Predicted, state: SimState, share: float) -> SteppedFrame:
-        positions = state.positions + share * (made.positions - state.positions)
+    def _part(self, made: Predicted, state: SimState, scale: float) -> SteppedFrame:
+        positions = state.positions + scale * (made.positions - state.positions)
         if self._made is None:  # the first step: from identity gradients
             before = turned = torch.eye(3).to(positions).expand_as(made.gradients)
         else:
             before, turned = self._made.gradients, self._made.rotations
-        gradients = before + share * (made.gradients - before)
-        rotations = polar_rotation(turned + share * (made.rotations - turned))
+        gradients = before + scale * (made.gradients - before)
+        rotations = polar_rotation(turned + scale * (made.rotations - turned))
         return SteppedFrame(positions, gradients, rotations)
 
     def _held_back(self, state: SimState, force: Tensor | None, energy: float, limit: float) -> tuple[Predicted, float]:
         self.held += 1
-        alone, lowest = self._shared(state, force, 0.0)
+        alone, lowest = self._corrected(state, force, 0.0)
         if lowest >= limit:
             return alone, lowest
-        part, found = self._shared(state, force, (limit - lowest) / (energy - lowest))
+        part, found = self._corrected(state, force, (limit - lowest) / (energy - lowest))
         return (part, found) if found <= limit else (alone, lowest)
 
-    def _shared(self, state: SimState, force: Tensor | None, share: float) -> tuple[Predicted, float]:
-        made = self._model.step(self._prepared.batch, state, force, self._prepared, share)
+    def _corrected(self, state: SimState, force: Tensor | None, scale: float) -> tuple[Predicted, float]:
+        made = self._model.step(self._prepared.batch, state, force, self._prepared, scale)
         return made, self._energy(_after(made, state))
 
     def _energy(self, state: SimState) -> float:

@@ -93,11 +93,12 @@ class SceneStepper:
             return self._model.step(prepared.batch, state, force, prepared)
 
         rest = prepared.batch.rest
-        if self._model.cuda_graph and rest.device.type == "cuda":
+        if self._model.rollout.cuda_graph and rest.device.type == "cuda":
             return GraphedStep(step, rest)
         return step
 
     def _made_guard(self, prepared: Prepared) -> EnergyGuard | None:
-        if not (self._model.passive_frames and self._model.knows_energy):
+        frames = self._model.rollout.energy_guard_frames
+        if not (frames and self._model.knows_energy):
             return None
-        return EnergyGuard(self._model, prepared, self._model.passive_frames, ceiling=self._ceiling)
+        return EnergyGuard(self._model, prepared, frames, ceiling=self._ceiling)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +16,7 @@ from gausim.models.step.recursion import Solved, Units
 
 # Lengths are divided by the diagonal of the scene before they get here: 1e-6 of it is nothing.
 TINY = 1e-6
+ANGLES = ("cos_sin", "inner")
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,18 +46,42 @@ class FeatureOptions:
         coarse_inputs: below the top level read positions from the coarse prediction instead of the current state.
         velocities: give velocities and accelerations; without them levers X_i - X_p, displacements and what the parent
             did to the template take their place.
+        attributes: material attributes per unit.
+        gravity: acceleration [scene units / s^2].
+        normaliser_floor: smallest standard deviation of a normalised input.
+
+    Raises:
+        ConfigError: an unknown angle, or nothing is left to see.
     """
 
     angle: str = "cos_sin"
     rest_inputs: bool = False
     coarse_inputs: bool = False
     velocities: bool = True
+    attributes: int = 4
+    gravity: Sequence[float] = (0.0, 0.0, 0.0)
+    normaliser_floor: float = 1e-2
 
     def __post_init__(self) -> None:
-        """Checks that something is left to see."""
+        """Checks the choices."""
+        object.__setattr__(self, "gravity", tuple(self.gravity))  # a configuration has a list
+        if self.angle not in ANGLES:
+            raise ConfigError(f"model.simulator.features.angle is '{self.angle}'; expected one of {', '.join(ANGLES)}.")
         if not (self.velocities or self.rest_inputs):
             raise ConfigError(
-                "model.simulator.velocity_inputs=false needs rest_inputs=true: the network would see nothing."
+                "model.simulator.features.velocities=false needs rest_inputs=true: the network would see nothing."
+            )
+
+    def check_frame(self, body_frame: bool) -> None:
+        """Refuses gravity, which is a direction of the scene, in the body's own axes.
+
+        Raises:
+            ConfigError: that is so.
+        """
+        if body_frame and any(self.gravity):
+            raise ConfigError(
+                "model.simulator.features.gravity is a direction of the scene: set "
+                "model.simulator.hierarchy.body_frame=false with it."
             )
 
     @property
@@ -64,6 +90,11 @@ class FeatureOptions:
         if not self.velocities:
             return 9
         return 12 if self.rest_inputs else 6
+
+    @property
+    def node_size(self) -> int:
+        """Number of node features."""
+        return self.node_normalised + 1 + self.attributes
 
     @property
     def edge_normalised(self) -> int:

@@ -1,10 +1,14 @@
-"""The lever head: gradients that move a unit by a given shift."""
+"""The heads: from the network's output to a deformation gradient."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from gausim.ops.deformation import gradient_from_output
 
 # Levers shorter than this move by less than they are told: no gradient moves a unit on its parent [diagonals].
 SHORT = 0.03
@@ -12,6 +16,55 @@ SHORT = 0.03
 TINY = 1e-4
 # Smallest factor by which a lever is shortened along itself before the shape gives way.
 MIN_ALONG = 0.2
+
+
+OUTPUTS = 11  # two quaternions and three logarithms of stretches
+LEVER_OUTPUTS = 3
+
+
+@dataclass(frozen=True)
+class Head:
+    """How the output of the network is read.
+
+    Attributes:
+        output_scale: factor on the eleven numbers.
+        zero_output: start with zero output (identity gradients).
+        lever: three more outputs per unit move its lever by so many diagonals each, see :func:`lever_gradient`; 0
+            leaves them out.
+        anchor: take the network's outputs at rest off, so that rest is an equilibrium.
+    """
+
+    output_scale: float = 1.0
+    zero_output: bool = False
+    lever: float = 0.0
+    anchor: bool = False
+
+    @property
+    def outputs(self) -> int:
+        """Numbers per unit."""
+        return OUTPUTS + (LEVER_OUTPUTS if self.lever else 0)
+
+    def __call__(
+        self,
+        output: Float[Tensor, "N O"],
+        lever: Float[Tensor, "N 3"] | None,
+        length: Float[Tensor, "N 1"],
+        *,
+        conserve_mass: bool,
+    ) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3 3"]]:
+        """F = U diag(lambda) V^T, behind it that of the lever, and its rotation U V^T.
+
+        Args:
+            output: of the network.
+            lever: from the parent to each unit before its own gradient [scene units]; None without a lever head.
+            length: diagonal of each unit's scene [scene units].
+            conserve_mass: det F = 1.
+        """
+        gradient, rotation = gradient_from_output(output[:, :OUTPUTS] * self.output_scale, conserve_mass=conserve_mass)
+        if lever is None:
+            return gradient, rotation
+        shift = output[:, OUTPUTS:] * (self.lever * length)
+        return lever_gradient(shift, lever, length, conserve_mass=conserve_mass) @ gradient, rotation
 
 
 def lever_gradient(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -12,7 +12,7 @@ from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.units import FixedUnits, per_level
 from gausim.models.step.body_frame import Frames
 from gausim.models.step.recursion import Solved
-from gausim.models.template.template import Motion, TemplateState
+from gausim.models.template.template import PreparedTemplate
 from gausim.ops.aggregation import weighted_sum
 
 
@@ -25,7 +25,7 @@ class Prepared:
     Attributes:
         batch: what it was made for.
         mass: masses of the simulated kernels.
-        share: mass of every kernel over that of its finest predicted unit; 0 for never-simulated kernels.
+        mass_fraction: mass of every kernel over that of its finest predicted unit; 0 for never-simulated kernels.
         levels: the predicted levels, coarse to fine.
         roots: what the top level hangs on.
         template: the template of the batch.
@@ -37,24 +37,46 @@ class Prepared:
 
     batch: SceneBatch
     mass: Float[Tensor, " M"]
-    share: Float[Tensor, " K"]
+    mass_fraction: Float[Tensor, " K"]
     levels: tuple[FixedUnits, ...]
     roots: Solved
-    template: Callable[[Motion], TemplateState]
+    template: PreparedTemplate
     frames: Frames | None
     rest: Float[Tensor, "N 3"]
     still: tuple[Tensor, ...] | None
     with_gradients: bool
 
-    def aggregate(self, positions: Float[Tensor, "K 3"]) -> list[Tensor]:
-        """Centres of mass of the units of every predicted level, coarse to fine."""
-        return self.per_level(weighted_sum(positions, self.share, self.batch.finest, self.batch.levels[-1].count))
+    def aggregate(self, positions: Float[Tensor, "K 3"]) -> Float[Tensor, "N 3"]:
+        """Centres of mass of the finest predicted units."""
+        return weighted_sum(positions, self.mass_fraction, self.batch.finest, self.batch.levels[-1].count)
 
-    def units(self, positions: Float[Tensor, "K 3"]) -> list[Tensor]:
+    def finest(self, positions: Float[Tensor, "K 3"]) -> Float[Tensor, "N 3"]:
         """The same in the bodies' own axes, where these are used."""
         found = self.aggregate(positions)
-        return found if self.frames is None else [self.frames.into(i, x) for i, x in enumerate(found)]
+        return found if self.frames is None else self.frames.into(len(self.levels) - 1, found)
 
     def per_level(self, finest: Float[Tensor, "N 3"]) -> list[Tensor]:
         """Positions of every predicted level, coarse to fine: coarser units are the centres of mass of the finer."""
-        return per_level(self.batch, [level.share for level in self.levels], finest)
+        return per_level(self.batch, [level.mass_fraction for level in self.levels], finest)
+
+    def check_serves(self, batch: SceneBatch) -> None:
+        """Refuses a batch that it was not made for.
+
+        Raises:
+            ValueError: that is so, or it carries no gradients while they are enabled.
+        """
+        if self.batch is not batch or (torch.is_grad_enabled() and not self.with_gradients):
+            raise ValueError(
+                "step: `prepared` was made for another batch, or without gradients while they are enabled now. "
+                "Call prepare(batch) where step is called."
+            )
+
+    def in_scene_axes(
+        self, finest: Solved, template: Tensor | None, predicted: list[Tensor]
+    ) -> tuple[Solved, Tensor | None, list[Tensor]]:
+        """The finest level, the template's gradients and all F, in the scene's axes."""
+        frames = self.frames
+        if frames is None:
+            return finest, template, predicted
+        turned = None if template is None else frames.turned_back(len(self.levels) - 1, template)
+        return frames.back(finest, self.rest), turned, [frames.turned_back(i, f) for i, f in enumerate(predicted)]

@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -49,11 +49,29 @@ class TemplateState:
     gradients: Float[Tensor, "N 3 3"] | None
 
 
+@runtime_checkable
+class PreparedTemplate(Protocol):
+    """The template of a batch while parameters do not change."""
+
+    def __call__(self, motion: Motion) -> TemplateState:
+        """The template state at t + 1."""
+
+    def carried(self, motion: Motion) -> Motion:
+        """The part of the motion that goes on: what the network sees of both states."""
+
+    def energy(self, motion: Motion) -> Float[Tensor, " S"]:
+        """Energy of every member of the batch.
+
+        Raises:
+            NotImplementedError: the template has none.
+        """
+
+
 class Template(nn.Module, ABC):
     """Proposes the next configuration of the finest predicted level from its two latest ones.
 
     Attributes:
-        has_energy: whether what :meth:`prepare` makes has an energy, too, as :class:`PreparedScenes` has.
+        has_energy: whether what :meth:`prepare` makes has an energy, as :class:`PreparedScenes` has.
         headroom: so many times the energy that a rollout begins with is allowed in its first frames.
         is_shared: whether its parameters serve all scenes, as the network's do, or are each a scene's own.
     """
@@ -62,7 +80,7 @@ class Template(nn.Module, ABC):
     headroom = 1.0
 
     @abstractmethod
-    def prepare(self, batch: SceneBatch, units: FixedUnits) -> Callable[[Motion], TemplateState]:
+    def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
         """The template of one batch while parameters do not change: it takes the motion to the template state at t + 1.
 
         Args:
@@ -179,6 +197,19 @@ class RestTemplate(Template):
         """Takes what every template takes; the rest state needs none of it."""
         super().__init__()
 
-    def prepare(self, batch: SceneBatch, units: FixedUnits) -> Callable[[Motion], TemplateState]:
+    def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
         """Rest positions, identity gradients."""
-        return lambda motion: TemplateState(motion.rest, None)
+        return _AtRest()
+
+
+class _AtRest:
+    """Rest positions, identity gradients, no energy; the network sees all of the motion."""
+
+    def __call__(self, motion: Motion) -> TemplateState:
+        return TemplateState(motion.rest, None)
+
+    def carried(self, motion: Motion) -> Motion:
+        return motion
+
+    def energy(self, motion: Motion) -> Float[Tensor, " S"]:
+        raise NotImplementedError("the rest state has no energy")

@@ -233,7 +233,10 @@ def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
         varied.append("w/o mass")
     if simulator.get("conserve_momentum") is False:
         varied.append("w/o momentum")
-    if simulator.get("predicted_levels") == [0]:
+    hierarchy = simulator.get("hierarchy")
+    levels = hierarchy.get("levels") if isinstance(hierarchy, dict) else None
+    alone = levels[0] if isinstance(levels, list) and len(levels) == 1 else None
+    if simulator.get("predicted_levels") == [0] or (isinstance(alone, dict) and alone.get("diameter") == 0):
         varied.append("w/o hierarchy")
     ablation = run.config.get("ablation")
     name = ablation.get("name") if isinstance(ablation, dict) else None

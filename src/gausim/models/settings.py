@@ -1,0 +1,83 @@
+"""How a simulator sees its scenes and how it is rolled out: what a configuration of it states besides its parts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from gausim.core import ConfigError
+
+
+@dataclass(frozen=True)
+class HierarchySettings:
+    """Which units a scene's kernels form, and which of them are neighbours (METHOD section 1).
+
+    Attributes:
+        levels: the predicted levels, coarse to fine: `diameter` of the clusters and `edge_length` of the graph, both as
+            fractions of the object's diagonal. The last may have diameter 0: the kernels themselves. That one alone is
+            "without hierarchy".
+        clustering: as in :func:`gausim.models.hierarchy.clusters.build_hierarchy`.
+        max_neighbours: edges per unit.
+        edges: neighbours in ``rest`` space, in the ``current`` state, or the ``union`` / ``intersection`` of both.
+        edge_bucket: fill the edges of a level up to a multiple of this with edges of a dummy node, so that their number
+            seldom changes; 0 does not. In evaluation mode on CUDA it never changes.
+        share_network: one network serves every predicted level; else each has its own (normalisers are shared).
+        body_frame: work in the body's own axes, so that a scene that is turned or moved moves likewise.
+
+    Raises:
+        ConfigError: no level, an unknown key, or diameters that do not fall.
+    """
+
+    levels: Sequence[Mapping[str, float]] = (
+        {"diameter": 0.35, "edge_length": 2.0},
+        {"diameter": 0.1, "edge_length": 0.4},
+    )
+    clustering: str = "agglomerative"
+    max_neighbours: int = 16
+    edges: str = "union"
+    edge_bucket: int = 0
+    share_network: bool = True
+    body_frame: bool = False
+
+    def __post_init__(self) -> None:
+        """Checks the levels."""
+        if not self.levels or any(set(level) != {"diameter", "edge_length"} for level in self.levels):
+            raise ConfigError(
+                "model.simulator.hierarchy.levels: expected at least one {diameter, edge_length}, got "
+                f"{[dict(level) for level in self.levels]}."
+            )
+        found = [float(level["diameter"]) for level in self.levels]
+        if found != sorted(set(found), reverse=True) or found[-1] < 0:
+            raise ConfigError(
+                f"model.simulator.hierarchy.levels: expected falling diameters, coarse to fine, got {found}."
+            )
+
+    @property
+    def diameters(self) -> tuple[float, ...]:
+        """Cluster diameters of levels 1..L of the hierarchy, fine to coarse [fractions of the diagonal]."""
+        return tuple(float(level["diameter"]) for level in reversed(self.levels) if level["diameter"])
+
+    @property
+    def predicted(self) -> tuple[int, ...]:
+        """Levels of the hierarchy whose gradients are predicted, coarse to fine; 0 is that of the kernels."""
+        first = len(self.diameters)
+        return tuple(first - position for position in range(len(self.levels)))
+
+    @property
+    def edge_lengths(self) -> tuple[float, ...]:
+        """Largest edge length per predicted level, coarse to fine [fractions of the diagonal]."""
+        return tuple(float(level["edge_length"]) for level in self.levels)
+
+
+@dataclass(frozen=True)
+class RolloutSettings:
+    """How predictions without gradients are made.
+
+    Attributes:
+        cuda_graph: on a CUDA device the step is replayed as one graph; of no effect elsewhere.
+        energy_guard_frames: the network may not raise the template's energy beyond the largest of so many frames before
+            (:class:`gausim.models.rollout.energy_guard.EnergyGuard`); 0, or a template without energy: no limit.
+    """
+
+    cuda_graph: bool = False
+    energy_guard_frames: int = 0

@@ -1,0 +1,111 @@
+"""What the network predicts: a deformation gradient for every unit of a level (METHOD sections 2 and 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gausim.models.hierarchy.batch import LevelBatch
+from gausim.models.hierarchy.edges import EdgeSet, fill, fill_edges
+from gausim.models.step.features import FeatureOptions, network_inputs
+from gausim.models.step.head import Head
+from gausim.models.step.recursion import Solved, Units
+from gausim.nn.mlp import zero_output as initialise_zero
+from gausim.nn.normaliser import RunningNormaliser, gathering_nothing
+
+
+class GradientPredictor(nn.Module):
+    """F of every unit from its own state, that of its parent and of its neighbours.
+
+    Attributes:
+        features: what the network sees.
+        edges: of which neighbours.
+        head: how its output is read.
+    """
+
+    gravity: Tensor
+
+    def __init__(
+        self,
+        *,
+        networks: int,
+        features: FeatureOptions,
+        network: Callable[..., nn.Module],
+        head: Head,
+        edges: EdgeSet,
+        conserve_mass: bool,
+    ) -> None:
+        """Builds the networks and the normalisers of their inputs.
+
+        Args:
+            networks: one for all predicted levels, or as many as there are.
+            features: what is seen of units and edges.
+            network: called with node_features=, edge_features= and outputs=.
+            head: how the output is read.
+            edges: which neighbours are seen.
+            conserve_mass: det F = 1.
+        """
+        super().__init__()
+        self.features, self.edges, self.head, self._conserve_mass = features, edges, head, conserve_mass
+        gravity = torch.tensor([float(g) for g in features.gravity])
+        self.register_buffer("gravity", gravity, persistent=False)
+        self.node_normaliser = RunningNormaliser(features.node_normalised, floor=features.normaliser_floor)
+        self.edge_normaliser = RunningNormaliser(features.edge_normalised, floor=features.normaliser_floor)
+        sizes = {"node_features": features.node_size, "edge_features": features.edge_size, "outputs": head.outputs}
+        made = [network(**sizes) for _ in range(networks)]
+        for one in made if head.zero_output else ():
+            initialise_zero(cast(nn.Sequential, one.decoder))
+        self.network: nn.Module = made[0] if networks == 1 else nn.ModuleList(made)
+
+    def freeze_statistics(self) -> None:
+        """The statistics of the inputs gather nothing more."""
+        self.node_normaliser.frozen = self.edge_normaliser.frozen = True
+
+    def gathering_nothing(self) -> AbstractContextManager[None]:
+        """A block whose inputs do not count for the statistics."""
+        return gathering_nothing([self.node_normaliser, self.edge_normaliser])
+
+    def forward(
+        self, level: LevelBatch, unit: Units, above: Solved, target: Float[Tensor, "N 3"], position: int
+    ) -> Float[Tensor, "N O"]:
+        """The network's raw output for each unit of the level at ``position``, coarse to fine.
+
+        Args:
+            level: the graph.
+            unit: its units.
+            above: their solved parents.
+            target: template positions [scene units].
+            position: of the level.
+        """
+        network = self.network[position] if isinstance(self.network, nn.ModuleList) else self.network
+        coarse = self.features.coarse_inputs and position > 0
+        fixed = self._fixes_shapes(unit.now)
+        edge_index = (self.edges.fixed if fixed else self.edges.of)(level, unit.now)
+        # Edges of the dummy node stand behind all others; their features are never seen, those of any node will do.
+        present = edge_index.clamp_max(level.count - 1) if fixed else edge_index
+        nodes, edges = network_inputs(
+            unit, target, above, present, level.length, level.dt, self.gravity, self.features, coarse=coarse
+        )
+        nodes, edges = self.node_normaliser(nodes), self.edge_normaliser(edges)
+        extra = self.edges.missing(edge_index.shape[1])
+        if fixed or self.edges.bucket:
+            nodes, edges = fill(nodes, 1), fill(edges, extra)
+            edge_index = fill_edges(edge_index, level.count, extra)
+        output: Tensor = network(nodes, edges, edge_index)[: level.count]
+        return output
+
+    def gradient(
+        self, output: Float[Tensor, "N O"], level: LevelBatch, above: Solved, target: Float[Tensor, "N 3"]
+    ) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3 3"]]:
+        """F and its rotation of each unit; the identity where the output is zero."""
+        lever = above.carry(target) - above.after.index_select(0, above.index) if self.head.lever else None
+        return self.head(output, lever, level.length, conserve_mass=self._conserve_mass)
+
+    def _fixes_shapes(self, positions: Tensor) -> bool:
+        """Whether the number of edges must not depend on the state: where steps may be captured in a CUDA graph."""
+        return self.edges.rule != "rest" and positions.device.type == "cuda" and not self.training

@@ -1,0 +1,165 @@
+"""What a simulator of scenes has besides its step: its scenes as units, and what of it is whose."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from gausim.core import ConfigError, GaussianScene, SimState, SmoothMotions
+from gausim.models.hierarchy.batch import BatchBuilder, GraphOptions, SceneBatch
+from gausim.models.hierarchy.clusters import build_hierarchy
+from gausim.models.settings import HierarchySettings
+from gausim.models.step.body_frame import Frames, body_axes
+from gausim.models.step.predictor import GradientPredictor
+from gausim.models.step.prepared import Prepared
+from gausim.models.template.smooth import smooth_motions
+from gausim.models.template.template import Motion, Template
+
+
+class SceneModel(nn.Module, ABC):
+    """The scenes, their hierarchies, densities and attributes; a subclass adds the template, the predictor and a step.
+
+    Attributes:
+        scenes: the rest scenes.
+        fps: frames per second of each.
+        hierarchies: the units of each.
+        predicted_levels: which levels of them are predicted, coarse to fine.
+    """
+
+    axes: Tensor
+    origins: Tensor
+    template: Template
+    predictor: GradientPredictor
+
+    def __init__(
+        self, scenes: Sequence[GaussianScene], fps: Sequence[float], settings: HierarchySettings, attributes: int
+    ) -> None:
+        """Builds the units.
+
+        Raises:
+            ConfigError: no scene, or not one frame rate per scene.
+            SceneError: a scene has nothing pinned, or nothing else.
+        """
+        super().__init__()
+        if not scenes or len(scenes) != len(fps):
+            raise ConfigError(
+                f"{len(scenes)} scenes and {len(fps)} frame rates given; expected one rate per scene, at least one."
+            )
+        self.scenes, self.fps = tuple(scenes), tuple(fps)
+        self.predicted_levels, self._in_body_frame = settings.predicted, settings.body_frame
+        self.body_axes = [body_axes(s) if settings.body_frame else np.eye(3) for s in scenes]
+        self.hierarchies = tuple(
+            build_hierarchy(
+                scene, radii=settings.diameters, clustering=settings.clustering,
+                axes=own if settings.body_frame else None,
+            )
+            for scene, own in zip(scenes, self.body_axes, strict=True)
+        )  # fmt: skip
+        graph = GraphOptions(settings.edge_lengths, settings.max_neighbours)
+        self._builder = BatchBuilder(self.scenes, self.hierarchies, self.fps, self.predicted_levels, graph)
+        self._batches: dict[tuple[tuple[int, ...], torch.device], SceneBatch] = {}
+        origins = [s.means.mean(0) if settings.body_frame else torch.zeros(3) for s in scenes]
+        self.register_buffer("axes", torch.from_numpy(np.stack(self.body_axes)).to(scenes[0].means), persistent=False)
+        self.register_buffer("origins", torch.stack(origins).to(scenes[0].means), persistent=False)
+        counts = [h.levels[0].count for h in self.hierarchies]
+        self.log_density = nn.ParameterList(torch.zeros(n) for n in counts)
+        self.attributes = nn.ParameterList(torch.zeros(n, attributes) for n in counts)
+
+    @abstractmethod
+    def prepare(self, batch: SceneBatch) -> Prepared:
+        """What steps of this batch have in common as long as no parameter changes."""
+
+    def batch(self, scene_ids: Sequence[int]) -> SceneBatch:
+        """The disjoint union for one sequence of each of these scenes (cached)."""
+        device = self.log_density[0].device
+        key = (tuple(scene_ids), device)
+        if key not in self._batches:
+            self._batches[key] = self._builder.build(key[0], device)
+        return self._batches[key]
+
+    def frames(self, batch: SceneBatch) -> Frames | None:
+        """The bodies' own axes for every unit of a batch; None where the scene's are used."""
+        return Frames.of(batch, self.axes, self.origins) if self._in_body_frame else None
+
+    def units_of_kernels(self, scene_id: int) -> tuple[Int[Tensor, " K"], ...]:
+        """The unit of every kernel of the scene at levels 1..L; -1 for kernels that are never simulated."""
+        hierarchy, count = self.hierarchies[scene_id], self.scenes[scene_id].count
+        none = torch.full((count,), -1)
+        levels = range(1, len(hierarchy.levels))
+        return tuple(none.index_copy(0, hierarchy.kernels, hierarchy.ancestor(0, level)) for level in levels)
+
+    def masses(self, batch: SceneBatch) -> tuple[Float[Tensor, " M"], Float[Tensor, " M"]]:
+        """Masses m = exp(r) V of the simulated kernels, and r."""
+        log_density = torch.cat([self.log_density[i] for i in batch.scene_ids])
+        return log_density.exp() * batch.volume, log_density
+
+    def pushed(self, prepared: Prepared, state: SimState, force: Float[Tensor, "K 3"]) -> SimState:
+        """The state that a force makes of a state: f dt^2 / (2 m) further, pinned kernels where they are."""
+        batch = prepared.batch
+        shift = force.index_select(0, batch.simulated) * batch.dt**2 / (2 * prepared.mass[:, None])
+        shift = torch.where(batch.pinned[:, None], torch.zeros_like(shift), shift)
+        return SimState(state.positions.index_add(0, batch.simulated, shift), state.previous)
+
+    @property
+    def knows_energy(self) -> bool:
+        """Whether the template has an energy."""
+        return self.template.has_energy
+
+    def energy(self, batch: SceneBatch, state: SimState, prepared: Prepared | None = None) -> Float[Tensor, " S"]:
+        """Energy of every member of the batch in the template's terms, up to a factor per scene.
+
+        Raises:
+            NotImplementedError: the template has none.
+        """
+        prepared = self.prepare(batch) if prepared is None else prepared
+        now, before = prepared.finest(state.positions), prepared.finest(state.previous)
+        return prepared.template.energy(Motion(prepared.levels[-1].rest, now, before))
+
+    def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
+        """How far the template has left the body of a scene; None where it learns no body."""
+        return self.template.mixing(scene_id)
+
+    def smooth_motions(self, scene_id: int) -> SmoothMotions | None:
+        """The motions of a scene that the template can carry; None where it carries none."""
+        motions = self.template.basis(scene_id)
+        if motions is None:
+            return None
+        modes, gradients, sizes = motions
+        axes = self.axes[scene_id].to(modes)
+        modes = torch.einsum("ba,nbm->nam", axes, modes)
+        gradients = torch.einsum("ca,ncdm,db->nabm", axes, gradients, axes)
+        own = modes, gradients, sizes
+        return smooth_motions(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], own)
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by role: networks, per-scene densities and attributes, and the rest of the template."""
+        networks = self.template.networks()
+        known = {id(p) for p in networks}
+        return {
+            "network": [*self.predictor.parameters(), *networks],
+            "scene": [*self.log_density, *self.attributes],
+            "template": [p for p in self.template.parameters() if id(p) not in known],
+        }
+
+    def shared(self) -> dict[str, nn.Module]:
+        """What all scenes have in common, by name: the predictor with its statistics, a shared template."""
+        return {"predictor": self.predictor, **({"template": self.template} if self.template.is_shared else {})}
+
+    def own(self, scene_id: int) -> tuple[str, ...]:
+        """What a scene has of its own: prefixes of names in the state dict."""
+        return f"log_density.{scene_id}", f"attributes.{scene_id}", *self.template.own(scene_id, "template.")
+
+    def freeze(self, *, scenes: bool = False) -> None:
+        """Keeps what :meth:`shared` names as it is: its weights do not learn, its statistics gather nothing more.
+
+        Args:
+            scenes: keep what the scenes have of their own, too.
+        """
+        for module in (self,) if scenes else self.shared().values():
+            module.requires_grad_(False)
+        self.predictor.freeze_statistics()
