@@ -75,6 +75,6 @@ def test_pushes_draws_and_resets(run) -> None:
 def test_it_is_the_rollout_where_nothing_acts(run, tmp_path: Path) -> None:
     sim = gausim.load(run.run_dir, sequence="seq_001")
     sim.step(10)
-    whole = run.module.foresee(1, 10)
+    whole = run.module.predict(1, 10)
     assert torch.equal(sim.trajectory.positions, whole.positions)
     save_scene(sim.interaction.scene, tmp_path / "s.ply")

@@ -26,11 +26,11 @@ def run(tmp_path, monkeypatch):
 
     model = SimpleNamespace(scenes=[toy.scene], dynamics=lambda scene_id: SimpleNamespace(rollout=rollout))
 
-    def foresee(sequence, steps):
+    def predict(sequence, steps):
         return rollout(SimState(toy.scene.means, initial.previous(sequence)), steps)
 
     module = SimpleNamespace(
-        model=model, simulator=model, initial_states=initial, foresee=foresee, method_name="gausim", footnotes=None
+        model=model, simulator=model, initial_states=initial, predict=predict, method_name="gausim", footnotes=None
     )
     directory = tmp_path / "run"
     directory.mkdir()

@@ -37,7 +37,7 @@ def test_a_trajectory_and_ply_files_come_back_bit_for_bit(run, tmp_path: Path, c
     options = ["--sequence", "seq_001", "--frames", "6"]
     assert export.main([source, "--format", "safetensors", *options]) == 0
     assert "wrote toy_seq_001.safetensors: 6 frames of 36 kernels at 24 frames" in capsys.readouterr().out
-    trajectory, whole = load_trajectory("toy_seq_001.safetensors"), run.module.foresee(1, 5)
+    trajectory, whole = load_trajectory("toy_seq_001.safetensors"), run.module.predict(1, 5)
     for name in ("positions", "gradients", "rotations", "unit_of_kernel"):
         assert torch.equal(getattr(trajectory, name), getattr(whole, name))
 
@@ -65,7 +65,7 @@ def test_usd_and_back(run) -> None:
     assert export.main([str(run.run_dir), "--format", "usd", "--frames", "4", "--out", "m.usdc"]) == 0
     assert export.main(["m.usdc", "--format", "ply", "--out", "p"]) == 0
     scenes, count, fps = load_ply_sequence("p")
-    whole = run.module.foresee(0, 3)
+    whole = run.module.predict(0, 3)
     assert count == 4 and fps == 24.0
     for scene, positions in zip(scenes, whole.positions, strict=True):
         assert torch.equal(scene.means, positions)
@@ -82,7 +82,7 @@ def test_pictures(run) -> None:
     # A trajectory's frames are drawn as the run draws them: deformed scenes are the same Gaussians.
     from gausim.render.draw import film
 
-    whole, record = run.module.foresee(0, 4), run.objects[0].sequences[0]
+    whole, record = run.module.predict(0, 4), run.objects[0].sequences[0]
     expected = film(run.renderer, run.module.model.scenes[0], whole, record.cameras_of(["cam_1"]))[:, 0].numpy()
     assert abs(shown[4].astype(int) - expected[4].astype(int)).mean() < 3
     assert export.main([source, "--format", "ply", "--frames", "3", "--out", "p"]) == 0

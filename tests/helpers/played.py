@@ -31,14 +31,14 @@ def played_run(folder: Path) -> SimpleNamespace:
         for number, velocity in enumerate(states.velocity):
             velocity[0] = 0.05 * (number + 1)
 
-    def foresee(sequence: int, steps: int):
+    def predict(sequence: int, steps: int):
         from gausim.core import SimState
 
         with torch.no_grad():
             return SceneDynamics(model).rollout(SimState(toy.scene.means, states.previous(sequence)), steps)
 
     module = SimpleNamespace(
-        model=model, simulator=model, initial_states=states, foresee=foresee, method_name="gausim", footnotes=None
+        model=model, simulator=model, initial_states=states, predict=predict, method_name="gausim", footnotes=None
     )
     directory = folder / "demo" / "seed_0"
     directory.mkdir(parents=True)

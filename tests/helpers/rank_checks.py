@@ -58,7 +58,7 @@ def real_module(objective: Objective, dtype: torch.dtype, settings: OptimizerSet
         renderer=ReferenceRenderer(),
         objective=objective,
         optimizer=settings,
-        share_every=1,
+        fraction_every=1,
     )
     return module.to(dtype)
 
@@ -97,7 +97,7 @@ def train(options: dict[str, Any]) -> dict[str, Any]:
         "statistics": {n: b.double().flatten().tolist() for n, b in module.named_buffers() if "normaliser" in n},
         "weights": digest(dict(module.state_dict())),
         "average": digest(module.average.state_dict()),
-        "yards": sorted(module.yardsticks.state_dict()),
+        "baselines": sorted(module.baselines.state_dict()),
     }
 
 

@@ -16,7 +16,7 @@ from gausim.cli import train as command
 from gausim.compose.build import load_run
 from gausim.core import ConfigError, RunError
 from gausim.runs.checkpoint import read_checkpoint
-from gausim.training.callbacks.convergence import Convergence, foresee_frames, verdict
+from gausim.training.callbacks.convergence import Convergence, forecast, verdict
 
 TINY = (
     "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
@@ -114,13 +114,13 @@ def test_the_forecast_is_one_for_a_still_object_and_none_for_the_truth(toy: Path
     for p in module.initial_states.parameters():
         p.data.zero_()
     silence(module.model)  # nothing moves a body at rest
-    still = foresee_frames(module, samples, 2)
+    still = forecast(module, samples, 2)
     assert still.error == pytest.approx(1.0, abs=1e-3) and 0.1 < still.moving < 1.0
     frames = [s.frames for s in samples]
     for sample, own in zip(samples, frames, strict=True):
         object.__setattr__(sample, "frames", own[:1].expand_as(own))
-    module.yardsticks._known.clear()
-    assert foresee_frames(module, samples, 2).moving == pytest.approx(0.0, abs=1e-6)
+    module.baselines._known.clear()
+    assert forecast(module, samples, 2).moving == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(

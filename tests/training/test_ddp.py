@@ -49,11 +49,11 @@ def distance(found: dict[str, Any], expected: dict[str, Any]) -> float:
 
 def assert_as_one(found: list[Any], alone: Any, tolerance: float, rounding: float = 1e-4) -> None:
     assert all(isinstance(answer, dict) for answer in (*found, alone)), (found, alone)
-    for name in ("weights", "average", "stats", "statistics", "yards"):
+    for name in ("weights", "average", "stats", "statistics", "baselines"):
         assert all(rank[name] == found[0][name] for rank in found), f"{name} differ between ranks"
     assert distance(found[0]["grads"], alone["grads"]) <= tolerance
     assert distance(found[0]["statistics"], alone["statistics"]) <= tolerance
-    assert found[0]["yards"] == alone["yards"]
+    assert found[0]["baselines"] == alone["baselines"]
     for mine, theirs in zip(found[0]["stats"], alone["stats"], strict=True):
         assert mine == pytest.approx(theirs, rel=rounding, abs=1e-12)
 

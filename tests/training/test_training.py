@@ -237,7 +237,7 @@ def test_mixing_counts_in_units_of_the_rest_states_loss() -> None:
         found.append((module, {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}))
     (_, without), (module, with_it) = found
     mixing = module.model.mixing(0)
-    scored = module.yardsticks.of(sample(0), module.simulator.scenes[0].means).static
+    scored = module.baselines.of(sample(0), module.simulator.scenes[0].means).static
     names = [n for n in with_it if "mixing" in n]
     expected = torch.autograd.grad(0.5 * sum(scored) / len(scored) * mixing, [module.get_parameter(n) for n in names])
     assert len(names) == 3 and all(float(e.abs().max()) > 0 for e in expected)

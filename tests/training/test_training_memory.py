@@ -31,7 +31,7 @@ def real_module(objective: Objective) -> GausSimModule:
     )
     return GausSimModule(
         model=model, initial_states=FreeInitialStates(model, [0]), scene_of_sequence=[0], renderer=blobs,
-        objective=objective, optimizer=OptimizerSettings(), share_every=0,
+        objective=objective, optimizer=OptimizerSettings(), fraction_every=0,
     )  # fmt: skip
 
 
@@ -186,11 +186,11 @@ def test_the_device_is_not_waited_for(backprop_steps: int) -> None:
     torch.cuda.set_sync_debug_mode("error")
     try:
         optimizer.zero_grad(set_to_none=True)
-        tally = module._rollout(samples, facts, draws)
+        statistics = module._rollout(samples, facts, draws)
         norms = module.settings.clip(optimizer)
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    assert len(tally.fetch(norms).numbers(facts, 3.0).images) == 3
+    assert len(statistics.fetch(norms).numbers(facts, 3.0).images) == 3
 
 
 @pytest.mark.gpu

@@ -1,4 +1,4 @@
-"""What the machine can do at best, measured in the same run: the yardsticks of every share of a peak."""
+"""What the machine can do at best, measured in the same run: what every fraction of a peak is of."""
 
 # Annotations would be checked by beartype in the tests, around a function that numba has to compile.
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"

@@ -113,13 +113,13 @@ def takes_of(made: Playable, beside: Playable | None, frames: int | None) -> lis
     for record in made.item.data.sequences:
         second = None
         if beside is not None and beside.predict is not None and record.name in other:
-            second = partial(_foreseen, beside.predict, other[record.name], frames)
-        first = partial(_foreseen, made.predict, record, frames)
+            second = partial(_predicted, beside.predict, other[record.name], frames)
+        first = partial(_predicted, made.predict, record, frames)
         takes.append(Take(f"Predicted: {record.name}", first, record.name, second))
     return takes
 
 
-def _foreseen(predict: TrainedPrediction, record: Any, frames: int | None) -> Trajectory:
+def _predicted(predict: TrainedPrediction, record: Any, frames: int | None) -> Trajectory:
     from gausim.compose.predict import head
 
     return head(predict.full(record), frames or record.count)

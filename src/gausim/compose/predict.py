@@ -130,7 +130,7 @@ class TrainedPrediction:
         """All predicted frames of a sequence, the recorded ones and those asked for beyond."""
         if record.name not in self._known:
             steps = max(record.count, self._frames) - 1
-            self._known[record.name] = self._run.module.foresee(self._ids[record.name], steps)
+            self._known[record.name] = self._run.module.predict(self._ids[record.name], steps)
         return self._known[record.name]
 
     def __call__(self, record: SequenceRecord) -> Trajectory:

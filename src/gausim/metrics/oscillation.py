@@ -1,7 +1,7 @@
 """How a prediction oscillates beside the truth: frequencies, damping, spectrum and phase in the truth's own modes.
 
 Motions are looked at in the principal motions of the true displacements: the few orthogonal shapes that hold most of
-their squared size. A shape seldom is one vibration mode, but it is the same yardstick for all predictions.
+their squared size. A shape seldom is one vibration mode, but it is the same measure for all predictions.
 """
 
 from __future__ import annotations

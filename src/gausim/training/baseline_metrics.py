@@ -1,4 +1,4 @@
-"""What the static prediction scores on each training sequence and how much the truth moves: yardsticks of training."""
+"""What the static prediction scores on each training sequence and how much the truth moves."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gausim.training.supervision.images import Supervision
 
 
 @dataclass
-class Yardstick:
+class SequenceBaseline:
     """Constants of one sequence, as far as its frames have been seen.
 
     Attributes:
@@ -32,17 +32,17 @@ def excess(loss: float, static: float, floor: float) -> float:
     return (loss - floor) / max(static - floor, 1e-3 * static, 1e-12)
 
 
-class Yardsticks:
+class Baselines:
     """Measures each sequence once; later batches look the numbers up."""
 
     def __init__(self, supervision: Supervision) -> None:
         """Keeps what measures."""
         self._supervision = supervision
-        self._known: dict[int, Yardstick] = {}
+        self._known: dict[int, SequenceBaseline] = {}
 
-    def of(self, sample: SequenceSample, rest: Tensor) -> Yardstick:
-        """The yardstick of a sample's sequence, for at least the sample's frames; ``rest`` is its scene's."""
-        known = self._known.setdefault(sample.sequence_id, Yardstick())
+    def of(self, sample: SequenceSample, rest: Tensor) -> SequenceBaseline:
+        """The baseline of a sample's sequence, for at least the sample's frames; ``rest`` is its scene's."""
+        known = self._known.setdefault(sample.sequence_id, SequenceBaseline())
         seen = len(known.static)
         if seen < sample.steps:
             losses, motion = self._supervision.static(sample, rest, seen)
@@ -52,9 +52,9 @@ class Yardsticks:
             known.motion += motion
         return known
 
-    def learn(self, sequences: Sequence[int], yards: Sequence[Yardstick]) -> None:
+    def learn(self, sequences: Sequence[int], baselines: Sequence[SequenceBaseline]) -> None:
         """Takes what the ranks found, so that each knows what one rank alone would."""
-        self._known.update(zip(sequences, yards, strict=True))
+        self._known.update(zip(sequences, baselines, strict=True))
 
     def state_dict(self) -> dict[int, dict[str, Any]]:
         """What is known of each sequence: measured with other frames at once, the last bits would differ."""
@@ -62,4 +62,4 @@ class Yardsticks:
 
     def load_state_dict(self, state: dict[int, dict[str, Any]]) -> None:
         """Continues with what ``state`` knew."""
-        self._known = {sequence: Yardstick(**known) for sequence, known in state.items()}
+        self._known = {sequence: SequenceBaseline(**known) for sequence, known in state.items()}

@@ -10,11 +10,11 @@ from torch.nn import Parameter
 
 from gausim.nn.normaliser import normalisers_of
 from gausim.training.ranks.ranks import Ranks
-from gausim.training.statistics import Tally
+from gausim.training.statistics import Statistics
 
 
 class Exchange:
-    """Makes the shares of the ranks the step of one rank; for a rank that is alone, it only keeps the statistics."""
+    """Makes the parts of the ranks the step of one rank; for a rank that is alone, it only keeps the statistics."""
 
     def __init__(self, ranks: Ranks, model: nn.Module) -> None:
         """Looks for the model's running statistics."""
@@ -27,27 +27,27 @@ class Exchange:
         return all(float(normaliser.count) for normaliser in self._normalisers)
 
     @torch.no_grad()
-    def step(self, weights: Sequence[Parameter], network: Sequence[Parameter], tally: Tally) -> None:
+    def step(self, weights: Sequence[Parameter], network: Sequence[Parameter], statistics: Statistics) -> None:
         """Adds gradients and what normalisers gathered; a weight that is in no rank's sequences keeps no gradient.
 
         Args:
             weights: all that learn, in the same order on all ranks.
             network: those whose pulls are compared.
-            tally: of this rank; its pulls become those of all sequences, and their share is formed.
+            statistics: of this rank; its pulls become those of all sequences, and their ratio is formed.
         """
         if self._ranks.size > 1:
             gathered = self._gathered()
             pull = weights[0].new_zeros(sum(p.numel() for p in network))
-            mine: list[Tensor | None] = [*(p.grad for p in weights), *gathered, *(tally.pulls or (None, None))]
+            mine: list[Tensor | None] = [*(p.grad for p in weights), *gathered, *(statistics.pulls or (None, None))]
             total = self._ranks.add(mine, [*weights, *gathered, pull, pull])
             for weight, gradient in zip(weights, total, strict=False):
                 weight.grad = gradient
             _assign(gathered, total[len(weights) : -2])
             images, momentum = total[-2:]
-            tally.pulls = None if images is None or momentum is None else (images, momentum)
-        if tally.pulls is not None:
-            by_images, by_momentum = (pull.norm() for pull in tally.pulls)
-            tally.share = by_momentum / (by_images + by_momentum).clamp_min(1e-30)
+            statistics.pulls = None if images is None or momentum is None else (images, momentum)
+        if statistics.pulls is not None:
+            by_images, by_momentum = (pull.norm() for pull in statistics.pulls)
+            statistics.gradient_fraction = by_momentum / (by_images + by_momentum).clamp_min(1e-30)
 
     @torch.no_grad()
     def statistics(self) -> None:

@@ -23,18 +23,18 @@ from gausim.render.draw import draw
 from gausim.runs.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes, fingerprints
 from gausim.runs.cost import TrainingCost
 from gausim.runs.renamed import with_present_weights
-from gausim.training.baseline_metrics import Yardsticks
+from gausim.training.baseline_metrics import Baselines
 from gausim.training.contracts import InitialVelocities, Mixing, SceneBatch, Simulator
 from gausim.training.exchange import Exchange
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.passivity import FreeMotion
 from gausim.training.ranks.ranks import Ranks, interleave
 from gausim.training.rollout import Explosions, States, UnitNoise, after, describe, windows
-from gausim.training.statistics import Found, Tally
+from gausim.training.statistics import Found, Statistics
 from gausim.training.supervision.images import ImageSupervision, Supervision
 from gausim.training.supervision.motion_tracks import TrackSupervision
 
-# Below this share of the true motion energy a prediction counts as collapsed to the rest state.
+# Below this fraction of the true motion energy a prediction counts as collapsed to the rest state.
 COLLAPSED = 0.05
 # Optimiser steps before a collapse is worth a warning: initial states begin at rest, so every run begins static.
 COLLAPSE_AFTER = 100
@@ -46,7 +46,7 @@ class GausSimModule(LightningModule):
     """Trains a simulator: rollout as one graph, drawing, losses, one optimiser step per batch.
 
     Backward runs after every stretch through which gradients flow, so that memory does not grow with T. Under several
-    ranks each computes its share of the sequences; the sums of gradients, statistics and numbers over the ranks are
+    ranks each computes its part of the sequences; the sums of gradients, statistics and numbers over the ranks are
     those of one rank that computes them all.
     """
 
@@ -61,7 +61,7 @@ class GausSimModule(LightningModule):
         optimizer: OptimizerSettings | None = None,
         supervision: Supervision | None = None,
         seed: int = 0,
-        share_every: int = 50,
+        fraction_every: int = 50,
     ) -> None:
         """Takes everything it works with; it builds nothing.
 
@@ -74,7 +74,7 @@ class GausSimModule(LightningModule):
             optimizer: who learns how fast; METHOD's when None.
             supervision: what predictions are compared with; the images when None.
             seed: of the static loss's draws and the input noise, together with the step's number.
-            share_every: optimiser steps between measurements of the momentum loss's share of the gradient; 0 is never.
+            fraction_every: optimiser steps between measurements of how much of the gradient is of momentum; 0 is never.
 
         Raises:
             ConfigError: the initial states do not fit the sequences.
@@ -85,7 +85,7 @@ class GausSimModule(LightningModule):
         self.objective = objective if objective is not None else Objective()
         self.settings = optimizer if optimizer is not None else OptimizerSettings()
         self.scene_of_sequence = tuple(scene_of_sequence)
-        self.seed, self.share_every = seed, share_every
+        self.seed, self.fraction_every = seed, fraction_every
         count = len(self.scene_of_sequence)
         if initial_states is not None and (own := len(list(initial_states.parameters()))) != count:
             raise ConfigError(f"initial states: {own} parameters for {count} sequences; expected one each.")
@@ -93,7 +93,7 @@ class GausSimModule(LightningModule):
         self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
         self.images = ImageSupervision(self.simulator.scenes, renderer, self.objective.image)
         self.supervision = self.images if supervision is None else supervision
-        self.yardsticks = Yardsticks(self.supervision)
+        self.baselines = Baselines(self.supervision)
         self.average = WeightAverage(self.settings.ema_decay)
         self.summary: dict[str, float] = {}
         self.last_stats: dict[str, float] = {}
@@ -161,7 +161,7 @@ class GausSimModule(LightningModule):
         """One step of the optimiser with all losses; works without a trainer, too.
 
         Args:
-            samples: this rank's share of the batch; it may be empty where there are several.
+            samples: this rank's part of the batch; it may be empty where there are several.
             optimizer: from :meth:`configure_optimizers`.
             draws: of the static loss and the input noise.
             advance: makes the optimiser's step; its own ``step`` when None.
@@ -175,12 +175,12 @@ class GausSimModule(LightningModule):
         optimizer.zero_grad(set_to_none=True)
         whole = interleave(self.ranks.gather([sample.facts for sample in samples]))
         self._prime(samples)
-        tally = self._rollout(samples, whole, draws)
-        self._static(samples, whole, draws, tally)
+        statistics = self._rollout(samples, whole, draws)
+        self._static(samples, whole, draws, statistics)
         self._unmix(samples, len(whole))
         weights = [p for p in self.parameters() if p.requires_grad]
-        self._exchange.step(weights, self._network(), tally)
-        stats = self._read(samples, whole, tally.fetch(self.settings.clip(optimizer)))
+        self._exchange.step(weights, self._network(), statistics)
+        stats = self._read(samples, whole, statistics.fetch(self.settings.clip(optimizer)))
         self._exchange.absorb()
         (advance or optimizer.step)()
         self.average.update(self)
@@ -211,19 +211,19 @@ class GausSimModule(LightningModule):
         done = min(max(done, self.time_fraction * epochs), self.progress_limit * epochs)
         return self.settings.set_rates(optimizer.optimizer, done, epochs)
 
-    def _rollout(self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator) -> Tally:
+    def _rollout(self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator) -> Statistics:
         steps = whole[0].steps
         if any(s.steps != steps for s in whole):
             raise ConfigError(f"a batch needs sequences of equal length, got {[s.steps for s in whole]} steps.")
         batch = self.simulator.batch([s.scene_id for s in samples]) if samples else None
-        tally, length = Tally(), self.objective.window(steps)
+        statistics, length = Statistics(), self.objective.window(steps)
         device = next(self.parameters()).device
         explosions = Explosions(batch, self.diagonals, whole, self.objective.explosion, ranks=self.ranks,
                                 deferred=device if self._defers(device) else None)  # fmt: skip
         free, unit = self.free_motion.chosen(draws), self._momentum_unit(samples)
         if batch is None:  # hears where the others' rollout ends
-            any(explosions.end(None, start, tally.reach) for start in range(0, steps, length))
-            return tally
+            any(explosions.end(None, start, statistics.reach) for start in range(0, steps, length))
+            return statistics
         comparison = self.supervision.comparison(samples, batch)
         starts: list[Callable[[SimState], SimState]] = [explosions.restart, *self._noise(batch, draws)]
         initial, kept = self.initial(samples, batch), self.objective.checkpoint_steps
@@ -231,19 +231,19 @@ class GausSimModule(LightningModule):
         own, last = torch.zeros(len(samples), device=device), initial
         for start, made in windows(self.simulator, batch, initial, steps, length, starts, checkpoint=kept):
             states = States.of(made)
-            if explosions.end(states.positions, start, tally.reach):
+            if explosions.end(states.positions, start, statistics.reach):
                 break
             losses, motion = comparison(explosions.spared(states), start)
-            tally.motion.append(motion)
+            statistics.motion.append(motion)
             momentum = explosions.counted(torch.stack([step.momentum for step in made]))
-            self._descend(explosions.counted(losses), unit * momentum, per, tally, measure=start == 0)
+            self._descend(explosions.counted(losses), unit * momentum, per, statistics, measure=start == 0)
             own = own + per * explosions.counted(losses).detach().sum(0)
             last = after(made, last)
         else:
             if free is not None:
                 state = explosions.restart(last)
-                tally.growth = self.free_motion.descend(batch, state, own, len(whole), free, self._backward)
-        return tally
+                statistics.growth = self.free_motion.descend(batch, state, own, len(whole), free, self._backward)
+        return statistics
 
     @staticmethod
     def _defers(device: torch.device) -> bool:
@@ -257,23 +257,27 @@ class GausSimModule(LightningModule):
         places = [self.ranks.rank + i * self.ranks.size for i in range(len(batch.members))]
         return [UnitNoise(batch, self.simulator.scenes, deviations, draws.initial_seed(), places)]
 
-    def _descend(self, losses: Tensor, momentum: Tensor, per: float, tally: Tally, *, measure: bool) -> None:
+    def _descend(self, losses: Tensor, momentum: Tensor, per: float, statistics: Statistics, *, measure: bool) -> None:
         """Backward of one stretch; the mean over sequences, whatever the stretch's length."""
         images_term = self.objective.image_weight * per * losses.sum()
         momentum_term = self.objective.momentum_weight * per * momentum.sum()
         weighted = momentum_term.requires_grad and self.objective.momentum_weight > 0
         network = self._network()
-        if measure and weighted and network and self.share_every and self.global_step % self.share_every == 0:
-            tally.pulls = _pull(images_term, network), _pull(momentum_term, network)
+        if measure and weighted and network and self.fraction_every and self.global_step % self.fraction_every == 0:
+            statistics.pulls = _pull(images_term, network), _pull(momentum_term, network)
         self._backward(images_term + momentum_term if weighted else images_term)
-        tally.images.append(losses.detach())
-        tally.momentum.append(momentum.detach())
+        statistics.images.append(losses.detach())
+        statistics.momentum.append(momentum.detach())
 
     def _network(self) -> list[nn.Parameter]:
         return [p for p in self.simulator.parameter_groups()["network"] if p.requires_grad]
 
     def _static(
-        self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator, tally: Tally
+        self,
+        samples: list[SequenceSample],
+        whole: list[SampleFacts],
+        draws: torch.Generator,
+        statistics: Statistics,
     ) -> None:
         chance = self.objective.static_chance(whole[0].steps)
         if float(torch.rand((), generator=draws)) >= chance:
@@ -295,7 +299,7 @@ class GausSimModule(LightningModule):
         loss = static_loss(step.positions, batch.rest, diagonal) / len(scene_ids)
         if loss.requires_grad:
             self._backward(self.objective.static_weight * loss)
-        tally.static = loss.detach()
+        statistics.static = loss.detach()
 
     def _unmix(self, samples: list[SequenceSample], count: int) -> None:
         """Backward of the template's mixing of modes, for each sequence in units of its rest state's loss."""
@@ -318,8 +322,8 @@ class GausSimModule(LightningModule):
     def _rest_loss(self, sample: SequenceSample) -> float:
         """What the rest state scores on the frames of a sample, their mean: the unit of penalties."""
         rest = self.simulator.scenes[sample.scene_id].means.to(next(self.parameters()).device)
-        yard = self.yardsticks.of(sample, rest)
-        losses = yard.static[: sample.steps]
+        baseline = self.baselines.of(sample, rest)
+        losses = baseline.static[: sample.steps]
         return sum(losses) / len(losses)
 
     # ------------------------------------------------------------------------------------------------ states, images
@@ -331,7 +335,7 @@ class GausSimModule(LightningModule):
         return SimState(batch.rest, previous.to(batch.rest))
 
     @torch.no_grad()
-    def foresee(self, sequence_id: int, steps: int) -> Trajectory:
+    def predict(self, sequence_id: int, steps: int) -> Trajectory:
         """Frames 0..``steps`` of a training sequence, from its own initial state, for all kernels of its scene.
 
         Raises:
@@ -359,19 +363,19 @@ class GausSimModule(LightningModule):
     def _read(self, samples: list[SequenceSample], whole: list[SampleFacts], found: Found) -> dict[str, float]:
         """Joins the numbers of all ranks, checks them and forms what is logged."""
         batch = self.simulator.batch([s.scene_id for s in samples]) if samples else None
-        yards = []
+        baselines = []
         for i, sample in enumerate(samples):
             assert batch is not None
-            yards.append(self.yardsticks.of(sample, batch.rest[batch.members[i].kernels]))
-        shares = self.ranks.gather((found, yards))
-        numbers = Found.join([share[0] for share in shares]).numbers(whole, self.objective.explosion)
-        yards = interleave([share[1] for share in shares])
-        self.yardsticks.learn([s.sequence_id for s in whole], yards)
+            baselines.append(self.baselines.of(sample, batch.rest[batch.members[i].kernels]))
+        parts = self.ranks.gather((found, baselines))
+        numbers = Found.join([part[0] for part in parts]).numbers(whole, self.objective.explosion)
+        baselines = interleave([part[1] for part in parts])
+        self.baselines.learn([s.sequence_id for s in whole], baselines)
         self._barren = 0 if numbers.images else self._barren + 1
         if self._barren >= BARREN_BATCHES:
             far = f"kernels moved beyond {self.objective.explosion} diagonals in {BARREN_BATCHES} batches in a row"
             raise DivergenceError(describe(0, whole, None, far))
-        return numbers.stats(whole[0].steps, len(whole), yards)
+        return numbers.stats(whole[0].steps, len(whole), baselines)
 
     def _record(self, stats: dict[str, float], weight: int) -> None:
         self.last_stats = stats
@@ -423,7 +427,7 @@ class GausSimModule(LightningModule):
         own: dict[str, Any] = {"format": RESUME_FORMAT, "scenes": fingerprints(self.simulator.scenes)}
         own["average"] = self.average.state_dict()
         own["epoch"] = {"sums": self._sums, "summary": self.summary, "warned": self._warned, "barren": self._barren}
-        own["yardsticks"] = self.yardsticks.state_dict()
+        own["baselines"] = self.baselines.state_dict()
         if isinstance(self.supervision, TrackSupervision):
             own["tracks"] = self.supervision.state_dict()
         checkpoint["gausim"], checkpoint["cost"] = own, self.cost.state_dict()
@@ -442,7 +446,7 @@ class GausSimModule(LightningModule):
         epoch = own["epoch"]
         self._sums, self.summary = epoch["sums"], epoch["summary"]
         self._warned, self._barren = epoch["warned"], epoch["barren"]
-        self.yardsticks.load_state_dict(own["yardsticks"])
+        self.baselines.load_state_dict(own.get("baselines") or own["yardsticks"])
         if isinstance(self.supervision, TrackSupervision):
             self.supervision.load_state_dict(own.get("tracks", {}))
 

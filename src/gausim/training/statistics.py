@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gausim.core import DivergenceError
 from gausim.data.dataset import SampleFacts
-from gausim.training.baseline_metrics import Yardstick, excess
+from gausim.training.baseline_metrics import SequenceBaseline, excess
 from gausim.training.ranks.ranks import interleave
 from gausim.training.rollout import check_reach, describe
 
@@ -28,7 +28,7 @@ class Numbers:
         motion: squared change of the predicted images, summed over the batch.
         static: the static loss, if this batch carried it.
         growth: of the energy of free motion, mean over sequences, if this batch looked at it.
-        share: the momentum loss's share of the network's gradient, where it was measured.
+        gradient_fraction: the momentum loss's fraction of the network's gradient, where it was measured.
         gradients: norm of each parameter group's gradient.
     """
 
@@ -37,21 +37,21 @@ class Numbers:
     motion: float
     static: float | None
     growth: float | None
-    share: float | None
+    gradient_fraction: float | None
     gradients: dict[str, float]
 
-    def stats(self, steps: int, count: int, yards: Sequence[Yardstick]) -> dict[str, float]:
+    def stats(self, steps: int, count: int, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:
         """What is logged of a step.
 
         Args:
             steps: predicted steps T.
             count: sequences of the step.
-            yards: of each of them.
+            baselines: of each of them.
         """
         lasted = len(self.images)
         stats = {f"grad_{name}": value for name, value in self.gradients.items()}
-        if self.share is not None:
-            stats["momentum_share"] = self.share
+        if self.gradient_fraction is not None:
+            stats["momentum_share"] = self.gradient_fraction
         if self.static is not None:
             stats["loss_static"] = self.static
         if self.growth is not None:
@@ -60,18 +60,18 @@ class Numbers:
         if lasted:
             stats["loss_momentum"] = sum(self.momentum) / (steps * count)
             stats["loss_image"] = sum(map(sum, self.images)) / (lasted * count)
-            stats.update(self._compare(yards))
+            stats.update(self._compare(baselines))
         return stats
 
-    def _compare(self, yards: Sequence[Yardstick]) -> dict[str, float]:
+    def _compare(self, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:
         """The prediction's losses and motion against the static prediction's and the truth's."""
         table = self.images
         floor = static = first = moved = 0.0
-        for yard in yards:
-            floor += yard.floor * len(table)
-            static += sum(yard.static[: len(table)])
-            moved += sum(yard.motion[: len(table)])
-            first += yard.static[0]
+        for baseline in baselines:
+            floor += baseline.floor * len(table)
+            static += sum(baseline.static[: len(table)])
+            moved += sum(baseline.motion[: len(table)])
+            first += baseline.static[0]
         loss = sum(map(sum, table))
         return {
             "ratio_static": loss / max(static, 1e-12),
@@ -92,7 +92,7 @@ class Found:
         motion: squared change of the predicted images per stretch, summed over sequences.
         static: the static loss of the scenes that are this rank's, if any.
         growth: of the energy of free motion, this rank's sequences' part of the mean, if looked at.
-        share: as in :class:`Numbers`, the same on all ranks.
+        gradient_fraction: as in :class:`Numbers`, the same on all ranks.
         gradients: likewise.
     """
 
@@ -102,17 +102,17 @@ class Found:
     motion: list[float]
     static: float | None
     growth: float | None
-    share: float | None
+    gradient_fraction: float | None
     gradients: dict[str, float]
 
     @staticmethod
-    def join(shares: Sequence[Found]) -> Found:
+    def join(parts: Sequence[Found]) -> Found:
         """What one rank with all sequences would have found."""
-        if len(shares) == 1:
-            return shares[0]
-        held = [share for share in shares if share.reach]  # the others had no sequence
-        static = [share.static for share in shares if share.static is not None]
-        growth = [share.growth for share in shares if share.growth is not None]
+        if len(parts) == 1:
+            return parts[0]
+        held = [part for part in parts if part.reach]  # the others had no sequence
+        static = [part.static for part in parts if part.static is not None]
+        growth = [part.growth for part in parts if part.growth is not None]
         return Found(
             reach=[_beside(tables) for tables in zip(*(s.reach for s in held), strict=True)],
             images=[_beside(tables) for tables in zip(*(s.images for s in held), strict=True)],
@@ -123,8 +123,8 @@ class Found:
             motion=[sum(values) for values in zip(*(s.motion for s in held), strict=True)],
             static=sum(static) if static else None,
             growth=sum(growth) if growth else None,
-            share=shares[0].share,
-            gradients=shares[0].gradients,
+            gradient_fraction=parts[0].gradient_fraction,
+            gradients=parts[0].gradients,
         )
 
     def numbers(self, samples: Sequence[SampleFacts], explosion: float) -> Numbers:
@@ -144,7 +144,7 @@ class Found:
             motion=sum(self.motion[:lasted]),
             static=self.static,
             growth=self.growth,
-            share=self.share if lasted else None,  # of the first stretch
+            gradient_fraction=self.gradient_fraction if lasted else None,  # of the first stretch
             gradients=self.gradients,
         )
         _check(numbers, samples)
@@ -161,7 +161,7 @@ class Found:
 
 
 @dataclass
-class Tally:
+class Statistics:
     """What one optimiser step found, stretch by stretch, on the device.
 
     Attributes:
@@ -171,8 +171,8 @@ class Tally:
         motion: squared change of the predicted images, summed over the batch.
         static: the static loss, if this batch carries it.
         growth: of the energy of free motion, if this batch looks at it.
-        pulls: gradients of the network by the image losses and by the momentum loss, where their share is measured.
-        share: the momentum loss's share of the network's gradient.
+        pulls: gradients of the network by the image losses and by the momentum loss, where their ratio is measured.
+        gradient_fraction: the momentum loss's fraction of the network's gradient.
     """
 
     reach: list[Float[Tensor, "T S"]] = field(default_factory=list)
@@ -182,7 +182,7 @@ class Tally:
     static: Float[Tensor, ""] | None = None
     growth: Float[Tensor, ""] | None = None
     pulls: tuple[Float[Tensor, " P"], Float[Tensor, " P"]] | None = None
-    share: Float[Tensor, ""] | None = None
+    gradient_fraction: Float[Tensor, ""] | None = None
 
     def fetch(self, norms: Mapping[str, Tensor]) -> Found:
         """Fetches everything at once.
@@ -190,7 +190,7 @@ class Tally:
         Args:
             norms: norm of each parameter group's gradient.
         """
-        single = [x for x in (self.static, self.growth, self.share) if x is not None]
+        single = [x for x in (self.static, self.growth, self.gradient_fraction) if x is not None]
         parts = [*self.reach, *self.images, *self.momentum, *self.motion, *single, *norms.values()]
         device = parts[0].device
         fetched = iter(torch.cat([p.detach().to(device, torch.float32).reshape(-1) for p in parts]).tolist())
@@ -199,8 +199,8 @@ class Tally:
         motion = _take(len(self.motion), fetched)
         static = next(fetched) if self.static is not None else None
         growth = next(fetched) if self.growth is not None else None
-        share = next(fetched) if self.share is not None else None
-        return Found(reach, images, momentum, motion, static, growth, share, dict(zip(norms, fetched, strict=True)))
+        fraction = next(fetched) if self.gradient_fraction is not None else None
+        return Found(reach, images, momentum, motion, static, growth, fraction, dict(zip(norms, fetched, strict=True)))
 
 
 def _take(count: int, fetched: Iterator[float]) -> list[float]:

@@ -145,7 +145,7 @@ class Convergence(Callback):
         count, last = len(data.index), data.curriculum.t_max
         chosen = np.unique(np.linspace(0, count - 1, min(count, self._sequences)).round().astype(int)).tolist()
         samples = [data.training_sample(i, last).to(module.device) for i in chosen]
-        return foresee_frames(module, samples, last - self._held_back)
+        return forecast(module, samples, last - self._held_back)
 
     # ------------------------------------------------------------------------------------------------ verdict
 
@@ -188,7 +188,7 @@ class Convergence(Callback):
 
 
 @torch.no_grad()
-def foresee_frames(module: GausSimModule, samples: Sequence[SequenceSample], first: int) -> Forecast:
+def forecast(module: GausSimModule, samples: Sequence[SequenceSample], first: int) -> Forecast:
     """Predicts the frames after ``first`` of all samples, each from its own initial state, and compares them."""
     loss = floor = static = 0.0
     try:
@@ -199,11 +199,11 @@ def foresee_frames(module: GausSimModule, samples: Sequence[SequenceSample], fir
                     windows(module.simulator, batch, module.initial([sample], batch), sample.steps, sample.steps)
                 )
                 losses, _ = module.supervision.comparison([sample], batch)(States.of(made[first:]), first)
-                yard = module.yardsticks.of(sample, batch.rest)
-                still = sum(yard.static[first : sample.steps])
+                baseline = module.baselines.of(sample, batch.rest)
+                still = sum(baseline.static[first : sample.steps])
                 own = float(losses.sum())
                 loss += own if math.isfinite(own) else 10.0 * still
-                static, floor = static + still, floor + yard.floor * (sample.steps - first)
+                static, floor = static + still, floor + baseline.floor * (sample.steps - first)
     except DivergenceError:
         return Forecast(10.0, 1.0)
     return Forecast(excess(loss, static, floor), (static - floor) / max(static, 1e-12))

@@ -86,13 +86,13 @@ class MotionWatch(Callback):
         rows, first = {}, 0
         with evaluating(module):
             for scene_id, item in enumerate(training_data(trainer).objects):
-                found = list(self._foreseen(module, item, scene_id, first))
+                found = list(self._predicted(module, item, scene_id, first))
                 first += len(item.sequences)
                 if found:
                     rows[item.name] = figures(found, item, _units(module, scene_id))
         return rows
 
-    def _foreseen(
+    def _predicted(
         self, module: GausSimModule, item: ObjectData, scene_id: int, first: int
     ) -> Iterator[tuple[GroundTruth, Tensor, Tensor]]:
         """True motion of each sequence, the predicted one and the kernels that the points are attached to."""
@@ -106,7 +106,7 @@ class MotionWatch(Callback):
             if truth is None:
                 continue
             try:
-                made = module.foresee(first + number, len(truth.positions) - 1)
+                made = module.predict(first + number, len(truth.positions) - 1)
             except DivergenceError as error:
                 module.print(f"motion of {item.name}/{record.name} is not told: {error}")
                 continue

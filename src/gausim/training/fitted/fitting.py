@@ -29,11 +29,11 @@ from gausim.core import (
 )
 from gausim.data.dataset import SampleFacts, SequenceSample
 from gausim.losses.objective import Objective
-from gausim.training.baseline_metrics import Yardsticks
+from gausim.training.baseline_metrics import Baselines
 from gausim.training.fitted.stages import FitPlan, Stage, StagedCurriculum
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
-from gausim.training.statistics import Tally
+from gausim.training.statistics import Statistics
 from gausim.training.supervision.images import Supervision
 
 
@@ -176,7 +176,7 @@ class FittedModule(GausSimModule):
             objective=Objective(explosion=explosion),
             supervision=supervision,
             seed=seed,
-            share_every=0,
+            fraction_every=0,
         )
         self.plan, self.made = plan, dict.fromkeys((name for name, _ in plan.order), 0.0)
         self.stage = ""
@@ -198,7 +198,7 @@ class FittedModule(GausSimModule):
         """What the method says of itself, and what the fit cost."""
         return {**super().footnotes, "extrapolates": self.method.extrapolates}
 
-    def foresee(self, sequence_id: int, steps: int) -> Trajectory:
+    def predict(self, sequence_id: int, steps: int) -> Trajectory:
         """Frames 0..``steps`` of a sequence."""
         rest = self.method.scenes[self.scene_of_sequence[sequence_id]].means
         with torch.no_grad():
@@ -251,11 +251,11 @@ class FittedModule(GausSimModule):
         return max(stage.rate(group, iteration) for group in stage.rates)
 
     def _enter(self, name: str) -> Stage:
-        """Makes a stage's loss the loss of the module; the yardsticks are measured by it anew."""
+        """Makes a stage's loss the loss of the module; the baselines are measured by it anew."""
         stage = dict(self.plan.order)[name]
         if name != self.stage:
             if self.stage:
-                self.yardsticks = Yardsticks(self.supervision)
+                self.baselines = Baselines(self.supervision)
             self.stage = name
         self.images.loss = stage.loss
         self.objective = Objective(
@@ -270,7 +270,11 @@ class FittedModule(GausSimModule):
             super()._backward(loss)
 
     def _static(
-        self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator, tally: Tally
+        self,
+        samples: list[SequenceSample],
+        whole: list[SampleFacts],
+        draws: torch.Generator,
+        statistics: Statistics,
     ) -> None:
         """The stage's penalties of the sequences of this rank; the mean over all sequences of the step."""
         weights = dict(self.plan.order)[self.stage].penalties
