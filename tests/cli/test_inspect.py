@@ -107,8 +107,9 @@ def test_the_default_hierarchy_is_that_of_the_models(
     common = ["inspect", str(scene_file), "--pin-below", "z=0.1", "--out", str(scene_file.parent / "clusters.png")]
     assert main(common) == 0
     default = capsys.readouterr().out
-    radii = [str(radius) for radius in simulator.radii]
-    assert main([*common, "--clustering", simulator.clustering, "--radii", *radii]) == 0
+    hierarchy = simulator.hierarchy
+    radii = [str(level.diameter) for level in reversed(hierarchy.levels)]
+    assert main([*common, "--clustering", hierarchy.clustering, "--radii", *radii]) == 0
     assert capsys.readouterr().out == default
     assert all(f"{float(radius):.3g} of diagonal" in default for radius in radii)
 

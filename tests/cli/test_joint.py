@@ -144,8 +144,8 @@ def test_a_resumed_run_keeps_its_own_network(
 def test_a_network_of_another_shape_is_refused_by_name(joint: dict[str, Path], tmp_path: Path) -> None:
     new = other_object(tmp_path / "new")
     message = (
-        r"init_from: the network of .*last\.ckpt does not fit this model: network\.decoder\.0\.bias is of shape \(4,\) "
-        r"there, of shape \(8,\) here.*config\.yaml has it; what differs: model\.simulator\.hidden\."
+        r"init_from: the network of .*last\.ckpt does not fit this model: predictor\.network\.decoder\.0\.bias is "
+        r"of shape \(4,\) there, of shape \(8,\) here.*config\.yaml has it; what differs: model\.simulator\.network\.hidden\."
     )
     with pytest.raises(ConfigError, match=message):
         tune(new, joint["gausim"], tmp_path / "wide", "model.simulator.network.hidden=16")

@@ -20,9 +20,6 @@ from typing import Any
 import torch
 from torch import distributed as dist
 
-from helpers.simulators import gausim
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 from gausim.core import DivergenceError
 from gausim.data.dataset import SequenceSample
 from gausim.losses import Objective
@@ -34,6 +31,7 @@ from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.ranks.ranks import Ranks
 from helpers import toy_object
+from helpers.simulators import gausim
 
 SCENES = (0, 0, 1, 0, 1, 1)  # of sequences 0 to 5; the last is in no batch
 AMPLITUDES = (0.4, -0.25, 0.3, -0.35, 0.2, 0.1)

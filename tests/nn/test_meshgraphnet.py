@@ -190,13 +190,13 @@ def test_state_does_not_depend_on_how_it_is_computed() -> None:
 
 
 def test_unknown_precision() -> None:
-    with pytest.raises(ConfigError, match=r"model\.simulator\.precision is 'fp16'"):
+    with pytest.raises(ConfigError, match=r"model\.simulator\.network\.precision is 'fp16'"):
         _network(precision="fp16")
 
 
 def test_missing_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CXX", "no-such-compiler")
-    with pytest.raises(ConfigError, match=r"model\.simulator\.compile.*'no-such-compiler'"):
+    with pytest.raises(ConfigError, match=r"model\.simulator\.network\.compile.*'no-such-compiler'"):
         _network(compile=True)(*_inputs())
 
 

@@ -66,5 +66,5 @@ def test_choices_differ_from_each_other() -> None:
 
 @pytest.mark.parametrize(("name", "value", "known"), UNKNOWN)
 def test_unknown_choices_are_refused(name: str, value: str, known: str) -> None:
-    with pytest.raises(ConfigError, match=rf"model\.simulator\.{name} is '{value}'; expected one of {known}"):
+    with pytest.raises(ConfigError, match=rf"model\.simulator\.network\.{name} is '{value}'; expected one of {known}"):
         network(**{"norm": "pre", "activation": "silu", name: value})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -18,7 +19,8 @@ from gausim.training.ranks.layout import Layout, Place
 from gausim.training.ranks.ranks import interleave, is_lost_connection
 from gausim.training.trainer import make_trainer
 
-PROGRAM = [sys.executable, str(Path(__file__).parents[1] / "helpers" / "rank_checks.py")]
+TESTS = Path(__file__).parents[1]
+PROGRAM = [sys.executable, str(TESTS / "helpers" / "rank_checks.py")]
 # Noise, the static loss and more than one step: all that could depend on which rank computes a sequence.
 ALL = {"static_probability": 1.0, "input_noise": 0.01}
 
@@ -28,7 +30,8 @@ Ask = Callable[..., list[Any]]
 @pytest.fixture(scope="module")
 def ask() -> Iterator[Ask]:
     """Asks for a check in so many ranks; returns what each found."""
-    with subprocess.Popen(PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])}
+    with subprocess.Popen(PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env) as server:
         assert server.stdin is not None and server.stdout is not None
 
         def order(check: str, ranks: int, **options: Any) -> list[Any]:

@@ -153,7 +153,7 @@ def test_what_a_module_loads_is_what_it_saves(whole: Path) -> None:
     module.on_load_checkpoint(loaded)
     module.on_save_checkpoint(saved)
     kept = loaded["gausim"]
-    assert {"average", "epoch", "yardsticks"} < set(kept) and all(kept["epoch"]["sums"].values())
+    assert {"average", "epoch", "baselines"} < set(kept) and all(kept["epoch"]["sums"].values())
     assert {k: digest(v) for k, v in saved["gausim"].items()} == {k: digest(v) for k, v in kept.items()}
 
 

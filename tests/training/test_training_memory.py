@@ -166,7 +166,7 @@ def test_one_read_per_optimiser_step(backprop_steps: int, monkeypatch: pytest.Mo
     module.images.renderer = blobs
     module.settings = OptimizerSettings(optimizer=torch.optim.SGD, ema_decay=0.9)  # Adam counts steps on the host
     optimizer, batch = module.configure_optimizers(), [sample(0), sample(1)]
-    module.optimise(batch, optimizer, torch.Generator().manual_seed(0))  # cameras and yardsticks are read once
+    module.optimise(batch, optimizer, torch.Generator().manual_seed(0))  # cameras and baselines are read once
     draws = torch.Generator().manual_seed(1)
     monkeypatch.setattr(module, "_static", lambda *a: None)  # whether to is drawn on the host, and never leaves it
     with torch_only(), watched(monkeypatch) as found:
