@@ -145,7 +145,8 @@ def test_a_network_of_another_shape_is_refused_by_name(joint: dict[str, Path], t
     new = other_object(tmp_path / "new")
     message = (
         r"init_from: the network of .*last\.ckpt does not fit this model: predictor\.network\.decoder\.0\.bias is "
-        r"of shape \(4,\) there, of shape \(8,\) here.*config\.yaml has it; what differs: model\.simulator\.network\.hidden\."
+        r"of shape \(4,\) there, of shape \(8,\) here.*config\.yaml has it; what differs: "
+        r"model\.simulator\.network\.hidden\."
     )
     with pytest.raises(ConfigError, match=message):
         tune(new, joint["gausim"], tmp_path / "wide", "model.simulator.network.hidden=16")
