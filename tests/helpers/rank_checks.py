@@ -80,7 +80,7 @@ def train(options: dict[str, Any]) -> dict[str, Any]:
         for parameter in module.simulator.parameter_groups()["network"]:
             parameter.mul_(options.get("wild", 1.0))
     if options.get("deferred"):  # as on a GPU
-        module._defers = lambda device: True  # type: ignore[method-assign]
+        module.defers = lambda device: True  # type: ignore[method-assign]
     optimizer, whole = module.configure_optimizers(), samples(options["count"], options.get("steps", 3), dtype)
     share, stats = whole[ranks.rank :: ranks.size], []
     for step in range(options.get("times", 1)):

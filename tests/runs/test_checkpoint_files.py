@@ -249,7 +249,7 @@ def test_the_average_follows_the_weights_and_is_what_loads() -> None:
     average = WeightAverage(0.9)
     for value in (0.0, 1.0, 1.0, 1.0):
         nn.init.constant_(module.weight, value)
-        average.update(module)
+        average.update(module.named_parameters())
     saved = {"state_dict": module.state_dict(), "gausim": {"average": average.state_dict()}}
     averaged, plain = nn.Linear(3, 2), nn.Linear(3, 2)
     load_weights(averaged, saved)

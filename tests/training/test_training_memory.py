@@ -19,6 +19,7 @@ from gausim.core import DivergenceError
 from gausim.losses import Objective
 from gausim.models.initial_state import FreeInitialStates
 from gausim.render.reference import ReferenceRenderer
+from gausim.training import step
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.supervision import comparison
@@ -99,7 +100,7 @@ def pair(objective: Objective, drift: float) -> tuple[GausSimModule, GausSimModu
     for module in made:
         with torch.no_grad():
             module.model.drift[0] += drift
-    made[1]._defers = lambda device: True  # type: ignore[method-assign]
+    made[1].defers = lambda device: True  # type: ignore[method-assign]
     return made[0], made[1]
 
 
@@ -115,11 +116,16 @@ def test_reads_put_off_change_nothing(backprop_steps: int, drift: float, lasts: 
         torch.testing.assert_close(parameters(later)[name], value, rtol=1e-5, atol=1e-8)
 
 
-def test_a_rollout_cut_short_in_the_middle_was_among_them() -> None:
+def test_a_rollout_cut_short_in_the_middle_was_among_them(monkeypatch: pytest.MonkeyPatch) -> None:
     now, _ = pair(Objective(backprop_steps=1, explosion=0.6, static_weight=0.0), 0.2)
     lengths = []
-    inner = now._descend
-    now._descend = lambda losses, *a, **k: (lengths.append(len(losses)), inner(losses, *a, **k))  # type: ignore
+    inner = step.descend
+
+    def counted(learner, losses, *arguments, **options) -> None:
+        lengths.append(len(losses))
+        inner(learner, losses, *arguments, **options)
+
+    monkeypatch.setattr(step, "descend", counted)
     optimise(now, steps=6)
     assert 0 < sum(lengths) < 6
 
@@ -168,7 +174,7 @@ def test_one_read_per_optimiser_step(backprop_steps: int, monkeypatch: pytest.Mo
     optimizer, batch = module.configure_optimizers(), [sample(0), sample(1)]
     module.optimise(batch, optimizer, torch.Generator().manual_seed(0))  # cameras and baselines are read once
     draws = torch.Generator().manual_seed(1)
-    monkeypatch.setattr(module, "_static", lambda *a: None)  # whether to is drawn on the host, and never leaves it
+    monkeypatch.setattr(module, "terms", lambda: ())  # whether to is drawn on the host, and never leaves it
     with torch_only(), watched(monkeypatch) as found:
         module.optimise(batch, optimizer, draws)
     assert found == ["tolist"]
@@ -186,7 +192,7 @@ def test_the_device_is_not_waited_for(backprop_steps: int) -> None:
     torch.cuda.set_sync_debug_mode("error")
     try:
         optimizer.zero_grad(set_to_none=True)
-        statistics = module._rollout(samples, facts, draws)
+        statistics = step.roll_out(module, samples, facts, draws)
         norms = module.settings.clip(optimizer)
     finally:
         torch.cuda.set_sync_debug_mode("default")

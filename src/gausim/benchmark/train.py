@@ -139,7 +139,7 @@ class _Case:
         """Clipping, optimiser and average of the weights, on the gradients that are there."""
         self.module.settings.clip(self.optimizer)
         self.optimizer.step()
-        self.module.average.update(self.module)
+        self.module.average.update(self.module.named_parameters())
 
     def rollout(self) -> Iterator[tuple[int, States, Tensor]]:
         """The stretches of the rollout: frames before it, states, momentum losses."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import pickle
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -195,13 +195,13 @@ class WeightAverage:
         self._values: dict[str, Tensor] = {}
 
     @torch.no_grad()
-    def update(self, module: nn.Module) -> None:
-        """Takes the parameters of a module in."""
+    def update(self, parameters: Iterable[tuple[str, nn.Parameter]]) -> None:
+        """Takes parameters by name in."""
         if self._decay == 0:
             return
         self._steps += 1
         decay = min(self._decay, (1 + self._steps) / (10 + self._steps))
-        for name, parameter in module.named_parameters():
+        for name, parameter in parameters:
             if name not in self._values:
                 self._values[name] = parameter.detach().clone()
             else:

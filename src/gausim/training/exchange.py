@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -19,12 +19,14 @@ class Exchange:
     def __init__(self, ranks: Ranks, model: nn.Module) -> None:
         """Looks for the model's running statistics."""
         self._ranks, self._normalisers = ranks, normalisers_of(model)
-        self.begun = False
+        self._begun = False
 
-    @property
-    def has_statistics(self) -> bool:
-        """Whether every normaliser has some; read from the device."""
-        return all(float(normaliser.count) for normaliser in self._normalisers)
+    def begin(self, see_first_frame: Callable[[], None]) -> None:
+        """Before the first step: normalisers without statistics see the first frame of the ranks' first batches."""
+        if not self._begun and not all(float(normaliser.count) for normaliser in self._normalisers):
+            see_first_frame()
+            self.statistics()
+        self._begun = True
 
     @torch.no_grad()
     def step(self, weights: Sequence[Parameter], network: Sequence[Parameter], statistics: Statistics) -> None:

@@ -12,34 +12,34 @@ from lightning.pytorch import LightningModule
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from gausim.core import ConfigError, DivergenceError, Renderer, SimState, Trajectory
-from gausim.data.dataset import SampleFacts, SequenceSample
+from gausim.core import ConfigError, Renderer, SimState, Trajectory
+from gausim.data.dataset import SequenceSample
 from gausim.data.sampler import hash_seed
 from gausim.losses.objective import Objective
-from gausim.losses.static import static_loss
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.nn.mode import evaluating
 from gausim.render.draw import draw
 from gausim.runs.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes, fingerprints
 from gausim.runs.cost import TrainingCost
 from gausim.runs.renamed import with_present_weights
+from gausim.training import step
 from gausim.training.baseline_metrics import Baselines
-from gausim.training.contracts import InitialVelocities, Mixing, SceneBatch, Simulator
+from gausim.training.contracts import InitialVelocities, SceneBatch, Simulator
 from gausim.training.exchange import Exchange
 from gausim.training.optimizers import OptimizerSettings
-from gausim.training.passivity import FreeMotion
-from gausim.training.ranks.ranks import Ranks, interleave
-from gausim.training.rollout import Explosions, States, UnitNoise, after, describe, windows
-from gausim.training.statistics import Found, Statistics
+from gausim.training.ranks.ranks import Ranks
+from gausim.training.rollout import States, windows
 from gausim.training.supervision.images import ImageSupervision, Supervision
 from gausim.training.supervision.motion_tracks import TrackSupervision
+from gausim.training.terms.free_motion import FreeMotion
+from gausim.training.terms.mixing import MixingTerm
+from gausim.training.terms.rest import RestTerm
+from gausim.training.terms.term import Term
 
 # Below this fraction of the true motion energy a prediction counts as collapsed to the rest state.
 COLLAPSED = 0.05
 # Optimiser steps before a collapse is worth a warning: initial states begin at rest, so every run begins static.
 COLLAPSE_AFTER = 100
-# Batches in a row whose rollout explodes before anything can be learned from it; then training has diverged.
-BARREN_BATCHES = 20
 
 
 class GausSimModule(LightningModule):
@@ -99,9 +99,9 @@ class GausSimModule(LightningModule):
         self.last_stats: dict[str, float] = {}
         self.time_fraction, self.progress_limit = 0.0, 1.0
         self._sums: dict[str, list[float]] = {}
-        self._warned, self._barren = False, 0
-        self.ranks, self._shown, self.cost = Ranks(), 0, TrainingCost()
-        self._exchange = Exchange(self.ranks, model)
+        self._warned, self.barren = False, 0
+        self.ranks, self.shown, self.cost = Ranks(), 0, TrainingCost()
+        self.exchange = Exchange(self.ranks, model)
 
     @property
     def method_name(self) -> str:
@@ -149,7 +149,7 @@ class GausSimModule(LightningModule):
         factor = self._set_rates(optimizer, batch_idx)
         draws = torch.Generator().manual_seed(hash_seed(self.seed, self.global_step))
         stats = self.optimise(samples, optimizer.optimizer, draws, optimizer.step)
-        self._record({**stats, "lr": self.settings.network_lr * factor}, self._shown)
+        self._record({**stats, "lr": self.settings.network_lr * factor}, self.shown)
 
     def optimise(
         self,
@@ -172,34 +172,21 @@ class GausSimModule(LightningModule):
         Raises:
             DivergenceError: a number is not finite; no parameter has moved.
         """
-        optimizer.zero_grad(set_to_none=True)
-        whole = interleave(self.ranks.gather([sample.facts for sample in samples]))
-        self._prime(samples)
-        statistics = self._rollout(samples, whole, draws)
-        self._static(samples, whole, draws, statistics)
-        self._unmix(samples, len(whole))
-        weights = [p for p in self.parameters() if p.requires_grad]
-        self._exchange.step(weights, self._network(), statistics)
-        stats = self._read(samples, whole, statistics.fetch(self.settings.clip(optimizer)))
-        self._exchange.absorb()
-        (advance or optimizer.step)()
-        self.average.update(self)
-        self._shown = len(whole)
-        return stats
+        return step.optimise(self, samples, optimizer, draws, advance or optimizer.step)
 
-    @torch.no_grad()
-    def _prime(self, samples: list[SequenceSample]) -> None:
-        """The first statistics of a new model's inputs: those of the first batch's first frame."""
-        if self._exchange.begun:
-            return
-        self._exchange.begun = True
-        if not self._exchange.has_statistics:
-            if samples:
-                batch = self.simulator.batch([s.scene_id for s in samples])
-                self.simulator.step(batch, self.initial(samples, batch))
-            self._exchange.statistics()
+    def terms(self) -> Sequence[Term]:
+        """The static loss and the penalty on mode mixing."""
+        return (
+            RestTerm(self.simulator, self.objective, self.diagonals, self.images),
+            MixingTerm(self.model, self.objective.mixing_weight),
+        )
 
-    def _backward(self, loss: Tensor) -> None:
+    def measures_fraction(self) -> bool:
+        """Every so many steps: what momentum is of the network's gradient."""
+        return bool(self.fraction_every) and self.global_step % self.fraction_every == 0
+
+    def accumulate(self, loss: Tensor) -> None:
+        """Adds the gradients of a loss, by the trainer where there is one."""
         if self._trainer is None:
             loss.backward()
         else:
@@ -211,115 +198,16 @@ class GausSimModule(LightningModule):
         done = min(max(done, self.time_fraction * epochs), self.progress_limit * epochs)
         return self.settings.set_rates(optimizer.optimizer, done, epochs)
 
-    def _rollout(self, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator) -> Statistics:
-        steps = whole[0].steps
-        if any(s.steps != steps for s in whole):
-            raise ConfigError(f"a batch needs sequences of equal length, got {[s.steps for s in whole]} steps.")
-        batch = self.simulator.batch([s.scene_id for s in samples]) if samples else None
-        statistics, length = Statistics(), self.objective.window(steps)
-        device = next(self.parameters()).device
-        explosions = Explosions(batch, self.diagonals, whole, self.objective.explosion, ranks=self.ranks,
-                                deferred=device if self._defers(device) else None)  # fmt: skip
-        free, unit = self.free_motion.chosen(draws), self._momentum_unit(samples)
-        if batch is None:  # hears where the others' rollout ends
-            any(explosions.end(None, start, statistics.reach) for start in range(0, steps, length))
-            return statistics
-        comparison = self.supervision.comparison(samples, batch)
-        starts: list[Callable[[SimState], SimState]] = [explosions.restart, *self._noise(batch, draws)]
-        initial, kept = self.initial(samples, batch), self.objective.checkpoint_steps
-        per = self.objective.step_weight(steps) / len(whole)
-        own, last = torch.zeros(len(samples), device=device), initial
-        for start, made in windows(self.simulator, batch, initial, steps, length, starts, checkpoint=kept):
-            states = States.of(made)
-            if explosions.end(states.positions, start, statistics.reach):
-                break
-            losses, motion = comparison(explosions.spared(states), start)
-            statistics.motion.append(motion)
-            momentum = explosions.counted(torch.stack([step.momentum for step in made]))
-            self._descend(explosions.counted(losses), unit * momentum, per, statistics, measure=start == 0)
-            own = own + per * explosions.counted(losses).detach().sum(0)
-            last = after(made, last)
-        else:
-            if free is not None:
-                state = explosions.restart(last)
-                statistics.growth = self.free_motion.descend(batch, state, own, len(whole), free, self._backward)
-        return statistics
-
     @staticmethod
-    def _defers(device: torch.device) -> bool:
+    def defers(device: torch.device) -> bool:
         """Whether reading a number would make the host wait; such reads are put off to the step's end."""
         return device.type != "cpu"
 
-    def _noise(self, batch: SceneBatch, draws: torch.Generator) -> list[UnitNoise]:
-        if self.objective.input_noise == 0:
-            return []
-        deviations = [self.objective.input_noise * d for d in self.diagonals]
-        places = [self.ranks.rank + i * self.ranks.size for i in range(len(batch.members))]
-        return [UnitNoise(batch, self.simulator.scenes, deviations, draws.initial_seed(), places)]
-
-    def _descend(self, losses: Tensor, momentum: Tensor, per: float, statistics: Statistics, *, measure: bool) -> None:
-        """Backward of one stretch; the mean over sequences, whatever the stretch's length."""
-        images_term = self.objective.image_weight * per * losses.sum()
-        momentum_term = self.objective.momentum_weight * per * momentum.sum()
-        weighted = momentum_term.requires_grad and self.objective.momentum_weight > 0
-        network = self._network()
-        if measure and weighted and network and self.fraction_every and self.global_step % self.fraction_every == 0:
-            statistics.pulls = _pull(images_term, network), _pull(momentum_term, network)
-        self._backward(images_term + momentum_term if weighted else images_term)
-        statistics.images.append(losses.detach())
-        statistics.momentum.append(momentum.detach())
-
-    def _network(self) -> list[nn.Parameter]:
+    def network(self) -> list[nn.Parameter]:
+        """Weights of the network that learn."""
         return [p for p in self.simulator.parameter_groups()["network"] if p.requires_grad]
 
-    def _static(
-        self,
-        samples: list[SequenceSample],
-        whole: list[SampleFacts],
-        draws: torch.Generator,
-        statistics: Statistics,
-    ) -> None:
-        chance = self.objective.static_chance(whole[0].steps)
-        if float(torch.rand((), generator=draws)) >= chance:
-            return
-        if self.objective.rest_image_weight and samples:
-            batch = self.simulator.batch([s.scene_id for s in samples])
-            step = self.simulator.step(batch, SimState(batch.rest, batch.rest))
-            losses, _ = self.images.at_rest(samples, batch)(States.of([step]), 0)
-            if losses.requires_grad:
-                self._backward(self.objective.rest_image_weight / len(whole) * losses.sum())
-        scene_ids = sorted({s.scene_id for s in whole})
-        own = scene_ids[self.ranks.rank :: self.ranks.size]
-        if not own:
-            return
-        batch = self.simulator.batch(own)
-        step = self.simulator.step(batch, SimState(batch.rest, batch.rest))
-        diagonal = torch.cat([batch.rest.new_full((len(batch.rest[m.kernels]), 1), self.diagonals[m.scene_id])
-                              for m in batch.members])  # fmt: skip
-        loss = static_loss(step.positions, batch.rest, diagonal) / len(scene_ids)
-        if loss.requires_grad:
-            self._backward(self.objective.static_weight * loss)
-        statistics.static = loss.detach()
-
-    def _unmix(self, samples: list[SequenceSample], count: int) -> None:
-        """Backward of the template's mixing of modes, for each sequence in units of its rest state's loss."""
-        weight = self.objective.mixing_weight
-        if not weight or not isinstance(self.model, Mixing):
-            return
-        for sample in samples:
-            mixing = self.model.mixing(sample.scene_id)
-            if mixing is None or not mixing.requires_grad:
-                continue
-            self._backward(weight / count * self._rest_loss(sample) * mixing)
-
-    def _momentum_unit(self, samples: list[SequenceSample]) -> float:
-        """What the rest state scores on the frames of the batch, over all ranks: the unit of the momentum loss."""
-        if self.objective.momentum_weight == 0:
-            return 0.0
-        scores = interleave(self.ranks.gather([self._rest_loss(sample) for sample in samples]))
-        return sum(scores) / len(scores)
-
-    def _rest_loss(self, sample: SequenceSample) -> float:
+    def rest_loss(self, sample: SequenceSample) -> float:
         """What the rest state scores on the frames of a sample, their mean: the unit of penalties."""
         rest = self.simulator.scenes[sample.scene_id].means.to(next(self.parameters()).device)
         baseline = self.baselines.of(sample, rest)
@@ -359,23 +247,6 @@ class GausSimModule(LightningModule):
         return torch.cat(frames)
 
     # ------------------------------------------------------------------------------------------------ numbers
-
-    def _read(self, samples: list[SequenceSample], whole: list[SampleFacts], found: Found) -> dict[str, float]:
-        """Joins the numbers of all ranks, checks them and forms what is logged."""
-        batch = self.simulator.batch([s.scene_id for s in samples]) if samples else None
-        baselines = []
-        for i, sample in enumerate(samples):
-            assert batch is not None
-            baselines.append(self.baselines.of(sample, batch.rest[batch.members[i].kernels]))
-        parts = self.ranks.gather((found, baselines))
-        numbers = Found.join([part[0] for part in parts]).numbers(whole, self.objective.explosion)
-        baselines = interleave([part[1] for part in parts])
-        self.baselines.learn([s.sequence_id for s in whole], baselines)
-        self._barren = 0 if numbers.images else self._barren + 1
-        if self._barren >= BARREN_BATCHES:
-            far = f"kernels moved beyond {self.objective.explosion} diagonals in {BARREN_BATCHES} batches in a row"
-            raise DivergenceError(describe(0, whole, None, far))
-        return numbers.stats(whole[0].steps, len(whole), baselines)
 
     def _record(self, stats: dict[str, float], weight: int) -> None:
         self.last_stats = stats
@@ -426,7 +297,7 @@ class GausSimModule(LightningModule):
         """Adds the scenes' fingerprints, the averaged weights and the epoch's numbers."""
         own: dict[str, Any] = {"format": RESUME_FORMAT, "scenes": fingerprints(self.simulator.scenes)}
         own["average"] = self.average.state_dict()
-        own["epoch"] = {"sums": self._sums, "summary": self.summary, "warned": self._warned, "barren": self._barren}
+        own["epoch"] = {"sums": self._sums, "summary": self.summary, "warned": self._warned, "barren": self.barren}
         own["baselines"] = self.baselines.state_dict()
         if isinstance(self.supervision, TrackSupervision):
             own["tracks"] = self.supervision.state_dict()
@@ -445,7 +316,7 @@ class GausSimModule(LightningModule):
         self.average.load_state_dict({**own["average"], "values": with_present_weights(own["average"]["values"])})
         epoch = own["epoch"]
         self._sums, self.summary = epoch["sums"], epoch["summary"]
-        self._warned, self._barren = epoch["warned"], epoch["barren"]
+        self._warned, self.barren = epoch["warned"], epoch["barren"]
         self.baselines.load_state_dict(own.get("baselines") or own["yardsticks"])
         if isinstance(self.supervision, TrackSupervision):
             self.supervision.load_state_dict(own.get("tracks", {}))
@@ -454,9 +325,3 @@ class GausSimModule(LightningModule):
         """What a checkpoint says of its training, for :attr:`footnotes`."""
         if "cost" in checkpoint:  # not in those of earlier versions
             self.cost.load_state_dict(checkpoint["cost"])
-
-
-def _pull(loss: Tensor, network: Sequence[nn.Parameter]) -> Float[Tensor, " P"]:
-    """Gradient of the network by one term."""
-    grads = torch.autograd.grad(loss, network, retain_graph=True, allow_unused=True, materialize_grads=True)
-    return torch.cat([g.reshape(-1) for g in grads])

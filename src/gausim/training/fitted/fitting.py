@@ -27,14 +27,14 @@ from gausim.core import (
     SimState,
     Trajectory,
 )
-from gausim.data.dataset import SampleFacts, SequenceSample
+from gausim.data.dataset import SequenceSample
 from gausim.losses.objective import Objective
 from gausim.training.baseline_metrics import Baselines
 from gausim.training.fitted.stages import FitPlan, Stage, StagedCurriculum
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
-from gausim.training.statistics import Statistics
 from gausim.training.supervision.images import Supervision
+from gausim.training.terms.term import StepInputs, Term
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +133,23 @@ class Sequences(nn.Module):
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The method's."""
         return {name: list(members) for name, members in self.fitted.parameter_groups().items()}
+
+
+class Penalties:
+    """What a stage asks of a method beside the rollout's loss."""
+
+    def __init__(self, method: FittedMethod, weights: Mapping[str, float]) -> None:
+        """Keeps the method and the weights of its penalties by name."""
+        self._method, self._weights = method, weights
+
+    def descend(self, step: StepInputs) -> None:
+        """Backward of the sequences that are this rank's; the mean over all sequences of the step."""
+        if not self._weights:
+            return
+        for facts in step.whole[step.ranks.rank :: step.ranks.size]:
+            found = self._method.penalties(facts.sequence_id)
+            loss = torch.stack([weight * found[name] for name, weight in self._weights.items()]).sum()
+            step.backward(loss / len(step.whole))
 
 
 class FittedModule(GausSimModule):
@@ -264,32 +281,21 @@ class FittedModule(GausSimModule):
         self.settings = OptimizerSettings(network_lr=1.0, clip_norm=stage.clip_norm)  # rates are the stages' own
         return stage
 
-    def _backward(self, loss: Tensor) -> None:
+    def accumulate(self, loss: Tensor) -> None:
         """Nothing where nothing learns: behind the first frame, an initial velocity when gradients stop there."""
         if loss.requires_grad:
-            super()._backward(loss)
+            super().accumulate(loss)
 
-    def _static(
-        self,
-        samples: list[SequenceSample],
-        whole: list[SampleFacts],
-        draws: torch.Generator,
-        statistics: Statistics,
-    ) -> None:
-        """The stage's penalties of the sequences of this rank; the mean over all sequences of the step."""
-        weights = dict(self.plan.order)[self.stage].penalties
-        if not weights:
-            return
-        for facts in whole[self.ranks.rank :: self.ranks.size]:
-            found = self.method.penalties(facts.sequence_id)
-            loss = torch.stack([weight * found[name] for name, weight in weights.items()]).sum()
-            self._backward(loss / len(whole))
+    def terms(self) -> Sequence[Term]:
+        """The stage's penalties."""
+        return (Penalties(self.method, dict(self.plan.order)[self.stage].penalties),)
 
-    def _network(self) -> list[nn.Parameter]:
+    def network(self) -> list[nn.Parameter]:
+        """None: a method has no network that sequences share."""
         return []
 
     @staticmethod
-    def _defers(device: torch.device) -> bool:
+    def defers(device: torch.device) -> bool:
         """Never: after an explosion there is no state of rest to go on from."""
         return False
 

@@ -20,7 +20,7 @@ from gausim.models.template.elastic import ElasticTemplate
 from gausim.models.template.template import RestTemplate, Template
 from gausim.render.cpu import CpuRenderer
 from gausim.training.module import GausSimModule
-from gausim.training.passivity import energy_growth
+from gausim.training.terms.free_motion import energy_growth
 
 SCENE_OF_SEQUENCE = sway.SCENE_OF_SEQUENCE
 sample, sway_module = sway.sample, sway.sway_module

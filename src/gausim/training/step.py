@@ -1,0 +1,148 @@
+"""One step of the optimiser: inputs, rollout, terms, backward, step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from gausim.core import ConfigError, DivergenceError, SimState
+from gausim.data.dataset import SampleFacts, SequenceSample
+from gausim.training.contracts import SceneBatch
+from gausim.training.learner import Learner
+from gausim.training.ranks.ranks import interleave
+from gausim.training.rollout import Explosions, States, UnitNoise, after, describe, windows
+from gausim.training.statistics import Found, Statistics
+from gausim.training.terms.term import StepInputs
+
+# Batches in a row whose rollout explodes before anything can be learned from it; then training has diverged.
+BARREN_BATCHES = 20
+
+
+def optimise(
+    learner: Learner,
+    samples: list[SequenceSample],
+    optimizer: Optimizer,
+    draws: torch.Generator,
+    advance: Callable[[], object],
+) -> dict[str, float]:
+    """One step with all losses; returns what is logged of it.
+
+    Raises:
+        DivergenceError: a number is not finite; no parameter has moved.
+    """
+    optimizer.zero_grad(set_to_none=True)
+    whole = interleave(learner.ranks.gather([sample.facts for sample in samples]))
+    learner.exchange.begin(lambda: _see_first_frame(learner, samples))
+    statistics = roll_out(learner, samples, whole, draws)
+    inputs = StepInputs(samples, whole, draws, statistics, learner.ranks, learner.accumulate, learner.rest_loss)
+    for term in learner.terms():
+        term.descend(inputs)
+    weights = [p for p in learner.parameters() if p.requires_grad]
+    learner.exchange.step(weights, learner.network(), statistics)
+    stats = _read(learner, samples, whole, statistics.fetch(learner.settings.clip(optimizer)))
+    learner.exchange.absorb()
+    advance()
+    learner.average.update(learner.named_parameters())
+    learner.shown = len(whole)
+    return stats
+
+
+@torch.no_grad()
+def _see_first_frame(learner: Learner, samples: list[SequenceSample]) -> None:
+    """Lets the statistics of a new model's inputs begin with the first frame of its first batch."""
+    if samples:
+        batch = learner.simulator.batch([s.scene_id for s in samples])
+        learner.simulator.step(batch, learner.initial(samples, batch))
+
+
+def roll_out(
+    learner: Learner, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator
+) -> Statistics:
+    """Predicts the batch stretch by stretch, with a backward pass after each: memory does not grow with T."""
+    steps, objective, ranks = whole[0].steps, learner.objective, learner.ranks
+    if any(s.steps != steps for s in whole):
+        raise ConfigError(f"a batch needs sequences of equal length, got {[s.steps for s in whole]} steps.")
+    batch = learner.simulator.batch([s.scene_id for s in samples]) if samples else None
+    statistics, length = Statistics(), objective.window(steps)
+    device = next(learner.parameters()).device
+    deferred = device if learner.defers(device) else None
+    explosions = Explosions(batch, learner.diagonals, whole, objective.explosion, ranks=ranks, deferred=deferred)
+    free, unit = learner.free_motion.chosen(draws), _momentum_unit(learner, samples)
+    if batch is None:  # hears where the others' rollout ends
+        any(explosions.end(None, start, statistics.reach) for start in range(0, steps, length))
+        return statistics
+    comparison = learner.supervision.comparison(samples, batch)
+    starts: list[Callable[[SimState], SimState]] = [explosions.restart, *_noise(learner, batch, draws)]
+    initial, kept = learner.initial(samples, batch), objective.checkpoint_steps
+    per = objective.step_weight(steps) / len(whole)
+    own, last = torch.zeros(len(samples), device=device), initial
+    for start, made in windows(learner.simulator, batch, initial, steps, length, starts, checkpoint=kept):
+        states = States.of(made)
+        if explosions.end(states.positions, start, statistics.reach):
+            break
+        losses, motion = comparison(explosions.spared(states), start)
+        statistics.motion.append(motion)
+        momentum = explosions.counted(torch.stack([step.momentum for step in made]))
+        descend(learner, explosions.counted(losses), unit * momentum, per, statistics, measure=start == 0)
+        own = own + per * explosions.counted(losses).detach().sum(0)
+        last = after(made, last)
+    else:
+        if free is not None:
+            state = explosions.restart(last)
+            statistics.growth = learner.free_motion.descend(batch, state, own, len(whole), free, learner.accumulate)
+    return statistics
+
+
+def descend(
+    learner: Learner, losses: Tensor, momentum: Tensor, per: float, statistics: Statistics, *, measure: bool
+) -> None:
+    """Backward of one stretch; the mean over sequences, whatever the stretch's length."""
+    objective, network = learner.objective, learner.network()
+    images_term = objective.image_weight * per * losses.sum()
+    momentum_term = objective.momentum_weight * per * momentum.sum()
+    weighted = momentum_term.requires_grad and objective.momentum_weight > 0
+    if measure and weighted and network and learner.measures_fraction():
+        statistics.pulls = _pull(images_term, network), _pull(momentum_term, network)
+    learner.accumulate(images_term + momentum_term if weighted else images_term)
+    statistics.images.append(losses.detach())
+    statistics.momentum.append(momentum.detach())
+
+
+def _pull(loss: Tensor, network: list[nn.Parameter]) -> Tensor:
+    """Gradient of the network by one term."""
+    grads = torch.autograd.grad(loss, network, retain_graph=True, allow_unused=True, materialize_grads=True)
+    return torch.cat([grad.flatten() for grad in grads])
+
+
+def _noise(learner: Learner, batch: SceneBatch, draws: torch.Generator) -> list[UnitNoise]:
+    if learner.objective.input_noise == 0:
+        return []
+    deviations = [learner.objective.input_noise * d for d in learner.diagonals]
+    places = [learner.ranks.rank + i * learner.ranks.size for i in range(len(batch.members))]
+    return [UnitNoise(batch, learner.simulator.scenes, deviations, draws.initial_seed(), places)]
+
+
+def _momentum_unit(learner: Learner, samples: list[SequenceSample]) -> float:
+    """What the rest state scores on the frames of the batch, over all ranks: the unit of the momentum loss."""
+    if learner.objective.momentum_weight == 0:
+        return 0.0
+    scores = interleave(learner.ranks.gather([learner.rest_loss(sample) for sample in samples]))
+    return sum(scores) / len(scores)
+
+
+def _read(learner: Learner, samples: list[SequenceSample], whole: list[SampleFacts], found: Found) -> dict[str, float]:
+    """Joins the numbers of all ranks, checks them and forms what is logged."""
+    rests = [learner.simulator.scenes[s.scene_id].means.to(next(learner.parameters()).device) for s in samples]
+    own = [learner.baselines.of(sample, rest) for sample, rest in zip(samples, rests, strict=True)]
+    parts = learner.ranks.gather((found, own))
+    numbers = Found.join([part[0] for part in parts]).numbers(whole, learner.objective.explosion)
+    baselines = interleave([part[1] for part in parts])
+    learner.baselines.learn([s.sequence_id for s in whole], baselines)
+    learner.barren = 0 if numbers.images else learner.barren + 1
+    if learner.barren >= BARREN_BATCHES:
+        far = f"kernels moved beyond {learner.objective.explosion} diagonals in {BARREN_BATCHES} batches in a row"
+        raise DivergenceError(describe(0, whole, None, far))
+    return numbers.stats(whole[0].steps, len(whole), baselines)

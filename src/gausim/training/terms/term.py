@@ -1,0 +1,45 @@
+"""What a term of the loss beside the rollout's own is given, and what it does with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from gausim.data.dataset import SampleFacts, SequenceSample
+from gausim.training.ranks.ranks import Ranks
+from gausim.training.statistics import Statistics
+
+
+@dataclass(frozen=True, eq=False)
+class StepInputs:
+    """One step of the optimiser, as its terms see it.
+
+    Attributes:
+        samples: this rank's sequences.
+        whole: facts of all ranks' sequences.
+        draws: random numbers of the step.
+        statistics: what is logged of it.
+        ranks: who computes.
+        backward: takes a loss to the gradients of the parameters.
+        rest_loss: what the rest state scores on the frames of a sample, their mean: the unit of penalties.
+    """
+
+    samples: Sequence[SequenceSample]
+    whole: Sequence[SampleFacts]
+    draws: torch.Generator
+    statistics: Statistics
+    ranks: Ranks
+    backward: Callable[[Tensor], None]
+    rest_loss: Callable[[SequenceSample], float]
+
+
+@runtime_checkable
+class Term(Protocol):
+    """A term of the loss that does not need the rollout."""
+
+    def descend(self, step: StepInputs) -> None:
+        """Backward of the term, as the mean over all sequences of the step."""
