@@ -9,6 +9,7 @@ import yaml
 from helpers.toy_object import toy_scene
 
 from gausim.compose.config import instantiate
+from gausim.core import RunError
 from gausim.runs.directory import CONFIG, RunDirectory
 from gausim.runs.renamed import MOVED, with_present_names, with_present_weights
 
@@ -49,6 +50,14 @@ def test_a_configuration_of_before_is_read_by_present_names(tmp_path) -> None:
     model = instantiate(simulator, scenes=[toy_scene()], fps=[24.0])()
     assert model.predicted_levels == (2, 1)
     assert with_present_names(found) == found
+
+
+@pytest.mark.parametrize("wrong", [{"predicted_levels": [7, 1]}, {"graph_radii": [2.0]}, {"predicted_levels": 3}])
+def test_levels_that_cannot_be_read_are_said(tmp_path, wrong) -> None:
+    simulator = {**OLD["model"]["simulator"], **wrong}
+    (tmp_path / CONFIG).write_text(yaml.safe_dump({"model": {"simulator": simulator}}))
+    with pytest.raises(RunError, match=r"config\.yaml: model\.simulator"):
+        RunDirectory(tmp_path).config()
 
 
 def test_weights_of_before_are_read_by_present_names() -> None:

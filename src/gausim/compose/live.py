@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from gausim.core.errors import ConfigError, DataError
-from gausim.models.rollout.dynamics import SceneDynamics
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -108,6 +107,7 @@ def _method(
 ) -> tuple[SimState, Steppable, Tensor, float | None]:
     """Initial state, dynamics, masses and the ceiling of the energy."""
     from gausim.core import FittedDynamics, SimState
+    from gausim.models.rollout.dynamics import SceneDynamics
     from gausim.models.step.simulator import GausSim
     from gausim.ops.covariance import kernel_volumes
     from gausim.training.fitted.fitting import FittedModule

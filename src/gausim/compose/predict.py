@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 from gausim.core.errors import DataError
-from gausim.models.rollout.dynamics import SceneDynamics
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -142,6 +141,7 @@ def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
     """How the first sequence of an object goes on for so many frames: free, and under random pushes from rest."""
     from gausim.core import ConfigError, SimState
     from gausim.evaluation.endurance import RandomPushes, endure
+    from gausim.models.rollout.dynamics import SceneDynamics
     from gausim.models.step.simulator import GausSim
 
     if not isinstance(run.module.model, GausSim):

@@ -145,7 +145,13 @@ class RunDirectory:
             raise RunError(f"{path}: cannot be read as YAML ({error}).") from error
         if not isinstance(loaded, dict):
             raise RunError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
-        return dict(with_present_names(loaded))
+        try:
+            return dict(with_present_names(loaded))
+        except (IndexError, TypeError, ValueError) as error:
+            raise RunError(
+                f"{path}: model.simulator: expected the settings of this version or the one before, got levels that "
+                f"cannot be read ({error}). Restore the file."
+            ) from error
 
     @contextmanager
     def writing(self) -> Iterator[None]:

@@ -12,7 +12,7 @@ from gausim.core import SimState
 from gausim.data.dataset import SequenceSample
 from gausim.losses.objective import Objective
 from gausim.runs.checkpoint import WeightAverage
-from gausim.training.baseline_metrics import Baselines
+from gausim.training.baseline_metrics import Baselines, SequenceBaseline
 from gausim.training.contracts import SceneBatch, Simulator
 from gausim.training.exchange import Exchange
 from gausim.training.optimizers import OptimizerSettings
@@ -79,6 +79,9 @@ class Learner(Protocol):
 
     def accumulate(self, loss: Tensor) -> None:
         """Adds the gradients of a loss to those of the parameters."""
+
+    def baseline(self, sample: SequenceSample) -> SequenceBaseline:
+        """What the rest state scores on a sample's sequence, for at least the sample's frames."""
 
     def rest_loss(self, sample: SequenceSample) -> float:
         """What the rest state scores on the frames of a sample, their mean: the unit of penalties."""

@@ -23,7 +23,7 @@ from gausim.runs.checkpoint import RESUME_FORMAT, WeightAverage, check_scenes, f
 from gausim.runs.cost import TrainingCost
 from gausim.runs.renamed import with_present_weights
 from gausim.training import step
-from gausim.training.baseline_metrics import Baselines
+from gausim.training.baseline_metrics import Baselines, SequenceBaseline
 from gausim.training.contracts import InitialVelocities, SceneBatch, Simulator
 from gausim.training.exchange import Exchange
 from gausim.training.optimizers import OptimizerSettings
@@ -207,11 +207,13 @@ class GausSimModule(LightningModule):
         """Weights of the network that learn."""
         return [p for p in self.simulator.parameter_groups()["network"] if p.requires_grad]
 
+    def baseline(self, sample: SequenceSample) -> SequenceBaseline:
+        """What the rest state scores on a sample's sequence, for at least the sample's frames."""
+        return self.baselines.of(sample, self.simulator.batch([sample.scene_id]).rest)
+
     def rest_loss(self, sample: SequenceSample) -> float:
         """What the rest state scores on the frames of a sample, their mean: the unit of penalties."""
-        rest = self.simulator.scenes[sample.scene_id].means.to(next(self.parameters()).device)
-        baseline = self.baselines.of(sample, rest)
-        losses = baseline.static[: sample.steps]
+        losses = self.baseline(sample).static[: sample.steps]
         return sum(losses) / len(losses)
 
     # ------------------------------------------------------------------------------------------------ states, images

@@ -135,9 +135,7 @@ def _momentum_unit(learner: Learner, samples: list[SequenceSample]) -> float:
 
 def _read(learner: Learner, samples: list[SequenceSample], whole: list[SampleFacts], found: Found) -> dict[str, float]:
     """Joins the numbers of all ranks, checks them and forms what is logged."""
-    rests = [learner.simulator.scenes[s.scene_id].means.to(next(learner.parameters()).device) for s in samples]
-    own = [learner.baselines.of(sample, rest) for sample, rest in zip(samples, rests, strict=True)]
-    parts = learner.ranks.gather((found, own))
+    parts = learner.ranks.gather((found, [learner.baseline(sample) for sample in samples]))
     numbers = Found.join([part[0] for part in parts]).numbers(whole, learner.objective.explosion)
     baselines = interleave([part[1] for part in parts])
     learner.baselines.learn([s.sequence_id for s in whole], baselines)

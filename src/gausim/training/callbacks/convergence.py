@@ -199,7 +199,7 @@ def forecast(module: GausSimModule, samples: Sequence[SequenceSample], first: in
                     windows(module.simulator, batch, module.initial([sample], batch), sample.steps, sample.steps)
                 )
                 losses, _ = module.supervision.comparison([sample], batch)(States.of(made[first:]), first)
-                baseline = module.baselines.of(sample, batch.rest)
+                baseline = module.baseline(sample)
                 still = sum(baseline.static[first : sample.steps])
                 own = float(losses.sum())
                 loss += own if math.isfinite(own) else 10.0 * still
