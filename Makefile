@@ -18,7 +18,7 @@ DIRS ?= $(if $(filter-out file,$(origin RUN)),$(RUN),outputs)
 ARGS ?=
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install test test-slow fuzz test-notebooks lint format data demo dataset train evaluate simulate report benchmark clean
+.PHONY: help install test test-slow test-types fuzz test-notebooks lint format data demo dataset train evaluate simulate report benchmark clean
 
 help: ## Show this text
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -37,6 +37,9 @@ test: install ## Run the default tests (without the slow ones)
 
 test-slow: install ## Run the slow tests
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) -m slow $(ARGS)
+
+test-types: install ## Run the default tests with every annotated type and shape checked at run time (twice the time)
+	GAUSIM_CHECK_TYPES=1 $(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) -m "not slow" $(ARGS)
 
 # One at a time: each is written for two cores, and compiling in two processes at once would compile twice.
 test-notebooks: install ## Execute the notebooks on the embedded synthetic data

@@ -22,10 +22,12 @@ def _left_unchecked(decorator: ast.AST, *, marked=_import_hook._is_no_type_check
     return marked(decorator) or bool(names & {"njit", "jit", "vectorize", "guvectorize", "wp"} and "torch" not in names)
 
 
-_import_hook._is_no_type_check = _left_unchecked
-# Before anything imports gausim: every annotated signature, shapes included, is checked in every test. An int is a
-# float as it is to mypy (PEP 484), or `lr: 1` in a configuration would fail under test and nowhere else.
-install_import_hook("gausim", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
+# `make test-types` sets it: the checks double the time of the suite.
+if os.environ.get("GAUSIM_CHECK_TYPES"):
+    _import_hook._is_no_type_check = _left_unchecked
+    # Before anything imports gausim: every annotated signature, shapes included, is checked in every test. An int is a
+    # float as it is to mypy (PEP 484), or `lr: 1` in a configuration would fail under test and nowhere else.
+    install_import_hook("gausim", "beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))")
 
 
 @pytest.fixture(scope="session")
