@@ -155,3 +155,12 @@ def test_parts_that_nothing_holds_still_have_orthonormal_modes() -> None:
     gram = np.einsum("nam,n,nak->mk", phi, mass, phi)
     np.testing.assert_allclose(gram, np.eye(len(values)), atol=1e-5)
     assert np.isfinite(slopes).all() and len(values) == 40 and not phi[held].any()
+
+
+def test_cells_do_not_depend_on_rounding() -> None:
+    points = np.random.default_rng(0).random((60, 3))
+    _, centres, weights = solid.cells(points, 0.3)
+    for shift in np.linspace(0.1, 7.7, 20):  # the outermost points lie on borders of cells
+        _, moved, same = solid.cells(points + shift, 0.3)
+        assert np.array_equal(weights, same)
+        np.testing.assert_allclose(moved - shift, centres, atol=1e-12)

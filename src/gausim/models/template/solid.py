@@ -30,6 +30,8 @@ NO_SUPPORT = 1e-9
 # Everything is held by springs of this share of the median stiffness: parts that nothing connects to a pin could move
 # without any force, and the equations would have no solution.
 FOUNDATION = 1e-8
+# Fraction of an integration cell that rounding may cost: the outermost kernels lie on the border of theirs.
+ROUNDING = 1e-6
 # Grid points within the support of a quadratic B-spline, along one axis.
 SUPPORT = 3
 
@@ -97,7 +99,7 @@ def cells(points: np.ndarray, spacing: float) -> tuple[Grid, np.ndarray, np.ndar
     grid = Grid(origin, spacing, (int(shape[0]), int(shape[1]), int(shape[2])))
     small = spacing / SUBDIVISIONS
     occupied = np.zeros(np.ceil(extent / small).astype(np.int64) + 2 * SUBDIVISIONS, dtype=bool)
-    occupied[tuple(np.floor((points - origin) / small).astype(np.int64).T)] = True
+    occupied[tuple(np.floor((points - origin) / small + ROUNDING).astype(np.int64).T)] = True
     occupied = inside(occupied)
     near = ndimage.binary_dilation(occupied, iterations=SUBDIVISIONS)
     centres = (np.argwhere(near) + 0.5) * small + origin
