@@ -45,7 +45,9 @@ def test_the_example_of_the_documentation(run, tmp_path: Path, monkeypatch) -> N
     assert (tmp_path / "push.json").is_file()
     recorded = sim.trajectory
     again = gausim.load(run.run_dir).replay("push.json")
-    assert torch.equal(again.positions, recorded.positions) and torch.equal(again.gradients, recorded.gradients)
+    assert torch.equal(again.positions, recorded.positions) and torch.equal(
+        again.deformation_gradients, recorded.deformation_gradients
+    )
 
 
 def test_pushes_draws_and_resets(run) -> None:

@@ -123,8 +123,8 @@ class Simulation:
         color = None if background is None else torch.tensor(background, dtype=frame.positions.dtype)
         with torch.no_grad():
             drawn = draw(
-                self.renderer, self._look, frame.positions[None], frame.gradients[None], frame.rotations[None],
-                self.interaction.unit_of_kernel, views, background=color,
+                self.renderer, self._look, frame.positions[None], frame.deformation_gradients[None],
+                frame.rotations[None], self.interaction.unit_of_kernel, views, background=color,
             )  # fmt: skip
         pixels: np.ndarray = to_bytes(drawn.rgb[0, 0]).cpu().numpy()
         return pixels

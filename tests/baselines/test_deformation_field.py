@@ -24,7 +24,9 @@ def test_it_begins_at_rest_and_satisfies_the_contract() -> None:
     with torch.no_grad():
         state = field.advance(field.begin(0))
     torch.testing.assert_close(state.positions, field.scenes[0].means)
-    torch.testing.assert_close(state.gradients, torch.eye(3).expand_as(state.gradients), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        state.deformation_gradients, torch.eye(3).expand_as(state.deformation_gradients), atol=1e-6, rtol=0
+    )
 
 
 def test_gradients_reproduce_the_deformed_covariance() -> None:
@@ -34,7 +36,7 @@ def test_gradients_reproduce_the_deformed_covariance() -> None:
         for own in (field.means[1], field.scales[1], field.rotations[1]):
             own.copy_(0.3 * torch.randn(own.shape, generator=generator))
         state = field.advance(field.begin(1))
-    got = transport_covariance(covariance_from_scales(scene.log_scales, scene.quats), state.gradients)
+    got = transport_covariance(covariance_from_scales(scene.log_scales, scene.quats), state.deformation_gradients)
     free = (scene.simulated & ~scene.pinned).float()[:, None]
     quats = torch.nn.functional.normalize(scene.quats, dim=-1) + free * field.rotations[1]
     expected = covariance_from_scales(scene.log_scales + free * field.scales[1], quats)
@@ -75,7 +77,7 @@ def test_it_learns_a_scene_that_moves_and_turns() -> None:
         state, found = field.begin(0), []
         for x, turn in wanted:
             state = field.advance(state)
-            by_turn = (state.gradients - turn).square() * free[:, None]
+            by_turn = (state.deformation_gradients - turn).square() * free[:, None]
             found.append((state.positions - x).square().mean() + 0.1 * by_turn.mean())
         return found
 

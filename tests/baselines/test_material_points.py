@@ -61,9 +61,11 @@ def test_kernels_follow_an_affine_motion_of_their_particles_exactly() -> None:
     assert driven.count == 12 and driven.followed.shape == (36, 8)
     wanted = turn() @ torch.diag(torch.tensor([1.2, 0.9, 1.05]))
     shift = torch.tensor([0.4, -0.2, 0.1])
-    positions, gradients, rotations = driven.carried(driven.rest @ wanted.T + shift, wanted.expand(12, 3, 3))
+    positions, deformation_gradients, rotations = driven.carried(
+        driven.rest @ wanted.T + shift, wanted.expand(12, 3, 3)
+    )
     torch.testing.assert_close(positions, scene.means @ wanted.T + shift, rtol=0, atol=2e-6)
-    torch.testing.assert_close(gradients, wanted.expand(36, 3, 3), rtol=0, atol=1e-6)
+    torch.testing.assert_close(deformation_gradients, wanted.expand(36, 3, 3), rtol=0, atol=1e-6)
     u, _, vt = torch.linalg.svd(wanted)
     torch.testing.assert_close(rotations, (u @ vt).expand(36, 3, 3), rtol=0, atol=1e-5)
 
@@ -73,11 +75,11 @@ def test_the_originals_kernels_turn_and_keep_their_shape() -> None:
     driven = clustered(scene, torch.zeros(0, 3), 36, even=True)
     torch.testing.assert_close(driven.weights, torch.full((36, 8), 1 / 8))
     shift = torch.tensor([0.4, -0.2, 0.1])
-    positions, gradients, rotations = driven.turned(driven.rest + shift)
+    positions, deformation_gradients, rotations = driven.turned(driven.rest + shift)
     torch.testing.assert_close(positions, scene.means + shift)
-    _, gradients, rotations = driven.turned(driven.rest @ turn().T + shift)
+    _, deformation_gradients, rotations = driven.turned(driven.rest @ turn().T + shift)
     torch.testing.assert_close(rotations, turn().expand(36, 3, 3), rtol=0, atol=1e-5)
-    assert torch.equal(gradients, rotations)
+    assert torch.equal(deformation_gradients, rotations)
 
 
 def test_clusters_and_pins() -> None:
@@ -117,7 +119,7 @@ def test_what_begins_at_rest_stays_at_rest_and_what_is_held_stays(make: Callable
     assert int(held.sum()) == 10
     for state in states:
         assert torch.equal(state.positions[held], rest[held])
-        assert torch.equal(state.gradients[held], torch.eye(3).expand(10, 3, 3))
+        assert torch.equal(state.deformation_gradients[held], torch.eye(3).expand(10, 3, 3))
     assert float((states[-1].positions - rest)[~held].norm(dim=1).min()) > 1e-3
 
 
@@ -134,7 +136,9 @@ def test_physgaussian_moves_as_the_material_point_method_moves_its_scene() -> No
     assert moved > 0.05
     for frame, state in enumerate(states):
         torch.testing.assert_close(state.positions, wanted.positions[frame], rtol=0, atol=1e-3 * moved)
-        torch.testing.assert_close(state.gradients, wanted.gradients[frame][wanted.unit_of_kernel], rtol=0, atol=1e-3)
+        torch.testing.assert_close(
+            state.deformation_gradients, wanted.deformation_gradients[frame][wanted.unit_of_kernel], rtol=0, atol=1e-3
+        )
 
 
 def observed(method: PhysDreamer, frames: int) -> list[Tensor]:

@@ -42,8 +42,8 @@ def test_kernels_follow_an_affine_motion_with_its_gradient() -> None:
     assert anchors.count == 36 and not bool(anchors.pinned.any())
     turn = quaternion_to_matrix(torch.tensor([1.0, 0.2, -0.1, 0.3]))
     wanted = turn @ torch.diag(torch.tensor([1.2, 0.9, 1.05]))
-    gradients, rotations = anchors.gradients(anchors.rest @ (wanted - torch.eye(3)).T)
-    error = (gradients - wanted).norm(dim=(1, 2)) / (wanted - torch.eye(3)).norm()
+    deformation_gradients, rotations = anchors.deformation_gradients(anchors.rest @ (wanted - torch.eye(3)).T)
+    error = (deformation_gradients - wanted).norm(dim=(1, 2)) / (wanted - torch.eye(3)).norm()
     assert float(error.max()) < 0.02  # the ridge shrinks it a little
     torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3).expand(36, 3, 3), atol=1e-5, rtol=0)
     shift = torch.tensor([0.1, -0.2, 0.3])
@@ -66,7 +66,7 @@ def test_held_kernels_and_pinned_anchors_never_move() -> None:
     assert bool(anchors.pinned.any()) and not bool(anchors.pinned.all())
     for state in states:
         assert torch.equal(state.positions[held], scene.means[held])
-        torch.testing.assert_close(state.gradients[held], torch.eye(3).expand(int(held.sum()), 3, 3))
+        torch.testing.assert_close(state.deformation_gradients[held], torch.eye(3).expand(int(held.sum()), 3, 3))
         assert torch.equal(state.inner[0][anchors.pinned], anchors.rest[anchors.pinned])
     assert float((states[-1].positions - scene.means)[~held].norm(dim=1).min()) > 0
 

@@ -24,7 +24,7 @@ def test_static_repeats_the_rest_state_whatever_the_start():
     trajectory = dynamics.rollout(SimState(rest.means + 1, rest.means - 1), 6)
     assert trajectory.frames == 7 and trajectory.fps == 25.0
     assert all(torch.equal(frame, rest.means) for frame in trajectory.positions)
-    assert torch.equal(trajectory.gradients[:, 0], torch.eye(3).expand(7, 3, 3))
+    assert torch.equal(trajectory.deformation_gradients[:, 0], torch.eye(3).expand(7, 3, 3))
     points = torch.randn(4, 3)
     carried = trajectory.carry(points, torch.tensor([0, 2, 4, 1]), rest.means)
     assert torch.allclose(carried, points.expand(7, 4, 3), atol=1e-6)

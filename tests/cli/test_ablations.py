@@ -80,7 +80,7 @@ def test_no_mass_leaves_det_F_free_in_the_head_and_in_the_template(toy: Path, mo
         module, _ = fresh(toy, ablation, model)
         step = random_step(module)
         own = max(float((torch.linalg.det(f.detach()) - 1).abs().max()) for f in step.predicted)
-        errors[ablation] = own, float((torch.linalg.det(step.gradients.detach()) - 1).abs().max())
+        errors[ablation] = own, float((torch.linalg.det(step.deformation_gradients.detach()) - 1).abs().max())
         silence(module.model)  # what is left is the template's
         errors[ablation] += (float((torch.linalg.det(random_rest(module)) - 1).abs().max()),)
     for ablation in ("none", "no_hierarchy"):
@@ -96,7 +96,9 @@ def random_rest(module: GausSimModule) -> torch.Tensor:
     batch = module.model.batch([0])
     generator = torch.Generator().manual_seed(0)
     shift = 0.05 * torch.randn(2, *batch.rest.shape, generator=generator)
-    return module.model.step(batch, SimState(batch.rest + shift[0], batch.rest + shift[1])).gradients.detach()
+    return module.model.step(
+        batch, SimState(batch.rest + shift[0], batch.rest + shift[1])
+    ).deformation_gradients.detach()
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -142,16 +144,20 @@ def test_combinations_set_what_their_parts_set() -> None:
 
 
 def test_the_sum_over_steps_is_T_times_the_mean(toy: Path) -> None:
-    gradients = {}
+    deformation_gradients = {}
     for ablation in ("none", "sum_over_steps"):
         config = ["loss.static_weight=0", "optimizer.clip_norm=0", "model=gausim_paper", f"ablation={ablation}"]
         torch.manual_seed(0)
         module, datamodule = build(compose("train", [f"data.root={toy}", *TINY, *config]))
         samples = [TrainingDataset(datamodule.index)[SampleKey(i, 3)] for i in range(2)]
         module.optimise(samples, module.configure_optimizers(), torch.Generator().manual_seed(0))
-        gradients[ablation] = {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}
-    assert gradients["none"].keys() == gradients["sum_over_steps"].keys()
-    for name, value in gradients["none"].items():
+        deformation_gradients[ablation] = {
+            n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None
+        }
+    assert deformation_gradients["none"].keys() == deformation_gradients["sum_over_steps"].keys()
+    for name, value in deformation_gradients["none"].items():
         size = float(value.abs().max())
-        torch.testing.assert_close(gradients["sum_over_steps"][name], 3 * value, rtol=1e-4, atol=1e-4 * size)
-    assert any(bool(value.any()) for value in gradients["none"].values())
+        torch.testing.assert_close(
+            deformation_gradients["sum_over_steps"][name], 3 * value, rtol=1e-4, atol=1e-4 * size
+        )
+    assert any(bool(value.any()) for value in deformation_gradients["none"].values())

@@ -38,7 +38,7 @@ def test_a_trajectory_and_ply_files_come_back_bit_for_bit(run, tmp_path: Path, c
     assert export.main([source, "--format", "safetensors", *options]) == 0
     assert "wrote toy_seq_001.safetensors: 6 frames of 36 kernels at 24 frames" in capsys.readouterr().out
     trajectory, whole = load_trajectory("toy_seq_001.safetensors"), run.module.predict(1, 5)
-    for name in ("positions", "gradients", "rotations", "unit_of_kernel"):
+    for name in ("positions", "deformation_gradients", "rotations", "unit_of_kernel"):
         assert torch.equal(getattr(trajectory, name), getattr(whole, name))
 
     assert export.main([source, "--format", "ply", "--out", "a", *options]) == 0
@@ -47,7 +47,7 @@ def test_a_trajectory_and_ply_files_come_back_bit_for_bit(run, tmp_path: Path, c
     assert export.main([*stored, "--format", "ply", "--out", "b"]) == 0
     expected = [
         deformed_scene(scene, *state, whole.unit_of_kernel)
-        for state in zip(whole.positions, whole.gradients, whole.rotations, strict=True)
+        for state in zip(whole.positions, whole.deformation_gradients, whole.rotations, strict=True)
     ]
     for folder in ("a", "b"):
         scenes, count, fps = load_ply_sequence(folder)

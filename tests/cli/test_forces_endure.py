@@ -61,7 +61,7 @@ def test_a_thousand_steps_of_random_forces(tmp_path: Path, monkeypatch: pytest.M
         before, pinned = live.frame.positions, live.held.clone()
         frame = live.step()
         assert torch.isfinite(frame.positions).all() and torch.isfinite(frame.rotations).all()
-        gradient = frame.gradients.double()[live.unit_of_kernel]
+        gradient = frame.deformation_gradients.double()[live.unit_of_kernel]
         assert float(torch.linalg.eigvalsh(gradient @ rest @ gradient.mT).min()) > 0
         assert torch.equal(frame.positions[held], scene.means[held])
         assert torch.equal(frame.positions[pinned], before[pinned])
@@ -72,6 +72,6 @@ def test_a_thousand_steps_of_random_forces(tmp_path: Path, monkeypatch: pytest.M
     start = replace(session, steps=100, entries=tuple(e for e in session.entries if e.at < 100))
     again = replay(open_interaction(load_run("outputs/toy/seed_0")), start)
     assert torch.equal(again.positions, recorded.positions[:101])
-    assert torch.equal(again.gradients, recorded.gradients[:101])
+    assert torch.equal(again.deformation_gradients, recorded.deformation_gradients[:101])
     ceiling = live._dynamics.energy_ceiling
     assert ceiling is not None and ceiling > 0 and ENERGY_ROOM > 1

@@ -128,8 +128,8 @@ def test_trilinear_points_follow_an_affine_motion_exactly(body: Body) -> None:
     rest = points.positions(body.nodes)
     moved = np.stack((body.nodes, body.nodes @ matrix.T + [0.1, 0.2, 0.3]))
     np.testing.assert_allclose(points.positions(moved)[1], rest @ matrix.T + [0.1, 0.2, 0.3], atol=1e-12)
-    np.testing.assert_allclose(points.gradients(moved)[1], np.tile(matrix, (40, 1, 1)), atol=1e-9)
-    np.testing.assert_allclose(points.gradients(moved)[0], np.tile(np.eye(3), (40, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(points.deformation_gradients(moved)[1], np.tile(matrix, (40, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(points.deformation_gradients(moved)[0], np.tile(np.eye(3), (40, 1, 1)), atol=1e-9)
     np.testing.assert_allclose(frames.transpose(0, 2, 1) @ frames, np.tile(np.eye(3), (40, 1, 1)), atol=1e-9)
     assert (np.linalg.det(frames) > 0).all()
 

@@ -29,7 +29,7 @@ def evaluated(toy):
     def half(record):
         full = toy.truth(record.name)
         middle = toy.scene.means + 0.5 * (full.positions - toy.scene.means)
-        return Trajectory(middle, full.gradients, full.rotations, full.unit_of_kernel, full.fps)
+        return Trajectory(middle, full.deformation_gradients, full.rotations, full.unit_of_kernel, full.fps)
 
     def still(record):
         rest = SimState(toy.scene.means, toy.scene.means)

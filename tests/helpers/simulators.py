@@ -69,7 +69,7 @@ def gausim(
     )
 
 
-def feed(model: GausSim, gradients: Callable[..., tuple[Tensor, Tensor]]) -> None:
+def feed(model: GausSim, deformation_gradients: Callable[..., tuple[Tensor, Tensor]]) -> None:
     """Has the network's place taken by a function of (level, unit, above, target, position), which gives F and Q."""
     seen: list[tuple[Units, int]] = []
 
@@ -79,7 +79,7 @@ def feed(model: GausSim, gradients: Callable[..., tuple[Tensor, Tensor]]) -> Non
 
     def gradient(output: Tensor, level: LevelBatch, above: Solved, target: Tensor) -> tuple[Tensor, Tensor]:
         unit, position = seen.pop()
-        return gradients(level, unit, above, target, position)
+        return deformation_gradients(level, unit, above, target, position)
 
     model.predictor.forward, model.predictor.gradient = forward, gradient  # type: ignore[method-assign]
 

@@ -63,7 +63,9 @@ class Sway(nn.Module):
             positions = positions * self.poison
         identity = torch.eye(3).expand(len(batch.members), 3, 3)
         momentum = (self.keep * drift.mean()).square()
-        return SimpleNamespace(positions=positions, gradients=identity, rotations=identity, momentum=momentum)
+        return SimpleNamespace(
+            positions=positions, deformation_gradients=identity, rotations=identity, momentum=momentum
+        )
 
 
 class Previous(nn.Module):

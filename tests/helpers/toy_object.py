@@ -107,7 +107,7 @@ def _write_sequence(toy: ToyObject, name: str) -> None:
 
 
 def rgba(scene: GaussianScene, trajectory: Trajectory, views: Cameras | None = None) -> Tensor:
-    drawn = draw(ReferenceRenderer(), scene, trajectory.positions, trajectory.gradients, trajectory.rotations,
-                 trajectory.unit_of_kernel, views or cameras())  # fmt: skip
+    drawn = draw(ReferenceRenderer(), scene, trajectory.positions, trajectory.deformation_gradients,
+                 trajectory.rotations, trajectory.unit_of_kernel, views or cameras())  # fmt: skip
     straight = drawn.rgb / drawn.alpha.clamp_min(1e-6)[..., None]
     return (torch.cat((straight, drawn.alpha[..., None]), -1).clamp(0, 1) * 255).round().to(torch.uint8)

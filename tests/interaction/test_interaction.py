@@ -18,7 +18,7 @@ X, Y, UP = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 
 
 def same(a, b) -> bool:
-    names = ("positions", "gradients", "rotations", "unit_of_kernel")
+    names = ("positions", "deformation_gradients", "rotations", "unit_of_kernel")
     return all(torch.equal(getattr(a, n), getattr(b, n)) for n in names) and a.fps == b.fps
 
 
@@ -35,7 +35,7 @@ def test_stepping_is_the_rollout_bit_for_bit(make_column, make_simulator, passiv
     for n in range(12):
         frame = stepper.step(force if 3 <= n < 5 else None)
         assert torch.equal(frame.positions, whole.positions[n + 1])
-        assert torch.equal(frame.gradients, whole.gradients[n + 1])
+        assert torch.equal(frame.deformation_gradients, whole.deformation_gradients[n + 1])
         assert torch.equal(frame.rotations, whole.rotations[n + 1])
     assert torch.equal(stepper.state.previous, whole.positions[11])
     assert float((whole.positions[-1] - scene.means).abs().max()) > 1e-3
@@ -264,14 +264,16 @@ class Broken:
         frame, self._steps = self._inner.step(force, held=held), self._steps + 1
         if self._steps < 2:
             return frame
-        positions, gradients = frame.positions.clone(), frame.gradients.clone()
+        positions, deformation_gradients = frame.positions.clone(), frame.deformation_gradients.clone()
         if self._how == "nan":
             positions[33, 1] = math.nan
         elif self._how == "far":
             positions[33, 1] += 20
         else:
-            gradients[self.unit_of_kernel[33]] *= torch.tensor([1.0, 1.0, 0.0 if self._how == "flat" else math.inf])
-        return replace(frame, positions=positions, gradients=gradients)
+            deformation_gradients[self.unit_of_kernel[33]] *= torch.tensor(
+                [1.0, 1.0, 0.0 if self._how == "flat" else math.inf]
+            )
+        return replace(frame, positions=positions, deformation_gradients=deformation_gradients)
 
     def settle(self) -> None: ...
 

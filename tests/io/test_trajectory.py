@@ -12,7 +12,7 @@ def trajectory(frames: int = 4, kernels: int = 7, units: int = 3) -> Trajectory:
     generator = torch.Generator().manual_seed(0)
     return Trajectory(
         positions=torch.randn(frames, kernels, 3, generator=generator),
-        gradients=torch.randn(frames, units, 3, 3, generator=generator),
+        deformation_gradients=torch.randn(frames, units, 3, 3, generator=generator),
         rotations=torch.randn(frames, units, 3, 3, generator=generator),
         unit_of_kernel=torch.randint(0, units, (kernels,), generator=generator),
         fps=30000 / 1001,
@@ -23,7 +23,7 @@ def test_round_trip_is_bitwise(tmp_path):
     original = trajectory()
     save_trajectory(tmp_path / "a" / "t.safetensors", original, facts={"object": "bunny"})
     loaded = load_trajectory(tmp_path / "a" / "t.safetensors")
-    for name in ("positions", "gradients", "rotations", "unit_of_kernel"):
+    for name in ("positions", "deformation_gradients", "rotations", "unit_of_kernel"):
         first, second = getattr(original, name), getattr(loaded, name)
         assert first.dtype == second.dtype and torch.equal(first, second)
     assert loaded.fps == original.fps
@@ -32,7 +32,7 @@ def test_round_trip_is_bitwise(tmp_path):
 
 def test_views_of_one_frame_are_written_out(tmp_path):
     one = trajectory()
-    still = Trajectory(one.positions[0].expand(5, -1, -1), one.gradients[:1].expand(5, -1, -1, -1),
+    still = Trajectory(one.positions[0].expand(5, -1, -1), one.deformation_gradients[:1].expand(5, -1, -1, -1),
                        one.rotations[:1].expand(5, -1, -1, -1), one.unit_of_kernel, 24.0)  # fmt: skip
     save_trajectory(tmp_path / "t.safetensors", still)
     assert torch.equal(load_trajectory(tmp_path / "t.safetensors").positions, still.positions)

@@ -31,12 +31,12 @@ def scene(count: int = 40, degree: int = 2) -> GaussianScene:
 def motion(rest: GaussianScene, frames: int = 4) -> list[GaussianScene]:
     g, made = torch.Generator().manual_seed(1), [rest]
     for _ in range(frames - 1):
-        gradients = torch.eye(3) + 0.2 * torch.randn(5, 3, 3, generator=g)
-        rotations = torch.linalg.qr(gradients)[0]
+        deformation_gradients = torch.eye(3) + 0.2 * torch.randn(5, 3, 3, generator=g)
+        rotations = torch.linalg.qr(deformation_gradients)[0]
         rotations = rotations * torch.det(rotations)[:, None, None].sign()
         units = torch.randint(0, 5, (rest.count,), generator=g)
         positions = rest.means + 0.1 * torch.randn(rest.means.shape, generator=g)
-        made.append(deformed_scene(rest, positions, gradients, rotations, units))
+        made.append(deformed_scene(rest, positions, deformation_gradients, rotations, units))
     return made
 
 

@@ -36,7 +36,7 @@ def test_union_of_scenes_and_sequences_equals_each_alone(
     for member, scene_id, state, force in zip(batch.members, ids, states, forces, strict=True):
         alone = model.step(model.batch((scene_id,)), state, force)
         assert torch.allclose(joint.positions[member.kernels], alone.positions, atol=1e-6)
-        assert torch.allclose(joint.gradients[member.units], alone.gradients, atol=1e-5)
+        assert torch.allclose(joint.deformation_gradients[member.units], alone.deformation_gradients, atol=1e-5)
         assert torch.allclose(joint.rotations[member.units], alone.rotations, atol=1e-5)
         assert torch.equal(member.unit_of_kernel, model.batch((scene_id,)).members[0].unit_of_kernel)
         momentum += float(alone.momentum)
@@ -58,7 +58,9 @@ def test_kernels_follow_their_unit_and_held_ones_the_identity(
     step = model.step(batch, make_state(scene))
     held = scene.pinned | ~scene.simulated
     last = member.units.stop - 1
-    assert torch.equal(step.gradients[last], torch.eye(3)) and torch.equal(step.rotations[last], torch.eye(3))
+    assert torch.equal(step.deformation_gradients[last], torch.eye(3)) and torch.equal(
+        step.rotations[last], torch.eye(3)
+    )
     assert bool((member.unit_of_kernel[held] == last).all()) and not bool((member.unit_of_kernel[~held] == last).any())
     finest = hierarchy.ancestor(0, model.predicted_levels[-1])
     free = ~hierarchy.levels[0].pinned

@@ -17,7 +17,7 @@ from gausim.models.template.elastic import ElasticTemplate
 from gausim.ops import aggregation
 from gausim.ops.deformation import bounded_deformation, gradient_from_output, polar_rotation
 
-NAMES = ("positions", "gradients", "rotations", "momentum")
+NAMES = ("positions", "deformation_gradients", "rotations", "momentum")
 
 
 def _random(*shape: int, seed: int) -> Tensor:

@@ -87,7 +87,7 @@ def roll(step: StepFunction, state: SimState, force: Tensor | None, steps: int =
 
 def assert_same(frames: list[Any], expected: list[Any], tolerance: float = 0.0) -> None:
     for frame, truth in zip(frames, expected, strict=True):
-        for name in ("positions", "gradients", "rotations"):
+        for name in ("positions", "deformation_gradients", "rotations"):
             torch.testing.assert_close(getattr(frame, name), getattr(truth, name), atol=tolerance, rtol=tolerance)
 
 
@@ -130,8 +130,8 @@ def test_step_reads_fixed_buffers_and_results_are_copies(bound: Callable) -> Non
 class Kept:
     """A step's result."""
 
-    def __init__(self, positions: Tensor, gradients: Tensor, rotations: Tensor) -> None:
-        self.positions, self.gradients, self.rotations = positions, gradients, rotations
+    def __init__(self, positions: Tensor, deformation_gradients: Tensor, rotations: Tensor) -> None:
+        self.positions, self.deformation_gradients, self.rotations = positions, deformation_gradients, rotations
 
 
 def test_capture_needs_a_cuda_device(bound: Callable) -> None:
@@ -159,7 +159,7 @@ def test_step_asks_its_device_nothing(
     state = SimState(state.positions.to("meta"), state.previous.to("meta"))
     with torch.no_grad(), _RefuseFunctions(), _RefuseOperations():
         frames = roll(step, state, state.previous)
-    assert {frame.gradients.device.type for frame in frames} == {"meta"}
+    assert {frame.deformation_gradients.device.type for frame in frames} == {"meta"}
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_gpu_replays_equal_the_steps(bound: Callable, template: str, edges: str)
     with torch.no_grad():
         model.predictor.network.decoder[-1].bias.add_(0.05)  # in place: replays read the new weights
     changed = roll(step_of(model), state, force, 8)
-    assert float((changed[0].gradients - expected[0].gradients).abs().max()) > 1e-3
+    assert float((changed[0].deformation_gradients - expected[0].deformation_gradients).abs().max()) > 1e-3
     assert_same(roll(graphed, state, force, 8), changed, 1e-5)
 
 

@@ -24,14 +24,14 @@ def test_offers_the_protocol_and_rolls_out_what_steps_give(make_scene, make_mode
     trajectory = dynamics.rollout(state, 4, forces=poke)
     assert trajectory.frames == 5 and trajectory.fps == 30.0 and not trajectory.positions.requires_grad
     assert torch.equal(trajectory.positions[0], state.positions)
-    assert torch.equal(trajectory.gradients[0], torch.eye(3).expand_as(trajectory.gradients[0]))
+    assert torch.equal(trajectory.deformation_gradients[0], torch.eye(3).expand_as(trajectory.deformation_gradients[0]))
     current = state
     for frame in range(4):
         with torch.no_grad():
             step = model.step(model.batch((1,)), current, poke(frame))
         current = SimState(step.positions, current.positions)
         assert torch.equal(trajectory.positions[frame + 1], step.positions)
-        assert torch.equal(trajectory.gradients[frame + 1], step.gradients)
+        assert torch.equal(trajectory.deformation_gradients[frame + 1], step.deformation_gradients)
         assert torch.equal(trajectory.rotations[frame + 1], step.rotations)
     still = dynamics.rollout(state, 4)
     assert torch.equal(still.positions[1], trajectory.positions[1])
@@ -72,7 +72,7 @@ def test_points_are_carried_by_the_unit_of_their_kernel(make_scene, make_model, 
                     (weight * scene.means[members]).sum(0),
                     (weight * trajectory.positions[frame][members]).sum(0),
                 )
-                gradient = trajectory.gradients[frame, trajectory.unit_of_kernel[k]]
+                gradient = trajectory.deformation_gradients[frame, trajectory.unit_of_kernel[k]]
                 expected = now + gradient @ (points[p] - rest)
             assert torch.allclose(carried[frame, p], expected, atol=1e-12)
 

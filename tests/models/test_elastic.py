@@ -225,10 +225,10 @@ def test_template_gradients_conserve_volume(make_scene, make_model, amount) -> N
         modes, _, sizes = model.template.basis(0)
         now = rest + modes @ (torch.linspace(amount, -amount, 9, dtype=torch.float64) / sizes)
         state = model.prepare(batch).template(Motion(rest, now, now))
-        det = torch.linalg.det(state.gradients)
-        assert bool(torch.isfinite(state.gradients).all()) and float(det.min()) > 0
+        det = torch.linalg.det(state.deformation_gradients)
+        assert bool(torch.isfinite(state.deformation_gradients).all()) and float(det.min()) > 0
         spread[conserve] = float((det - 1).abs().max())
-        assert float((state.gradients - torch.eye(3)).abs().max()) > 1e-3
+        assert float((state.deformation_gradients - torch.eye(3)).abs().max()) > 1e-3
     assert spread[True] < 1e-5 < 1e-3 < spread[False]
 
 

@@ -83,8 +83,10 @@ def test_dummy_edges_change_nothing_for_real_units(make_scene, make_model, make_
         state.previous.requires_grad_()
         model.zero_grad()
         step = model.step(batch, state)
-        sum(x.square().sum() for x in (step.positions, step.gradients, step.momentum)).backward()
-        results.append([step.positions, step.gradients, *(p.grad for p in model.parameters() if p.grad is not None)])
+        sum(x.square().sum() for x in (step.positions, step.deformation_gradients, step.momentum)).backward()
+        results.append(
+            [step.positions, step.deformation_gradients, *(p.grad for p in model.parameters() if p.grad is not None)]
+        )
     for other in results[1:]:
         for a, b in zip(results[0], other, strict=True):
             assert torch.allclose(a, b, rtol=1e-9, atol=1e-12)

@@ -36,9 +36,9 @@ def test_starts_at_rest_and_moves_only_free_kernels(model, kind) -> None:
 def test_only_the_sequence_that_is_asked_for_gets_a_gradient(model, kind) -> None:
     initial = kind(model, [0, 1, 0])
     initial.previous(2).square().sum().backward()
-    gradients = [p.grad for p in initial.parameters()]
-    assert gradients[0] is None and gradients[1] is None
-    assert float(gradients[2].abs().max()) > 0
+    deformation_gradients = [p.grad for p in initial.parameters()]
+    assert deformation_gradients[0] is None and deformation_gradients[1] is None
+    assert float(deformation_gradients[2].abs().max()) > 0
 
 
 def test_free_displacement_is_in_diagonals_of_the_scene(model) -> None:
@@ -57,15 +57,15 @@ def test_modal_velocity_moves_units_as_the_basis_says(model) -> None:
     scene, hierarchy = model.scenes[0], model.hierarchies[0]
     moved = (scene.means - initial.previous(0).detach())[hierarchy.kernels]
     level, unit = hierarchy.levels[1], hierarchy.ancestor(0, 1)
-    modes, gradients, sizes = model.template.basis(0)
-    modes, gradients = modes / sizes, gradients / sizes
+    modes, deformation_gradients, sizes = model.template.basis(0)
+    modes, deformation_gradients = modes / sizes, deformation_gradients / sizes
     for c in (~level.pinned).nonzero()[:, 0].tolist():
         weight = hierarchy.levels[0].volume[unit == c, None]
         centre = (weight * moved[unit == c]).sum(0) / weight.sum()
         assert torch.allclose(centre, modes[c] @ velocity, atol=1e-5)
         offset = scene.means[hierarchy.kernels][unit == c] - level.rest[c]
         within = moved[unit == c] - modes[c] @ velocity
-        assert torch.allclose(within, offset @ (gradients[c] @ velocity).T, atol=1e-5)
+        assert torch.allclose(within, offset @ (deformation_gradients[c] @ velocity).T, atol=1e-5)
 
 
 def test_template_without_a_basis_is_refused(make_scene, make_model) -> None:

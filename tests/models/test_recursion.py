@@ -64,7 +64,7 @@ def test_positions_equal_the_corrected_sum_over_three_levels(make_scene, make_mo
                 expected = expected + product @ (points[i] - points[i + 1])
             gradient = factors[1] @ factors[2] @ factors[3]
             expected = expected + gradient @ (rest[k] - points[0])
-            assert torch.allclose(step.gradients[chains[1, k]], gradient, atol=1e-12)
+            assert torch.allclose(step.deformation_gradients[chains[1, k]], gradient, atol=1e-12)
             rotation = turns[1][chains[1, k]] @ turns[2][chains[2, k]] @ turns[3][chains[3, k]]
             assert torch.allclose(step.rotations[chains[1, k]], rotation, atol=1e-12)
             checked += 1
@@ -107,7 +107,7 @@ def test_rotating_the_scene_and_the_gradients_rotates_everything(make_scene, mak
         with torch.no_grad():
             step = model.step(model.batch((0,)), moved)
         unit = model.batch((0,)).members[0].unit_of_kernel
-        results.append((step, step.gradients[unit], step.rotations[unit], current))
+        results.append((step, step.deformation_gradients[unit], step.rotations[unit], current))
     (step, gradient, rotation, _), (other, other_gradient, other_rotation, _) = results
     assert float((step.positions - scene.means).norm(dim=-1).max()) > 0.05
     assert torch.allclose(other.positions, step.positions @ r.T, atol=1e-12)

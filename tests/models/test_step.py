@@ -28,7 +28,7 @@ def test_predicted_gradients_have_determinant_one_only_with_mass_on(
         )
         with torch.no_grad():
             step = model.step(model.batch((0,)), state)
-        error = torch.cat([torch.linalg.det(f) - 1 for f in (*step.predicted, step.gradients)]).abs()
+        error = torch.cat([torch.linalg.det(f) - 1 for f in (*step.predicted, step.deformation_gradients)]).abs()
         size = torch.cat([(f - torch.eye(3)).abs().amax((-1, -2)) for f in step.predicted])
         assert float(size.max()) > 0.5
         assert float(error.max()) < 1e-5 if conserve else float(error.max()) > 0.1
@@ -45,7 +45,7 @@ def test_zero_output_is_the_rest_state_from_any_state(
         with torch.no_grad():
             step = model.step(model.batch((0,)), make_state(scene, amount=amount))
         assert float((step.positions - scene.means).abs().max()) < 1e-6
-        assert torch.equal(step.gradients, torch.eye(3).expand_as(step.gradients))
+        assert torch.equal(step.deformation_gradients, torch.eye(3).expand_as(step.deformation_gradients))
         assert torch.equal(step.rotations, torch.eye(3).expand_as(step.rotations))
 
 
@@ -125,7 +125,7 @@ def test_permuting_kernels_permutes_the_step(make_scene, make_model, make_state,
     assert float((step.positions - scene.means).norm(dim=-1).max()) > 1e-3
     assert float((result.positions - step.positions[order]).abs().max()) < 1e-5
     unit, other_unit = (m.batch((0,)).members[0].unit_of_kernel for m in (model, other))
-    for name in ("gradients", "rotations"):
+    for name in ("deformation_gradients", "rotations"):
         difference = getattr(result, name)[other_unit] - getattr(step, name)[unit][order]
         assert float(difference.abs().max()) < 2e-5
     assert float(result.momentum) == pytest.approx(float(step.momentum), rel=1e-3, abs=1e-12)

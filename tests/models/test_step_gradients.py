@@ -20,7 +20,7 @@ class _Stepper(nn.Module):
 
     def forward(self, positions: Tensor, previous: Tensor, force: Tensor) -> tuple[Tensor, ...]:
         step = self.model.step(self.model.batch((0,)), SimState(positions, previous), force)
-        return step.positions, step.gradients, step.rotations, step.momentum
+        return step.positions, step.deformation_gradients, step.rotations, step.momentum
 
 
 def _function(stepper: _Stepper, names: list[str], outputs: tuple[int, ...]):

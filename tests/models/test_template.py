@@ -54,10 +54,12 @@ def test_gradients_act_on_the_template_configuration(make_scene, make_model, mak
         if not level.pinned[c]:
             root = rest[level.root[c]]
             centre = root + own[c] @ (template.positions[c] - root)
-            expected = centre + own[c] @ template.gradients[c] @ (rest[k] - level.rest[c])  # the template deforms first
-            u, _, vh = torch.linalg.svd(template.gradients[c])
+            expected = centre + own[c] @ template.deformation_gradients[c] @ (
+                rest[k] - level.rest[c]
+            )  # the template deforms first
+            u, _, vh = torch.linalg.svd(template.deformation_gradients[c])
             w, _, xh = torch.linalg.svd(own[c])
-            assert torch.allclose(step.gradients[c], own[c] @ template.gradients[c], atol=1e-12)
+            assert torch.allclose(step.deformation_gradients[c], own[c] @ template.deformation_gradients[c], atol=1e-12)
             assert torch.allclose(step.rotations[c], w @ xh @ u @ vh, atol=1e-9)
         assert torch.allclose(step.positions[hierarchy.kernels[k]], expected, atol=1e-12)
 

@@ -36,11 +36,15 @@ def test_deformed_covariances_and_untouched_kernels():
         means=normal(6, 3).float(), log_scales=0.3 * normal(6, 3, seed=1).float(), quats=normal(6, 4, seed=2).float(),
         opacity_logits=torch.zeros(6), sh=normal(6, 9, 3, seed=3).float(),
     )  # fmt: skip
-    gradients = torch.stack((torch.eye(3), torch.eye(3) + 0.3 * normal(3, 3, seed=4).float()))
+    deformation_gradients = torch.stack((torch.eye(3), torch.eye(3) + 0.3 * normal(3, 3, seed=4).float()))
     rotations = torch.stack((torch.eye(3), quaternion_to_matrix(normal(1, 4, seed=5).float())[0]))
     unit = torch.tensor([0, 1, 1, 0, 1, 0])
-    moved = deformed_scene(scene, scene.means + 1, gradients, rotations, unit)
-    expected = gradients[unit] @ covariance_from_scales(scene.log_scales, scene.quats) @ gradients[unit].mT
+    moved = deformed_scene(scene, scene.means + 1, deformation_gradients, rotations, unit)
+    expected = (
+        deformation_gradients[unit]
+        @ covariance_from_scales(scene.log_scales, scene.quats)
+        @ deformation_gradients[unit].mT
+    )
     assert torch.allclose(covariance_from_scales(moved.log_scales, moved.quats), expected, rtol=1e-4, atol=1e-5)
     still = unit == 0
     for name in ("log_scales", "quats", "sh"):

@@ -16,12 +16,12 @@ NAMES = ("positions", "gradients", "rotations", "covars", "sh")
 
 def case(degree: int) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor]:
     g = torch.Generator().manual_seed(degree)
-    gradients = torch.eye(3) + 0.3 * torch.randn(STATES, UNITS, 3, 3, generator=g)
+    deformation_gradients = torch.eye(3) + 0.3 * torch.randn(STATES, UNITS, 3, 3, generator=g)
     root = torch.randn(KERNELS, 3, 3, generator=g)
     inputs = {
         "positions": torch.randn(STATES, KERNELS, 3, generator=g),
-        "gradients": gradients,
-        "rotations": polar_rotation(gradients),
+        "gradients": deformation_gradients,
+        "rotations": polar_rotation(deformation_gradients),
         "covars": root @ root.mT,
         "sh": torch.randn(KERNELS, (degree + 1) ** 2, 3, generator=g),
     }

@@ -28,11 +28,11 @@ def first_time(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
 
 def test_on_the_cpu_it_is_the_cpu_renderer(inputs: Callable, caplog: pytest.LogCaptureFixture) -> None:
     given = replace(inputs(2, 2, 80, (34, 22)), depth=True).to(torch.float32)
-    images, gradients = given.draw_with_gradients(AutoRenderer(threads=2))
+    images, deformation_gradients = given.draw_with_gradients(AutoRenderer(threads=2))
     expected, expected_gradients = given.draw_with_gradients(CpuRenderer(threads=2))
     assert torch.equal(images.rgb, expected.rgb) and torch.equal(images.alpha, expected.alpha)
     assert torch.equal(images.depth, expected.depth)
-    assert all(torch.equal(a, b) for a, b in zip(gradients, expected_gradients, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip(deformation_gradients, expected_gradients, strict=True))
     said = [record.getMessage() for record in caplog.records if "render=auto" in record.getMessage()]
     assert len(said) == 1 and "by the CPU renderer, not by gsplat: " in said[0]
 
@@ -89,8 +89,8 @@ def test_gpu_tensors_without_gsplat_are_drawn_on_the_cpu_and_return(
     expected, expected_gradients = given.draw_with_gradients(CpuRenderer())
     for name in ("means", "covars", "colors", "opacities", "viewmats", "Ks", "background"):
         setattr(given, name, getattr(given, name).detach().cuda())
-    images, gradients = given.draw_with_gradients(AutoRenderer())
+    images, deformation_gradients = given.draw_with_gradients(AutoRenderer())
     assert images.rgb.device.type == "cuda" and torch.equal(images.rgb.cpu(), expected.rgb)
-    for value, truth in zip(gradients, expected_gradients, strict=True):
+    for value, truth in zip(deformation_gradients, expected_gradients, strict=True):
         assert value.device.type == "cuda"
         torch.testing.assert_close(value.cpu(), truth)

@@ -39,7 +39,7 @@ NAMES = ("means", "covars", "colors", "opacities", "background")
 def test_image_and_gradients_equal_the_reference(inputs: Callable, case: str, depth: bool) -> None:
     given = replace(inputs(**CASES[case]), depth=depth)
     given.opacities[:, 1::9] = 1e-3  # below 1/255
-    images, gradients = given.to(torch.float32).draw_with_gradients(CpuRenderer(threads=2))
+    images, deformation_gradients = given.to(torch.float32).draw_with_gradients(CpuRenderer(threads=2))
     expected, expected_gradients = given.to(torch.float64).draw_with_gradients(ReferenceRenderer())
     assert float(expected.alpha.detach().max()) > 0.1
     torch.testing.assert_close(images.rgb.double(), expected.rgb, atol=1e-5, rtol=0)
@@ -48,15 +48,15 @@ def test_image_and_gradients_equal_the_reference(inputs: Callable, case: str, de
     if images.depth is not None and expected.depth is not None:
         assert float(expected.depth.detach().max()) > 0.1
         torch.testing.assert_close(images.depth.double(), expected.depth, atol=3e-5, rtol=0)
-    for name, value, truth in zip(NAMES, gradients, expected_gradients, strict=True):
+    for name, value, truth in zip(NAMES, deformation_gradients, expected_gradients, strict=True):
         assert float((value - truth).norm() / truth.norm()) < 1e-4, name
 
 
 def test_one_view_alone_is_cut_into_more_bands_and_stays_the_same(inputs: Callable) -> None:
     """A single view has nine bands, six views have two each: images agree bit for bit, gradients to rounding."""
     given = inputs(2, 3, 300, (40, 130)).to(torch.float32)
-    together, gradients = given.draw_with_gradients(CpuRenderer(threads=2))
-    sums = [torch.zeros_like(x) for x in gradients]
+    together, deformation_gradients = given.draw_with_gradients(CpuRenderer(threads=2))
+    sums = [torch.zeros_like(x) for x in deformation_gradients]
     g = torch.Generator().manual_seed(5)
     weights = torch.randn(together.rgb.shape, generator=g), torch.randn(together.alpha.shape, generator=g)
     for b, v in itertools.product(range(2), range(3)):
@@ -69,18 +69,18 @@ def test_one_view_alone_is_cut_into_more_bands_and_stays_the_same(inputs: Callab
         loss = (alone.rgb * weights[0][state, view]).sum() + (alone.alpha * weights[1][state, view]).sum()
         for i, grad in enumerate(torch.autograd.grad(loss, leaves)):
             sums[i][((state,), (state,), (state, view), (state,), ())[i]] += grad
-    for value, expected in zip(sums, gradients, strict=True):
+    for value, expected in zip(sums, deformation_gradients, strict=True):
         assert float((value - expected).norm() / expected.norm()) < 1e-5
 
 
 @pytest.mark.parametrize("size", [(66, 50), (40, 130)])
 def test_threads_change_no_bit(inputs: Callable, size: tuple[int, int]) -> None:
     given = inputs(2, 2, 400, size)
-    images, gradients = given.to(torch.float32).draw_with_gradients(CpuRenderer(threads=1))
+    images, deformation_gradients = given.to(torch.float32).draw_with_gradients(CpuRenderer(threads=1))
     for threads in (2, 5):
         again, again_gradients = given.to(torch.float32).draw_with_gradients(CpuRenderer(threads=threads))
         assert torch.equal(again.rgb, images.rgb) and torch.equal(again.alpha, images.alpha)
-        assert all(torch.equal(a, b) for a, b in zip(again_gradients, gradients, strict=True))
+        assert all(torch.equal(a, b) for a, b in zip(again_gradients, deformation_gradients, strict=True))
 
 
 def test_view_that_sees_nothing(inputs: Callable) -> None:

@@ -73,49 +73,51 @@ def test_colours_are_looked_up_along_the_unrotated_direction(
 def test_gradients_reach_positions_gradients_and_rotations(scene: Callable, cameras: Cameras, units: Tensor) -> None:
     look = SceneAppearance.of(scene(COUNT, 1))
     small = replace(cameras, width=8, height=6, Ks=cameras.Ks * torch.tensor([0.25, 0.25, 1]).double()[:, None])
-    gradients, rotations = deformation(2)
+    deformation_gradients, rotations = deformation(2)
     positions = 0.3 * torch.randn(2, COUNT, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
 
-    def image(positions: Tensor, gradients: Tensor, rotations: Tensor) -> Tensor:
-        return draw(ReferenceRenderer(), look, positions, gradients, rotations, units, small).rgb
+    def image(positions: Tensor, deformation_gradients: Tensor, rotations: Tensor) -> Tensor:
+        return draw(ReferenceRenderer(), look, positions, deformation_gradients, rotations, units, small).rgb
 
-    given = tuple(x.clone().requires_grad_() for x in (positions, gradients, rotations))
+    given = tuple(x.clone().requires_grad_() for x in (positions, deformation_gradients, rotations))
     assert torch.autograd.gradcheck(image, given, atol=1e-6, fast_mode=True)
     assert all(float(g.abs().max()) > 0 for g in torch.autograd.grad(image(*given).sum(), given))
 
 
 def test_mask_draws_the_kernels_it_names(scene: Callable, cameras: Cameras, units: Tensor) -> None:
     still = scene(COUNT, 2)
-    (gradients, rotations), positions = deformation(2), still.means.expand(2, -1, -1)
+    (deformation_gradients, rotations), positions = deformation(2), still.means.expand(2, -1, -1)
     part = still.select(still.foreground)
     expected = draw(
         ReferenceRenderer(),
         part,
         positions[:, still.foreground],
-        gradients,
+        deformation_gradients,
         rotations,
         units[still.foreground],
         cameras,
     )
-    images = draw(ReferenceRenderer(), still, positions, gradients, rotations, units, cameras, mask=still.foreground)
+    images = draw(
+        ReferenceRenderer(), still, positions, deformation_gradients, rotations, units, cameras, mask=still.foreground
+    )
     assert torch.equal(images.rgb, expected.rgb)
-    whole = draw(ReferenceRenderer(), still, positions, gradients, rotations, units, cameras)
+    whole = draw(ReferenceRenderer(), still, positions, deformation_gradients, rotations, units, cameras)
     assert float((whole.rgb - expected.rgb).abs().max()) > 1e-2
     with pytest.raises(ConfigError, match="SceneAppearance.of"):
         draw(
-            ReferenceRenderer(), SceneAppearance.of(still), positions, gradients, rotations, units, cameras,
+            ReferenceRenderer(), SceneAppearance.of(still), positions, deformation_gradients, rotations, units, cameras,
             mask=still.foreground,
         )  # fmt: skip
 
 
 def test_trajectory_is_drawn_chunk_by_chunk(scene: Callable, cameras: Cameras, units: Tensor) -> None:
     still = scene(COUNT, 1)
-    gradients, rotations = (x.float() for x in deformation(5))
+    deformation_gradients, rotations = (x.float() for x in deformation(5))
     positions = (still.means + torch.linspace(0, 0.2, 5)[:, None, None]).float()
-    trajectory = Trajectory(positions, gradients, rotations, units, 24.0)
+    trajectory = Trajectory(positions, deformation_gradients, rotations, units, 24.0)
     renderer = CpuRenderer(threads=1)
     behind = torch.tensor([1.0, 1.0, 1.0])
-    expected = draw(renderer, still, positions, gradients, rotations, units, cameras, background=behind).rgb
+    expected = draw(renderer, still, positions, deformation_gradients, rotations, units, cameras, background=behind).rgb
     parts = []
     for part in draw_trajectory(renderer, still, trajectory, cameras, background=behind, chunk=2):
         assert torch.is_grad_enabled()

@@ -188,8 +188,8 @@ def test_gpu_images_and_depth_equal_the_reference(inputs: Callable, case: str) -
 @pytest.mark.parametrize("case", CASES)
 def test_gpu_gradients_equal_the_reference(inputs: Callable, case: str) -> None:
     single, double = on_gpu(inputs, case)
-    _, gradients = single.draw_with_gradients(GsplatRenderer())
+    _, deformation_gradients = single.draw_with_gradients(GsplatRenderer())
     _, expected = double.draw_with_gradients(ReferenceRenderer())
     names = ("means", "covars", "colors", "opacities", "background")
-    for name, value, truth in zip(names, gradients, expected, strict=True):
+    for name, value, truth in zip(names, deformation_gradients, expected, strict=True):
         assert float((value.cpu() - truth).norm() / truth.norm()) < 5e-3, name

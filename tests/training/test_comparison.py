@@ -85,8 +85,10 @@ def test_chunks_give_what_one_graph_gives(pixels: int, monkeypatch: pytest.Monke
     torch.testing.assert_close(motion, moved.detach(), rtol=1e-12, atol=0)
     assert not motion.requires_grad
     weights = torch.rand(expected.shape, generator=torch.Generator().manual_seed(2)).double()
-    gradients = torch.autograd.grad(losses, case.states.tensors(), weights)
-    for ours, plain in zip(gradients, torch.autograd.grad(expected, case.states.tensors(), weights), strict=True):
+    deformation_gradients = torch.autograd.grad(losses, case.states.tensors(), weights)
+    for ours, plain in zip(
+        deformation_gradients, torch.autograd.grad(expected, case.states.tensors(), weights), strict=True
+    ):
         assert float(plain.norm()) > 0
         assert float((ours - plain).norm()) <= 1e-6 * float(plain.norm())
 
@@ -112,7 +114,7 @@ def test_stretches_continue_where_the_last_one_ended() -> None:
 
 def test_only_what_needs_a_gradient_gets_one() -> None:
     case = Case(steps=2)
-    fixed = States(case.states.positions, case.states.gradients.detach(), case.states.rotations.detach())
+    fixed = States(case.states.positions, case.states.deformation_gradients.detach(), case.states.rotations.detach())
     losses, _ = case.comparison()(fixed, 0)
     (gradient,) = torch.autograd.grad(losses.sum(), [case.states.positions])
     both, _ = case.comparison()(case.states, 0)

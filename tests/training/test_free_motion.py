@@ -41,7 +41,7 @@ class Spiral:
     def step(self, batch: SimpleNamespace, state: SimState, force: object = None, prepared: object = None) -> object:
         factor = self.factor.repeat_interleave(2)[:, None]
         positions = batch.rest + factor * (state.positions - batch.rest)
-        return SimpleNamespace(positions=positions, gradients=None, rotations=None, momentum=None)
+        return SimpleNamespace(positions=positions, deformation_gradients=None, rotations=None, momentum=None)
 
     def energy(self, batch: SimpleNamespace, state: SimState, prepared: object = None) -> Tensor:
         self.sizes.append(float((state.positions - batch.rest).abs().max()))

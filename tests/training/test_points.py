@@ -55,15 +55,23 @@ def batch(members: int) -> SimpleNamespace:
 def states(steps: int, members: int) -> States:
     g = torch.Generator().manual_seed(4)
     positions = SCENE.means.repeat(members, 1) + 0.1 * torch.randn(steps, members * SCENE.count, 3, generator=g)
-    gradients = torch.eye(3) + 0.3 * torch.randn(steps, 2 * members, 3, 3, generator=g)
-    return States(positions.requires_grad_(), gradients.requires_grad_(), torch.eye(3).expand_as(gradients))
+    deformation_gradients = torch.eye(3) + 0.3 * torch.randn(steps, 2 * members, 3, 3, generator=g)
+    return States(
+        positions.requires_grad_(),
+        deformation_gradients.requires_grad_(),
+        torch.eye(3).expand_as(deformation_gradients),
+    )
 
 
 def plain(known: GroundTruth, made: States, member: int) -> Tensor:
     """Positions of the points as the evaluation carries them."""
     rows, units = slice(member * SCENE.count, (member + 1) * SCENE.count), slice(2 * member, 2 * member + 2)
     trajectory = Trajectory(
-        made.positions[:, rows], made.gradients[:, units], made.rotations[:, units], torch.arange(SCENE.count) % 2, 24.0
+        made.positions[:, rows],
+        made.deformation_gradients[:, units],
+        made.rotations[:, units],
+        torch.arange(SCENE.count) % 2,
+        24.0,
     )
     return trajectory.carry(known.rest, attach_points(SCENE, known.rest), SCENE.means)
 
@@ -82,9 +90,11 @@ def test_losses_are_squared_distances_in_percent_and_reach_positions_and_gradien
         moved += float((100 * (points.detach() - before.detach()).norm(dim=-1) / SCENE.diagonal).square().mean(1).sum())
     torch.testing.assert_close(losses, torch.stack(expected, 1))
     assert float(motion) == pytest.approx(moved, rel=1e-5)
-    ours = torch.autograd.grad(losses.sum(), [made.positions, made.gradients])
+    ours = torch.autograd.grad(losses.sum(), [made.positions, made.deformation_gradients])
     for gradient, other in zip(
-        ours, torch.autograd.grad(torch.stack(expected).sum(), [made.positions, made.gradients]), strict=True
+        ours,
+        torch.autograd.grad(torch.stack(expected).sum(), [made.positions, made.deformation_gradients]),
+        strict=True,
     ):
         assert float(other.norm()) > 0
         torch.testing.assert_close(gradient, other)

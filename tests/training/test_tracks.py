@@ -52,8 +52,12 @@ def coordinates() -> Tensor:
 def filmed(model: GausSim, coordinates: Tensor) -> SequenceSample:
     motions = model.smooth_motions(0)
     assert motions is not None
-    gradients = motions.deformations(coordinates)
-    state = SCENE.means + motions.displacements(coordinates), gradients, polar_rotation(gradients)
+    deformation_gradients = motions.deformations(coordinates)
+    state = (
+        SCENE.means + motions.displacements(coordinates),
+        deformation_gradients,
+        polar_rotation(deformation_gradients),
+    )
     drawn = draw(CpuRenderer(), SCENE, *state, motions.unit_of_kernel, toy_object.cameras())
     straight = drawn.rgb / drawn.alpha.clamp_min(1e-6)[..., None]
     rgba = (torch.cat((straight, drawn.alpha[..., None]), -1).clamp(0, 1) * 255).round().to(torch.uint8)

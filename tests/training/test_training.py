@@ -68,7 +68,7 @@ def test_absent_sequences_and_scenes_do_not_move_in_twenty_steps(tmp_path: Path)
         torch.testing.assert_close(value, after_warm[name], rtol=0, atol=0)  # same seed, same steps
 
 
-def gradients(module: GausSimModule, samples: list[SequenceSample], tmp_path: Path) -> dict[str, Tensor]:
+def deformation_gradients(module: GausSimModule, samples: list[SequenceSample], tmp_path: Path) -> dict[str, Tensor]:
     """Gradients of the first optimiser step."""
     kept: dict[str, Tensor] = {}
 
@@ -84,7 +84,7 @@ def gradients(module: GausSimModule, samples: list[SequenceSample], tmp_path: Pa
 @pytest.mark.parametrize("backprop_steps", [1, 2, 0])
 def test_windows_stop_gradients_and_nothing_else(backprop_steps: int, tmp_path: Path) -> None:
     objective = Objective(backprop_steps=backprop_steps, static_weight=0.0, momentum_weight=0.0)
-    ours = gradients(sway_module(objective), [sample(0), sample(2)], tmp_path)
+    ours = deformation_gradients(sway_module(objective), [sample(0), sample(2)], tmp_path)
     module = sway_module(objective)
     samples = [sample(0), sample(2)]
     batch = module.model.batch([0, 1])

@@ -98,7 +98,7 @@ def play(viewer: Viewer, page: Any, folder: Path, interaction: Interaction) -> N
     page.wait(lambda: viewer.page.saved, 10, "a saved session")
     again = replay(interaction, load_session(viewer.page.saved[-1]))
     assert again.frames == recorded.frames
-    for name in ("positions", "gradients", "rotations"):
+    for name in ("positions", "deformation_gradients", "rotations"):
         assert torch.equal(getattr(again, name), getattr(recorded, name)), name
     page.press_button("Play", "[role=tab]")
     page.press_button("Reset")

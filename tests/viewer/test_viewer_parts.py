@@ -146,10 +146,10 @@ def test_hierarchy_has_one_colour_per_unit(painter: tuple[Painter, Interaction])
 
 def test_strain_is_the_largest_logarithm_of_a_stretch(painter: tuple[Painter, Interaction]) -> None:
     paint, interaction = painter
-    gradients = interaction.frame.gradients.clone()
+    deformation_gradients = interaction.frame.deformation_gradients.clone()
     unit = int(interaction.unit_of_kernel[interaction.scene.simulated & ~interaction.scene.pinned][0])
-    gradients[unit] = torch.diag(torch.tensor([1.0, 0.5, 1.5]))
-    frame = SteppedFrame(interaction.frame.positions, gradients, interaction.frame.rotations)
+    deformation_gradients[unit] = torch.diag(torch.tensor([1.0, 0.5, 1.5]))
+    frame = SteppedFrame(interaction.frame.positions, deformation_gradients, interaction.frame.rotations)
     still = torch.zeros(interaction.scene.count)
     _, rgb, legend = paint(frame, interaction.unit_of_kernel, still, STRAIN, torch.ones(3))
     assert legend.high == pytest.approx(np.log(2.0), rel=1e-5)
@@ -281,7 +281,9 @@ def test_what_was_done_is_played_back_bit_for_bit(live: tuple[Live, list[Shown]]
         one.advance()
     assert "over" in one.message
     again = one.interaction.trajectory()
-    assert torch.equal(again.positions, recorded.positions) and torch.equal(again.gradients, recorded.gradients)
+    assert torch.equal(again.positions, recorded.positions) and torch.equal(
+        again.deformation_gradients, recorded.deformation_gradients
+    )
     assert one.interaction.session() == session
     assert torch.equal(replay(one.interaction, session).positions, recorded.positions)
 

@@ -103,7 +103,7 @@ class DeformationField(Fitted):
         phase = frame % (self.seen + 1)
         if phase == 0:
             rest = self.begin(state.sequence_id)
-            return FittedState(state.sequence_id, frame, rest.positions, rest.gradients, rest.rotations)
+            return FittedState(state.sequence_id, frame, rest.positions, rest.deformation_gradients, rest.rotations)
         return FittedState(state.sequence_id, frame, *self._deformed(state.sequence_id, phase))
 
     def _deformed(self, sequence_id: int, frame: int) -> tuple[Tensor, Tensor, Tensor]:

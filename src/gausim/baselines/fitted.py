@@ -52,7 +52,12 @@ class Fitted(nn.Module):
     def advance(self, state: FittedState) -> FittedState:
         """The same again."""
         return FittedState(
-            state.sequence_id, state.frame + 1, state.positions, state.gradients, state.rotations, state.inner
+            state.sequence_id,
+            state.frame + 1,
+            state.positions,
+            state.deformation_gradients,
+            state.rotations,
+            state.inner,
         )
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:

@@ -26,7 +26,7 @@ class StaticDynamics:
         identity = torch.eye(3, dtype=self.rest.dtype, device=self.rest.device).expand(frames, 1, 3, 3)
         return Trajectory(
             positions=self.rest.expand(frames, -1, -1),
-            gradients=identity,
+            deformation_gradients=identity,
             rotations=identity,
             unit_of_kernel=torch.zeros(len(self.rest), dtype=torch.long, device=self.rest.device),
             fps=self.fps,

@@ -40,9 +40,11 @@ def measure(count: int, size: int) -> dict[str, float]:
 
 def _appearance(count: int) -> None:
     state = deformed(count, 1, 1, 1)
-    positions, gradients, rotations = leaves = [value.requires_grad_() for value in state[:3]]
+    positions, deformation_gradients, rotations = leaves = [value.requires_grad_() for value in state[:3]]
     look, unit = state.look, state.unit_of_kernel
-    outputs = deformed_appearance(positions, gradients, rotations, unit, look.covars, look.sh, state.centers)
+    outputs = deformed_appearance(
+        positions, deformation_gradients, rotations, unit, look.covars, look.sh, state.centers
+    )
     torch.autograd.grad(outputs, leaves, [torch.ones_like(output) for output in outputs])
 
 

@@ -134,7 +134,7 @@ def _compiled(state: Deformed) -> tuple[Tensor, Tensor]:
 
 def _by_torch(state: Deformed) -> tuple[Tensor, Tensor]:
     covars = transport_covariance(
-        state.look.covars.expand(1, -1, -1, -1), state.gradients.index_select(1, state.unit_of_kernel)
+        state.look.covars.expand(1, -1, -1, -1), state.deformation_gradients.index_select(1, state.unit_of_kernel)
     )
     return covars, view_colors(state.look, state.positions, state.rotations, state.unit_of_kernel, state.centers)
 
@@ -146,7 +146,7 @@ def _forward(state: Deformed, form: _Form) -> object:
 
 def _gradients(state: Deformed, form: _Form) -> tuple[Tensor, ...]:
     leaves = [value.detach().requires_grad_() for value in state[:3]]
-    outputs = form(state._replace(positions=leaves[0], gradients=leaves[1], rotations=leaves[2]))
+    outputs = form(state._replace(positions=leaves[0], deformation_gradients=leaves[1], rotations=leaves[2]))
     return torch.autograd.grad(outputs, leaves, [torch.ones_like(output) for output in outputs])
 
 

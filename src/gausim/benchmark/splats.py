@@ -92,7 +92,7 @@ class Deformed(NamedTuple):
     """One deformed state of a scene and four cameras: what colours and covariances are made of."""
 
     positions: Float[Tensor, "1 K 3"]
-    gradients: Float[Tensor, "1 N 3 3"]
+    deformation_gradients: Float[Tensor, "1 N 3 3"]
     rotations: Float[Tensor, "1 N 3 3"]
     unit_of_kernel: Int[Tensor, " K"]
     look: SceneAppearance
@@ -102,7 +102,7 @@ class Deformed(NamedTuple):
 def deformed(count: int, units: int, views: int, degree: int) -> Deformed:
     """Random kernels, deformation gradients near one and colours of spherical harmonics of that degree."""
     g = torch.Generator().manual_seed(0)
-    gradients = torch.eye(3) + 0.1 * torch.randn(1, units, 3, 3, generator=g)
+    deformation_gradients = torch.eye(3) + 0.1 * torch.randn(1, units, 3, 3, generator=g)
     scene = GaussianScene.create(
         means=SPREAD * torch.randn(count, 3, generator=g),
         log_scales=0.5 * torch.randn(count, 3, generator=g) + math.log(0.5 / count**0.5),
@@ -113,4 +113,6 @@ def deformed(count: int, units: int, views: int, degree: int) -> Deformed:
     look, centers = SceneAppearance.of(scene), torch.randn(views, 3, generator=g)
     centers = DISTANCE * torch.nn.functional.normalize(centers, dim=-1)
     unit = torch.randint(0, units, (count,), generator=g)
-    return Deformed(scene.means[None], gradients, polar_rotation(gradients), unit, look, centers)
+    return Deformed(
+        scene.means[None], deformation_gradients, polar_rotation(deformation_gradients), unit, look, centers
+    )

@@ -297,7 +297,9 @@ class Bound:
         for _ in range(self.steps):
             step = self.model.step(self.batch, state, None, prepared)
             state = SimState(step.positions, state.positions)
-            total = total + step.positions.sum() + step.gradients.sum() + step.rotations.sum() + step.momentum
+            total = (
+                total + step.positions.sum() + step.deformation_gradients.sum() + step.rotations.sum() + step.momentum
+            )
         return total
 
     def both(self) -> None:

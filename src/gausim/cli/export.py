@@ -247,7 +247,7 @@ def _of_trajectory(
     from gausim.ops.deformed_scene import deformed_scene
 
     def scenes() -> Iterator[GaussianScene]:
-        for state in zip(trajectory.positions, trajectory.gradients, trajectory.rotations, strict=True):
+        for state in zip(trajectory.positions, trajectory.deformation_gradients, trajectory.rotations, strict=True):
             yield deformed_scene(scene, *state, trajectory.unit_of_kernel)
 
     return Motion(name, trajectory.fps, trajectory.frames, scenes, scene, trajectory, cameras, renderer)
@@ -262,7 +262,7 @@ def _thinned(motion: Motion, every: int) -> Motion:
         trajectory = replace(
             trajectory,
             positions=trajectory.positions[::every],
-            gradients=trajectory.gradients[::every],
+            deformation_gradients=trajectory.deformation_gradients[::every],
             rotations=trajectory.rotations[::every],
             fps=trajectory.fps / every,
         )

@@ -165,7 +165,7 @@ def head(trajectory: Trajectory, frames: int) -> Trajectory:
     return replace(
         trajectory,
         positions=trajectory.positions[:frames],
-        gradients=trajectory.gradients[:frames],
+        deformation_gradients=trajectory.deformation_gradients[:frames],
         rotations=trajectory.rotations[:frames],
     )
 

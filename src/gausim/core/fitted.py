@@ -25,7 +25,7 @@ class FittedState:
         sequence_id: the sequence, numbered over all objects.
         frame: its frame, 0 the first.
         positions: kernel means [scene units].
-        gradients: deformation gradients of the N units that carry kernels.
+        deformation_gradients: deformation gradients of the N units that carry kernels.
         rotations: their rotations.
         inner: what the method carries on to the next frame beside these (anchors, particles, fields).
     """
@@ -33,7 +33,7 @@ class FittedState:
     sequence_id: int
     frame: int
     positions: Float[Tensor, "K 3"]
-    gradients: Float[Tensor, "N 3 3"]
+    deformation_gradients: Float[Tensor, "N 3 3"]
     rotations: Float[Tensor, "N 3 3"]
     inner: tuple[Tensor, ...] = ()
 
@@ -42,7 +42,7 @@ class FittedState:
         return replace(
             self,
             positions=self.positions.detach(),
-            gradients=self.gradients.detach(),
+            deformation_gradients=self.deformation_gradients.detach(),
             rotations=self.rotations.detach(),
             inner=tuple(x.detach() for x in self.inner),
         )
@@ -156,7 +156,7 @@ class FittedStepper:
         self._inner = method.begin(sequence_id)
         positions = initial.positions.to(self._inner.positions)
         self.state = SimState(positions, positions)
-        self.frame = SteppedFrame(positions, self._inner.gradients, self._inner.rotations)
+        self.frame = SteppedFrame(positions, self._inner.deformation_gradients, self._inner.rotations)
         self.unit_of_kernel: Int[Tensor, " K"] = method.unit_of_kernel(self._scene_id)
         self.fps: float = method.fps[self._scene_id]
 
@@ -176,7 +176,7 @@ class FittedStepper:
                 f"frame {made.frame}. Fit it again with smaller rates (model.plan.stages.STAGE.rates)."
             )
         self.state = SimState(made.positions, self.state.positions)
-        self.frame = SteppedFrame(made.positions, made.gradients, made.rotations)
+        self.frame = SteppedFrame(made.positions, made.deformation_gradients, made.rotations)
         return self.frame
 
     def settle(self) -> None:

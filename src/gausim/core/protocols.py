@@ -32,12 +32,12 @@ class SteppedFrame:
 
     Attributes:
         positions: kernel means [scene units].
-        gradients: accumulated deformation gradients of the N units that carry kernels.
+        deformation_gradients: accumulated deformation gradients of the N units that carry kernels.
         rotations: their rotations.
     """
 
     positions: Float[Tensor, "K 3"]
-    gradients: Float[Tensor, "N 3 3"]
+    deformation_gradients: Float[Tensor, "N 3 3"]
     rotations: Float[Tensor, "N 3 3"]
 
 
@@ -117,7 +117,7 @@ def trajectory_of(frames: Sequence[SteppedFrame], stepper: Stepper) -> Trajector
     """Frames of a stepper as one trajectory."""
     return Trajectory(
         torch.stack([f.positions for f in frames]),
-        torch.stack([f.gradients for f in frames]),
+        torch.stack([f.deformation_gradients for f in frames]),
         torch.stack([f.rotations for f in frames]),
         stepper.unit_of_kernel,
         stepper.fps,

@@ -37,14 +37,14 @@ class Trajectory:
 
     Attributes:
         positions: kernel means [scene units].
-        gradients: accumulated deformation gradients of the N units that carry kernels.
+        deformation_gradients: accumulated deformation gradients of the N units that carry kernels.
         rotations: their accumulated rotations.
         unit_of_kernel: the unit of each kernel; pinned and never-simulated kernels point to an identity unit.
         fps: frames per second.
     """
 
     positions: Float[Tensor, "F K 3"]
-    gradients: Float[Tensor, "F N 3 3"]
+    deformation_gradients: Float[Tensor, "F N 3 3"]
     rotations: Float[Tensor, "F N 3 3"]
     unit_of_kernel: Int[Tensor, " K"]
     fps: float
@@ -60,7 +60,7 @@ class Trajectory:
         A point s attached to kernel k goes to x_k + G (X_s - X_k), which for a kernel of unit c is
         x_c + G_c (X_s - X_c) (METHOD section 5, the 3D error).
         """
-        gradient = self.gradients[:, self.unit_of_kernel[kernel]]
+        gradient = self.deformation_gradients[:, self.unit_of_kernel[kernel]]
         offset = (points - rest[kernel]).to(gradient)
         return self.positions[:, kernel] + torch.einsum("fpij,pj->fpi", gradient, offset)
 

@@ -277,7 +277,7 @@ class _ObjectMeasure:
     def _draw(self, trajectory: Trajectory, frames: range, cameras: Cameras) -> Rendered:
         """Foreground on black; colours beyond [0, 1] are cut, as in every image file."""
         part = slice(frames.start, frames.stop)
-        state = trajectory.positions[part], trajectory.gradients[part], trajectory.rotations[part]
+        state = trajectory.positions[part], trajectory.deformation_gradients[part], trajectory.rotations[part]
         images = draw(self.renderer, self.look, *state, trajectory.unit_of_kernel, cameras)
         return Rendered(images.rgb.clamp(0, 1), images.alpha)
 

@@ -327,7 +327,7 @@ class Interaction:
                 f"{self.scene.name}: kernel {kernel} is {float(away[kernel]):.3g} diagonals from rest at frame "
                 f"{number}, expected at most {self._farthest:g}. Reset, and use smaller forces."
             )
-        g = frame.gradients.double()
+        g = frame.deformation_gradients.double()
         volume = determinant(g).abs() / g.square().sum((-2, -1)).pow(1.5)
         flat = ~(volume >= FLATTEST)
         if bool(flat.any()):
@@ -363,7 +363,9 @@ def replay(
     wrong = differences(interaction, session)
     if wrong and not (other_model and all(allowed for _, allowed in wrong)):
         raise DataError("session: " + "; ".join(text for text, _ in wrong) + ". Replay it with what it was made with.")
-    size = session.steps * 4 * (interaction.frame.positions.numel() + 2 * interaction.frame.gradients.numel())
+    size = (
+        session.steps * 4 * (interaction.frame.positions.numel() + 2 * interaction.frame.deformation_gradients.numel())
+    )
     if size > _MOST_BYTES:
         raise DataError(f"session: its {session.steps} frames take {size >> 30} GiB, expected at most 8. Shorten it.")
     interaction.gravity, interaction.seed = session.gravity, session.seed

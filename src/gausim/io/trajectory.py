@@ -15,6 +15,7 @@ from gausim.io.files import write_durably
 
 FORMAT = "gausim.trajectory/1"
 _TENSORS = ("positions", "gradients", "rotations", "unit_of_kernel", "fps")
+_ATTRIBUTES = {"gradients": "deformation_gradients"}  # names in the file that differ from those of Trajectory
 
 
 def save_trajectory(path: Path | str, trajectory: Trajectory, *, facts: Mapping[str, str] | None = None) -> None:
@@ -26,7 +27,8 @@ def save_trajectory(path: Path | str, trajectory: Trajectory, *, facts: Mapping[
         facts: texts for the header, e.g. object and sequence.
     """
     path = Path(path)
-    tensors = {name: getattr(trajectory, name).detach().cpu().contiguous() for name in _TENSORS[:-1]}
+    found = {name: getattr(trajectory, _ATTRIBUTES.get(name, name)) for name in _TENSORS[:-1]}
+    tensors = {name: value.detach().cpu().contiguous() for name, value in found.items()}
     tensors["fps"] = torch.tensor(trajectory.fps, dtype=torch.float64)
     write_durably(path, save(tensors, metadata={**(facts or {}), "format": FORMAT}))
 
@@ -52,7 +54,7 @@ def load_trajectory(path: Path | str) -> Trajectory:
     if missing:
         raise DataError(f"{path}: tensor '{missing[0]}' is missing; it has {sorted(found)}. Export it again.")
     _check(path, tensors)
-    return Trajectory(**{n: tensors[n] for n in _TENSORS[:-1]}, fps=float(tensors["fps"]))
+    return Trajectory(**{_ATTRIBUTES.get(n, n): tensors[n] for n in _TENSORS[:-1]}, fps=float(tensors["fps"]))
 
 
 def _check(path: Path, tensors: dict[str, Tensor]) -> None:

@@ -22,7 +22,7 @@ _KERNELS_AT_ONCE = 8192
 def deformed_scene(
     scene: GaussianScene,
     positions: Float[Tensor, "K 3"],
-    gradients: Float[Tensor, "N 3 3"],
+    deformation_gradients: Float[Tensor, "N 3 3"],
     rotations: Float[Tensor, "N 3 3"],
     unit_of_kernel: Int[Tensor, " K"],
 ) -> GaussianScene:
@@ -32,12 +32,14 @@ def deformed_scene(
     result looks in every viewer as the trajectory does here. Kernels of units that did not deform keep their fields
     bit for bit.
     """
-    identity = torch.eye(3, dtype=gradients.dtype, device=gradients.device)
-    change = torch.maximum((gradients - identity).abs().amax((1, 2)), (rotations - identity).abs().amax((1, 2)))
+    identity = torch.eye(3, dtype=deformation_gradients.dtype, device=deformation_gradients.device)
+    change = torch.maximum(
+        (deformation_gradients - identity).abs().amax((1, 2)), (rotations - identity).abs().amax((1, 2))
+    )
     moved = (change > _UNMOVED)[unit_of_kernel]
     log_scales, quats, sh = scene.log_scales.clone(), scene.quats.clone(), scene.sh.clone()
     for index in moved.nonzero()[:, 0].split(_KERNELS_AT_ONCE):
-        gradient = gradients[unit_of_kernel[index]].double()
+        gradient = deformation_gradients[unit_of_kernel[index]].double()
         covars = covariance_from_scales(scene.log_scales[index].double(), scene.quats[index].double())
         lengths, axes = torch.linalg.eigh(gradient @ covars @ gradient.mT)
         # A reflection is no rotation; turning one axis round leaves the covariance as it is.

@@ -63,7 +63,7 @@ def draw(
     renderer: Renderer,
     scene: GaussianScene | SceneAppearance,
     positions: Float[Tensor, "B K 3"],
-    gradients: Float[Tensor, "B N 3 3"],
+    deformation_gradients: Float[Tensor, "B N 3 3"],
     rotations: Float[Tensor, "B N 3 3"],
     unit_of_kernel: Int[Tensor, " K"],
     cameras: Cameras,
@@ -82,7 +82,7 @@ def draw(
         renderer: what draws.
         scene: the rest scene; training passes a SceneAppearance made once.
         positions: kernel means of each state [scene units].
-        gradients: accumulated deformation gradients G of the N units.
+        deformation_gradients: accumulated deformation gradients G of the N units.
         rotations: their accumulated rotations Q.
         unit_of_kernel: the unit of each kernel.
         cameras: V views.
@@ -102,13 +102,13 @@ def draw(
         positions, unit_of_kernel = positions.index_select(1, look.index), unit_of_kernel[look.index]
     states, views = positions.shape[0], cameras.viewmats.shape[0]
     centers = cameras.centers.to(positions)
-    if fits(positions, gradients, rotations, look.covars, look.sh, centers):
+    if fits(positions, deformation_gradients, rotations, look.covars, look.sh, centers):
         covars, colors = deformed_appearance(
-            positions, gradients, rotations, unit_of_kernel, look.covars, look.sh, centers
+            positions, deformation_gradients, rotations, unit_of_kernel, look.covars, look.sh, centers
         )
     else:
         rest = look.covars.expand(states, -1, -1, -1)
-        covars = transport_covariance(rest, gradients.index_select(1, unit_of_kernel))
+        covars = transport_covariance(rest, deformation_gradients.index_select(1, unit_of_kernel))
         colors = view_colors(look, positions, rotations, unit_of_kernel, centers)
     return renderer(
         positions,
@@ -165,7 +165,7 @@ def draw_trajectory(
                 renderer,
                 scene,
                 trajectory.positions[frames],
-                trajectory.gradients[frames],
+                trajectory.deformation_gradients[frames],
                 trajectory.rotations[frames],
                 trajectory.unit_of_kernel,
                 cameras,

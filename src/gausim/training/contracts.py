@@ -47,13 +47,13 @@ class Step(Protocol):
 
     Attributes:
         positions: (K over all members, 3) kernel means [scene units].
-        gradients: (N over all members, 3, 3) accumulated deformation gradients of the units.
+        deformation_gradients: (N over all members, 3, 3) accumulated deformation gradients of the units.
         rotations: (N over all members, 3, 3) their accumulated rotations.
         momentum: the momentum loss, summed over members; zero where it is switched off.
     """
 
     positions: Tensor
-    gradients: Tensor
+    deformation_gradients: Tensor
     rotations: Tensor
     momentum: Tensor
 

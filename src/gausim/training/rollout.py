@@ -69,7 +69,7 @@ class Frame:
     """One predicted frame without what the model adds to it (see :class:`gausim.training.contracts.Step`)."""
 
     positions: Tensor
-    gradients: Tensor
+    deformation_gradients: Tensor
     rotations: Tensor
     momentum: Tensor
 
@@ -85,7 +85,7 @@ def checkpointed_step(model: Simulator, batch: SceneBatch, state: SimState) -> F
     def run(positions: Tensor, previous: Tensor) -> tuple[Tensor, ...]:
         with gathering_nothing(normalisers) if next(calls) else nullcontext():
             step = model.step(batch, SimState(positions, previous))
-        return step.positions, step.gradients, step.rotations, step.momentum
+        return step.positions, step.deformation_gradients, step.rotations, step.momentum
 
     # No random numbers in a step, so no generator is to be put back.
     return Frame(*torch_checkpoint(run, state.positions, state.previous, use_reentrant=False, preserve_rng_state=False))
@@ -97,12 +97,12 @@ class States:
 
     Attributes:
         positions: kernel means [scene units].
-        gradients: accumulated deformation gradients of the units.
+        deformation_gradients: accumulated deformation gradients of the units.
         rotations: their rotations.
     """
 
     positions: Float[Tensor, "T K 3"]
-    gradients: Float[Tensor, "T N 3 3"]
+    deformation_gradients: Float[Tensor, "T N 3 3"]
     rotations: Float[Tensor, "T N 3 3"]
 
     @staticmethod
@@ -110,13 +110,13 @@ class States:
         """Stacks the steps of a stretch."""
         return States(
             torch.stack([step.positions for step in steps]),
-            torch.stack([step.gradients for step in steps]),
+            torch.stack([step.deformation_gradients for step in steps]),
             torch.stack([step.rotations for step in steps]),
         )
 
     def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
         """The three of them."""
-        return self.positions, self.gradients, self.rotations
+        return self.positions, self.deformation_gradients, self.rotations
 
 
 class Looks:
@@ -328,7 +328,7 @@ class Explosions:
         """The states, or those of rest once the rollout has ended: they can be drawn whatever happened."""
         if self._lasts is None:
             return states
-        identity = torch.eye(3, dtype=states.gradients.dtype, device=states.gradients.device)
+        identity = torch.eye(3, dtype=states.deformation_gradients.dtype, device=states.deformation_gradients.device)
         rests = (self._rest, identity, identity)
         return States(*(torch.where(self._lasts, x, r) for x, r in zip(states.tensors(), rests, strict=True)))
 

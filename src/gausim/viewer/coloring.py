@@ -83,25 +83,31 @@ class Painter:
             mode: one of :attr:`modes`.
             eye: where the camera is [scene units].
         """
-        positions, gradients, rotations, unit = (
-            frame.positions.cpu(), frame.gradients.cpu(), frame.rotations.cpu(), unit_of_kernel.cpu()
+        positions, deformation_gradients, rotations, unit = (
+            frame.positions.cpu(), frame.deformation_gradients.cpu(), frame.rotations.cpu(), unit_of_kernel.cpu()
         )  # fmt: skip
         look = self._look.to(positions)
-        if mode == VIEW and fits(positions, gradients, rotations, look.covars, look.sh):
+        if mode == VIEW and fits(positions, deformation_gradients, rotations, look.covars, look.sh):
             covars, rgb = deformed_appearance(
-                positions[None], gradients[None], rotations[None], unit, look.covars, look.sh, eye[None].to(positions)
+                positions[None],
+                deformation_gradients[None],
+                rotations[None],
+                unit,
+                look.covars,
+                look.sh,
+                eye[None].to(positions),
             )
             return covars[0], rgb[0, 0], Legend("spherical harmonics for the camera that moved last")
-        covars = transport_covariance(look.covars, gradients[unit])
+        covars = transport_covariance(look.covars, deformation_gradients[unit])
         if mode == VIEW:
             rgb = view_colors(look, positions[None], rotations[None], unit, eye[None].to(positions))[0, 0]
             return covars, rgb, Legend("spherical harmonics for the camera that moved last")
-        rgb, legend = self._value(gradients[unit], speed.cpu(), mode)
+        rgb, legend = self._value(deformation_gradients[unit], speed.cpu(), mode)
         return covars, rgb, legend
 
-    def _value(self, gradients: Tensor, speed: Tensor, mode: str) -> tuple[Tensor, Legend]:
+    def _value(self, deformation_gradients: Tensor, speed: Tensor, mode: str) -> tuple[Tensor, Legend]:
         if mode == STRAIN:
-            stretch = torch.linalg.svdvals(gradients.double()).clamp_min(1e-12).log().abs().amax(-1).float()
+            stretch = torch.linalg.svdvals(deformation_gradients.double()).clamp_min(1e-12).log().abs().amax(-1).float()
             return self._scaled(mode, stretch, "strain: largest |log| of the singular values of G", "")
         if mode == SPEED:
             return self._scaled(mode, speed / self._diagonal, "speed", "diagonals / s")

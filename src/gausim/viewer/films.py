@@ -52,7 +52,7 @@ class Films:
         """The shown frame as that camera sees it, over black."""
         frame = shown.frame
         image = draw(
-            self._renderer, self._look, frame.positions[None], frame.gradients[None], frame.rotations[None],
+            self._renderer, self._look, frame.positions[None], frame.deformation_gradients[None], frame.rotations[None],
             shown.unit_of_kernel, self._records[sequence].cameras_of([view]),
         ).rgb[0, 0]  # fmt: skip
         return to_bytes(image).cpu().numpy()

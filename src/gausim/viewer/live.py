@@ -112,7 +112,7 @@ class Live(threading.Thread):
         self.message, self.playing, self.pace, self.source = "", True, 1.0, LIVE
         self.rate, self.seconds, self.steps = Rate(), 0.0, 0
         frame = interaction.frame
-        size = 4 * (2 * frame.positions.numel() + 2 * frame.gradients.numel())
+        size = 4 * (2 * frame.positions.numel() + 2 * frame.deformation_gradients.numel())
         self._history: deque[Shown] = deque(maxlen=max(32, min(3000, _HISTORY_BYTES // size)))
         self._place: int | None = None  # on the live timeline; None: its end
         self._script: _Script | None = None
@@ -332,7 +332,7 @@ class Live(threading.Thread):
 
 def _of(trajectory: Trajectory, number: int, name: str, beside: Shown | None = None) -> Shown:
     frame = SteppedFrame(
-        trajectory.positions[number], trajectory.gradients[number], trajectory.rotations[number]
+        trajectory.positions[number], trajectory.deformation_gradients[number], trajectory.rotations[number]
     )  # fmt: skip
     before = trajectory.positions[max(0, number - 1)]
     speed = (frame.positions - before).norm(dim=-1) * trajectory.fps

@@ -87,7 +87,7 @@ def _frames(scene: GaussianScene, trajectory: Trajectory, every: int) -> range:
             f"{scene.name}: {len(numbers)} frames of {scene.count} kernels take {size / 2**30:.1f} GiB, expected "
             f"at most {_LARGEST >> 30}. Take every {-(-size * every // _LARGEST)}th frame, or export PLY files."
         )
-    for values in (trajectory.positions, trajectory.gradients):
+    for values in (trajectory.positions, trajectory.deformation_gradients):
         bad = ~torch.isfinite(values).reshape(trajectory.frames, -1).all(-1)
         if bool(bad.any()):
             raise DivergenceError(f"{scene.name}: frame {int(bad.nonzero()[0])} is not finite; it cannot be shown.")
@@ -119,7 +119,7 @@ def _recorded(
 
     def buffer(number: int) -> np.ndarray:
         frame = SteppedFrame(
-            trajectory.positions[number].float(), trajectory.gradients[number].float(),
+            trajectory.positions[number].float(), trajectory.deformation_gradients[number].float(),
             trajectory.rotations[number].float(),
         )  # fmt: skip
         mode, seen_from = VIEW if colors == "view" else BASE, placing.to_scene(torch.tensor(eye, dtype=torch.float32))

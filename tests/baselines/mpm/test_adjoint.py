@@ -77,7 +77,7 @@ def compared(name: str, function: Callable[[Tensor], Tensor], at: Tensor, step: 
     return error
 
 
-STEPS = {"positions": 1e-4, "velocities": 1e-2, "affine": 1e-1, "gradients": 1e-3}
+STEPS = {"positions": 1e-4, "velocities": 1e-2, "affine": 1e-1, "deformation_gradients": 1e-3}
 
 
 @pytest.mark.parametrize("field", STEPS)

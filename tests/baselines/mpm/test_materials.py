@@ -34,7 +34,7 @@ def answer(
     left[i] = softened(kind, F[i], 2.0, y[i], rheology)
 
 
-def gradients(count: int, size: float, seed: int) -> np.ndarray:
+def deformation_gradients(count: int, size: float, seed: int) -> np.ndarray:
     return np.eye(3) + size * np.random.default_rng(seed).standard_normal((count, 3, 3))
 
 
@@ -87,7 +87,7 @@ def expected_stress(kind: MaterialKind, F: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.name.lower())
 @pytest.mark.parametrize("size", [0.15, 1e-3])
 def test_stress_and_return_map_follow_the_closed_formulas(kind: MaterialKind, size: float):
-    F = gradients(200, size, 1)
+    F = deformation_gradients(200, size, 1)
     mapped, stress, left = on_device(kind, F)
     strain = principal(F)[1]
     plastic = np.abs(expected_strain(kind, strain) - strain).max(-1) > 1e-6
@@ -103,7 +103,7 @@ def test_stress_and_return_map_follow_the_closed_formulas(kind: MaterialKind, si
 
 
 def test_von_mises_ends_on_its_surface_and_sand_on_its_cone():
-    F = gradients(200, 0.15, 2)
+    F = deformation_gradients(200, 0.15, 2)
     mapped = on_device(MaterialKind.VON_MISES, F)[0]
     strain = principal(mapped.astype(np.float64))[1]
     shear = 2 * MU * np.linalg.norm(strain - strain.mean(-1, keepdims=True), axis=-1)
@@ -119,7 +119,7 @@ def test_von_mises_ends_on_its_surface_and_sand_on_its_cone():
 
 
 def test_stress_at_rest_is_zero_and_turning_leaves_it_zero():
-    turn = np.linalg.qr(gradients(50, 1.0, 3))[0]
+    turn = np.linalg.qr(deformation_gradients(50, 1.0, 3))[0]
     turn *= np.sign(np.linalg.det(turn))[:, None, None]
     for kind in KINDS:
         assert np.abs(on_device(kind, turn)[1]).max() < 5e-6
@@ -127,7 +127,7 @@ def test_stress_at_rest_is_zero_and_turning_leaves_it_zero():
 
 
 def test_plasticine_without_yield_stress_left_bears_nothing():
-    F = gradients(3, 0.1, 4)
+    F = deformation_gradients(3, 0.1, 4)
     inputs = [int(MaterialKind.PLASTICINE), wp.array(F, dtype=wp.mat33, device="cpu")]
     outputs = [wp.zeros(3, dtype=wp.mat33, device="cpu") for _ in range(2)] + [wp.zeros(3, dtype=float, device="cpu")]
     soft = wp.full(3, -0.1, dtype=float, device="cpu")
@@ -149,7 +149,7 @@ def slope(function: Callable[[np.ndarray], np.ndarray], F: np.ndarray, weight: n
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: k.name.lower())
 @pytest.mark.parametrize("size", [0.15, 0.0])
 def test_derivatives_agree_with_differences_also_at_rest(kind: MaterialKind, size: float):
-    F, weight = gradients(60, size, 5), gradients(60, 1.0, 6)
+    F, weight = deformation_gradients(60, size, 5), deformation_gradients(60, 1.0, 6)
     if size == 0:  # at rest the maps of plasticity have an edge or a singular direction; the stress has not
         maps = [("stress", expected_stress)]
     else:

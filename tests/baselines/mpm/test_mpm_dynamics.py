@@ -53,10 +53,10 @@ def test_rollout_is_a_trajectory_that_starts_at_the_initial_state(pole):
     trajectory = dynamics.rollout(start, 6)
     assert trajectory.frames == 7 and trajectory.fps == 24.0
     assert torch.equal(trajectory.positions[0], pole.means)
-    assert torch.equal(trajectory.gradients[0], torch.eye(3).expand_as(trajectory.gradients[0]))
+    assert torch.equal(trajectory.deformation_gradients[0], torch.eye(3).expand_as(trajectory.deformation_gradients[0]))
     still = pole.pinned | ~pole.simulated
     assert torch.equal(trajectory.positions[:, still], pole.means[still].expand(7, -1, -1))
-    carried = trajectory.gradients[:, trajectory.unit_of_kernel[still]]
+    carried = trajectory.deformation_gradients[:, trajectory.unit_of_kernel[still]]
     assert torch.equal(carried, torch.eye(3).expand_as(carried))
     top = pole.means[:, 2] > 8.7
     first = (trajectory.positions[1] - trajectory.positions[0])[top & pole.simulated]
@@ -76,7 +76,7 @@ def test_place_and_scale_of_the_scene_do_not_matter(pole):
     second = MPMDynamics(other, fps=fps, material=SOFT, grid=GRID).rollout(state, 4)
     moved = (first.positions - first.positions[0]).abs().max()
     assert (10 * (second.positions + 3) - first.positions).abs().max() < 2e-3 * moved
-    assert (second.gradients - first.gradients).abs().max() < 1e-3
+    assert (second.deformation_gradients - first.deformation_gradients).abs().max() < 1e-3
 
 
 def test_forces_and_impulses_are_in_units_of_the_scene(pole):
@@ -120,7 +120,12 @@ def test_filling_adds_particles_that_are_not_shown(lattice):
     velocity = dynamics.mapping.scale * 0.01 * 24.0
     assert float(state.velocities[count:, 0][free].mean()) == pytest.approx(velocity, rel=0.1)
     trajectory = dynamics.rollout(start, 2)
-    assert trajectory.positions.shape == (3, count, 3) and trajectory.gradients.shape == (3, count + 1, 3, 3)
+    assert trajectory.positions.shape == (3, count, 3) and trajectory.deformation_gradients.shape == (
+        3,
+        count + 1,
+        3,
+        3,
+    )
 
 
 def test_young_modulus_of_kernels_carries_gradients(pole):

@@ -206,12 +206,15 @@ class MaterialPoints(Fitted):
         particles = body.solver.advance(ParticleState(*state.inner), state.frame, young_modulus=self.modulus(scene_id))
         x = body.mapping.to_scene(particles.positions)
         return FittedState(
-            state.sequence_id, state.frame + 1, *self.carry(body.driven, x, particles.gradients), particles.tensors()
+            state.sequence_id,
+            state.frame + 1,
+            *self.carry(body.driven, x, particles.deformation_gradients),
+            particles.tensors(),
         )
 
-    def carry(self, driven: Driven, x: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def carry(self, driven: Driven, x: Tensor, deformation_gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Positions, gradients and rotations of the kernels."""
-        return driven.carried(x, gradients)
+        return driven.carried(x, deformation_gradients)
 
     def speed(self, scene_id: int) -> Float[Tensor, " P"]:
         """The speed sqrt(E / rho) of waves in longest sides per frame: what a modulus means for the motion."""

@@ -155,10 +155,10 @@ class MPMDynamics:
         free = ~self.scene.pinned[self._index]
         return initial.positions.index_put((self._index[free],), moved[free])
 
-    def unit_gradients(self, state: ParticleState) -> Float[Tensor, "N 3 3"]:
+    def unit_deformations(self, state: ParticleState) -> Float[Tensor, "N 3 3"]:
         """F of the simulated kernels and, last, the identity for the others."""
-        gradients = state.gradients[: len(self._index)]
-        return torch.cat((gradients, torch.eye(3).to(gradients)[None]))
+        deformation_gradients = state.deformation_gradients[: len(self._index)]
+        return torch.cat((deformation_gradients, torch.eye(3).to(deformation_gradients)[None]))
 
     @property
     def unit_of_kernel(self) -> Int[Tensor, " K"]:
@@ -212,24 +212,24 @@ class MPMStepper:
         self._particles = self._dynamics.advance(self._particles, self._number, force)
         self._number += 1
         positions = self._dynamics.kernel_positions(self._particles, self._initial)
-        gradients = self._dynamics.unit_gradients(self._particles)
+        deformation_gradients = self._dynamics.unit_deformations(self._particles)
         self.state = SimState(positions, self.state.positions)
-        self.frame = SteppedFrame(positions, gradients, rotations(gradients))
+        self.frame = SteppedFrame(positions, deformation_gradients, rotations(deformation_gradients))
         return self.frame
 
     def settle(self) -> None:
         """Nothing: every step says at once what is wrong."""
 
 
-def rotations(gradients: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:
+def rotations(deformation_gradients: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:
     """Polar rotations with determinant 1, also of matter that is turned inside out."""
-    identity = torch.eye(3).to(gradients)
-    upright = (determinant(gradients) > LEAST_DETERMINANT)[..., None, None]
-    result = polar_rotation(torch.where(upright, gradients, identity))
+    identity = torch.eye(3).to(deformation_gradients)
+    upright = (determinant(deformation_gradients) > LEAST_DETERMINANT)[..., None, None]
+    result = polar_rotation(torch.where(upright, deformation_gradients, identity))
     turned = (result @ result.mT - identity).abs().amax((-1, -2), keepdim=True) < ORTHOGONAL
     if (upright & turned).all():
         return result
-    u, _, vt = torch.linalg.svd(gradients)
+    u, _, vt = torch.linalg.svd(deformation_gradients)
     sign = torch.ones_like(u[..., 0, :])
     sign[..., 2] = determinant(u @ vt).sign()
     return torch.where(upright & turned, result, (u * sign[..., None, :]) @ vt)

@@ -23,14 +23,14 @@ class ParticleState:
         positions: x.
         velocities: v.
         affine: C, the velocity gradient of APIC [1 / s].
-        gradients: F, the elastic part of the deformation gradient.
+        deformation_gradients: F, the elastic part of the deformation gradient.
         yield_stress: y, which plasticine loses as it flows.
     """
 
     positions: Float[Tensor, "N 3"]
     velocities: Float[Tensor, "N 3"]
     affine: Float[Tensor, "N 3 3"]
-    gradients: Float[Tensor, "N 3 3"]
+    deformation_gradients: Float[Tensor, "N 3 3"]
     yield_stress: Float[Tensor, " N"]
 
     @staticmethod
@@ -49,7 +49,7 @@ class ParticleState:
 
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """(x, v, C, F, y)."""
-        return self.positions, self.velocities, self.affine, self.gradients, self.yield_stress
+        return self.positions, self.velocities, self.affine, self.deformation_gradients, self.yield_stress
 
     def detach(self) -> ParticleState:
         """The same numbers without history (gradients stop here)."""

@@ -87,7 +87,7 @@ class MPMSolver:
 
     def _check(self, state: ParticleState, frame: int) -> None:
         require_inside(state.positions.detach(), self.grid, f"frame {frame}")
-        finite = torch.isfinite(state.gradients.detach()).flatten(1).all(1)
+        finite = torch.isfinite(state.deformation_gradients.detach()).flatten(1).all(1)
         if not finite.all():
             first = int((~finite).nonzero()[0])
             place = ", ".join(f"{value:.4g}" for value in state.positions[first].tolist())

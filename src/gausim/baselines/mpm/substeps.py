@@ -22,7 +22,7 @@ class State:
     positions: Any
     velocities: Any
     affine: Any
-    gradients: Any
+    deformation_gradients: Any
     yield_stress: Any
 
     @staticmethod
@@ -34,7 +34,7 @@ class State:
 
     def all(self) -> list[Any]:
         """The arrays in the order of the kernels' outputs."""
-        return [self.positions, self.velocities, self.affine, self.gradients, self.yield_stress]
+        return [self.positions, self.velocities, self.affine, self.deformation_gradients, self.yield_stress]
 
     def zero(self) -> None:
         """Sets all numbers to 0."""
@@ -149,7 +149,15 @@ class Substeps:
         self._to_grid(window, state, young[0], acceleration[0], time, dt)
 
         inputs, outputs = self._gather(window, state, following, young[0], dt)
-        to = [adjoint.positions, adjoint.gradients, adjoint.yield_stress, velocity, young[1], None, *inputs[6:]]
+        to = [
+            adjoint.positions,
+            adjoint.deformation_gradients,
+            adjoint.yield_stress,
+            velocity,
+            young[1],
+            None,
+            *inputs[6:],
+        ]
         self._adjoint(self._kernels.grid_to_particles, self.count, inputs, outputs, to, adjoint_following.all())
         inputs, outputs = self._update(window, time, dt)
         to = [momentum, *[None] * 5, *inputs[6:]]
@@ -158,7 +166,7 @@ class Substeps:
         to = [adjoint.positions, adjoint.velocities, adjoint.affine, stress, acceleration[1], None, None, *inputs[7:]]
         self._adjoint(self._kernels.particles_to_grid, self.count, inputs, outputs, to, [momentum])
         inputs, outputs = self._stresses(state, young[0])
-        to = [adjoint.gradients, adjoint.yield_stress, young[1], *inputs[3:]]
+        to = [adjoint.deformation_gradients, adjoint.yield_stress, young[1], *inputs[3:]]
         self._adjoint(self._kernels.stress_kernel, self.count, inputs, outputs, to, [stress])
 
     def _to_grid(self, window: Window, state: State, young: Any, acceleration: Any, time: float, dt: float) -> None:
@@ -169,7 +177,7 @@ class Substeps:
 
     def _stresses(self, state: State, young: Any) -> tuple[list[Any], list[Any]]:
         material = self._material
-        inputs = [state.gradients, state.yield_stress, young, material.poisson_ratio, int(material.kind)]
+        inputs = [state.deformation_gradients, state.yield_stress, young, material.poisson_ratio, int(material.kind)]
         return inputs, [self._stress]
 
     def _scatter(self, window: Window, state: State, acceleration: Any, dt: float) -> tuple[list[Any], list[Any]]:
@@ -186,7 +194,7 @@ class Substeps:
     def _gather(
         self, window: Window, state: State, following: State, young: Any, dt: float
     ) -> tuple[list[Any], list[Any]]:
-        arrays = [state.positions, state.gradients, state.yield_stress, window.velocity, young, self._held]
+        arrays = [state.positions, state.deformation_gradients, state.yield_stress, window.velocity, young, self._held]
         material = [self._material.poisson_ratio, int(self._material.kind), self._rheology]
         return [*arrays, *material, 1 / self._grid.dx, window.origin_, window.shape_, dt], following.all()
 

@@ -89,7 +89,9 @@ class Anchors:
         moved = torch.einsum("kn,kni->ki", self.weights.to(displacement), self._gather(displacement))
         return self.means.to(displacement) + self.diagonal * moved
 
-    def gradients(self, displacement: Float[Tensor, "A 3"]) -> tuple[Float[Tensor, "K 3 3"], Float[Tensor, "K 3 3"]]:
+    def deformation_gradients(
+        self, displacement: Float[Tensor, "A 3"]
+    ) -> tuple[Float[Tensor, "K 3 3"], Float[Tensor, "K 3 3"]]:
         """Deformation gradients and rotations of the kernels.
 
         F minimises sum_a w_a |F (X_a - X) - (x_a - x)|^2 with X, x the weighted means of the followed anchors:

@@ -83,10 +83,12 @@ class AnchoredMotion(Fitted):
         anchors = self.anchors(sequence_id)
         displacement = x - anchors.rest
         if self.gradients:
-            gradients, rotations = anchors.gradients(displacement)
+            deformation_gradients, rotations = anchors.deformation_gradients(displacement)
         else:
-            gradients = rotations = torch.eye(3).to(x).expand(len(anchors.means), 3, 3)
-        return FittedState(sequence_id, frame, anchors.positions(displacement), gradients, rotations, (x, v))
+            deformation_gradients = rotations = torch.eye(3).to(x).expand(len(anchors.means), 3, 3)
+        return FittedState(
+            sequence_id, frame, anchors.positions(displacement), deformation_gradients, rotations, (x, v)
+        )
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
         """``velocity``, one per sequence."""

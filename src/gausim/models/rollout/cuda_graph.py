@@ -23,7 +23,7 @@ class Predicted(Protocol):
         """x_{t+1} of all kernels, (K, 3) [scene units]."""
 
     @property
-    def gradients(self) -> Tensor:
+    def deformation_gradients(self) -> Tensor:
         """Accumulated deformation gradients of the units, (N, 3, 3)."""
 
     @property
@@ -91,7 +91,7 @@ class GraphedStep:
     def _compute(self, pushed: bool) -> SteppedFrame:
         """What is captured."""
         made = self._step(self._state, self._force if pushed else None)
-        return SteppedFrame(made.positions, made.gradients, made.rotations)
+        return SteppedFrame(made.positions, made.deformation_gradients, made.rotations)
 
     def _record(self, pushed: bool) -> tuple[torch.cuda.CUDAGraph, SteppedFrame]:
         device = self._force.device
@@ -116,4 +116,4 @@ class GraphedStep:
 
 
 def _copy(frame: SteppedFrame) -> SteppedFrame:
-    return SteppedFrame(frame.positions.clone(), frame.gradients.clone(), frame.rotations.clone())
+    return SteppedFrame(frame.positions.clone(), frame.deformation_gradients.clone(), frame.rotations.clone())

@@ -80,7 +80,7 @@ class EnergyGuard:
             if energy > self._ceiling:
                 result, energy = self._cut_short(result, state, self._ceiling)
         self._last.append(energy)
-        self._made = SteppedFrame(result.positions, result.gradients, result.rotations)
+        self._made = SteppedFrame(result.positions, result.deformation_gradients, result.rotations)
         return result
 
     def _weakened(self, state: SimState, force: Tensor, ceiling: float) -> tuple[Predicted, float]:
@@ -109,12 +109,12 @@ class EnergyGuard:
     def _part(self, made: Predicted, state: SimState, scale: float) -> SteppedFrame:
         positions = state.positions + scale * (made.positions - state.positions)
         if self._made is None:  # the first step: from identity gradients
-            before = turned = torch.eye(3).to(positions).expand_as(made.gradients)
+            before = turned = torch.eye(3).to(positions).expand_as(made.deformation_gradients)
         else:
-            before, turned = self._made.gradients, self._made.rotations
-        gradients = before + scale * (made.gradients - before)
+            before, turned = self._made.deformation_gradients, self._made.rotations
+        deformation_gradients = before + scale * (made.deformation_gradients - before)
         rotations = polar_rotation(turned + scale * (made.rotations - turned))
-        return SteppedFrame(positions, gradients, rotations)
+        return SteppedFrame(positions, deformation_gradients, rotations)
 
     def _held_back(self, state: SimState, force: Tensor | None, energy: float, limit: float) -> tuple[Predicted, float]:
         self.held += 1

@@ -81,7 +81,7 @@ class SceneStepper:
         self._number += 1
         self._watch.positions(self._number, positions)
         self.state = SimState(positions, self.state.positions)
-        self.frame = SteppedFrame(positions, made.gradients, made.rotations)
+        self.frame = SteppedFrame(positions, made.deformation_gradients, made.rotations)
         return self.frame
 
     def settle(self) -> None:

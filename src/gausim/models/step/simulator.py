@@ -35,7 +35,7 @@ class Step:
 
     Attributes:
         positions: x_{t+1} of all kernels of the batch [scene units].
-        gradients: accumulated deformation gradients of the finest predicted units, per member plus its identity unit.
+        deformation_gradients: accumulated, of the finest predicted units, per member plus its identity unit.
         rotations: their accumulated rotations.
         momentum: sum over levels and parents of ||m_c x_c - sum m_i x_i||^2, masses over that of the scene and lengths
             over its diagonal; zero where it is switched off.
@@ -43,7 +43,7 @@ class Step:
     """
 
     positions: Float[Tensor, "K 3"]
-    gradients: Float[Tensor, "N 3 3"]
+    deformation_gradients: Float[Tensor, "N 3 3"]
     rotations: Float[Tensor, "N 3 3"]
     momentum: Float[Tensor, ""]
     predicted: tuple[Float[Tensor, "_ 3 3"], ...]
@@ -174,7 +174,7 @@ class GausSim(SceneModel):
             if position and self.conserve_momentum:
                 momentum = momentum + _momentum(level, unit, after, above.after, prepared.levels[position - 1])
             above = Solved(unit.rest, x, previous, after, target, accumulated, turned, above.index)
-        return above, template.gradients, momentum, predicted
+        return above, template.deformation_gradients, momentum, predicted
 
     def _outputs_at_rest(self, prepared: Prepared) -> tuple[Tensor, ...]:
         """The network's output for every unit of every predicted level where nothing moves."""

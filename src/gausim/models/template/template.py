@@ -1,4 +1,4 @@
-"""Template states: the configuration that the predicted gradients deform.
+"""Template states: the configuration that the predicted deformation gradients deform further.
 
 The recursion of METHOD section 2 deforms a template: x_i = x_p + C_i (T_i - T_p), where C_i accumulates the network's
 gradients. In the paper the template is the rest state. An inertial template (:mod:`gausim.models.template.elastic`)
@@ -42,11 +42,11 @@ class TemplateState:
 
     Attributes:
         positions: unit positions [scene units].
-        gradients: deformation gradient of each unit, or None for the identity.
+        deformation_gradients: of each unit, or None for the identity.
     """
 
     positions: Float[Tensor, "N 3"]
-    gradients: Float[Tensor, "N 3 3"] | None
+    deformation_gradients: Float[Tensor, "N 3 3"] | None
 
 
 @runtime_checkable
@@ -140,7 +140,7 @@ class PreparedScenes:
         Args:
             batch: the disjoint graph.
             made: makes the template of a scene, given its number and the rows of one member's units.
-            conserve_volume: scale gradients to determinant 1.
+            conserve_volume: scale deformation gradients to determinant 1.
         """
         self._conserve_volume = conserve_volume
         self.parts = [
@@ -162,9 +162,9 @@ class PreparedScenes:
         """Positions X + u and gradients I + grad u, their determinants bounded."""
         made = [part(*self._displacements(motion, rows, members)).flatten(0, 1) for part, rows, members in self.parts]
         moved = made[0] if len(made) == 1 else torch.cat(made).index_select(0, self._places)
-        gradients = moved[:, 3:].reshape(-1, 3, 3) + torch.eye(3, dtype=moved.dtype, device=moved.device)
-        gradients = bounded_deformation(gradients, MIN_DETERMINANT, unit=self._conserve_volume)
-        return TemplateState(motion.rest + moved[:, :3], gradients)
+        deformation = moved[:, 3:].reshape(-1, 3, 3) + torch.eye(3, dtype=moved.dtype, device=moved.device)
+        deformation = bounded_deformation(deformation, MIN_DETERMINANT, unit=self._conserve_volume)
+        return TemplateState(motion.rest + moved[:, :3], deformation)
 
     def carried(self, motion: Motion) -> Motion:
         """The part of the motion that goes on: what the network sees of both states."""
@@ -198,12 +198,12 @@ class RestTemplate(Template):
         super().__init__()
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
-        """Rest positions, identity gradients."""
+        """Rest positions, identity deformation gradients."""
         return _AtRest()
 
 
 class _AtRest:
-    """Rest positions, identity gradients, no energy; the network sees all of the motion."""
+    """Rest positions, identity deformation gradients, no energy; the network sees all of the motion."""
 
     def __call__(self, motion: Motion) -> TemplateState:
         return TemplateState(motion.rest, None)

@@ -21,7 +21,7 @@ BACKWARD_TASKS = 4  # each has gradients of all units of its own
 
 def deformed_appearance(
     positions: Float[Tensor, "B n 3"],
-    gradients: Float[Tensor, "B N 3 3"],
+    deformation_gradients: Float[Tensor, "B N 3 3"],
     rotations: Float[Tensor, "B N 3 3"],
     unit_of_kernel: Int[Tensor, " n"],
     covars: Float[Tensor, "n 3 3"],
@@ -35,7 +35,7 @@ def deformed_appearance(
 
     Args:
         positions: kernel means of B states [scene units].
-        gradients: accumulated deformation gradients G of the N units.
+        deformation_gradients: accumulated deformation gradients G of the N units.
         rotations: their accumulated rotations Q.
         unit_of_kernel: the unit of each kernel.
         covars: rest covariances S [scene units^2].
@@ -44,7 +44,7 @@ def deformed_appearance(
     """
     pool = shared_pool(torch.get_num_threads())
     with announced("the colours of deformed kernels"):
-        return _Shade.apply(positions, gradients, rotations, covars, sh, unit_of_kernel, centers, pool)
+        return _Shade.apply(positions, deformation_gradients, rotations, covars, sh, unit_of_kernel, centers, pool)
 
 
 def _lanes(rows: Tensor) -> Any:
@@ -75,11 +75,17 @@ def _cuts(blocks: int, tasks: int, states: int) -> list[tuple[int, int]]:
 class _Shade(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, positions: Tensor, gradients: Tensor, rotations: Tensor, covars: Tensor, sh: Tensor, *rest: Any
+        ctx: Any,
+        positions: Tensor,
+        deformation_gradients: Tensor,
+        rotations: Tensor,
+        covars: Tensor,
+        sh: Tensor,
+        *rest: Any,
     ) -> Any:
         unit, centers, pool = rest
         states, count = positions.shape[:2]
-        inputs = [_array(x) for x in (positions, gradients, rotations)]
+        inputs = [_array(x) for x in (positions, deformation_gradients, rotations)]
         fixed = _array(unit), _lanes(covars), _lanes(sh), round(sh.shape[1] ** 0.5) - 1, _array(centers)
         out_covars = np.empty((states, count, 3, 3), np.float32)
         out_colors = np.empty((states, centers.shape[0], count, 3), np.float32)
@@ -91,19 +97,19 @@ class _Shade(torch.autograd.Function):
 
         pool.run(task, [(b, part) for b in range(states) for part in cuts])
         if any(ctx.needs_input_grad[:5]):
-            ctx.save_for_backward(positions, gradients, rotations, covars, sh)
+            ctx.save_for_backward(positions, deformation_gradients, rotations, covars, sh)
             ctx.inputs, ctx.fixed, ctx.pool = inputs, fixed, pool
         return torch.from_numpy(out_covars), torch.from_numpy(out_colors)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_covars: Tensor, grad_colors: Tensor) -> Any:
-        positions, gradients, _, covars, sh = ctx.saved_tensors
+        positions, deformation_gradients, _, covars, sh = ctx.saved_tensors
         states, fixed, needed = positions.shape[0], ctx.fixed, ctx.needs_input_grad
         given = _array(grad_covars), _array(grad_colors)
         cuts = _cuts(fixed[1].shape[0], BACKWARD_TASKS, states)
         moved = np.empty(positions.shape, np.float32)
-        of_units = np.zeros((2, states, len(cuts), *gradients.shape[1:]), np.float32)
+        of_units = np.zeros((2, states, len(cuts), *deformation_gradients.shape[1:]), np.float32)
         of_rest = np.empty((states, *fixed[1].shape), np.float32) if needed[3] else None
         of_sh = np.empty((states, *fixed[2].shape), np.float32) if needed[4] else None
 

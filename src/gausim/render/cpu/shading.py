@@ -27,14 +27,14 @@ C30, C31, C32, C33, C34, C35, C36 = (np.float32(c) for c in spherical_harmonics.
 
 
 @numba.njit(fastmath=True, **HELPER)
-def gather(base, positions, gradients, rotations, unit, lanes):
+def gather(base, positions, deformation_gradients, rotations, unit, lanes):
     """Fills P, G and Q with those of the sixteen kernels from ``base`` on; beyond the last it is repeated."""
     for j in range(LANES):
         k = min(base + j, positions.shape[0] - 1)
         for i in range(3):
             lanes[P + i * LANES + j] = positions[k, i]
             for h in range(3):
-                lanes[G + (3 * i + h) * LANES + j] = gradients[unit[k], i, h]
+                lanes[G + (3 * i + h) * LANES + j] = deformation_gradients[unit[k], i, h]
                 lanes[Q + (3 * i + h) * LANES + j] = rotations[unit[k], i, h]
 
 
@@ -128,14 +128,25 @@ def product(a, at, b, bt, step, stride, out, to):
 
 @numba.njit(fastmath=True, **KERNEL)
 def shade(
-    first, end, positions, gradients, rotations, unit, rest, coefficients, degree, centers, out_covars, out_colors
+    first,
+    end,
+    positions,
+    deformation_gradients,
+    rotations,
+    unit,
+    rest,
+    coefficients,
+    degree,
+    centers,
+    out_covars,
+    out_colors,
 ):
     """Covariances (K, 3, 3) and colours (V, K, 3) of one state's kernels in the blocks ``first .. end - 1``."""
     lanes, basis = np.empty(LANES_SIZE, np.float32), np.empty(16 * LANES, np.float32)
     for block in range(first, end):
         base = block * LANES
         n = min(LANES, positions.shape[0] - base)
-        gather(base, positions, gradients, rotations, unit, lanes)
+        gather(base, positions, deformation_gradients, rotations, unit, lanes)
         product(lanes, G, rest[block].reshape(-1), 0, 3, 1, lanes, OUT)
         product(lanes, OUT, lanes, G, 1, 3, lanes, OUT + 9 * LANES)
         for j in range(n):
@@ -217,8 +228,8 @@ def covariance_adjoint(lanes, rest, at_block, grad_covar, work, grad_rest):
 
 @numba.njit(fastmath=True, **KERNEL)
 def shade_adjoint(
-    first, end, positions, gradients, rotations, unit, rest, coefficients, degree, centers, grad_covars, grad_colors,
-    grad_positions, grad_gradients, grad_rotations, grad_rest, grad_coefficients,
+    first, end, positions, deformation_gradients, rotations, unit, rest, coefficients, degree, centers,
+    grad_covars, grad_colors, grad_positions, grad_gradients, grad_rotations, grad_rest, grad_coefficients,
 ):  # fmt: skip
     """Adjoint of :func:`shade`: writes ``grad_positions``, adds to the gradients of the units, writes the last two.
 
@@ -229,7 +240,7 @@ def shade_adjoint(
     for block in range(first, end):
         base = block * LANES
         n = min(LANES, positions.shape[0] - base)
-        gather(base, positions, gradients, rotations, unit, lanes)
+        gather(base, positions, deformation_gradients, rotations, unit, lanes)
         lanes[OUT:] = ZERO
         for j in range(LANES):
             k = min(base + j, positions.shape[0] - 1)

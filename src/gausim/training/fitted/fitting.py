@@ -59,7 +59,7 @@ class FittedStep:
     """One predicted frame of a batch (see :class:`gausim.training.contracts.Step`) and the state to go on from."""
 
     positions: Float[Tensor, "K 3"]
-    gradients: Float[Tensor, "N 3 3"]
+    deformation_gradients: Float[Tensor, "N 3 3"]
     rotations: Float[Tensor, "N 3 3"]
     momentum: Float[Tensor, ""]
     state: Carried
@@ -115,8 +115,12 @@ class Sequences(nn.Module):
         """The next frame of every sequence."""
         parts = [self.fitted.advance(part) for part in state.parts]
         following = Carried.of(parts)
-        gradients, rotations = (torch.cat([getattr(p, n) for p in parts]) for n in ("gradients", "rotations"))
-        return FittedStep(following.positions, gradients, rotations, gradients.new_zeros(()), following)
+        deformation_gradients, rotations = (
+            torch.cat([getattr(p, n) for p in parts]) for n in ("deformation_gradients", "rotations")
+        )
+        return FittedStep(
+            following.positions, deformation_gradients, rotations, deformation_gradients.new_zeros(()), following
+        )
 
     def shared(self) -> dict[str, nn.Module]:
         """Nothing that another run could take over."""

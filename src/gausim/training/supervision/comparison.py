@@ -136,9 +136,9 @@ class _Compare(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, positions: Tensor, gradients: Tensor, rotations: Tensor, work: Comparison, start: int
+        ctx: Any, positions: Tensor, deformation_gradients: Tensor, rotations: Tensor, work: Comparison, start: int
     ) -> tuple[Tensor, Tensor]:
-        inputs, wanted = (positions, gradients, rotations), ctx.needs_input_grad[:3]
+        inputs, wanted = (positions, deformation_gradients, rotations), ctx.needs_input_grad[:3]
         kept = [torch.zeros_like(x) if need else None for x, need in zip(inputs, wanted, strict=True)]
         losses = positions.new_zeros(positions.shape[0], len(work.last))
         motion = positions.new_zeros(())

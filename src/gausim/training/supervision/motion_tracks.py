@@ -109,9 +109,9 @@ class MotionTracker:
         optimizer = torch.optim.Adam([place], lr=self._rate, betas=BETAS)
         for iteration in range(self._iterations):
             optimizer.param_groups[0]["lr"] = self._rate * (1 - iteration / self._iterations)
-            gradients = motions.deformations(place[None])
-            rotations = polar_rotation(gradients.detach())
-            state = rest + motions.displacements(place[None]), gradients, rotations
+            deformation_gradients = motions.deformations(place[None])
+            rotations = polar_rotation(deformation_gradients.detach())
+            state = rest + motions.displacements(place[None]), deformation_gradients, rotations
             drawn = draw(renderer, look, *state, motions.unit_of_kernel, sample.cameras)
             optimizer.zero_grad()
             error = loss(channels(drawn.rgb, drawn.alpha, loss), target).sum()

@@ -124,7 +124,7 @@ class _PointComparison:
         """Loss of each predicted frame and member, and the squared change of the predicted points (summed)."""
         losses, motion = [], states.positions.new_zeros(())
         for i, (truth, scale) in enumerate(zip(self._truths, self._scales, strict=True)):
-            turned = states.gradients[:, self._units[i]] @ self._offsets[i][..., None]
+            turned = states.deformation_gradients[:, self._units[i]] @ self._offsets[i][..., None]
             points = states.positions[:, self._kernels[i]] + turned[..., 0]
             span = slice(start + 1, start + 1 + len(points))
             steps = torch.cat((self._last[i][None], points)).diff(dim=0)

@@ -36,7 +36,7 @@ def inside(x: wp.vec3, nodes: wp.vec3i) -> bool:
 
 @wp.kernel
 def stress_kernel(
-    gradients: wp.array[wp.mat33],
+    deformation_gradients: wp.array[wp.mat33],
     yield_stress: wp.array[float],
     young: wp.array[float],
     poisson: float,
@@ -47,7 +47,7 @@ def stress_kernel(
     p = wp.tid()
     mu = shear_modulus(young[p], poisson)
     lam = lame_lambda(young[p], poisson)
-    stress[p] = kirchhoff_stress(kind, gradients[p], mu, lam, yield_stress[p])
+    stress[p] = kirchhoff_stress(kind, deformation_gradients[p], mu, lam, yield_stress[p])
 
 
 @wp.kernel
@@ -130,7 +130,7 @@ def grid_update(
 @wp.kernel
 def grid_to_particles(
     positions: wp.array[wp.vec3],
-    gradients: wp.array[wp.mat33],
+    deformation_gradients: wp.array[wp.mat33],
     yield_stress: wp.array[float],
     velocity: wp.array3d[wp.vec3],
     young: wp.array[float],
@@ -168,7 +168,7 @@ def grid_to_particles(
                     v += u
                     B += wp.outer(u, wp.vec3(float(a), float(b), float(c)) - f)
     C = (4.0 * inverse_dx) * B
-    F = (identity() + dt * C) * gradients[p]
+    F = (identity() + dt * C) * deformation_gradients[p]
     mu = shear_modulus(young[p], poisson)
     lam = lame_lambda(young[p], poisson)
     moved = positions[p] + dt * v
