@@ -38,7 +38,7 @@ def test_rows_of_the_training_benchmark(backprop_steps: int, tmp_path: Path) -> 
     toy = toy_object.write_toy_object(tmp_path / "toy", frames=8)
     data = ReadyDataModule(toy.root, curriculum=Curriculum(t_max=3), batch_size=2)
     scenes = [item.scene() for item in data.objects]
-    template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=4)
+    template = partial(ElasticTemplate, modes=6, neighbours=6)
     model = gausim(scenes, [24.0], radii=(0.3, 0.7), edges="rest", hidden=8, layers=1, template=template)
     module = GausSimModule(
         model=model, initial_states=ModalInitialStates(model, (0, 0)), scene_of_sequence=(0, 0),

@@ -20,7 +20,7 @@ from gausim.interaction.session import Event, Force, Gravity, Impulse, Pin, Rele
 from gausim.ops.covariance import covariance_from_scales
 
 TINY = (
-    LEVELS, "model.simulator.template.modes=8", "model.simulator.template.solid=null",
+    LEVELS, "model.simulator.template.modes=8",
     "model.simulator.network.hidden=8", "data.curriculum.t_max=3", "data.repeats=1", "data.batch_size=2",
     "trainer.max_epochs=4", "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1",
     "render=reference",

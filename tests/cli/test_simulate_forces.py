@@ -34,7 +34,9 @@ def run(loaded, monkeypatch):
 
 def same(a: Path, b: Path) -> bool:
     first, second = load_trajectory(a), load_trajectory(b)
-    return all(torch.equal(getattr(first, n), getattr(second, n)) for n in ("positions", "deformation_gradients", "rotations"))
+    return all(
+        torch.equal(getattr(first, n), getattr(second, n)) for n in ("positions", "deformation_gradients", "rotations")
+    )
 
 
 def test_forces_write_files_and_their_session_replays_them(run, tmp_path: Path, capsys) -> None:

@@ -17,7 +17,7 @@ from gausim.models.template.elastic import ElasticTemplate
 
 def _model(**options: object) -> GausSim:
     torch.manual_seed(0)
-    template = partial(ElasticTemplate, modes=9, neighbours=6, hidden=0)
+    template = partial(ElasticTemplate, modes=9, neighbours=6)
     settings = {"radii": (0.3, 0.7), "hidden": 8, "layers": 1, "edges": "rest", "template": template}
     return gausim([toy_object.toy_scene()], [24.0], **(settings | options))
 

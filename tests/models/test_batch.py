@@ -19,7 +19,7 @@ def test_union_of_scenes_and_sequences_equals_each_alone(
     make_scene, make_model, make_state, join_states, predicted, graph, elastic
 ) -> None:
     scenes = [make_scene(70, dtype=torch.float64), make_scene(55, seed=1, dtype=torch.float64)]
-    options = {"template": partial(ElasticTemplate, modes=5, neighbours=6, hidden=4)} if elastic else {}
+    options = {"template": partial(ElasticTemplate, modes=5, neighbours=6)} if elastic else {}
     model = make_model(
         scenes, predicted_levels=predicted, graph_radii=graph, gravity=(0.0, 1.0, -3.0), output_scale=2.0, **options
     )

@@ -137,7 +137,7 @@ def _rollout(model, batch, state: SimState, *, share: bool, steps: int = 3) -> l
 OPTIONS = [
     {},
     {"predicted_levels": (0,), "graph_radii": (0.3,)},
-    {"rest_inputs": True, "edges": "rest", "template": partial(ElasticTemplate, modes=5, neighbours=6, hidden=4)},
+    {"rest_inputs": True, "edges": "rest", "template": partial(ElasticTemplate, modes=5, neighbours=6)},
     {"coarse_inputs": True, "angle": "inner", "conserve_mass": False, "gravity": (0.0, 1.0, -3.0)},
 ]
 

@@ -21,7 +21,7 @@ from gausim.models.step.simulator import GausSim
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.models.template.template import RestTemplate
 
-TEMPLATES = {"rest": RestTemplate, "elastic": partial(ElasticTemplate, modes=8, neighbours=6, hidden=8)}
+TEMPLATES = {"rest": RestTemplate, "elastic": partial(ElasticTemplate, modes=8, neighbours=6)}
 # What makes the host wait for the device, or gives a shape that depends on values: by name in Python and in ATen.
 ASKING = {
     *("item", "tolist", "numpy", "cpu", "__bool__", "__int__", "__float__", "__index__"),

@@ -12,7 +12,7 @@ from gausim.models.template.elastic import ElasticTemplate
 
 @pytest.fixture
 def model(make_scene, make_model):
-    template = partial(ElasticTemplate, modes=5, neighbours=6, hidden=4)
+    template = partial(ElasticTemplate, modes=5, neighbours=6)
     return make_model([make_scene(60), make_scene(50, seed=1)], template=template)
 
 

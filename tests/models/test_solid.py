@@ -133,13 +133,13 @@ def test_the_template_carries_solid_modes_and_the_simulator_steps_with_them(make
 
     scene = make_scene(120)
     hierarchy = build_hierarchy(scene, radii=(0.2, 0.5))
-    template = ElasticTemplate([hierarchy], 1, modes=9, solid=0.15, hidden=0)
+    template = ElasticTemplate([hierarchy], 1, modes=9, solid=0.15)
     own = template.scene(0)
     z = torch.randn(4, 9)
     moved = torch.einsum("sm,ndm->snd", z, own.modes)
     torch.testing.assert_close(moved.flatten(1) @ own.projection.flatten(0, 1), z, atol=1e-3, rtol=1e-3)
     model = gausim([scene], [24.0], radii=(0.2, 0.5), hidden=8, layers=1, zero_output=True,
-                    template=partial(ElasticTemplate, modes=9, solid=0.15, hidden=0, geometric=1.0))  # fmt: skip
+                    template=partial(ElasticTemplate, modes=9, solid=0.15, geometric=1.0))  # fmt: skip
     batch = model.batch([0])
     step = model.step(batch, SimState(batch.rest, batch.rest))
     torch.testing.assert_close(step.positions, batch.rest, atol=1e-5, rtol=0)

@@ -51,11 +51,8 @@ def test_zero_output_is_the_rest_state_from_any_state(
 
 def test_zero_output_at_rest_stays_at_rest_with_the_elastic_template(make_scene, make_model) -> None:
     scene = make_scene()
-    template = partial(ElasticTemplate, modes=8, neighbours=6, hidden=8)
+    template = partial(ElasticTemplate, modes=8, neighbours=6)
     model = make_model(scene, zero_output=True, template=template)
-    with torch.no_grad():  # an untrained force would be zero anyway
-        for p in model.template.networks():
-            p.copy_(torch.randn_like(p))
     trajectory = SceneDynamics(model).rollout(SimState(scene.means, scene.means), 50)
     assert float((trajectory.positions - scene.means).abs().max()) < 1e-6
     moved = SceneDynamics(model).rollout(SimState(scene.means * 1.01, scene.means), 2)
@@ -68,7 +65,7 @@ def test_pinned_and_never_simulated_kernels_never_move_in_1000_steps(make_scene,
     options = {"edges": "rest", "output_scale": 0.2}
     if elastic:
         options["output_scale"] = 1e-3  # random corrections of a template that remembers them may grow without bound
-        options["template"] = partial(ElasticTemplate, modes=6, neighbours=6, hidden=0)
+        options["template"] = partial(ElasticTemplate, modes=6, neighbours=6)
     model = make_model(scene, **options)
     generator = torch.Generator().manual_seed(0)
 

@@ -11,7 +11,7 @@ from helpers.toy_object import toy_scene
 from gausim.compose.config import instantiate
 from gausim.core import RunError
 from gausim.runs.directory import CONFIG, RunDirectory
-from gausim.runs.renamed import MOVED, with_present_names, with_present_weights
+from gausim.runs.renamed import ELASTIC, MOVED, with_present_names, with_present_weights
 
 
 @pytest.mark.parametrize("new", sorted(MOVED.values()))
@@ -66,3 +66,17 @@ def test_weights_of_before_are_read_by_present_names() -> None:
         "model.predictor.network.decoder.0.weight": 1, "model.log_density.0": 2,
         "model.predictor.node_normaliser.mean": 3,
     }  # fmt: skip
+
+
+def test_settings_of_the_elastic_template_that_are_gone_are_dropped_or_refused() -> None:
+    old = {
+        "_target_": "gausim.models.elastic.ElasticTemplate",
+        "modes": 8,
+        "solid": 0.12,
+        "hidden": 0,
+        "damping": "full",
+    }
+    assert with_present_names(old) == {"_target_": ELASTIC, "modes": 8, "solid": 0.12}
+    for name, value in {"damping": "rayleigh", "hidden": 64, "solid": None}.items():
+        with pytest.raises(ValueError, match=f"template.{name} is"):
+            with_present_names({**old, name: value})

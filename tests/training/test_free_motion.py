@@ -100,7 +100,7 @@ def _module(objective: Objective, template: Callable[..., Template]) -> GausSimM
     )  # fmt: skip
 
 
-ELASTIC = partial(ElasticTemplate, modes=6, neighbours=6, hidden=0)
+ELASTIC = partial(ElasticTemplate, modes=6, neighbours=6)
 
 
 def test_training_carries_it_as_often_as_asked_and_repeats_itself() -> None:

@@ -31,7 +31,7 @@ FRAMES, MODES = 5, 6
 
 @pytest.fixture(scope="module")
 def model() -> GausSim:
-    template = partial(ElasticTemplate, modes=MODES, neighbours=6, hidden=0)
+    template = partial(ElasticTemplate, modes=MODES, neighbours=6)
     torch.manual_seed(0)
     return gausim([SCENE], [24.0], radii=(0.2, 0.5), graph_radii=(2.0, 0.6), hidden=8, layers=1, template=template)
 

@@ -194,7 +194,7 @@ def test_clipping_by_group_and_altogether() -> None:
 def test_absent_sequences_and_scenes_do_not_move_in_the_real_model(tmp_path: Path) -> None:
     torch.manual_seed(0)
     scenes = [toy_object.toy_scene(), toy_object.toy_scene()]
-    template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=4)
+    template = partial(ElasticTemplate, modes=6, neighbours=6)
     model = gausim(scenes, [24.0, 24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
     module = GausSimModule(
         model=model, initial_states=ModalInitialStates(model, SCENE_OF_SEQUENCE), scene_of_sequence=SCENE_OF_SEQUENCE,
@@ -222,7 +222,7 @@ def test_mixing_counts_in_units_of_the_rest_states_loss() -> None:
     found = []
     for weight in (0.0, 0.5):
         torch.manual_seed(0)
-        template = partial(ElasticTemplate, modes=6, neighbours=6, hidden=0, inertia="trained")
+        template = partial(ElasticTemplate, modes=6, neighbours=6)
         model = gausim([toy_object.toy_scene()], [24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
         with torch.no_grad():
             for name, p in model.template.named_parameters():

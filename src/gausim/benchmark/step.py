@@ -53,8 +53,7 @@ ELASTIC: Settings = {
 }
 EDGE_LENGTHS, KERNEL_EDGE_LENGTH = (2.0, 0.4), 0.1
 ELASTIC_TEMPLATE: Settings = {
-    "modes": 48, "solid": 0.12, "geometric": 1.0, "neighbours": 24, "damping": "full", "inertia": "trained",
-    "period": 8.0, "hidden": 0, "amplitude": 0.02,
+    "modes": 48, "solid": 0.12, "geometric": 1.0, "neighbours": 24, "period": 8.0, "amplitude": 0.02,
 }  # fmt: skip
 # Calls of what takes long; its first call is not timed either.
 LONG_ROUNDS = 2

@@ -149,8 +149,8 @@ class RunDirectory:
             return dict(with_present_names(loaded))
         except (IndexError, TypeError, ValueError) as error:
             raise RunError(
-                f"{path}: model.simulator: expected the settings of this version or the one before, got levels that "
-                f"cannot be read ({error}). Restore the file."
+                f"{path}: model.simulator: expected the settings of this version or the one before, got some that "
+                f"cannot be read ({error}). Restore the file, or read the run with the version that made it."
             ) from error
 
     @contextmanager

@@ -62,13 +62,22 @@ PARTS: dict[str, tuple[str, dict[str, str]]] = {
         {"cuda_graph": "cuda_graph", "passive_frames": "energy_guard_frames"},
     ),
 }  # fmt: skip
+# Settings of the elastic template that are gone, and the value that is left of each.
+ELASTIC = "gausim.models.template.elastic.ElasticTemplate"
+SETTLED: dict[str, Any] = {"damping": "full", "inertia": "trained", "hidden": 0}
 WEIGHTS = ("network.", "node_normaliser.", "edge_normaliser.")
 
 
 def with_present_names(config: Any) -> Any:
-    """A configuration whose `_target_`s are where they are now; what never moved stays as it is."""
+    """A configuration by the present names; what never moved stays as it is.
+
+    Raises:
+        IndexError, TypeError, ValueError: levels that cannot be read, or a setting that is no longer supported.
+    """
     if isinstance(config, dict):
         found = {k: _present(v) if k == "_target_" else with_present_names(v) for k, v in config.items()}
+        if found.get("_target_") == ELASTIC:
+            return _settled(found)
         return _in_parts(found) if found.get("_target_") == SIMULATOR and "hierarchy" not in found else found
     return [with_present_names(v) for v in config] if isinstance(config, list) else config
 
@@ -78,6 +87,14 @@ def _present(target: Any) -> Any:
         if isinstance(target, str) and (target == old or target.startswith(f"{old}.")):
             return new + target[len(old) :]
     return target
+
+
+def _settled(old: Mapping[str, Any]) -> dict[str, Any]:
+    """The elastic template's settings without those of which one value is left."""
+    for name, value in {**SETTLED, "solid": old.get("solid", 0.12), "geometric": old.get("geometric", 1.0)}.items():
+        if old.get(name, value) != value or value is None:
+            raise ValueError(f"template.{name} is {old.get(name)!r}, which is no longer supported: train the run again")
+    return {name: value for name, value in old.items() if name not in SETTLED}
 
 
 def _in_parts(old: Mapping[str, Any]) -> dict[str, Any]:

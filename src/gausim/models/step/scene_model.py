@@ -137,13 +137,11 @@ class SceneModel(nn.Module, ABC):
         return smooth_motions(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], own)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by role: networks, per-scene densities and attributes, and the rest of the template."""
-        networks = self.template.networks()
-        known = {id(p) for p in networks}
+        """Parameters by role: the network, per-scene densities and attributes, and the template."""
         return {
-            "network": [*self.predictor.parameters(), *networks],
+            "network": list(self.predictor.parameters()),
             "scene": [*self.log_density, *self.attributes],
-            "template": [p for p in self.template.parameters() if id(p) not in known],
+            "template": list(self.template.parameters()),
         }
 
     def shared(self) -> dict[str, nn.Module]:

@@ -1,19 +1,15 @@
-"""The network of springs between units: its vibration modes, and what it does beyond small motions."""
+"""Springs between units: what they do beyond small motions."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.sparse import bsr_matrix, diags
-from scipy.sparse.linalg import eigsh
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 # Springs keep this share of their stiffness across their direction: a central-force network alone has soft mechanisms.
 TRANSVERSE_STIFFNESS = 0.3
-# Regularises the least-squares gradient of units whose neighbours lie in a plane (share of the trace).
-GRADIENT_RIDGE = 1e-3
 # The springs' force beyond the linear one stays below this share of the trained stiffness's own (both as they act in a
 # step): it is taken at the beginning of the step, and thin parts that turn far would make it explode.
 LARGEST_BEYOND = 0.5
@@ -36,49 +32,6 @@ def spring_network(rest: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.nd
     outer = offset[:, :, None] * offset[:, None, :] / length**2
     blocks = ((1 - TRANSVERSE_STIFFNESS) * outer + TRANSVERSE_STIFFNESS * np.eye(3)) / length**2
     return pairs, blocks
-
-
-def vibration_modes(
-    rest: np.ndarray, mass: np.ndarray, pinned: np.ndarray, *, modes: int, neighbours: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest eigenvalues (M,), relative to the first, and mass-orthonormal modes (N, 3, M), zero on pinned units."""
-    pairs, blocks = spring_network(rest, neighbours)
-    i, j = pairs.T
-    rows, cols = np.concatenate((i, j, i, j)), np.concatenate((i, j, j, i))
-    data = np.concatenate((blocks, blocks, -blocks, -blocks))
-    order = np.lexsort((cols, rows))
-    pointer = np.searchsorted(rows[order], np.arange(len(rest) + 1))
-    stiffness = bsr_matrix((data[order], cols[order], pointer), shape=(3 * len(rest),) * 2).tocsr()
-    free = np.repeat(~pinned, 3)
-    scale = np.repeat(mass, 3)[free] ** -0.5
-    reduced = (diags(scale) @ stiffness[free][:, free] @ diags(scale)).tocsc()
-    size = reduced.shape[0]
-    count = min(modes, size)
-    if size <= max(300, 3 * count):
-        values, vectors = np.linalg.eigh(reduced.toarray())
-    else:
-        shift = -1e-6 * reduced.diagonal().mean()
-        values, vectors = eigsh(reduced, count, sigma=shift, v0=np.ones(size))
-        ascending = np.argsort(values)
-        values, vectors = values[ascending], vectors[:, ascending]
-    values, vectors = values[:count], vectors[:, :count]
-    vectors = vectors * np.sign(vectors[np.abs(vectors).argmax(0), np.arange(count)])
-    full = np.zeros((3 * len(rest), count))
-    full[free] = scale[:, None] * vectors
-    values = np.maximum(values, 1e-4 * values[-1])
-    return values / values[0], full.reshape(len(rest), 3, count)
-
-
-def mode_gradients(rest: np.ndarray, modes: np.ndarray, neighbours: int) -> np.ndarray:
-    """Least-squares displacement gradient of each mode at each unit, (N, 3, 3, M)."""
-    k = min(neighbours + 1, len(rest))
-    near = cKDTree(rest).query(rest, k=k)[1].reshape(len(rest), k)[:, 1:]
-    offset = rest[near] - rest[:, None]
-    weight = 1.0 / np.maximum((offset**2).sum(-1), 1e-12)
-    moment = np.einsum("nk,nka,nkb->nab", weight, offset, offset)
-    moment += GRADIENT_RIDGE * np.trace(moment, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    difference = modes[near] - modes[:, None]
-    return np.einsum("nk,nkim,nka,nab->nibm", weight, difference, offset, np.linalg.inv(moment), optimize=True)
 
 
 class Springs(nn.Module):

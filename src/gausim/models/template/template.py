@@ -96,10 +96,6 @@ class Template(nn.Module, ABC):
         """What a scene has of its own in the template: names in its state dict, each behind ``prefix``."""
         return ()
 
-    def networks(self) -> list[nn.Parameter]:
-        """Weights of neural networks in the template; they learn at the pace of a network."""
-        return []
-
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor] | None:
         """Smooth motions of one scene that the template can carry: (N, 3, M), their gradients (N, 3, 3, M), sizes (M,).
 
