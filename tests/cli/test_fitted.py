@@ -34,10 +34,10 @@ SMALL: dict[str, list[str]] = {
         f"{STAGES}.field.iterations=4", "model.plan.round=2",
     ],
     "physdreamer": [
-        "model.method.particles=30", "model.method.cells=12", f"{STAGES}.velocity.iterations=4",
+        "model.method.particles=30", "model.method.discretisation.cells=12", f"{STAGES}.velocity.iterations=4",
         f"{STAGES}.material.iterations=2", "model.plan.round=2",
     ],
-    "physgaussian": ["model.method.cells=12", f"{STAGES}.velocity.iterations=4", "model.plan.round=2"],
+    "physgaussian": ["model.method.discretisation.cells=12", f"{STAGES}.velocity.iterations=4", "model.plan.round=2"],
 }  # fmt: skip
 NAMES = {
     "deformation_field": "deformation_field (no diffusion prior)",
@@ -173,7 +173,7 @@ def test_physgaussian_takes_over_what_physdreamer_has_found(
     needs_warp("physgaussian")
     train.main(["model=physdreamer", *SMALL["physdreamer"], *arguments, "name=found"])
     source = "init_from=outputs/found/seed_0"
-    alone = ["model=physgaussian", "model.method.cells=12", f"{STAGES}.velocity=null", *arguments]
+    alone = ["model=physgaussian", "model.method.discretisation.cells=12", f"{STAGES}.velocity=null", *arguments]
     train.main([*alone, source, "name=given"])
     found, given = weights("found"), weights("given")
     shared = [name for name in given if ".velocity." in name]

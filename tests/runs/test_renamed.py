@@ -80,3 +80,19 @@ def test_settings_of_the_elastic_template_that_are_gone_are_dropped_or_refused()
     for name, value in {"damping": "rayleigh", "hidden": 64, "solid": None}.items():
         with pytest.raises(ValueError, match=f"template.{name} is"):
             with_present_names({**old, name: value})
+
+
+def test_the_settings_of_material_points_are_in_groups() -> None:
+    old = {
+        "_target_": "gausim.baselines.physdreamer.PhysDreamer", "particles": 8, "young_modulus": 1e5, "cells": 20,
+        "density": 2000.0, "modulus_scale": 1.0, "filling": None,
+    }  # fmt: skip
+    new = with_present_names(old)
+    assert set(new) == {"_target_", "particles", "material", "discretisation", "modulus"}
+    assert new["material"] == {"_target_": "gausim.baselines.mpm.Material", "young_modulus": 1e5, "density": 2000.0}
+    assert new["discretisation"]["cells"] == 20 and new["modulus"]["scale"] == 1.0
+    assert with_present_names(new) == new
+    flows = {"_target_": "gausim.baselines.physgaussian.PhysGaussian", "material": "von_mises", "yield_stress": 1.0}
+    with pytest.raises(ValueError, match="no longer supported"):
+        with_present_names(flows)
+    assert "yield_stress" not in with_present_names({**flows, "material": "fixed_corotated"})

@@ -65,6 +65,22 @@ PARTS: dict[str, tuple[str, dict[str, str]]] = {
 # Settings of the elastic template that are gone, and the value that is left of each.
 ELASTIC = "gausim.models.template.elastic.ElasticTemplate"
 SETTLED: dict[str, Any] = {"damping": "full", "inertia": "trained", "hidden": 0}
+# The material points' settings that are in groups now; what flowed is gone.
+_MATERIAL = ("gausim.baselines.mpm.Material", ("young_modulus", "poisson_ratio", "density"))
+_GRID = (
+    "gausim.baselines.material_point.method.Discretisation", ("cells", "damping", "substeps", "courant", "filling"),
+)  # fmt: skip
+GROUPS: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
+    "gausim.baselines.material_point.physdreamer.PhysDreamer": {
+        "material": _MATERIAL,
+        "discretisation": _GRID,
+        "modulus": (
+            "gausim.baselines.material_point.physdreamer.ModulusField",
+            ("parametrisation", "modulus_scale", "modulus_resolution"),
+        ),
+    },
+    "gausim.baselines.material_point.physgaussian.PhysGaussian": {"material": _MATERIAL, "discretisation": _GRID},
+}
 WEIGHTS = ("network.", "node_normaliser.", "edge_normaliser.")
 
 
@@ -78,6 +94,8 @@ def with_present_names(config: Any) -> Any:
         found = {k: _present(v) if k == "_target_" else with_present_names(v) for k, v in config.items()}
         if found.get("_target_") == ELASTIC:
             return _settled(found)
+        if found.get("_target_") in GROUPS and "discretisation" not in found:
+            return _grouped(found)
         return _in_parts(found) if found.get("_target_") == SIMULATOR and "hierarchy" not in found else found
     return [with_present_names(v) for v in config] if isinstance(config, list) else config
 
@@ -95,6 +113,19 @@ def _settled(old: Mapping[str, Any]) -> dict[str, Any]:
         if old.get(name, value) != value or value is None:
             raise ValueError(f"template.{name} is {old.get(name)!r}, which is no longer supported: train the run again")
     return {name: value for name, value in old.items() if name not in SETTLED}
+
+
+def _grouped(old: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a method of material points in their groups."""
+    groups = GROUPS[old["_target_"]]
+    if old.get("material", "fixed_corotated") != "fixed_corotated":
+        raise ValueError(f"method.material is {old['material']!r}, which is no longer supported: fit the run again")
+    gone = {"material", "yield_stress", *(name for _, names in groups.values() for name in names)}
+    new = {name: value for name, value in old.items() if name not in gone}
+    for group, (target, names) in groups.items():
+        own = {name.removeprefix(f"{group}_"): old[name] for name in names if name in old}
+        new[group] = {"_target_": target, **own}
+    return new
 
 
 def _in_parts(old: Mapping[str, Any]) -> dict[str, Any]:

@@ -11,21 +11,16 @@ import torch
 pytest.importorskip("warp", reason="the material point method needs warp-lang (extra 'baselines')")
 
 from gausim.baselines.mpm import (  # noqa: E402
-    Box,
-    Conditions,
     Grid,
     Material,
-    MaterialKind,
     MPMSolver,
     Particles,
     ParticleState,
-    PrescribedMotion,
     TimeStep,
 )
 
 GRID = Grid(cells=24, size=2.4, gravity=(0.3, -0.2, -9.8), damping=1.5)
 STEPS, DT = 3, 0.004
-WALL = PrescribedMotion(Box((0.0, 0.0, 0.0), (2.4, 2.4, 1.16)), velocity=(0.1, 0.0, 0.2))
 
 
 def spline(distance: float) -> float:
@@ -37,22 +32,9 @@ def spline(distance: float) -> float:
 def stress(material: Material, F: np.ndarray, E: float) -> np.ndarray:
     nu = material.poisson_ratio
     mu, lam = E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
-    u, s, vt = np.linalg.svd(F)
-    if material.kind in (MaterialKind.FIXED_COROTATED, MaterialKind.PLASTICINE):
-        J = np.linalg.det(F)
-        return 2 * mu * (F - u @ vt) @ F.T + lam * J * (J - 1) * np.eye(3)
-    return u @ np.diag(2 * mu * np.log(s) + lam * np.log(s).sum()) @ u.T
-
-
-def returned(material: Material, F: np.ndarray, E: float) -> np.ndarray:
-    if material.kind is not MaterialKind.VON_MISES:
-        return F
-    u, s, vt = np.linalg.svd(F)
-    strain = np.log(s)
-    shear = strain - strain.mean()
-    most = material.yield_stress / (2 * E / (2 * (1 + material.poisson_ratio)))
-    shear *= min(1.0, most / np.linalg.norm(shear))
-    return u @ np.diag(np.exp(strain.mean() + shear)) @ vt
+    u, _, vt = np.linalg.svd(F)
+    J = np.linalg.det(F)
+    return 2 * mu * (F - u @ vt) @ F.T + lam * J * (J - 1) * np.eye(3)
 
 
 def step(x, v, C, F, m, V, E, held, pinned, material):  # all float64
@@ -74,21 +56,18 @@ def step(x, v, C, F, m, V, E, held, pinned, material):  # all float64
     velocity = np.zeros_like(momentum)
     full = mass >= 1e-15
     velocity[full] = momentum[full] / mass[full][:, None] * (1 - GRID.damping * DT) + DT * np.array(GRID.gravity)
-    height = np.arange(n) * dx
-    velocity[:, :, height <= WALL.box.upper[2]] = WALL.velocity
     velocity[pinned] = 0
     moved, v, C, F = x.copy(), np.zeros_like(v), np.zeros_like(C), F.copy()
     for p in range(len(x)):
         gathered = list(nodes(p))
         v[p] = sum((w * velocity[node] for node, w, _ in gathered), np.zeros(3))
         C[p] = sum((4 / dx**2 * w * np.outer(velocity[node], o) for node, w, o in gathered), np.zeros((3, 3)))
-        F[p] = returned(material, (np.eye(3) + DT * C[p]) @ F[p], E[p])
+        F[p] = (np.eye(3) + DT * C[p]) @ F[p]
         moved[p] = x[p] + DT * v[p] * (not held[p])
     return moved, v, C, F
 
 
-@pytest.mark.parametrize("kind", [MaterialKind.FIXED_COROTATED, MaterialKind.VON_MISES], ids=lambda k: k.name.lower())
-def test_three_substeps_agree_with_the_reference(kind: MaterialKind):
+def test_three_substeps_agree_with_the_reference():
     rng = np.random.default_rng(0)
     N = 40
     x = rng.uniform(1.1, 1.5, (N, 3))
@@ -96,21 +75,21 @@ def test_three_substeps_agree_with_the_reference(kind: MaterialKind):
     v, C = rng.standard_normal((N, 3)), 2 * rng.standard_normal((N, 3, 3))
     F = np.eye(3) + 0.1 * rng.standard_normal((N, 3, 3))
     E = np.exp(rng.uniform(5, 7, N))
-    material = Material(kind, young_modulus=300.0, poisson_ratio=0.3, density=100.0, yield_stress=40.0)
+    material = Material(young_modulus=300.0, poisson_ratio=0.3, density=100.0)
 
     def tensor(a: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(a).float()
 
     particles = Particles.create(tensor(x), grid=GRID, density=material.density, pinned=torch.from_numpy(held))
     assert 2 < held.sum() < N / 2
-    solver = MPMSolver(particles, material, GRID, TimeStep(STEPS * DT, STEPS, 1.0), Conditions((WALL,)))
-    start = ParticleState(tensor(x), tensor(v), tensor(C), tensor(F), torch.full((N,), material.yield_stress))
+    solver = MPMSolver(particles, material, GRID, TimeStep(STEPS * DT, STEPS, 1.0))
+    start = ParticleState(tensor(x), tensor(v), tensor(C), tensor(F))
     end = solver.advance(start, 0, young_modulus=tensor(E))
     m, V = particles.mass.double().numpy(), particles.volume.double().numpy()
     reference = (x, v, C, F)
     for _ in range(STEPS):
         reference = step(*reference, m, V, E, held, particles.pinned_nodes.numpy(), material)
-    for name, found, true in zip("xvCF", end.tensors(), reference, strict=False):
+    for name, found, true in zip("xvCF", end.tensors(), reference, strict=True):
         error = np.abs(found.numpy() - true).max() / np.abs(true).max()
         print(name, f"{error:.1e}")
         assert error < 1e-4, name

@@ -40,6 +40,25 @@ LEAST_MODULUS, GREATEST_MODULUS = 1e3, 5e8
 
 
 @dataclass(frozen=True)
+class Discretisation:
+    """The grid and the substeps, as a configuration gives them.
+
+    Attributes:
+        cells: per axis of the method's unit of length.
+        damping: rate at which the grid loses velocity [1 / s].
+        substeps: per frame; None derives them from the bound of the time step.
+        courant: c of that bound, dt < c dx / sqrt(E / rho); measured, 0.5 is stable up to nu = 0.4.
+        filling: how the interior is filled before particles are placed; None leaves it empty.
+    """
+
+    cells: int
+    damping: float = 0.0
+    substeps: int | None = None
+    courant: float = 0.5
+    filling: Filling | None = None
+
+
+@dataclass(frozen=True)
 class Domain:
     """How scenes are simulated.
 
@@ -47,24 +66,18 @@ class Domain:
         side: longest side of the scene in the simulation [simulation units].
         size: edge of the cubic domain, in whose middle the scene is [simulation units].
         cells: cells per axis over the whole domain.
-        damping: rate at which the grid loses velocity [1 / s].
-        substeps: per frame; None derives them from the bound of the time step.
-        courant: c of that bound, dt < c dx / sqrt(E / rho).
-        filling: how the interior is filled; None leaves it empty.
+        settings: damping, substeps and filling.
     """
 
     side: float
     size: float
     cells: int
-    damping: float = 0.0
-    substeps: int | None = None
-    courant: float = 0.3
-    filling: Filling | None = None
+    settings: Discretisation
 
     @property
     def grid(self) -> Grid:
         """The background grid."""
-        return Grid(cells=self.cells, size=self.size, damping=self.damping)
+        return Grid(cells=self.cells, size=self.size, damping=self.settings.damping)
 
     def mapping(self, scene: GaussianScene) -> SceneMapping:
         """From a scene to the simulation."""
@@ -75,13 +88,13 @@ class Domain:
 
     def filled(self, scene: GaussianScene) -> Float[Tensor, "M 3"]:
         """Points in the interior of a scene [scene units]."""
-        if self.filling is None:
+        if self.settings.filling is None:
             return scene.means.new_zeros(0, 3)
         mapping, body = self.mapping(scene), scene.select(scene.simulated)
         covars = mapping.scale**2 * covariance_from_scales(body.log_scales, body.quats)
         opacities = torch.sigmoid(body.opacity_logits)
         return mapping.to_scene(
-            fill_interior(mapping.to_simulation(body.means), covars, opacities, self.grid, self.filling)
+            fill_interior(mapping.to_simulation(body.means), covars, opacities, self.grid, self.settings.filling)
         )
 
 
@@ -164,7 +177,8 @@ class MaterialPoints(Fitted):
 
     def _body(self, scene_id: int, driven: Driven) -> Body:
         scene, domain = self.scenes[scene_id], self.domain
-        mapping, step = domain.mapping(scene), TimeStep(1 / self.fps[scene_id], domain.substeps, domain.courant)
+        settings = domain.settings
+        mapping, step = domain.mapping(scene), TimeStep(1 / self.fps[scene_id], settings.substeps, settings.courant)
         particles = Particles.create(
             mapping.to_simulation(driven.rest), grid=domain.grid, density=self.material.density, pinned=driven.pinned
         )
@@ -189,9 +203,7 @@ class MaterialPoints(Fitted):
         body = self.body(self.scene_of_sequence[sequence_id])
         speed = self.domain.side * self.velocity_scale
         velocity = speed * self.velocity[sequence_id](body.places) * ~body.driven.pinned[:, None]
-        particles = ParticleState.at_rest(
-            body.mapping.to_simulation(body.driven.rest), velocity, material=self.material
-        )
+        particles = ParticleState.at_rest(body.mapping.to_simulation(body.driven.rest), velocity)
         return replace(super().begin(sequence_id), inner=particles.tensors())
 
     def advance(self, state: FittedState) -> FittedState:
@@ -256,7 +268,8 @@ def require_modulus(value: float) -> float:
     """
     if not (math.isfinite(value) and LEAST_MODULUS <= value <= GREATEST_MODULUS):
         raise ConfigError(
-            f"model.method.young_modulus: expected {LEAST_MODULUS:g} .. {GREATEST_MODULUS:g} [simulation units], got "
-            f"{value:g}. Periods scale with sqrt(density / young_modulus): change the density, too, to go further."
+            f"model.method.material.young_modulus: expected {LEAST_MODULUS:g} .. {GREATEST_MODULUS:g} [simulation "
+            f"units], got {value:g}. Periods scale with sqrt(density / young_modulus): change the density, too, to go "
+            "further."
         )
     return value

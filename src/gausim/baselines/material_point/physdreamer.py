@@ -7,6 +7,7 @@ Fitted are a velocity field per sequence and a field of Young's modulus per obje
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -18,11 +19,12 @@ from gausim.baselines.material_point.fields import TriPlaneField
 from gausim.baselines.material_point.method import (
     GREATEST_MODULUS,
     LEAST_MODULUS,
+    Discretisation,
     Domain,
     MaterialPoints,
     require_modulus,
 )
-from gausim.baselines.mpm import Filling, Material
+from gausim.baselines.mpm import Material
 from gausim.baselines.mpm.config import COVERED_POISSON_RATIO, pressure_wave
 from gausim.core import ConfigError, GaussianScene
 
@@ -31,6 +33,31 @@ SIDE, CELLS, SUBSTEPS = 1 / 1.8, 64, 768
 # Edge of the domain; the original's is 1, which large motions leave. Only nodes round the particles cost anything.
 SIZE = 2.0
 LOG, LINEAR = "log", "linear"
+
+
+@dataclass(frozen=True)
+class ModulusField:
+    """How Young's modulus varies over an object.
+
+    Attributes:
+        parametrisation: ``log``, E_0 exp(s f), or the original's ``linear``, E_0 + s f.
+        scale: s; the original's 1000 with ``linear``.
+        resolution: of the planes of f.
+    """
+
+    parametrisation: str = LOG
+    scale: float = 1.0
+    resolution: int = 8
+
+    def __post_init__(self) -> None:
+        if self.parametrisation not in (LOG, LINEAR):
+            raise ConfigError(
+                f"model.method.modulus.parametrisation: expected log or linear, got '{self.parametrisation}'."
+            )
+        if self.resolution < 2 or not self.scale > 0:
+            raise ConfigError(
+                f"model.method.modulus: expected resolution >= 2 and scale > 0, got {self.resolution} and {self.scale}."
+            )
 
 
 class PhysDreamer(MaterialPoints):
@@ -48,22 +75,14 @@ class PhysDreamer(MaterialPoints):
         fps: Sequence[float],
         scene_of_sequence: Sequence[int],
         seen: int,
-        particles: int = 600,
-        cells: int = CELLS,
-        young_modulus: float = 1e5,
-        parametrisation: str = LOG,
-        modulus_scale: float = 1.0,
-        poisson_ratio: float = 0.3,
-        density: float = 2000.0,
-        damping: float = 0.0,
-        substeps: int | None = None,
+        particles: int,
+        material: Material,
+        discretisation: Discretisation,
         most_substeps: int = SUBSTEPS,
-        courant: float = 0.5,
-        filling: Filling | None = None,
+        modulus: ModulusField,
         gradients: bool = True,
         velocity_resolution: int = 24,
         velocity_scale: float = 0.18,
-        modulus_resolution: int = 8,
     ) -> None:
         """Places the driving particles.
 
@@ -73,46 +92,32 @@ class PhysDreamer(MaterialPoints):
             scene_of_sequence: the scene of each sequence.
             seen: predicted frames that training may see.
             particles: at most so many per object.
-            cells: per simulation unit; the longest side has ``cells`` / 1.8.
-            young_modulus: E_0 [simulation units].
-            parametrisation: ``log``, E_0 exp(s f), or ``linear``, E_0 + s f.
-            modulus_scale: s.
-            poisson_ratio: nu.
-            density: rho [simulation units].
-            damping: rate at which the grid loses velocity [1 / s].
-            substeps: per frame; None derives them from the bound of the time step.
+            material: E_0, nu and rho [simulation units].
+            discretisation: ``cells`` per simulation unit; the longest side has ``cells`` / 1.8.
             most_substeps: E is kept below what would need more.
-            courant: c of that bound; measured, 0.5 is stable up to nu = 0.4.
-            filling: how the interior is filled before particles are placed; None leaves it empty.
+            modulus: how E varies over the object.
             gradients: kernels follow the affine maps of their particles; else their mean displacement and Kabsch
                 rotation (the original).
             velocity_resolution: of the planes of the velocity fields.
             velocity_scale: of their outputs [longest sides / s]; 0.18 is the original's 0.1 simulation units.
-            modulus_resolution: of the planes of the modulus fields.
 
         Raises:
-            ConfigError: a number out of range, an unknown parametrisation, or Warp is not installed.
+            ConfigError: a number out of range, or Warp is not installed.
             SceneError: too few kernels.
         """
-        if particles < 8 or cells < 4 or modulus_resolution < 2 or not modulus_scale > 0:
+        cells = discretisation.cells
+        if particles < 8 or cells < 4:
+            raise ConfigError(f"model.method: expected particles >= 8 and cells >= 4, got {particles} and {cells}.")
+        self.most, self.gradients, self.cells, self.field = particles, gradients, cells, modulus
+        self.initial = require_modulus(material.young_modulus)
+        domain = Domain(SIDE, SIZE, round(SIZE * cells), discretisation)
+        most = discretisation.substeps or most_substeps
+        self.greatest = [self._bound(rate, most, material, domain) for rate in fps]
+        if self.initial > min(self.greatest):
             raise ConfigError(
-                "model.method: expected particles >= 8, cells >= 4, modulus_resolution >= 2 and modulus_scale > 0, got "
-                f"{particles}, {cells}, {modulus_resolution} and {modulus_scale}."
-            )
-        if parametrisation not in (LOG, LINEAR):
-            raise ConfigError(f"model.method.parametrisation: expected log or linear, got '{parametrisation}'.")
-        self.most, self.gradients, self.cells = particles, gradients, cells
-        self.initial, self.parametrisation, self.modulus_scale = (
-            require_modulus(young_modulus), parametrisation, modulus_scale,
-        )  # fmt: skip
-        material = Material(young_modulus=young_modulus, poisson_ratio=poisson_ratio, density=density)
-        domain = Domain(SIDE, SIZE, round(SIZE * cells), damping, substeps, courant, filling)
-        self.greatest = [self._bound(rate, substeps or most_substeps, material, domain) for rate in fps]
-        if young_modulus > min(self.greatest):
-            raise ConfigError(
-                f"model.method.young_modulus: {young_modulus:g} would need more than {substeps or most_substeps} "
-                f"substeps per frame on {cells} cells, which allow {min(self.greatest):.3g}. Raise most_substeps (or "
-                "substeps), or lower cells."
+                f"model.method.material.young_modulus: {self.initial:g} would need more than {most} "
+                f"substeps per frame on {cells} cells, which allow {min(self.greatest):.3g}. Raise most_substeps "
+                "(or discretisation.substeps), or lower discretisation.cells."
             )
         super().__init__(
             scenes=scenes,
@@ -124,13 +129,13 @@ class PhysDreamer(MaterialPoints):
             velocity_resolution=velocity_resolution,
             velocity_scale=velocity_scale,
         )
-        self.modulus_field = nn.ModuleList(TriPlaneField(modulus_resolution) for _ in self.scenes)
+        self.modulus_field = nn.ModuleList(TriPlaneField(modulus.resolution) for _ in self.scenes)
 
     @staticmethod
     def _bound(fps: float, substeps: int, material: Material, domain: Domain) -> float:
         """The greatest E that so many substeps per frame allow, a little less: (c dx substeps fps)^2 rho."""
         faster = max(1.0, pressure_wave(material.poisson_ratio) / pressure_wave(COVERED_POISSON_RATIO))
-        speed = 0.999 * domain.courant * domain.grid.dx * substeps * fps / faster
+        speed = 0.999 * domain.settings.courant * domain.grid.dx * substeps * fps / faster
         return min(GREATEST_MODULUS, speed**2 * material.density)
 
     def drive(self, scene: GaussianScene) -> Driven:
@@ -148,8 +153,8 @@ class PhysDreamer(MaterialPoints):
             scene_id: the object.
             places: as :meth:`MaterialPoints.places` gives them.
         """
-        f = self.modulus_scale * self.modulus_field[scene_id](places)[:, 0]
-        found = self.initial * torch.exp(f) if self.parametrisation == LOG else self.initial + f
+        f = self.field.scale * self.modulus_field[scene_id](places)[:, 0]
+        found = self.initial * torch.exp(f) if self.field.parametrisation == LOG else self.initial + f
         return found.clamp(LEAST_MODULUS, self.greatest[scene_id])
 
     def carry(self, driven: Driven, x: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:

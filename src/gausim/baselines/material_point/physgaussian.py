@@ -1,4 +1,4 @@
-"""Forward simulation by the material point method with a given material: PhysGaussian (Xie et al., CVPR 2024).
+"""Forward simulation by the material point method with a given elastic material: PhysGaussian (Xie et al., CVPR 2024).
 
 Every opaque kernel is a particle and deforms with it: S = F S_0 F^T. The material is not identified: Young's modulus is
 the configuration's, or what a run of physdreamer has found (``init_from``). Nor does the original know how a recorded
@@ -15,9 +15,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.baselines.material_point.driven import Driven, opaque
-from gausim.baselines.material_point.method import Domain, MaterialPoints, require_modulus
+from gausim.baselines.material_point.method import Discretisation, Domain, MaterialPoints, require_modulus
 from gausim.baselines.material_point.physdreamer import PhysDreamer
-from gausim.baselines.mpm import Filling, Material, MaterialKind
+from gausim.baselines.mpm import Material
 from gausim.core import ConfigError, GaussianScene
 
 # What the original takes: the scene's longest side is 1, 50 cells over a domain of edge 2, 100 substeps per frame.
@@ -37,16 +37,8 @@ class PhysGaussian(MaterialPoints):
         fps: Sequence[float],
         scene_of_sequence: Sequence[int],
         seen: int,
-        material: str = "fixed_corotated",
-        young_modulus: float = 1e5,
-        poisson_ratio: float = 0.4,
-        density: float = 200.0,
-        yield_stress: float = 1e3,
-        cells: int = CELLS,
-        damping: float = 0.0,
-        substeps: int | None = None,
-        courant: float = 0.5,
-        filling: Filling | None = None,
+        material: Material,
+        discretisation: Discretisation,
         opacity: float = OPACITY,
         velocity_resolution: int = 24,
         velocity_scale: float = 0.18,
@@ -58,47 +50,30 @@ class PhysGaussian(MaterialPoints):
             fps: frames per second of each.
             scene_of_sequence: the scene of each sequence.
             seen: predicted frames that training may see.
-            material: fixed_corotated, von_mises, drucker_prager, viscoplastic or plasticine.
-            young_modulus: E [simulation units].
-            poisson_ratio: nu.
-            density: rho [simulation units].
-            yield_stress: of what flows [as E].
-            cells: per axis of the domain, whose edge is twice the longest side.
-            damping: rate at which the grid loses velocity [1 / s].
-            substeps: per frame; None derives them from the bound of the time step.
-            courant: c of that bound; measured, 0.5 is stable up to nu = 0.4.
-            filling: how the interior is filled; None leaves it empty.
+            material: E, nu and rho [simulation units].
+            discretisation: ``cells`` per axis of the domain, whose edge is twice the longest side.
             opacity: above which a kernel is a particle.
             velocity_resolution: of the planes of the velocity fields.
             velocity_scale: of their outputs [longest sides / s].
 
         Raises:
-            ConfigError: a number out of range, an unknown material, or Warp is not installed.
+            ConfigError: a number out of range, or Warp is not installed.
             SceneError: no kernel is opaque enough.
         """
-        kinds = {kind.name.lower(): kind for kind in MaterialKind}
-        if material not in kinds:
-            raise ConfigError(f"model.method.material: expected {', '.join(kinds)}, got '{material}'.")
         self.opacity = opacity
-        matter = Material(
-            kind=kinds[material],
-            young_modulus=require_modulus(young_modulus),
-            poisson_ratio=poisson_ratio,
-            density=density,
-            yield_stress=yield_stress,
-        )
+        require_modulus(material.young_modulus)
         super().__init__(
             scenes=scenes,
             fps=fps,
             scene_of_sequence=scene_of_sequence,
             seen=seen,
-            material=matter,
-            domain=Domain(SIDE, SIZE, cells, damping, substeps, courant, filling),
+            material=material,
+            domain=Domain(SIDE, SIZE, discretisation.cells, discretisation),
             velocity_resolution=velocity_resolution,
             velocity_scale=velocity_scale,
         )
         for scene_id in range(len(self.scenes)):
-            moduli = torch.full((self.body(scene_id).driven.count,), float(young_modulus))
+            moduli = torch.full((self.body(scene_id).driven.count,), float(material.young_modulus))
             self.register_buffer(f"young_{scene_id}", moduli)
 
     def drive(self, scene: GaussianScene) -> Driven:
@@ -146,9 +121,8 @@ class PhysGaussian(MaterialPoints):
 
     def notes(self) -> tuple[str, ...]:
         """That nothing of the material is identified."""
-        kind = self.material.kind.name.lower().replace("_", " ")
         return (
-            f"PhysGaussian ({kind}) with a given modulus, which it does not identify; the original does not fit how a "
+            "PhysGaussian with a given modulus, which it does not identify; the original does not fit how a "
             f"sequence begins either, and takes {CELLS} cells (here {self.domain.cells}) and {SUBSTEPS} substeps.",
             *(f"{self.said(i)}." for i in range(len(self.scenes))),
         )

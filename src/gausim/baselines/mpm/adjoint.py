@@ -11,7 +11,7 @@ from torch import Tensor
 from gausim.baselines.mpm.runtime import on_stream_of, warp
 from gausim.baselines.mpm.substeps import State, Substeps, Window
 
-STATE = 5  # tensors of a particle state
+STATE = 4  # tensors of a particle state
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,6 @@ class FramePlan:
         count: substeps.
         dt: duration of each [s].
         dx: edge of a cell [simulation units].
-        start: time at which the frame begins [s].
         keep: whether a backward pass will come.
     """
 
@@ -31,14 +30,13 @@ class FramePlan:
     count: int
     dt: float
     dx: float
-    start: float
     keep: bool
 
 
 class Frame(torch.autograd.Function):
-    """(x, v, C, F, y, E, a) at the start of a frame -> (x, v, C, F, y) at its end.
+    """(x, v, C, F, E, a) at the start of a frame -> (x, v, C, F) at its end.
 
-    With gradients wanted, the state of every substep is kept until the backward pass, 25 numbers per particle; grids
+    With gradients wanted, the state of every substep is kept until the backward pass, 24 numbers per particle; grids
     and stresses are computed again there. Otherwise two states are kept.
     """
 
@@ -73,8 +71,8 @@ class Frame(torch.autograd.Function):
             following = State.of(tuple(h[plan.count] for h in history))
             for s in reversed(range(plan.count)):
                 now = State.of(tuple(h[s] for h in history))
-                states, pair, time = (now, following), (found, given), plan.start + s * plan.dt
-                plan.substeps.backward(windows, states, pair, (E, adjoint_E), (a, adjoint_a), time, plan.dt)
+                states, pair = (now, following), (found, given)
+                plan.substeps.backward(windows, states, pair, (E, adjoint_E), (a, adjoint_a), plan.dt)
                 given, found, following = found, given, now
         final = tensors if plan.count % 2 == 0 else other
         return (None, *final, adjoint_young, adjoint_acceleration)
@@ -92,7 +90,7 @@ def _run(plan: FramePlan, window: Window, given: tuple[Tensor, ...]) -> tuple[Te
         E, a = _young_and_acceleration(young, acceleration)
         for s in range(plan.count):
             now, following = states[s % slots], states[(s + 1) % slots]
-            plan.substeps.forward(window, now, following, E, a, plan.start + s * plan.dt, plan.dt)
+            plan.substeps.forward(window, now, following, E, a, plan.dt)
     return history
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from enum import IntEnum
 
 from jaxtyping import Float
 from torch import Tensor
@@ -12,39 +11,19 @@ from torch import Tensor
 from gausim.core import ConfigError
 
 
-class MaterialKind(IntEnum):
-    """Kinds of matter; the numbers are compiled into the kernels."""
-
-    FIXED_COROTATED = 0
-    VON_MISES = 1
-    DRUCKER_PRAGER = 2
-    VISCOPLASTIC = 3
-    PLASTICINE = 4
-
-
 @dataclass(frozen=True)
 class Material:
-    """One material; Young's modulus may vary over the particles.
+    """A fixed corotated elastic material; Young's modulus may vary over the particles.
 
     Attributes:
-        kind: which stress and which return map.
         young_modulus: E of every particle that is not given its own [mass / (length s^2), simulation units].
         poisson_ratio: nu, in (-1, 0.5).
         density: mass per volume [simulation units].
-        yield_stress: y of von Mises (|dev tau| <= y), viscoplastic (sqrt(2/3) y) and plasticine [as E].
-        friction_angle: of Drucker-Prager [degrees] (Klar et al. 2016).
-        plastic_viscosity: of the viscoplastic flow [E s].
-        softening: of plasticine, loss of yield stress per plastic flow [as E].
     """
 
-    kind: MaterialKind = MaterialKind.FIXED_COROTATED
     young_modulus: float = 1e5
     poisson_ratio: float = 0.4
     density: float = 200.0
-    yield_stress: float = 1e3
-    friction_angle: float = 25.0
-    plastic_viscosity: float = 10.0
-    softening: float = 0.1
 
     def __post_init__(self) -> None:
         if not -1 < self.poisson_ratio < 0.5:
@@ -52,17 +31,6 @@ class Material:
         for name in ("young_modulus", "density"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"{name}: expected a positive number, got {getattr(self, name)}.")
-        for name in ("yield_stress", "plastic_viscosity", "softening"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"{name}: expected a number that is not negative, got {getattr(self, name)}.")
-        if not 0 <= self.friction_angle < 90:
-            raise ConfigError(f"friction_angle: expected degrees in [0, 90), got {self.friction_angle}.")
-
-    @property
-    def friction(self) -> float:
-        """Alpha = sqrt(2/3) 2 sin(phi) / (3 - sin(phi)) of the friction angle phi."""
-        sine = math.sin(math.radians(self.friction_angle))
-        return math.sqrt(2 / 3) * 2 * sine / (3 - sine)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gausim.baselines.mpm.config import Grid, Material
+from gausim.baselines.mpm.config import Grid
 from gausim.core import DivergenceError
 
 HALF = 0.999  # a node half way between held and free matter is held, whatever rounding makes of it
@@ -23,20 +23,16 @@ class ParticleState:
         positions: x.
         velocities: v.
         affine: C, the velocity gradient of APIC [1 / s].
-        deformation_gradients: F, the elastic part of the deformation gradient.
-        yield_stress: y, which plasticine loses as it flows.
+        deformation_gradients: F.
     """
 
     positions: Float[Tensor, "N 3"]
     velocities: Float[Tensor, "N 3"]
     affine: Float[Tensor, "N 3 3"]
     deformation_gradients: Float[Tensor, "N 3 3"]
-    yield_stress: Float[Tensor, " N"]
 
     @staticmethod
-    def at_rest(
-        positions: Float[Tensor, "N 3"], velocities: Float[Tensor, "N 3"] | None = None, *, material: Material
-    ) -> ParticleState:
+    def at_rest(positions: Float[Tensor, "N 3"], velocities: Float[Tensor, "N 3"] | None = None) -> ParticleState:
         """Undeformed particles (F = I, C = 0), at rest unless velocities are given."""
         x = positions.float()
         return ParticleState(
@@ -44,12 +40,11 @@ class ParticleState:
             torch.zeros_like(x) if velocities is None else velocities.float(),
             x.new_zeros(len(x), 3, 3),
             torch.eye(3, device=x.device).repeat(len(x), 1, 1),
-            x.new_full((len(x),), material.yield_stress),
         )
 
-    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """(x, v, C, F, y)."""
-        return self.positions, self.velocities, self.affine, self.deformation_gradients, self.yield_stress
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """(x, v, C, F)."""
+        return self.positions, self.velocities, self.affine, self.deformation_gradients
 
     def detach(self) -> ParticleState:
         """The same numbers without history (gradients stop here)."""
@@ -111,8 +106,8 @@ def node_volumes(positions: Float[Tensor, "N 3"], volume: Float[Tensor, " N"], g
     i, j, k = base.long().unbind(-1)
     total = volume.new_zeros(n**3)
     for a, b, c in itertools.product(range(3), repeat=3):
-        share = volume * weights[a, :, 0] * weights[b, :, 1] * weights[c, :, 2]
-        total.index_add_(0, ((i + a) * n + j + b) * n + k + c, share)
+        part = volume * weights[a, :, 0] * weights[b, :, 1] * weights[c, :, 2]
+        total.index_add_(0, ((i + a) * n + j + b) * n + k + c, part)
     return total.view(n, n, n)
 
 

@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.baselines.mpm.adjoint import Frame, FramePlan
-from gausim.baselines.mpm.conditions import Conditions
 from gausim.baselines.mpm.config import Grid, Material, TimeStep
 from gausim.baselines.mpm.particles import Particles, ParticleState, require_inside
 from gausim.baselines.mpm.substeps import Substeps
@@ -26,21 +25,11 @@ class MPMSolver:
         material: the material of all particles.
         grid: the background grid.
         step: how frames are divided into substeps.
-        conditions: prescribed motions and impulses, in the simulation's coordinates.
     """
 
-    def __init__(
-        self,
-        particles: Particles,
-        material: Material,
-        grid: Grid,
-        step: TimeStep,
-        conditions: Conditions | None = None,
-    ) -> None:
+    def __init__(self, particles: Particles, material: Material, grid: Grid, step: TimeStep) -> None:
         self.particles, self.material, self.grid, self.step = particles, material, grid, step
-        self.conditions = conditions or Conditions()
-        boxes = self.conditions.packed(particles.mass.device)
-        self._substeps = Substeps(particles, material, grid, boxes)
+        self._substeps = Substeps(particles, material, grid)
 
     def substeps(self, young_modulus: Float[Tensor, " N"]) -> int:
         """Substeps that a frame takes with these moduli.
@@ -59,11 +48,11 @@ class MPMSolver:
         young_modulus: Float[Tensor, " N"] | None = None,
         acceleration: Float[Tensor, "N 3"] | None = None,
     ) -> ParticleState:
-        """The state at the end of frame number ``frame``, which lasts from ``frame`` to ``frame`` + 1 frame times.
+        """The state at the end of a frame.
 
         Args:
             state: the state at its start.
-            frame: its number, counted from 0.
+            frame: its number, counted from 0, for what errors say.
             young_modulus: E per particle; the material's if not given.
             acceleration: of every particle during the frame, beside gravity [simulation units / s^2].
 
@@ -71,7 +60,6 @@ class MPMSolver:
             ConfigError: the configured number of substeps violates the bound of the time step.
             DivergenceError: a particle left the domain or is not finite.
         """
-        state = self.conditions.pushed(state, frame)
         if young_modulus is None:
             young_modulus = state.positions.new_full((len(state.positions),), self.material.young_modulus)
         if acceleration is None:
@@ -79,8 +67,7 @@ class MPMSolver:
         count = self.substeps(young_modulus)
         tensors = (*state.tensors(), young_modulus.float(), acceleration.float())
         keep = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-        time = self.step.frame_time
-        plan = FramePlan(self._substeps, count, time / count, self.grid.dx, frame * time, keep)
+        plan = FramePlan(self._substeps, count, self.step.frame_time / count, self.grid.dx, keep)
         following = ParticleState(*Frame.apply(plan, *tensors))
         self._check(following, frame + 1)
         return following

@@ -17,24 +17,23 @@ from gausim.kernels.announce import announced
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """The five arrays of a particle state, or of its adjoint, as Warp sees them."""
+    """The four arrays of a particle state, or of its adjoint, as Warp sees them."""
 
     positions: Any
     velocities: Any
     affine: Any
     deformation_gradients: Any
-    yield_stress: Any
 
     @staticmethod
     def of(tensors: tuple[Tensor, ...]) -> State:
-        """Views of contiguous float32 tensors (x, v, C, F, y); no copies."""
+        """Views of contiguous float32 tensors (x, v, C, F); no copies."""
         wp = warp()
-        kinds = (wp.vec3, wp.vec3, wp.mat33, wp.mat33, wp.float32)
+        kinds = (wp.vec3, wp.vec3, wp.mat33, wp.mat33)
         return State(*(wp.from_torch(t.detach(), dtype=kind) for t, kind in zip(tensors, kinds, strict=True)))
 
     def all(self) -> list[Any]:
         """The arrays in the order of the kernels' outputs."""
-        return [self.positions, self.velocities, self.affine, self.deformation_gradients, self.yield_stress]
+        return [self.positions, self.velocities, self.affine, self.deformation_gradients]
 
     def zero(self) -> None:
         """Sets all numbers to 0."""
@@ -78,10 +77,9 @@ class Substeps:
         particles: mass, volume and pins, on the device to compute on.
         material: the material of all particles.
         grid: the grid.
-        boxes: prescribed motions (lower, upper, velocity, span), one row each.
     """
 
-    def __init__(self, particles: Particles, material: Material, grid: Grid, boxes: tuple[Tensor, ...]) -> None:
+    def __init__(self, particles: Particles, material: Material, grid: Grid) -> None:
         wp = warp()
         from gausim.baselines.mpm.device_code import transfer
 
@@ -93,12 +91,10 @@ class Substeps:
         self._grid, self._material = grid, material
         # Warp's views do not own the memory of the tensors they look at.
         held, pinned = particles.pinned.to(torch.uint8), particles.pinned_nodes.to(torch.uint8)
-        self._alive = [t.contiguous() for t in (particles.mass, particles.volume, held, pinned, *boxes)]
-        mass, volume, held, pinned, *boxes_ = self._alive
+        self._alive = [t.contiguous() for t in (particles.mass, particles.volume, held, pinned)]
+        mass, volume, held, pinned = self._alive
         self._mass, self._volume = wp.from_torch(mass), wp.from_torch(volume)
         self._held, self._pinned_nodes = wp.from_torch(held), wp.from_torch(pinned)
-        self._boxes = [wp.from_torch(b, dtype=wp.vec3) for b in boxes_]
-        self._rheology = wp.vec3(material.friction, material.plastic_viscosity, material.softening)
         self._stress, self._adjoint_stress = (wp.zeros(self.count, dtype=wp.mat33, device=self.device) for _ in "ab")
 
     def window(self, positions: Float[Tensor, "N 3"] | None = None) -> Window:
@@ -112,12 +108,10 @@ class Substeps:
         x, y, z = (b - a + 1 for a, b in zip(first, end, strict=True))
         return Window((first[0], first[1], first[2]), (x, y, z), self.device)
 
-    def forward(
-        self, window: Window, state: State, following: State, young: Any, acceleration: Any, time: float, dt: float
-    ) -> None:
-        """Writes the state after a substep of ``dt`` that begins at ``time`` to ``following``."""
-        self._to_grid(window, state, young, acceleration, time, dt)
-        inputs, outputs = self._gather(window, state, following, young, dt)
+    def forward(self, window: Window, state: State, following: State, young: Any, acceleration: Any, dt: float) -> None:
+        """Writes the state after a substep of ``dt`` to ``following``."""
+        self._to_grid(window, state, young, acceleration, dt)
+        inputs, outputs = self._gather(window, state, following, dt)
         self._launch(self._kernels.grid_to_particles, self.count, inputs, outputs)
 
     def backward(
@@ -127,7 +121,6 @@ class Substeps:
         adjoints: tuple[State, State],
         young: tuple[Any, Any],
         acceleration: tuple[Any, Any],
-        time: float,
         dt: float,
     ) -> None:
         """Overwrites the first of ``adjoints`` from the second, and adds to those of ``young`` and ``acceleration``.
@@ -138,7 +131,6 @@ class Substeps:
             adjoints: of these states.
             young: values and adjoints.
             acceleration: values and adjoints.
-            time: start of the substep [s].
             dt: its duration [s].
         """
         (window, adjoint_window), (state, following), (adjoint, adjoint_following) = windows, states, adjoints
@@ -146,38 +138,29 @@ class Substeps:
         for array in (momentum, velocity, stress):
             array.zero_()
         adjoint.zero()
-        self._to_grid(window, state, young[0], acceleration[0], time, dt)
+        self._to_grid(window, state, young[0], acceleration[0], dt)
 
-        inputs, outputs = self._gather(window, state, following, young[0], dt)
-        to = [
-            adjoint.positions,
-            adjoint.deformation_gradients,
-            adjoint.yield_stress,
-            velocity,
-            young[1],
-            None,
-            *inputs[6:],
-        ]
+        inputs, outputs = self._gather(window, state, following, dt)
+        to = [adjoint.positions, adjoint.deformation_gradients, velocity, None, *inputs[4:]]
         self._adjoint(self._kernels.grid_to_particles, self.count, inputs, outputs, to, adjoint_following.all())
-        inputs, outputs = self._update(window, time, dt)
-        to = [momentum, *[None] * 5, *inputs[6:]]
+        inputs, outputs = self._update(window, dt)
+        to = [momentum, None, *inputs[2:]]
         self._adjoint(self._kernels.grid_update, window.shape, inputs, outputs, to, [velocity])
         inputs, outputs = self._scatter(window, state, acceleration[0], dt)
         to = [adjoint.positions, adjoint.velocities, adjoint.affine, stress, acceleration[1], None, None, *inputs[7:]]
         self._adjoint(self._kernels.particles_to_grid, self.count, inputs, outputs, to, [momentum])
         inputs, outputs = self._stresses(state, young[0])
-        to = [adjoint.deformation_gradients, adjoint.yield_stress, young[1], *inputs[3:]]
+        to = [adjoint.deformation_gradients, young[1], *inputs[2:]]
         self._adjoint(self._kernels.stress_kernel, self.count, inputs, outputs, to, [stress])
 
-    def _to_grid(self, window: Window, state: State, young: Any, acceleration: Any, time: float, dt: float) -> None:
+    def _to_grid(self, window: Window, state: State, young: Any, acceleration: Any, dt: float) -> None:
         window.momentum.zero_()
         self._launch(self._kernels.stress_kernel, self.count, *self._stresses(state, young))
         self._launch(self._kernels.particles_to_grid, self.count, *self._scatter(window, state, acceleration, dt))
-        self._launch(self._kernels.grid_update, window.shape, *self._update(window, time, dt))
+        self._launch(self._kernels.grid_update, window.shape, *self._update(window, dt))
 
     def _stresses(self, state: State, young: Any) -> tuple[list[Any], list[Any]]:
-        material = self._material
-        inputs = [state.deformation_gradients, state.yield_stress, young, material.poisson_ratio, int(material.kind)]
+        inputs = [state.deformation_gradients, young, self._material.poisson_ratio]
         return inputs, [self._stress]
 
     def _scatter(self, window: Window, state: State, acceleration: Any, dt: float) -> tuple[list[Any], list[Any]]:
@@ -185,18 +168,15 @@ class Substeps:
         numbers = [1 / self._grid.dx, window.origin_, window.shape_, dt]
         return [*moving, self._mass, self._volume, *numbers], [window.momentum]
 
-    def _update(self, window: Window, time: float, dt: float) -> tuple[list[Any], list[Any]]:
+    def _update(self, window: Window, dt: float) -> tuple[list[Any], list[Any]]:
         grid = self._grid
         kept = max(0.0, 1 - grid.damping * dt)
-        numbers = [self._wp.vec3(*grid.gravity), kept, grid.dx, window.origin_, time, dt]
-        return [window.momentum, self._pinned_nodes, *self._boxes, *numbers], [window.velocity]
+        numbers = [self._wp.vec3(*grid.gravity), kept, window.origin_, dt]
+        return [window.momentum, self._pinned_nodes, *numbers], [window.velocity]
 
-    def _gather(
-        self, window: Window, state: State, following: State, young: Any, dt: float
-    ) -> tuple[list[Any], list[Any]]:
-        arrays = [state.positions, state.deformation_gradients, state.yield_stress, window.velocity, young, self._held]
-        material = [self._material.poisson_ratio, int(self._material.kind), self._rheology]
-        return [*arrays, *material, 1 / self._grid.dx, window.origin_, window.shape_, dt], following.all()
+    def _gather(self, window: Window, state: State, following: State, dt: float) -> tuple[list[Any], list[Any]]:
+        arrays = [state.positions, state.deformation_gradients, window.velocity, self._held]
+        return [*arrays, 1 / self._grid.dx, window.origin_, window.shape_, dt], following.all()
 
     def _launch(self, kernel: Any, size: Any, inputs: list[Any], outputs: list[Any]) -> None:
         self._wp.launch(kernel, dim=size, inputs=inputs, outputs=outputs, device=self.device)

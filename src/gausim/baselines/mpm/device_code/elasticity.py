@@ -1,8 +1,8 @@
-"""Kirchhoff stresses tau = J sigma of the two elastic energies."""
+"""The Kirchhoff stress tau = J sigma of the elastic energy."""
 
 import warp as wp
 
-from gausim.baselines.mpm.device_code.matrices import hencky_strain, identity, polar_rotation
+from gausim.baselines.mpm.device_code.matrices import identity, polar_rotation
 
 
 @wp.func
@@ -23,10 +23,3 @@ def fixed_corotated(F: wp.mat33, mu: float, lam: float) -> wp.mat33:
     R = polar_rotation(F)
     J = wp.determinant(F)
     return 2.0 * mu * (F - R) * wp.transpose(F) + lam * J * (J - 1.0) * identity()
-
-
-@wp.func
-def hencky_stress(F: wp.mat33, mu: float, lam: float) -> wp.mat33:
-    """Tau = 2 mu H + lambda tr(H) I with the logarithmic strain H (St. Venant-Kirchhoff in it)."""
-    H = hencky_strain(F)
-    return 2.0 * mu * H + lam * wp.trace(H) * identity()

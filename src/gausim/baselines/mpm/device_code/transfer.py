@@ -9,8 +9,7 @@ kernel would be compiled 27 times.
 
 import warp as wp
 
-from gausim.baselines.mpm.device_code.constitutive import kirchhoff_stress, return_map, softened
-from gausim.baselines.mpm.device_code.elasticity import lame_lambda, shear_modulus
+from gausim.baselines.mpm.device_code.elasticity import fixed_corotated, lame_lambda, shear_modulus
 from gausim.baselines.mpm.device_code.matrices import identity
 
 LEAST_NODE_MASS = wp.constant(1.0e-15)
@@ -37,17 +36,15 @@ def inside(x: wp.vec3, nodes: wp.vec3i) -> bool:
 @wp.kernel
 def stress_kernel(
     deformation_gradients: wp.array[wp.mat33],
-    yield_stress: wp.array[float],
     young: wp.array[float],
     poisson: float,
-    kind: int,
     stress: wp.array[wp.mat33],
 ) -> None:
     """Kirchhoff stress per particle."""
     p = wp.tid()
     mu = shear_modulus(young[p], poisson)
     lam = lame_lambda(young[p], poisson)
-    stress[p] = kirchhoff_stress(kind, deformation_gradients[p], mu, lam, yield_stress[p])
+    stress[p] = fixed_corotated(deformation_gradients[p], mu, lam)
 
 
 @wp.kernel
@@ -92,36 +89,18 @@ def particles_to_grid(
 def grid_update(
     grid: wp.array3d[wp.vec4],
     pinned_nodes: wp.array3d[wp.uint8],
-    lower: wp.array[wp.vec3],
-    upper: wp.array[wp.vec3],
-    motion: wp.array[wp.vec3],
-    span: wp.array[wp.vec3],
     gravity: wp.vec3,
     kept: float,
-    dx: float,
     origin: wp.vec3,
-    time: float,
     dt: float,
     velocity: wp.array3d[wp.vec3],
 ) -> None:
-    """Velocity of nodes: momentum over mass, gravity, damping (the factor ``kept``), then what is prescribed.
-
-    Nodes in box r = ``lower``..``upper`` move with ``motion[r]`` between the times ``span[r]`` = (start, end, follows);
-    a box that follows moves along. Later boxes win, pinned nodes win over boxes.
-    """
+    """Velocity of nodes: momentum over mass, damping (the factor ``kept``) and gravity; 0 where nodes are pinned."""
     i, j, k = wp.tid()
     node = grid[i, j, k]
     v = wp.vec3(0.0, 0.0, 0.0)
     if node[3] >= LEAST_NODE_MASS:
         v = kept * wp.vec3(node[0], node[1], node[2]) / node[3] + dt * gravity
-    x = dx * (origin + wp.vec3(float(i), float(j), float(k)))
-    for r in range(lower.shape[0]):
-        if time >= span[r][0] and time < span[r][1]:
-            y = x - span[r][2] * (time - span[r][0]) * motion[r]
-            above = y[0] >= lower[r][0] and y[1] >= lower[r][1] and y[2] >= lower[r][2]
-            below = y[0] <= upper[r][0] and y[1] <= upper[r][1] and y[2] <= upper[r][2]
-            if above and below:
-                v = motion[r]
     if pinned_nodes[i + int(origin[0]), j + int(origin[1]), k + int(origin[2])] != wp.uint8(0):
         v = wp.vec3(0.0, 0.0, 0.0)
     velocity[i, j, k] = v
@@ -131,13 +110,8 @@ def grid_update(
 def grid_to_particles(
     positions: wp.array[wp.vec3],
     deformation_gradients: wp.array[wp.mat33],
-    yield_stress: wp.array[float],
     velocity: wp.array3d[wp.vec3],
-    young: wp.array[float],
     held: wp.array[wp.uint8],
-    poisson: float,
-    kind: int,
-    rheology: wp.vec3,
     inverse_dx: float,
     origin: wp.vec3,
     nodes: wp.vec3i,
@@ -146,9 +120,8 @@ def grid_to_particles(
     new_velocities: wp.array[wp.vec3],
     new_affine: wp.array[wp.mat33],
     new_gradients: wp.array[wp.mat33],
-    new_yield_stress: wp.array[float],
 ) -> None:
-    """V = sum_i w_i v_i, C = 4 / dx^2 sum_i w_i v_i (x_i - x)^T, x += dt v, F = Z((I + dt C) F).
+    """V = sum_i w_i v_i, C = 4 / dx^2 sum_i w_i v_i (x_i - x)^T, x += dt v, F = (I + dt C) F.
 
     Held particles keep their position.
     """
@@ -168,14 +141,10 @@ def grid_to_particles(
                     v += u
                     B += wp.outer(u, wp.vec3(float(a), float(b), float(c)) - f)
     C = (4.0 * inverse_dx) * B
-    F = (identity() + dt * C) * deformation_gradients[p]
-    mu = shear_modulus(young[p], poisson)
-    lam = lame_lambda(young[p], poisson)
     moved = positions[p] + dt * v
     if held[p] != wp.uint8(0):
         moved = positions[p]
     new_positions[p] = moved
     new_velocities[p] = v
     new_affine[p] = C
-    new_gradients[p] = return_map(kind, F, mu, lam, yield_stress[p], rheology, dt)
-    new_yield_stress[p] = softened(kind, F, mu, yield_stress[p], rheology)
+    new_gradients[p] = (identity() + dt * C) * deformation_gradients[p]
