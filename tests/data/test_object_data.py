@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,6 +16,7 @@ from gausim.core import ConfigError, DataError, SceneError
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData, find_objects
 from gausim.data.records import read_stills
+from gausim.kernels.compiled import torch_only
 
 VIEWS = ("cam_0", "cam_1", "cam_2")
 FRAMES, POINTS = 20, 5  # of tests/data/conftest.py
@@ -64,6 +66,25 @@ def test_sequences_can_be_limited(blob: Path) -> None:
             _ = ObjectData(blob, sequences=wrong).sequences
 
 
+def test_compiled_and_torch_give_the_same_bits_for_every_value() -> None:
+    colour, alpha = torch.arange(256).repeat(256), torch.arange(256).repeat_interleave(256)
+    frames = torch.stack((colour, 255 - colour, colour // 2, alpha), -1).to(torch.uint8).reshape(2, 128, 256, 4)
+    compiled = composite(frames)
+    with torch_only():
+        plain = composite(frames)
+    assert all(torch.equal(a, b) for a, b in zip(compiled, plain, strict=True))
+    assert float(compiled[0].max()) == 1.0
+
+
+def test_strided_frames() -> None:
+    frames = torch.randint(0, 256, (3, 5, 7, 4), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
+    strided = frames.transpose(0, 1)
+    assert not strided.is_contiguous()
+    for a, b in zip(composite(strided), composite(strided.contiguous()), strict=True):
+        assert torch.equal(a, b)
+    assert composite(frames[:0])[0].shape == (0, 5, 7, 3)
+
+
 def test_composite_over_black_and_over_a_color() -> None:
     frame = torch.tensor([[[255, 102, 0, 51], [10, 20, 30, 0]]], dtype=torch.uint8)
     rgb, alpha = composite(frame)
@@ -74,56 +95,44 @@ def test_composite_over_black_and_over_a_color() -> None:
     torch.testing.assert_close(rgb[0], torch.tensor([[0.6, 0.28, 0.8], [0.5, 0.25, 1.0]]))
 
 
-def test_missing_view_is_named(spoilt: Path, tiny: SimpleNamespace) -> None:
-    path = spoilt / "sequences" / "seq_000" / "transforms.json"
-    tiny.edit(path, lambda d: d.update(frames=[f for f in d["frames"] if f["camera"] != "cam_1"]))
-    with pytest.raises(DataError, match=r"seq_000/transforms.json: view 'cam_1' lacks 20 of 20 frames"):
+SEQUENCE = Path("sequences/seq_000")
+
+
+def _moved(data: dict) -> None:
+    data["frames"][FRAMES + 5]["transform_matrix"][0][3] += 0.1
+
+
+def _without_a_view(data: dict) -> None:
+    data.update(frames=[f for f in data["frames"] if f["camera"] != "cam_1"])
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (_without_a_view, r"seq_000/transforms.json: view 'cam_1' lacks 20 of 20 frames"),
+        (lambda data: data["frames"].pop(FRAMES + 7), r"view 'cam_1' lacks 1 of 20 frames \(first: 7\)"),
+        (_moved, "camera 'cam_1' moves at frame 5"),
+        (lambda data: data.update(fps=30), "'fps' is 30, dataset.json says 24"),
+    ],
+)
+def test_wrong_cameras_of_a_sequence(spoilt: Path, tiny: SimpleNamespace, edit: Callable, message: str) -> None:
+    tiny.edit(spoilt / SEQUENCE / "transforms.json", edit)
+    with pytest.raises(DataError, match=message):
         _ = ObjectData(spoilt).sequences
 
 
-def test_missing_frame_of_a_view_is_named(spoilt: Path, tiny: SimpleNamespace) -> None:
-    path = spoilt / "sequences" / "seq_000" / "transforms.json"
-    tiny.edit(path, lambda d: d["frames"].pop(FRAMES + 7))
-    with pytest.raises(DataError, match=r"view 'cam_1' lacks 1 of 20 frames \(first: 7\)"):
-        _ = ObjectData(spoilt).sequences
-
-
-def test_frame_of_another_size(spoilt: Path, tiny: SimpleNamespace) -> None:
-    path = spoilt / "sequences" / "seq_000" / "cam_1" / "0003.png"
-    tiny.png(path, tiny.pixels(0, 1, 3)[:4, :4])
-    record = ObjectData(spoilt).sequences[0]
-    with pytest.raises(DataError, match=r"cam_1/0003.png: expected 8x6 RGBA \(8 bit\), got 4x4 RGBA"):
-        record.frames(range(16), ["cam_0", "cam_1"])
-
-
-def test_rgb_without_alpha(spoilt: Path, tiny: SimpleNamespace) -> None:
-    path = spoilt / "sequences" / "seq_000" / "cam_0" / "0002.png"
-    cv2.imwrite(str(path), tiny.pixels(0, 0, 2)[..., :3].copy())
-    record = ObjectData(spoilt).sequences[0]
-    with pytest.raises(DataError, match=r"cam_0/0002.png: expected 8x6 RGBA .*got 8x6 RGB .*with alpha"):
-        record.frames(range(3), ["cam_0"])
-
-
-def test_sixteen_bit_and_undecodable_and_missing_images(spoilt: Path, tiny: SimpleNamespace) -> None:
-    folder = spoilt / "sequences" / "seq_000" / "cam_0"
-    record = ObjectData(spoilt).sequences[0]
+def test_wrong_images(spoilt: Path, tiny: SimpleNamespace) -> None:
+    folder, record = spoilt / SEQUENCE / "cam_0", ObjectData(spoilt).sequences[0]
     cv2.imwrite(str(folder / "0000.png"), tiny.pixels(0, 0, 0).astype(np.uint16))
     (folder / "0001.png").write_bytes(b"no image")
     (folder / "0002.png").unlink()
-    for frame, message in enumerate((r"got 8x6 RGBA \(16 bit\)", "cannot be decoded", "no such image")):
-        with pytest.raises(DataError, match=rf"{frame:04d}.png: .*{message}"):
+    cv2.imwrite(str(folder / "0003.png"), tiny.pixels(0, 0, 2)[..., :3].copy())
+    tiny.png(folder / "0004.png", tiny.pixels(0, 0, 4)[:4, :4])
+    expected = (r"got 8x6 RGBA \(16 bit\)", "cannot be decoded", "no such image", "got 8x6 RGB .*with alpha",
+                r"expected 8x6 RGBA \(8 bit\), got 4x4 RGBA")  # fmt: skip
+    for frame, message in enumerate(expected):
+        with pytest.raises(DataError, match=rf"cam_0/{frame:04d}.png: .*{message}"):
             record.frames(range(frame, frame + 1), ["cam_0"])
-
-
-def test_moving_camera(spoilt: Path, tiny: SimpleNamespace) -> None:
-    path = spoilt / "sequences" / "seq_000" / "transforms.json"
-
-    def move(data) -> None:
-        data["frames"][FRAMES + 5]["transform_matrix"][0][3] += 0.1
-
-    tiny.edit(path, move)
-    with pytest.raises(DataError, match="camera 'cam_1' moves at frame 5"):
-        _ = ObjectData(spoilt).sequences
 
 
 def test_frames_and_views_out_of_range(blob: Path) -> None:
@@ -198,12 +207,6 @@ def test_missing_scene_names_the_remedy(spoilt: Path) -> None:
     (spoilt / "scene.ply").unlink()
     with pytest.raises(DataError, match="gausim reconstruct"):
         ObjectData(spoilt).scene()
-
-
-def test_fps_of_a_sequence_must_agree(spoilt: Path, tiny: SimpleNamespace) -> None:
-    tiny.edit(spoilt / "dataset.json", lambda d: d.update(fps=30))
-    with pytest.raises(DataError, match=r"'fps' is 24, dataset.json says 30"):
-        _ = ObjectData(spoilt).sequences
 
 
 def test_bunny(data_root: Path) -> None:

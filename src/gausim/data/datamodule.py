@@ -12,14 +12,7 @@ from torch.utils.data import DataLoader
 
 from gausim.core import ConfigError
 from gausim.data.curriculum import Curriculum
-from gausim.data.dataset import (
-    SampleKey,
-    SequenceIndex,
-    SequenceSample,
-    TrainingDataset,
-    WholeSequenceDataset,
-    collate,
-)
+from gausim.data.dataset import SampleKey, SequenceIndex, SequenceSample, TrainingDataset, collate
 from gausim.data.objects import ObjectData, find_objects
 from gausim.data.prefetch import PrefetchingLoader
 from gausim.data.sampler import SequenceBatchSampler
@@ -29,8 +22,7 @@ from gausim.ops.selection import Selection
 class ReadyDataModule(LightningDataModule):
     """Streams multi-view sequences of one or several objects, their length set by the curriculum.
 
-    Training batches are lists of :class:`SequenceSample` (frames 0..T of the training views only); test batches
-    hold one whole sequence in all views.
+    Training batches are lists of :class:`SequenceSample` (frames 0..T of the training views only).
 
     Attributes:
         repeats: how many times each sequence is shown per epoch.
@@ -140,10 +132,6 @@ class ReadyDataModule(LightningDataModule):
             collate_fn=collate,
             prefetch=self._prefetch,
         )
-
-    def test_dataloader(self) -> DataLoader:
-        """Whole sequences in order, one per batch, in all views."""
-        return DataLoader(WholeSequenceDataset(self.index), batch_size=1, collate_fn=collate, num_workers=0)
 
     def state_dict(self) -> dict[str, Any]:
         """Epoch and position of the order of training, for an exact resume."""

@@ -1,9 +1,9 @@
-"""Samples for training and for measuring: whole stretches of one sequence, as 8-bit frames with their cameras."""
+"""Samples for training: stretches of one sequence from frame 0 on, as 8-bit frames with their cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -81,15 +81,7 @@ class SequenceSample:
 
     def to(self, device: torch.device | str) -> SequenceSample:
         """The same sample on another device (Lightning moves batches through this)."""
-        return SequenceSample(
-            self.scene_id,
-            self.object_name,
-            self.sequence_id,
-            self.sequence_name,
-            self.frames.to(device, non_blocking=True),
-            self.cameras.to(device),
-            self.fps,
-        )
+        return replace(self, frames=self.frames.to(device, non_blocking=True), cameras=self.cameras.to(device))
 
 
 class SequenceIndex:
@@ -151,24 +143,6 @@ class TrainingDataset(Dataset):
                 "Lower the curriculum's t_max."
             )
         return self._index.sample(sequence, range(steps + 1), item.train_views)
-
-
-class WholeSequenceDataset(Dataset):
-    """All frames of every sequence, in order, for measuring: training views first, then the held-out ones."""
-
-    def __init__(self, index: SequenceIndex) -> None:
-        """Serves the sequences of ``index`` by their id."""
-        self._index = index
-
-    def __len__(self) -> int:
-        """Number of sequences."""
-        return len(self._index)
-
-    def __getitem__(self, sequence: int) -> SequenceSample:
-        """Every frame of one sequence."""
-        scene_id, record = self._index.entries[sequence]
-        item = self._index.objects[scene_id]
-        return self._index.sample(sequence, range(record.count), (*item.train_views, *item.heldout_views))
 
 
 def collate(samples: list[SequenceSample]) -> list[SequenceSample]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import queue
-import threading
+from collections import deque
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import torch
@@ -19,8 +18,8 @@ T = TypeVar("T")
 class PrefetchingLoader(DataLoader):
     """A loader whose next batches are read by one thread while the current one is trained on.
 
-    In memory are the batch in use and at most ``prefetch`` more, the one that is being read included. Order and content
-    are those of a loader that does not read ahead.
+    A thread instead of a worker process, because decoded images stay in memory, where validation reads them too. Order
+    and content are those of a loader that does not read ahead.
     """
 
     def __init__(
@@ -31,27 +30,15 @@ class PrefetchingLoader(DataLoader):
         collate_fn: Callable[[list[Any]], Any],
         prefetch: int,
     ) -> None:
-        """Serves the batches of ``batch_sampler``.
-
-        Args:
-            dataset: where samples come from.
-            batch_sampler: which ones make a batch.
-            collate_fn: makes a batch of them.
-            prefetch: batches read ahead; 0 reads each when it is asked for.
+        """Serves the batches of ``batch_sampler``; ``prefetch`` of them are read ahead, 0 reads each when asked.
 
         Raises:
             ConfigError: ``prefetch`` is negative.
         """
         if prefetch < 0:
             raise ConfigError(f"data.prefetch: expected 0 or more batches read ahead, got {prefetch}.")
-        super().__init__(
-            dataset,
-            batch_sampler=batch_sampler,
-            collate_fn=collate_fn,
-            num_workers=0,
-            # The loader draws a number per epoch; from the global generator, a resumed run would draw another count.
-            generator=torch.Generator(),
-        )
+        # The loader draws a number per epoch; from the global generator, a resumed run would draw another count.
+        super().__init__(dataset, batch_sampler=batch_sampler, collate_fn=collate_fn, generator=torch.Generator())
         self.prefetch = prefetch
         self._open: Generator[Any, None, None] | None = None
 
@@ -63,42 +50,18 @@ class PrefetchingLoader(DataLoader):
         return self._open or super().__iter__()
 
 
-@dataclass(frozen=True)
-class _Ended:
-    """The source has no more items, or has failed."""
-
-    error: BaseException | None
-
-
 def read_ahead(source: Iterator[T], most: int) -> Generator[T, None, None]:
-    """The items of ``source``, at most ``most`` of them read before they are asked for.
+    """The items of ``source``, ``most`` of them read before they are asked for; an error comes where it happened.
 
     Closing the generator ends the thread that reads.
-
-    Raises:
-        BaseException: what ``source`` raised, at the item where it did.
     """
-    permits, ready, stop = threading.Semaphore(most), queue.SimpleQueue[T | _Ended](), threading.Event()
-
-    def read() -> None:
-        try:
-            while permits.acquire() and not stop.is_set():
-                ready.put(next(source))
-        except StopIteration:
-            ready.put(_Ended(None))
-        except BaseException as error:  # whatever it is, it belongs to the thread that asks
-            ready.put(_Ended(error))
-
-    thread = threading.Thread(target=read, name="gausim-prefetch", daemon=True)
-    thread.start()
+    end = object()
+    pool = ThreadPoolExecutor(1, thread_name_prefix="gausim-prefetch")
     try:
-        while not isinstance(item := ready.get(), _Ended):
-            permits.release()
-            yield item
+        ahead = deque(pool.submit(next, source, end) for _ in range(most))
+        while (item := ahead.popleft().result()) is not end:
+            ahead.append(pool.submit(next, source, end))
+            yield item  # type: ignore[misc]
             del item  # not held while the next one is waited for
-        if item.error is not None:
-            raise item.error
     finally:
-        stop.set()
-        permits.release()
-        thread.join()
+        pool.shutdown(cancel_futures=True)
