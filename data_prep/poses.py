@@ -171,9 +171,9 @@ def _found(
 ) -> tuple[list[Posed], PointTable, dict[str, Any]]:
     """Poses in the world that they were found in, points, and what is to be told of them."""
     from data_prep.cameras import sources as pose_sources
-    from gausim.io.colmap import find_colmap, read_colmap
+    from gausim.io.colmap import find_colmap, no_points, read_colmap
 
-    points = pose_sources.no_points()
+    points = no_points()
     if sources.kind == "mapping":
         return _map(work, material, mapping, tick)
     if sources.colmap is not None and sources.images is not None:

@@ -13,7 +13,6 @@ import numpy as np
 from data_prep.common.photos import Photo, list_images, open_photo
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.colmap import ColmapCamera, ColmapModel
-from gausim.io.colmap_files import PointTable
 
 # Endings with which projection matrices are named after their image.
 _MATRIX_ENDING = re.compile(r"([._-](P|proj|projection|camera))?$", re.IGNORECASE)
@@ -41,12 +40,6 @@ class Posed:
     viewmat: np.ndarray
     xy: np.ndarray
     point_ids: np.ndarray
-
-
-def no_points() -> PointTable:
-    """A table without points."""
-    empty = np.empty(0, np.int64)
-    return PointTable(empty, np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0), empty)
 
 
 def from_model(model: ColmapModel, photos: dict[str, Photo]) -> list[Posed]:

@@ -1,23 +1,22 @@
-"""COLMAP models: binary and text say the same, pycolmap agrees, and what is broken is named and never believed."""
+"""COLMAP models: binary and text say the same, pycolmap agrees, and what is broken is named (see also tests/fuzz)."""
 
 from __future__ import annotations
 
 import os
-import random
 import struct
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from helpers import colmap_files
 
 from gausim.core import DataError
-from gausim.io.colmap import ColmapCamera, ColmapModel, find_colmap, read_colmap
+from gausim.io.colmap import ColmapCamera, find_colmap, read_colmap
 
 WRITERS: dict[str, Callable] = {"binary": colmap_files.write_binary, "text": colmap_files.write_text}
-MUTATIONS = 400
 
 
 @pytest.fixture(params=list(WRITERS))
@@ -43,20 +42,15 @@ def test_both_forms_say_what_was_written(model: Path) -> None:
 
 
 def test_pycolmap_reads_the_same(model: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
     theirs, ours = pycolmap.Reconstruction(model), read_colmap(model)
-    assert len(theirs.images) == len(ours.images)
     by_name = {image.name: image for image in theirs.images.values()}
+    assert set(by_name) == {image.name for image in ours.images}
     for image in ours.images:
         np.testing.assert_allclose(by_name[image.name].cam_from_world().matrix(), image.viewmat[:3], atol=1e-12)
-    for number, camera in ours.cameras.items():
-        k = theirs.cameras[number].calibration_matrix()
-        np.testing.assert_allclose((k[0, 0], k[1, 1], k[0, 2], k[1, 2]), camera.intrinsics)
 
 
 @pytest.mark.parametrize("name", colmap_files.MODEL_NUMBERS)
 def test_every_lens_model_is_read_with_its_intrinsics(tmp_path: Path, name: str) -> None:
-    pycolmap = pytest.importorskip("pycolmap")
     theirs = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
     theirs.params = [v + 0.01 * i for i, v in enumerate(theirs.params)]
     _, images, points = colmap_files.small_model()
@@ -157,75 +151,10 @@ def test_counts_are_not_believed(tmp_path: Path, role: str) -> None:
     assert peak < 1 << 20
 
 
-def test_memory_stays_in_proportion_to_the_files(tmp_path: Path) -> None:
-    cameras, images, points = colmap_files.small_model()
-    many = [(float(i % 60), 3.0, i + 20) for i in range(4000)]
-    images[3] = (*images[3][:4], many)
-    points = points + [(i + 20, (0.1, 0.2, 0.3), (1, 2, 3), 0.5, []) for i in range(4000)]
-    limit = {"binary": 2, "text": 4}  # a short number in text takes eight bytes in memory
-    for form, write in WRITERS.items():
-        write(tmp_path / form, cameras, images, points)
-        size = sum(p.stat().st_size for p in (tmp_path / form).iterdir())
-        tracemalloc.start()
-        read = read_colmap(tmp_path / form)
-        _, peak = tracemalloc.get_traced_memory()
-        tracemalloc.stop()
-        assert len(read.points.ids) == 4003 and peak < limit[form] * size + (1 << 18), (form, peak, size)
-
-
-def _mutated(data: bytes, rng: random.Random) -> bytes:
-    out = bytearray(data)
-    for _ in range(rng.randint(1, 4)):
-        at = rng.randrange(len(out) + 1)
-        match rng.randrange(5):
-            case 0 if out:
-                out[at % len(out)] ^= 1 << rng.randrange(8)
-            case 1:
-                del out[at : at + rng.randint(1, 40)]
-            case 2:
-                out[at:at] = bytes(rng.randrange(256) for _ in range(rng.randint(1, 16)))
-            case 3:
-                extreme = rng.choice([b"\xff" * 8, b"\x7f\xf0" + bytes(6), struct.pack("<d", float("nan")), bytes(8)])
-                out[at : at + 8] = extreme
-            case 4:
-                out[at:at] = rng.choice(
-                    [b" nan ", b" inf ", b" -1 ", b" 1e999 ", b"\n", b"#", b" 99999999999999999999 "]
-                )
-    return bytes(out)
-
-
-def _is_sound(model: ColmapModel) -> bool:
-    finite = [c.params for c in model.cameras.values()] + [model.points.xyz, model.points.error]
-    finite += [array for image in model.images for array in (image.viewmat, image.xy)]
-    count = len(model.points.ids)
-    shapes = model.points.xyz.shape == (count, 3) == model.points.rgb.shape and model.points.tracks.shape == (count,)
-    return shapes and all(np.isfinite(a).all() for a in finite) and all(i.camera in model.cameras for i in model.images)
-
-
-@pytest.mark.parametrize("form", list(WRITERS))
-def test_mutated_files_are_refused_by_name_or_sound(tmp_path: Path, form: str) -> None:
-    WRITERS[form](tmp_path, *colmap_files.small_model())
-    rng, refused = random.Random(7), 0
-    paths = sorted(tmp_path.iterdir())
-    contents = {path: path.read_bytes() for path in paths}
-    for _ in range(MUTATIONS):
-        path = rng.choice(paths)
-        path.write_bytes(_mutated(contents[path], rng))
-        try:
-            assert _is_sound(read_colmap(tmp_path))
-        except DataError as error:
-            # What one file says can be at odds with another, which is then the one that is named.
-            assert str(tmp_path) in str(error)
-            refused += 1
-        path.write_bytes(contents[path])
-    assert MUTATIONS // 2 < refused < MUTATIONS
-
-
 def test_a_real_model_is_read_as_pycolmap_reads_it() -> None:
     root = os.environ.get("GAUSIM_TEST_DATA")
     if not root:
         pytest.skip("GAUSIM_TEST_DATA names no folder of real data")
-    pycolmap = pytest.importorskip("pycolmap")
     folder = find_colmap(Path(root) / "photos" / "backyard_colmap")
     ours, theirs = read_colmap(folder), pycolmap.Reconstruction(folder)
     assert len(ours.images) == theirs.num_reg_images() == 15

@@ -1,26 +1,16 @@
-"""Reader of COLMAP sparse models, binary and text: cameras with their lenses, poses of the images, points.
-
-The reader is our own because these files come from anywhere: it never runs or allocates what a file merely claims
-(:mod:`gausim.io.colmap_files`), and every error names the file and the field.
-"""
+"""COLMAP sparse models: cameras with their lenses, poses of the images, points. Errors name the file and the field."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from gausim.core.errors import DataError
-from gausim.io.colmap_files import (
-    PARAMETERS,
-    CameraRecord,
-    ImageRecord,
-    PointTable,
-    read_cameras,
-    read_images,
-    read_points,
-)
+from gausim.io.colmap_files import CameraRow, ImageRow, PointTable, read_cameras, read_images, read_points
 
 # Models with two focal lengths; the others have one for both axes.
 _TWO_FOCAL = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE")
@@ -152,96 +142,82 @@ def read_colmap(folder: Path | str) -> ColmapModel:
     folder = Path(folder)
     files = colmap_files(folder)
     cameras: dict[int, ColmapCamera] = {}
-    for record in read_cameras(files["cameras"]):
-        _unique(files["cameras"], record.where, record.number, cameras)
-        cameras[record.number] = _camera(files["cameras"], record)
-    images: dict[int, ColmapImage] = {}
-    names: dict[str, int] = {}
-    for image in read_images(files["images"]):
-        _unique(files["images"], image.where, image.number, images)
-        _unique(files["images"], image.where, image.name, names)
-        names[image.name] = image.number
-        images[image.number] = _image(files["images"], image, cameras)
+    for row in read_cameras(files["cameras"]):
+        _unique(files["cameras"], row.where, row.number, cameras)
+        cameras[row.number] = _camera(files["cameras"], row)
+    images: dict[int | str, ColmapImage] = {}
+    for entry in read_images(files["images"]):
+        image = _image(files["images"], entry, cameras)
+        for key in (entry.number, entry.name):
+            _unique(files["images"], entry.where, key, images)
+            images[key] = image
     if not images:
         raise DataError(f"{files['images']}: holds no image. Expected the registered images of a model.")
-    points = _points(files["points3D"]) if "points3D" in files else _no_points()
-    return ColmapModel(folder, cameras, tuple(sorted(images.values(), key=lambda i: i.name)), points)
+    points = _points(files["points3D"]) if "points3D" in files else no_points()
+    named = sorted(key for key in images if isinstance(key, str))
+    return ColmapModel(folder, cameras, tuple(images[name] for name in named), points)
 
 
-def _camera(path: Path, record: CameraRecord) -> ColmapCamera:
-    where = f"{path}: {record.where}"
-    if not (0 < record.width <= _LARGEST_SIDE and 0 < record.height <= _LARGEST_SIDE):
-        size = f"{record.width} x {record.height}"
+def no_points() -> PointTable:
+    """A table without rows."""
+    empty = np.empty(0, np.int64)
+    return PointTable(empty, np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0), empty)
+
+
+def _camera(path: Path, row: CameraRow) -> ColmapCamera:
+    where = f"{path}: {row.where}"
+    if not (0 < row.width <= _LARGEST_SIDE and 0 < row.height <= _LARGEST_SIDE):
+        size = f"{row.width} x {row.height}"
         raise DataError(f"{where}: fields 'width', 'height' are {size}, expected 1 to {_LARGEST_SIDE} pixels.")
-    _check_finite(f"{where}: field 'params'", record.params)
-    assert len(record.params) == PARAMETERS[record.model]
-    camera = ColmapCamera(record.model, record.width, record.height, record.params)
+    _check_finite(f"{where}: field 'params'", row.params)
+    camera = ColmapCamera(row.model, row.width, row.height, row.params)
     if min(camera.intrinsics[:2]) <= 0:
         raise DataError(f"{where}: field 'params': focal lengths must be positive, got {camera.intrinsics[:2]}.")
     return camera
 
 
-def _image(path: Path, record: ImageRecord, cameras: dict[int, ColmapCamera]) -> ColmapImage:
-    where = f"{path}: {record.where}"
-    place = PurePosixPath(record.name)
-    if not record.name.isprintable() or not place.name or place.is_absolute() or ".." in place.parts:
-        raise DataError(f"{where}: field 'name' must be a path inside the folder of images, got {record.name!r:.80}.")
-    if record.camera not in cameras:
-        raise DataError(f"{where}: field 'camera_id' is {record.camera}, the cameras are {sorted(cameras)[:20]}.")
-    _check_finite(f"{where}: field 'quaternion'", record.quaternion)
-    _check_finite(f"{where}: field 'translation'", record.translation)
-    _check_finite(f"{where}: keypoints", record.xy)
-    length = float(np.linalg.norm(record.quaternion))
+def _image(path: Path, row: ImageRow, cameras: dict[int, ColmapCamera]) -> ColmapImage:
+    where, place = f"{path}: {row.where}", PurePosixPath(row.name)
+    if not row.name.isprintable() or not place.name or place.is_absolute() or ".." in place.parts:
+        raise DataError(f"{where}: field 'name' must be a path inside the folder of images, got {row.name!r:.80}.")
+    if row.camera not in cameras:
+        raise DataError(f"{where}: field 'camera_id' is {row.camera}, the cameras are {sorted(cameras)[:20]}.")
+    quaternion, translation = row.pose[:4], row.pose[4:]
+    for field, values in (
+        ("field 'quaternion'", quaternion),
+        ("field 'translation'", translation),
+        ("keypoints", row.xy),
+    ):
+        _check_finite(f"{where}: {field}", values)
+    length = float(np.linalg.norm(quaternion))
     if abs(length - 1) > _UNIT_TOLERANCE:
         raise DataError(f"{where}: field 'quaternion' has length {length:.4g}, expected 1. Export the model again.")
     viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation_matrix(record.quaternion / length), record.translation
-    return ColmapImage(record.name, record.camera, viewmat, record.xy, record.point_ids)
+    viewmat[:3, :3], viewmat[:3, 3] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix(), translation
+    return ColmapImage(row.name, row.camera, viewmat, row.xy, row.point_ids)
 
 
 def _points(path: Path) -> PointTable:
     table = read_points(path)
     for field in ("xyz", "error"):
-        values = getattr(table, field)
-        good = (
-            (np.isfinite(values) & (np.abs(values) <= _LARGEST))
-            .reshape(len(table.ids), 3 if field == "xyz" else 1)
-            .all(1)
-        )
-        if not good.all():
-            first = int(np.argmin(good))
-            raise DataError(
-                f"{path}: points3D[{first}]: field '{field}' is {values[first]}, expected finite numbers up to "
-                f"{_LARGEST:g} ({int((~good).sum())} of {len(good)} points). Export the model again."
-            )
-    order = np.argsort(table.ids, kind="stable")
-    twice = np.flatnonzero(np.diff(table.ids[order]) == 0)
-    if len(twice):
-        raise DataError(f"{path}: field 'id' {table.ids[order[twice[0]]]} stands twice. Export the model again.")
+        _check_finite(f"{path}: field '{field}'", getattr(table, field))
+    ids, counts = np.unique(table.ids, return_counts=True)
+    if len(ids) < len(table.ids):
+        raise DataError(f"{path}: field 'id' {ids[counts > 1][0]} stands twice. Export the model again.")
     return table
-
-
-def _no_points() -> PointTable:
-    empty = np.empty(0, np.int64)
-    return PointTable(empty, np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0), empty)
-
-
-def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """(3, 3) float64 rotation of a unit quaternion (4,) w x y z."""
-    w, x, y, z = quaternion
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
 
 
 def _check_finite(where: str, values: np.ndarray) -> None:
     # One comparison: it is false for NaN as well.
-    if not (np.abs(values) <= _LARGEST).all():
-        raise DataError(f"{where} must be finite numbers up to {_LARGEST:g}, got {values.ravel()[:12].tolist()}.")
+    good = np.abs(values) <= _LARGEST
+    if not good.all():
+        first = values[tuple(np.argwhere(~good)[0])]
+        raise DataError(
+            f"{where}: expected finite numbers up to {_LARGEST:g}, got {first} (number {int(np.argmin(good))}; "
+            f"{int((~good).sum())} of {good.size} are wrong). Export the model again."
+        )
 
 
-def _unique(path: Path, where: str, value: int | str, known: dict) -> None:
+def _unique(path: Path, where: str, value: int | str, known: Collection[int | str]) -> None:
     if value in known:
         raise DataError(f"{path}: {where}: '{value}' stands twice. Export the model again.")

@@ -6,11 +6,13 @@ The PLY holds what every 3DGS viewer reads; what the dynamics needs besides (mas
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.lib.recfunctions import structured_to_unstructured
 from torch import Tensor
 
 from gausim.core.errors import SceneError
@@ -29,11 +31,9 @@ _TYPES = {
 }  # fmt: skip
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 # f_rest holds (d + 1)^2 - 1 coefficients for each of three channels.
-_REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3}
-_REQUIRED = (
-    "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
-    "rot_0", "rot_1", "rot_2", "rot_3",
-)  # fmt: skip
+_REST_COUNTS = (0, 9, 24, 45)
+_POSITION, _COLOR = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
+_SHAPE = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
 # No header of a Gaussian scene comes near this; a binary file without end_header must not be read whole as text.
 _HEADER_LIMIT = 1 << 16
 
@@ -70,25 +70,18 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
         SceneError: naming the file and the property that is missing, malformed, NaN, infinite or a zero quaternion.
     """
     path = Path(path)
-    if not path.is_file():
-        raise SceneError(f"{path}: no such file. Expected a 3DGS scene in PLY format.")
     table = _read_vertices(path)
     rest = _rest_names(path, table.dtype.names or ())
-    values = {n: _finite_column(path, table, n) for n in (*_REQUIRED, *rest)}
-    quats = _stack(values, [f"rot_{i}" for i in range(4)])
-    zero = (quats == 0).all(-1)
-    if zero.any():
-        raise SceneError(
-            f"{path}: properties 'rot_0'..'rot_3' are all zero for {int(zero.sum())} of {len(zero)} vertices "
-            f"(first: vertex {int(zero.nonzero()[0])}); expected a non-zero quaternion. Remove them or export again."
-        )
+    values = torch.from_numpy(_columns(path, table, [*_POSITION, *_SHAPE, *_COLOR, *rest]))
+    means, opacity, log_scales, quats, color, high = values.split((3, 1, 3, 4, 3, len(rest)), dim=1)
+    sh = torch.cat([color[:, None], high.reshape(len(table), 3, -1).transpose(1, 2)], dim=1)
     try:
         scene = GaussianScene.create(
-            means=_stack(values, ["x", "y", "z"]),
-            log_scales=_stack(values, [f"scale_{i}" for i in range(3)]),
-            quats=quats,
-            opacity_logits=torch.from_numpy(values["opacity"]),
-            sh=_sh_from_columns(values, rest),
+            means=means.contiguous(),
+            log_scales=log_scales.contiguous(),
+            quats=quats.contiguous(),
+            opacity_logits=opacity[:, 0].contiguous(),
+            sh=sh,
             name=path.stem if name is None else name,
         )
     except SceneError as error:
@@ -104,13 +97,11 @@ def load_points(path: Path | str) -> np.ndarray:
         SceneError: naming the file and the property that is missing, malformed, NaN or infinite.
     """
     path = Path(path)
-    if not path.is_file():
-        raise SceneError(f"{path}: no such file. Expected a point cloud in PLY format.")
     table = _read_vertices(path)
-    missing = [n for n in ("x", "y", "z") if n not in (table.dtype.names or ())]
+    missing = [n for n in _POSITION if n not in (table.dtype.names or ())]
     if missing:
         raise SceneError(f"{path}: property '{missing[0]}' is missing. Expected points with x, y and z.")
-    return np.stack([_finite_column(path, table, n) for n in ("x", "y", "z")], axis=-1)
+    return _columns(path, table, list(_POSITION))
 
 
 def save_scene(scene: GaussianScene, path: Path | str, *, masks: bool = True) -> None:
@@ -123,9 +114,7 @@ def save_scene(scene: GaussianScene, path: Path | str, *, masks: bool = True) ->
     """
     path = Path(path)
     rest_count = 3 * (scene.sh.shape[1] - 1)
-    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    names += [f"f_rest_{i}" for i in range(rest_count)]
-    names += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    names = [*_POSITION, "nx", "ny", "nz", *_COLOR, *(f"f_rest_{i}" for i in range(rest_count)), *_SHAPE]
     # Channel-major: all coefficients of red, then of green, then of blue.
     rest = scene.sh[:, 1:].transpose(1, 2).reshape(scene.count, rest_count)
     normals = torch.zeros_like(scene.means)
@@ -164,7 +153,7 @@ def load_masks(scene: GaussianScene, path: Path | str) -> GaussianScene:
         stored = read_npz(path)
     except ValueError as error:
         raise SceneError(f"{path}: not a readable npz of plain arrays ({error}). Write the masks again.") from error
-    values: dict[str, Tensor] = {}
+    values: dict[str, Any] = {}
     for n in MASK_NAMES:
         found = stored.get(n)
         if found is None or found.shape != (scene.count,) or found.dtype != np.bool_:
@@ -177,33 +166,12 @@ def load_masks(scene: GaussianScene, path: Path | str) -> GaussianScene:
     scale = stored.get("volume_scale", np.zeros(0))
     if scale.shape != () or not np.isfinite(scale) or scale <= 0:
         raise SceneError(f"{path}: field 'volume_scale': expected one positive number, got {scale!r}.")
-    return GaussianScene.create(
-        means=scene.means,
-        log_scales=scene.log_scales,
-        quats=scene.quats,
-        opacity_logits=scene.opacity_logits,
-        sh=scene.sh,
-        volume_scale=float(scale),
-        name=scene.name,
-        **values,
-    )
-
-
-def _stack(values: dict[str, np.ndarray], names: list[str]) -> Tensor:
-    return torch.from_numpy(np.stack([values[n] for n in names], axis=-1))
-
-
-def _sh_from_columns(values: dict[str, np.ndarray], rest: list[str]) -> Tensor:
-    dc = _stack(values, ["f_dc_0", "f_dc_1", "f_dc_2"])[:, None]
-    if not rest:
-        return dc
-    high = _stack(values, rest).reshape(dc.shape[0], 3, -1).transpose(1, 2)
-    return torch.cat([dc, high], dim=1).contiguous()
+    return replace(scene, volume_scale=float(scale), **values).validated()
 
 
 def _rest_names(path: Path, names: tuple[str, ...]) -> list[str]:
     """The f_rest properties in order, after checking that nothing 3DGS needs is missing."""
-    missing = [n for n in _REQUIRED if n not in names]
+    missing = [n for n in (*_POSITION, *_COLOR, *_SHAPE) if n not in names]
     if missing:
         raise SceneError(
             f"{path}: property '{missing[0]}' is missing (missing in all: {', '.join(missing)}). Expected a 3DGS PLY; "
@@ -221,21 +189,26 @@ def _rest_names(path: Path, names: tuple[str, ...]) -> list[str]:
     return rest
 
 
-def _finite_column(path: Path, table: np.ndarray, name: str) -> np.ndarray:
+def _columns(path: Path, table: np.ndarray, names: list[str]) -> np.ndarray:
+    """These properties of all vertices, (K, n) float32, all finite."""
     # Overflow to infinity of a double beyond float32 is reported by the check below, not by a warning.
     with np.errstate(over="ignore"):
-        column = table[name].astype(np.float32)
-    bad = ~np.isfinite(column)
+        values = structured_to_unstructured(table[names], np.float32)
+    bad = ~np.isfinite(values)
     if bad.any():
+        column = int(bad.any(0).argmax())
         raise SceneError(
-            f"{path}: property '{name}' is NaN or infinite for {int(bad.sum())} of {len(bad)} vertices "
-            f"(first: vertex {int(bad.argmax())}); expected finite numbers. Remove them or repair the reconstruction."
+            f"{path}: property '{names[column]}' is NaN or infinite for {int(bad[:, column].sum())} of {len(bad)} "
+            f"vertices (first: vertex {int(bad[:, column].argmax())}); expected finite numbers. Remove them or repair "
+            "the reconstruction."
         )
-    return column
+    return values
 
 
 def _read_vertices(path: Path) -> np.ndarray:
     """The vertex table, after checking that the file holds as many bytes (or lines) as its header promises."""
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file. Expected a 3DGS scene or points in PLY format.")
     header = _read_header(path)
     if header.count == 0:
         raise SceneError(f"{path}: element 'vertex' is empty; expected at least one Gaussian.")
@@ -257,21 +230,19 @@ def _read_vertices(path: Path) -> np.ndarray:
 def _read_text(path: Path, header: _Header) -> np.ndarray:
     lines = path.read_bytes()[header.offset :].decode("ascii", errors="replace").split("\n")
     rows = [line.split() for line in lines if line.strip()][: header.count]
-    width = len(header.dtype.names or ())
-    if len(rows) < header.count:
+    names = header.dtype.names or ()
+    wrong = next((i for i, row in enumerate(rows) if len(row) != len(names)), None)
+    if len(rows) < header.count or wrong is not None:
+        found = f"{len(rows)} lines" if wrong is None else f"{len(rows[wrong])} numbers at vertex {wrong}"
         raise SceneError(
-            f"{path}: element 'vertex' declares {header.count} vertices but the file holds {len(rows)} lines of data. "
-            "It is truncated; copy or export it again."
+            f"{path}: element 'vertex' declares {header.count} vertices of {len(names)} numbers, but the file holds "
+            f"{found}. It is truncated; copy or export it again."
         )
-    table = np.empty(header.count, dtype=header.dtype)
-    for i, row in enumerate(rows):
-        try:
-            if len(row) != width:
-                raise ValueError(f"{len(row)} values")
-            table[i] = tuple(float(v) for v in row)
-        except ValueError as error:
-            raise SceneError(f"{path}: vertex {i}: expected {width} numbers, got {error}. Export it again.") from error
-    return table
+    try:
+        values = np.array(rows, np.float64)
+    except ValueError as error:
+        raise SceneError(f"{path}: element 'vertex': expected numbers ({error!s:.80}). Export it again.") from error
+    return values.view([(name, np.float64) for name in names])[:, 0]
 
 
 def _read_header(path: Path) -> _Header:
