@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.lib.recfunctions import structured_to_unstructured
-from torch import Tensor
 
 from gausim.core.errors import SceneError
 from gausim.core.scene import GaussianScene
