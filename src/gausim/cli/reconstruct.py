@@ -32,7 +32,7 @@ COLUMN = 480
 SAVES = 20
 # An open scene has parts of every size, seen through one another, and grows from few points.
 SCENE_OPTIONS: dict[str, Any] = {
-    "kernels": 30_000, "rounds": 16, "minimum_opacity": 0.01, "anisotropy_limit": 10.0,
+    "kernels": 30_000, "minimum_opacity": 0.01, "anisotropy_limit": 10.0,
 }  # fmt: skip
 
 

@@ -22,6 +22,12 @@ from gausim.reconstruction.stills import ImageSet
 FINAL_MEANS_RATE = 0.01
 FINAL_RATE = 0.1
 SSIM_WINDOW = 11
+# Weights of D-SSIM against L1 (3DGS), of the L1 error of alpha against the mask, and of long kernels.
+SSIM_WEIGHT, ALPHA_WEIGHT, ANISOTROPY_WEIGHT = 0.2, 0.2, 0.02
+# Share of an object's kernels placed at the start; splitting adds the rest. An open scene starts with all its points.
+START_SHARE = 0.6
+# Times that kernels are pruned and split.
+ROUNDS = {"object": 8, "scene": 16}
 # Pixels around the masks' bounding box that the structural loss sees as well.
 CROP_MARGIN = 6
 # Steps between two looks at the largest sizes that kernels may have.
@@ -47,17 +53,9 @@ class ReconstructionOptions:
         extent: ``object``: what the masks show, within their visual hull; ``scene``: everything in the images.
         sh_degree: degree of the spherical harmonics, 0..3.
         hull_resolution: voxels along the longest side of the visual hull.
-        hull_margin: voxels by which a kernel's centre may leave the hull.
         missing_masks: share of the views whose masks may miss a part that all others show.
-        start_share: share of the kernels placed at the start; splitting adds the rest. An open scene starts with all
-            of its points.
-        rounds: times that kernels are pruned and split.
         minimum_opacity: kernels below are pruned.
-        maximum_scale: ceiling of a standard deviation [mean distances between neighbours at the start]; of objects.
-        ssim_weight: share of D-SSIM against L1 (3DGS: 0.2).
-        alpha_weight: weight of the L1 error of alpha against the mask.
         anisotropy_limit: r of the penalty mean(max(s_max / s_min, r) - r) (PhysGaussian).
-        anisotropy_weight: its weight.
         random_background: composite over a random colour in every step instead of black.
         patience: stop early where the mean loss over a twentieth of the steps was not better so many times in a row,
             after the last round; 0 never stops.
@@ -70,16 +68,9 @@ class ReconstructionOptions:
     extent: Literal["object", "scene"] = "object"
     sh_degree: int = 1
     hull_resolution: int = 96
-    hull_margin: int = 1
     missing_masks: float = 0.0
-    start_share: float = 0.6
-    rounds: int = 8
     minimum_opacity: float = 0.05
-    maximum_scale: float = 1.5
-    ssim_weight: float = 0.2
-    alpha_weight: float = 0.2
     anisotropy_limit: float = 3.0
-    anisotropy_weight: float = 0.02
     random_background: bool = True
     patience: int = 3
     seed: int = 0
@@ -87,12 +78,12 @@ class ReconstructionOptions:
 
     def __post_init__(self) -> None:
         """Checks the ranges, or raises :class:`ConfigError`."""
-        for name in ("kernels", "iterations", "hull_resolution", "rounds"):
+        for name in ("kernels", "iterations", "hull_resolution"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"reconstruction: {name} must be at least 1, got {getattr(self, name)}.")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ConfigError(f"reconstruction: sh_degree must be 0, 1, 2 or 3, got {self.sh_degree}.")
-        for name in ("missing_masks", "minimum_opacity", "ssim_weight"):
+        for name in ("missing_masks", "minimum_opacity"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"reconstruction: {name} must be in [0, 1), got {getattr(self, name)}.")
 
@@ -100,8 +91,8 @@ class ReconstructionOptions:
     def round_steps(self) -> tuple[int, ...]:
         """Steps after which kernels are pruned and split: between 10 % and 70 % of the way."""
         first, last = 0.1 * self.iterations, 0.7 * self.iterations
-        steps = {int(first + (last - first) * i / max(1, self.rounds - 1)) for i in range(self.rounds)}
-        return tuple(sorted(steps))
+        rounds = ROUNDS[self.extent]
+        return tuple(sorted({int(first + (last - first) * i / (rounds - 1)) for i in range(rounds)}))
 
 
 def reconstruct(
@@ -217,8 +208,7 @@ class Reconstruction:
     def scene(self) -> GaussianScene:
         """The kernels that are opaque and within bounds."""
         self._limit()
-        opaque = torch.sigmoid(self.splats["opacity"].detach()) > self._options.minimum_opacity
-        self.splats.keep(self._inside() & opaque)
+        self.splats.keep(self._lasting())
         return self.splats.scene(self._name)
 
     def state(self) -> dict[str, Tensor]:
@@ -280,19 +270,19 @@ class Reconstruction:
         self.splats.blame(share.mean(-1))
 
     def _loss(self, rgb: Tensor, alpha: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
-        options = self._options
-        loss = (1 - options.ssim_weight) * (rgb - truth).abs().mean()
-        loss = loss + options.alpha_weight * (alpha - mask).abs().mean()
-        if options.ssim_weight > 0:
-            rows, columns = _crop(mask > 0)
-            first, second = (x[rows, columns].contiguous()[None, None] for x in (rgb, truth))
-            share = first.shape[2] * first.shape[3] / mask.numel()  # outside both are background: D-SSIM is zero there
-            loss = loss + options.ssim_weight * share * self._similarity(first, second)[0]
+        rows, columns = _crop(mask > 0)
+        first, second = (x[rows, columns].contiguous()[None, None] for x in (rgb, truth))
+        share = first.shape[2] * first.shape[3] / mask.numel()  # outside both are background: D-SSIM is zero there
+        similarity = SSIM_WEIGHT * share * self._similarity(first, second)[0]
         ratio = (self.splats["log_scales"].amax(-1) - self.splats["log_scales"].amin(-1)).exp()
-        return loss + options.anisotropy_weight * (ratio - options.anisotropy_limit).clamp_min(0).mean()
+        long = (ratio - self._options.anisotropy_limit).clamp_min(0).mean()
+        color, alphas = (rgb - truth).abs().mean(), (alpha - mask).abs().mean()
+        return (1 - SSIM_WEIGHT) * color + ALPHA_WEIGHT * alphas + similarity + ANISOTROPY_WEIGHT * long
 
-    def _inside(self) -> Bool[Tensor, " K"]:
-        return self._start.bounds.contains(self.splats["means"].detach())
+    def _lasting(self) -> Bool[Tensor, " K"]:
+        """Kernels that are opaque and within bounds."""
+        opaque = torch.sigmoid(self.splats["opacity"].detach()) > self._options.minimum_opacity
+        return opaque & self._start.bounds.contains(self.splats["means"].detach())
 
     @torch.no_grad()
     def _limit(self) -> None:
@@ -300,13 +290,13 @@ class Reconstruction:
         self.splats["log_scales"].copy_(torch.minimum(self.splats["log_scales"], largest.log()[:, None]))
 
     def _prune(self) -> None:
-        opaque = torch.sigmoid(self.splats["opacity"].detach()) > self._options.minimum_opacity
-        seen = self.splats.seen
-        keep = opaque & seen & self._inside()
+        seen, lasting = self.splats.seen, self._lasting()
+        keep = seen & lasting
         if keep.sum() < 2:
             raise DivergenceError(
-                f"reconstruction: only {int(keep.sum())} of {len(keep)} kernels are left after pruning (opaque: "
-                f"{int(opaque.sum())}, seen: {int(seen.sum())}). Check masks and poses, or take more iterations."
+                f"reconstruction: only {int(keep.sum())} of {len(keep)} kernels are left after pruning (opaque and "
+                f"within bounds: {int(lasting.sum())}, seen: {int(seen.sum())}). Check masks and poses, or take more "
+                "iterations."
             )
         self.splats.keep(keep)
 
@@ -355,11 +345,9 @@ def _start(images: ImageSet, options: ReconstructionOptions, cloud: PointCloud |
         return start_open(images, cloud, name=name)
     return start_object(
         images,
-        round(options.start_share * options.kernels),
+        round(START_SHARE * options.kernels),
         resolution=options.hull_resolution,
-        margin=options.hull_margin,
         missing=options.missing_masks,
-        ceiling=options.maximum_scale,
         cloud=cloud,
         name=name,
     )

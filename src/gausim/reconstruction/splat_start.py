@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
@@ -18,25 +18,14 @@ from gausim.reconstruction.stills import ImageSet
 OPAQUE = 200
 # Neighbours whose mean distance is the size of a kernel at the start.
 NEIGHBOURS = 3
-# Rows of the distances between points that are held at a time.
-ROWS = 2048
+# Voxels by which a kernel's centre may leave the hull.
+MARGIN = 1
+# Largest standard deviation of an object's kernels [mean distances between neighbours at the start].
+OBJECT_CEILING = 1.5
 # Smallest standard deviation at the start of an open scene [mean distances of the cameras].
 SMALLEST = 1e-4
 # A kernel of an open scene has at most this share of its distance to the nearest camera as standard deviation.
 OPEN_CEILING = 0.2
-
-
-@runtime_checkable
-class Bounds(Protocol):
-    """Where kernels may be, and how large there."""
-
-    def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
-        """True for the points where a kernel may be."""
-        ...
-
-    def largest(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """The largest standard deviation of a kernel at these points [scene units]."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +104,7 @@ class Start:
     points: Float[Tensor, "K 3"]
     colors: Float[Tensor, "K 3"]
     scales: Float[Tensor, " K"]
-    bounds: Bounds
+    bounds: WithinHull | BeforeCameras
     extent: float
 
 
@@ -124,9 +113,7 @@ def start_object(
     count: int,
     *,
     resolution: int,
-    margin: int,
     missing: float,
-    ceiling: float,
     cloud: PointCloud | None,
     name: str,
 ) -> Start:
@@ -136,9 +123,7 @@ def start_object(
         images: whose alpha > 0 is the object.
         count: balls.
         resolution: voxels along the longest side of the hull.
-        margin: voxels by which a kernel's centre may leave it.
         missing: share of the views whose masks may miss a part that all others show.
-        ceiling: of a standard deviation [mean distances between neighbours].
         cloud: points instead of the surface.
         name: of the scene, for errors.
 
@@ -153,7 +138,7 @@ def start_object(
             "Check that the alpha channel is the object's mask and that the poses belong to the images, or allow some "
             "masks to miss parts (--missing-masks 0.2)."
         )
-    room = hull.dilated(margin)
+    room = hull.dilated(MARGIN)
     points, normals = hull.surface()
     colors = None
     if cloud is not None:
@@ -170,7 +155,7 @@ def start_object(
     distance = neighbour_distance(points)
     chosen = _surface_colors(points, normals, images) if colors is None else colors[index]
     scales = 0.6 * distance.clamp_min(1e-3 * hull.spacing)
-    return Start(points, chosen, scales, WithinHull(room, ceiling * float(distance.mean())), hull.diagonal)
+    return Start(points, chosen, scales, WithinHull(room, OBJECT_CEILING * float(distance.mean())), hull.diagonal)
 
 
 def start_open(images: ImageSet, cloud: PointCloud, *, name: str) -> Start:
@@ -196,9 +181,9 @@ def start_open(images: ImageSet, cloud: PointCloud, *, name: str) -> Start:
 
 def neighbour_distance(points: Float[Tensor, "K 3"]) -> Float[Tensor, " K"]:
     """Mean distance of every point to its nearest neighbours [scene units]."""
-    nearest = min(NEIGHBOURS + 1, len(points))
-    parts = [torch.cdist(part, points).topk(nearest, largest=False).values[:, 1:] for part in points.split(ROWS)]
-    return torch.cat(parts).mean(-1)
+    count = min(NEIGHBOURS + 1, len(points))
+    distances, _ = cKDTree(points.numpy()).query(points.numpy(), k=count)
+    return torch.from_numpy(distances[:, 1:].mean(-1)).to(points)
 
 
 def _surface_colors(

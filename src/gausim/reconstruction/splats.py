@@ -45,7 +45,13 @@ class LearningRates:
 
 
 class Splats:
-    """K Gaussians as leaf tensors, their optimiser and what densification needs to know about them."""
+    """K Gaussians as leaf tensors, their optimiser and what densification needs to know about them.
+
+    Attributes:
+        optimizer: Adam, one group per parameter.
+        error: the largest error (K,) noted by :meth:`blame` since :meth:`forget`.
+        seen: kernels (K,) that received any gradient since :meth:`forget`.
+    """
 
     def __init__(
         self,
@@ -85,7 +91,7 @@ class Splats:
             rate = getattr(rates, name) * (extent if name == "means" else 1.0)
             groups.append({"params": [value.float().requires_grad_()], "lr": rate, "base": rate, "name": name})
         self.optimizer = torch.optim.Adam(groups, eps=1e-15)
-        self._error, self._seen = torch.zeros(count), torch.zeros(count, dtype=torch.bool)
+        self.error, self.seen = torch.zeros(count), torch.zeros(count, dtype=torch.bool)
 
     def __getitem__(self, name: str) -> Tensor:
         return next(g["params"][0] for g in self.optimizer.param_groups if g["name"] == name)
@@ -94,16 +100,6 @@ class Splats:
     def count(self) -> int:
         """Number of kernels K."""
         return self["means"].shape[0]
-
-    @property
-    def seen(self) -> Bool[Tensor, " K"]:
-        """Kernels that received any gradient since :meth:`forget`."""
-        return self._seen
-
-    @property
-    def error(self) -> Float[Tensor, " K"]:
-        """The largest error noted by :meth:`blame` since :meth:`forget`."""
-        return self._error
 
     def sh(self) -> Float[Tensor, "K B 3"]:
         """All colour coefficients."""
@@ -128,13 +124,13 @@ class Splats:
 
     def blame(self, error: Float[Tensor, " K"]) -> None:
         """Notes how much of an image's error lies under each kernel."""
-        self._error = torch.maximum(self._error, error)
+        self.error = torch.maximum(self.error, error)
 
     def step(self, decay: dict[str, float]) -> None:
         """One Adam step with the base step sizes times ``decay`` (by name, "" for all others)."""
         gradient = self["means"].grad
         if gradient is not None:
-            self._seen |= (gradient != 0).any(-1)
+            self.seen |= (gradient != 0).any(-1)
         for group in self.optimizer.param_groups:
             group["lr"] = group["base"] * decay.get(group["name"], decay[""])
         self.optimizer.step()
@@ -142,7 +138,7 @@ class Splats:
 
     def state(self) -> dict[str, Tensor]:
         """Parameters, Adam's moments and what has been noted: everything that changes."""
-        state = {"error": self._error, "seen": self._seen}
+        state = {"error": self.error, "seen": self.seen}
         for group in self.optimizer.param_groups:
             (value,), name = group["params"], group["name"]
             state[name] = value.detach()
@@ -158,15 +154,15 @@ class Splats:
             kept = {key: state[f"{name}.{key}"].clone() for key in ADAM_STATE if f"{name}.{key}" in state}
             if kept:
                 self.optimizer.state[value] = kept
-        self._error, self._seen = state["error"].clone(), state["seen"].clone()
+        self.error, self.seen = state["error"].clone(), state["seen"].clone()
 
     @torch.no_grad()
     def keep(self, mask: Bool[Tensor, " K"]) -> None:
         """Drops the other kernels; what has been noted of those that stay is kept."""
-        error, seen = self._error[mask], self._seen[mask]
+        error, seen = self.error[mask], self.seen[mask]
         if not mask.all():
             self._change(lambda value: value[mask])
-        self._error, self._seen = error, seen
+        self.error, self.seen = error, seen
 
     @torch.no_grad()
     def split(self, index: Int[Tensor, " n"]) -> None:
@@ -198,4 +194,4 @@ class Splats:
 
     def forget(self) -> None:
         """Starts afresh to gather what is seen and where errors are."""
-        self._error, self._seen = torch.zeros(self.count), torch.zeros(self.count, dtype=torch.bool)
+        self.error, self.seen = torch.zeros(self.count), torch.zeros(self.count, dtype=torch.bool)
