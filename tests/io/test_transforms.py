@@ -69,30 +69,25 @@ def test_blenders_own_layout(tmp_path: Path) -> None:
     assert posed.frames[0].path.is_file() and posed.frames[0].frame is None
 
 
-def test_intrinsics_of_a_frame_win(tmp_path: Path) -> None:
+def edited(tmp_path: Path, **fields: object) -> Path:
+    """A file whose second entry has these fields."""
     path = written(tmp_path)
     data = json.loads(path.read_text())
-    data["frames"][1]["fl_x"] = 77.0
+    data["frames"][1].update(fields)
     path.write_text(json.dumps(data))
-    assert read_transforms(path).cameras.Ks[:, 0, 0].tolist() == [30.0, 77.0]
+    return path
 
 
-@pytest.mark.parametrize(
-    ("matrix", "message"),
-    [
-        ((1.1 * torch.eye(3)).tolist(), "is not a rotation"),
-        (torch.diag(torch.tensor([1.0, 1.0, -1.0])).tolist(), "is not a rotation"),
-        (torch.zeros(3, 3).tolist(), "is not a rotation"),
-    ],
-)
-def test_pose_that_is_no_rotation(tmp_path: Path, matrix: list[list[float]], message: str) -> None:
-    path = written(tmp_path)
-    data = json.loads(path.read_text())
-    pose = data["frames"][1]["transform_matrix"]
-    for i in range(3):
-        pose[i][:3] = matrix[i]
-    path.write_text(json.dumps(data))
-    with pytest.raises(DataError, match=rf"transforms.json: transform_matrix of 'a/1.png' {message}"):
+def test_what_an_entry_says_itself_wins(tmp_path: Path) -> None:
+    assert read_transforms(edited(tmp_path, fl_x=77.0)).cameras.Ks[:, 0, 0].tolist() == [30.0, 77.0]
+    with pytest.raises(DataError, match=r"frames\[1\]: is 21x16, frames\[0\] is 20x16"):
+        read_transforms(edited(tmp_path, w=21))
+
+
+@pytest.mark.parametrize("diagonal", [(1.1, 1.1, 1.1), (1.0, 1.0, -1.0), (0.0, 0.0, 0.0)])
+def test_pose_that_is_no_rotation(tmp_path: Path, diagonal: tuple[float, float, float]) -> None:
+    path = edited(tmp_path, transform_matrix=np.diag([*diagonal, 1.0]).tolist())
+    with pytest.raises(DataError, match=r"transforms.json: transform_matrix of 'a/1.png' is not a rotation"):
         read_transforms(path)
 
 
@@ -119,15 +114,6 @@ def test_malformed_fields_are_named(tmp_path: Path, changes: dict[str, object], 
     with pytest.raises(DataError, match=message) as error:
         read_transforms(path)
     assert str(path) in str(error.value)
-
-
-def test_images_of_several_sizes(tmp_path: Path) -> None:
-    path = written(tmp_path)
-    data = json.loads(path.read_text())
-    data["frames"][1]["w"] = 21
-    path.write_text(json.dumps(data))
-    with pytest.raises(DataError, match=r"frames\[1\]: is 21x16, frames\[0\] is 20x16"):
-        read_transforms(path)
 
 
 def test_missing_file(tmp_path: Path) -> None:

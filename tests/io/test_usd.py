@@ -132,22 +132,15 @@ def test_broken_files_are_named(tmp_path: Path, change: dict[str, str], message:
         list(load_usd(tmp_path / "bad.usda").scenes())
 
 
-@pytest.mark.parametrize("content", [b"", b"#usda 1.0\ndef {", b"PXR-USDC" + bytes(80), b"\x80\x04\x95junk"])
-@pytest.mark.parametrize("suffix", [".usda", ".usdc", ".usd"])
-def test_what_is_no_usd_is_refused(tmp_path: Path, content: bytes, suffix: str) -> None:
-    path = tmp_path / f"bad{suffix}"
-    path.write_bytes(content)
-    with pytest.raises(DataError, match="bad.usd"):
-        load_usd(path)
-
-
-def test_truncated_binaries_are_refused(tmp_path: Path) -> None:
+def test_what_is_no_usd_is_refused(tmp_path: Path) -> None:
     save_usd(tmp_path / "m.usdc", motion(scene()), 24.0)
-    data = (tmp_path / "m.usdc").read_bytes()
-    for share in (0.1, 0.5, 0.9, 0.99):
-        (tmp_path / "cut.usdc").write_bytes(data[: int(share * len(data))])
-        with pytest.raises(DataError, match="cut.usdc"):
-            load_usd(tmp_path / "cut.usdc")
+    whole = (tmp_path / "m.usdc").read_bytes()
+    cut = [whole[: int(share * len(whole))] for share in (0.1, 0.5, 0.9, 0.99)]
+    for content in (b"", b"#usda 1.0\ndef {", b"PXR-USDC" + bytes(80), b"\x80\x04\x95junk", *cut):
+        for suffix in (".usda", ".usdc", ".usd"):
+            (tmp_path / f"bad{suffix}").write_bytes(content)
+            with pytest.raises(DataError, match="bad.usd"):
+                load_usd(tmp_path / f"bad{suffix}")
 
 
 def test_names_and_sizes_are_checked(tmp_path: Path, monkeypatch) -> None:

@@ -312,7 +312,7 @@ def _write_pictures(motion: Motion, path: Path, arguments: argparse.Namespace) -
     pictures = _pictures(motion, arguments)
     if arguments.format == "gif":
         return write_gif(path, pictures, motion.fps)
-    return write_video(path, pictures, motion.fps).frames
+    return write_video(path, pictures, motion.fps)
 
 
 _WRITERS: dict[str, Callable[[Motion, Path, argparse.Namespace], int]] = {

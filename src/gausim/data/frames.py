@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -22,28 +21,7 @@ POSE_TOLERANCE = 1e-5
 FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".hevc", ".h265", ".mts")
 
 
-@runtime_checkable
-class FrameSource(Protocol):
-    """The frames of one sequence.
-
-    Attributes:
-        count: number of frames.
-        cameras: one per view, in the data set's order.
-    """
-
-    count: int
-    cameras: Cameras
-
-    def read(self, frames: range, columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:
-        """Straight-alpha RGBA of these frames and cameras, all of which exist."""
-        ...
-
-    def absent(self) -> list[Path]:
-        """Files of frames that are named but not there."""
-        ...
-
-
-def open_frames(root: Path, views: Sequence[str], fps: float) -> FrameSource:
+def open_frames(root: Path, views: Sequence[str], fps: float) -> PackedSource | ImageSource:
     """The frames of a sequence's folder; only headers are read.
 
     Args:
@@ -66,7 +44,12 @@ def open_frames(root: Path, views: Sequence[str], fps: float) -> FrameSource:
 
 
 class PackedSource:
-    """Packed frames: every call reads what it asks for, so memory does not grow with the data set."""
+    """Packed frames: every call reads what it asks for, so memory does not grow with the data set.
+
+    Attributes:
+        count: number of frames.
+        cameras: one per view, in the data set's order.
+    """
 
     def __init__(self, root: Path, views: Sequence[str], fps: float) -> None:
         """Reads the header; no frame is read yet."""
@@ -83,16 +66,16 @@ class PackedSource:
         self.count, self.cameras = packed.count, packed.cameras.select(self._columns)
 
     def read(self, frames: range, columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:
-        """See :class:`FrameSource`."""
+        """Straight-alpha RGBA of these frames and cameras, all of which exist."""
         return self._packed.read(frames, [self._columns[column] for column in columns])
 
     def absent(self) -> list[Path]:
-        """See :class:`FrameSource`; a header is read with its pixels' size, so nothing can be."""
+        """None: a header is read with its pixels' size."""
         return []
 
 
 class ImageSource:
-    """Image files: each is decoded once and kept in memory."""
+    """Image files, with the attributes of :class:`PackedSource`: each is decoded once and kept in memory."""
 
     def __init__(self, root: Path, views: Sequence[str], fps: float) -> None:
         """Reads ``transforms.json``; no image is decoded yet."""
@@ -110,7 +93,7 @@ class ImageSource:
         self._decoded = np.zeros((self.count, len(views)), bool)
 
     def read(self, frames: range, columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:
-        """See :class:`FrameSource`.
+        """Straight-alpha RGBA of these frames and cameras, all of which exist.
 
         Raises:
             DataError: an image is missing or malformed.
@@ -123,7 +106,7 @@ class ImageSource:
         return torch.from_numpy(self._pixels[np.ix_(list(frames), list(columns))])
 
     def absent(self) -> list[Path]:
-        """See :class:`FrameSource`."""
+        """Files of frames that are named but not there."""
         return [frame.path for row in self._frames for frame in row if not frame.path.is_file()]
 
 

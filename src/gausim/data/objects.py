@@ -16,7 +16,7 @@ from gausim.core import DataError, GaussianScene
 from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_array, read_stills
 from gausim.data.scenes import select_masks
 from gausim.io.ply import load_scene
-from gausim.io.transforms import read_json
+from gausim.io.transforms import positive_field, read_json
 from gausim.ops.selection import Selection, require_pinned
 
 
@@ -62,7 +62,7 @@ class ObjectData:
         path = self.root / "dataset.json"
         self.facts = read_json(path)
         self.name = str(self.facts.get("name", self.root.name))
-        self.fps = _positive(self.facts, "fps", path)
+        self.fps = positive_field(self.facts, "fps", str(path))
         self.views = _names(self.facts, "views", path)
         self.train_views = _names(self.facts, "train_views", path)
         self.heldout_views = _names(self.facts, "heldout_views", path)
@@ -112,13 +112,9 @@ class ObjectData:
         """True motion of a sequence of this object, or None where it is unknown."""
         return sequence.ground_truth(self.rest_points)
 
-    @cached_property
-    def _stills(self) -> Stills:
-        return read_stills(self.root / "static" / "transforms.json")
-
     def stills(self) -> Stills:
-        """Posed images of the rest state, decoded once, with the split that reconstruction is measured by."""
-        return self._stills
+        """Posed images of the rest state, with the split that reconstruction is measured by."""
+        return read_stills(self.root / "static" / "transforms.json")
 
     @property
     def diagonal(self) -> float | None:
@@ -180,21 +176,9 @@ def _names(facts: dict[str, Any], key: str, path: Path) -> tuple[str, ...]:
     return tuple(value)
 
 
-def _positive(facts: dict[str, Any], key: str, path: Path) -> float:
-    value = facts.get(key)
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
-        raise DataError(f"{path}: field '{key}' must be a positive number, got {value!r}.")
-    return float(value)
-
-
 def _frame_range(facts: dict[str, Any], path: Path) -> range:
     value = facts.get("train_frames")
-    if (
-        not isinstance(value, list)
-        or len(value) != 2
-        or not all(type(v) is int for v in value)
-        or value[0] != 0
-        or value[1] < 2
-    ):
+    numbers = value if isinstance(value, list) and all(type(v) is int for v in value) else []
+    if len(numbers) != 2 or numbers[0] != 0 or numbers[1] < 2:
         raise DataError(f"{path}: field 'train_frames' must be [0, first unseen frame], e.g. [0, 16], got {value!r}.")
-    return range(*value)
+    return range(*numbers)

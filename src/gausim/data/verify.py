@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from gausim.core import GausSimError
@@ -56,8 +57,7 @@ def verify(root: Path, *, quick: bool = False, scene: bool = True) -> list[Fault
     return faults
 
 
-def _check(where: str, action: object) -> list[Fault]:
-    assert callable(action)
+def _check(where: str, action: Callable[[], object]) -> list[Fault]:
     try:
         action()
     except (GausSimError, OSError) as error:
@@ -89,14 +89,14 @@ def _sequences(data: ObjectData, *, quick: bool) -> Iterator[Fault]:
             )
         elif not quick:
             yield from _images(record, where)
-        yield from _check(f"{where}/ground_truth.npz", lambda record=record: data.ground_truth(record))
+        yield from _check(f"{where}/ground_truth.npz", partial(data.ground_truth, record))
 
 
 def _images(record: SequenceRecord, where: str) -> Iterator[Fault]:
     """Reads every image and looks for the object; packed pixels are hashed."""
     if is_packed(record.root):
         packed = read_packed(record.root)
-        if packed.digest() != packed.sha256:
+        if sha256(record.root / PIXELS) != packed.sha256:
             yield Fault(f"{where}/{PIXELS}", "its bytes are not those that were packed. Pack the sequence again.")
             return
     seen = dict.fromkeys(record.views, False)

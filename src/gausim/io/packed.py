@@ -18,8 +18,7 @@ from jaxtyping import UInt8
 from torch import Tensor
 
 from gausim.core import Cameras, DataError
-from gausim.io.files import sha256
-from gausim.io.transforms import read_json
+from gausim.io.transforms import positive_field, read_json
 
 SCHEMA = 1
 HEADER, PIXELS = "frames.json", "frames.bin"
@@ -73,29 +72,23 @@ class PackedFrames:
     size: int
     sha256: str
 
-    def read(self, frames: Sequence[int], columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:
-        """Whole images of these frames and views, transparent black outside the crops.
+    def read(self, frames: range, columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:
+        """Whole images of consecutive frames of these views, transparent black outside the crops.
 
         Only the bytes asked for are read, and nothing stays in memory.
         """
         path, (height, width) = self.folder / PIXELS, (self.cameras.height, self.cameras.width)
         images = np.zeros((len(frames), len(columns), height, width, 4), np.uint8)
+        try:
+            stored = np.memmap(path, np.uint8, mode="r", shape=(self.size,)) if self.size else np.empty(0, np.uint8)
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path}: cannot be read ({error}). `gausim verify` tells what is wrong.") from error
         for row, column in enumerate(columns):
             crop = self.crops[column]
-            if not crop.frame_bytes:
-                continue
-            shape = (self.count, crop.height, crop.width, 4)
-            try:
-                stored = np.memmap(path, np.uint8, mode="r", offset=crop.offset, shape=shape)
-            except (OSError, ValueError) as error:
-                raise DataError(f"{path}: cannot be read ({error}). `gausim verify` tells what is wrong.") from error
-            part = images[:, row, crop.top : crop.top + crop.height, crop.left : crop.left + crop.width]
-            np.copyto(part, stored[list(frames)] if not _ascending(frames) else stored[frames[0] : frames[-1] + 1])
+            begin, end = (crop.offset + frame * crop.frame_bytes for frame in (frames.start, frames.stop))
+            pixels = stored[begin:end].reshape(len(frames), crop.height, crop.width, 4)
+            images[:, row, crop.top : crop.top + crop.height, crop.left : crop.left + crop.width] = pixels
         return torch.from_numpy(images)
-
-    def digest(self) -> str:
-        """SHA-256 of ``frames.bin`` as it is."""
-        return sha256(self.folder / PIXELS)
 
 
 def is_packed(folder: Path) -> bool:
@@ -115,9 +108,8 @@ def read_packed(folder: Path) -> PackedFrames:
         raise DataError(f"{path}: schema is {data.get('schema')!r}, expected {SCHEMA}. Pack the sequence again.")
     count = _integer(data, "frames", path, 1, MOST_FRAMES)
     width, height = (_integer(data, key, path, 1, MOST_PIXELS) for key in ("width", "height"))
-    fps, size, content = data.get("fps"), _integer(data, "bytes", path, 0, 1 << 62), data.get("sha256")
-    if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps < float("inf"):
-        raise DataError(f"{path}: field 'fps' must be a positive number, got {fps!r}.")
+    fps, size = positive_field(data, "fps", str(path)), _integer(data, "bytes", path, 0, 1 << 62)
+    content = data.get("sha256")
     if not isinstance(content, str) or len(content) != 64:
         raise DataError(f"{path}: field 'sha256' must be 64 hexadecimal digits, got {content!r}.")
     views = data.get("views")
@@ -129,11 +121,7 @@ def read_packed(folder: Path) -> PackedFrames:
     if not pixels.is_file() or pixels.stat().st_size != size:
         found = f"{pixels.stat().st_size} bytes" if pixels.is_file() else "no such file"
         raise DataError(f"{pixels}: expected {size} bytes as {HEADER} says, got {found}. Pack the sequence again.")
-    return PackedFrames(folder, count, float(fps), cameras, crops, size, content)
-
-
-def _ascending(frames: Sequence[int]) -> bool:
-    return list(frames) == list(range(frames[0], frames[0] + len(frames)))
+    return PackedFrames(folder, count, fps, cameras, crops, size, content)
 
 
 def _integer(data: dict[str, Any], key: str, where: Path | str, low: int, high: int) -> int:
@@ -163,19 +151,18 @@ def _cameras(views: list[dict[str, Any]], path: Path, width: int, height: int) -
     names = [view.get("name") for view in views]
     if not all(isinstance(name, str) for name in names) or len(set(names)) != len(names):
         raise DataError(f"{path}: field 'name' of the views must be different texts, got {names}.")
-    matrices = {}
-    for key, side in (("viewmat", 4), ("K", 3)):
-        for i, view in enumerate(views):
-            try:
-                found = torch.tensor(view.get(key), dtype=torch.float64)
-            except (TypeError, ValueError, RuntimeError):
-                found = torch.empty(0)
-            if found.shape != (side, side) or not torch.isfinite(found).all():
-                raise DataError(f"{path}: views[{i}]: field '{key}' must be a finite {side} x {side} matrix.")
-            matrices[key, i] = found.float()
-    for i in range(len(views)):
-        k = matrices["K", i]
-        if min(float(k[0, 0]), float(k[1, 1])) <= 0 or not torch.equal(k[2], torch.tensor([0.0, 0.0, 1.0])):
-            raise DataError(f"{path}: views[{i}]: field 'K' must have positive focal lengths and end in 0 0 1.")
-    stacked = [torch.stack([matrices[key, i] for i in range(len(views))]) for key in ("viewmat", "K")]
+    stacked = [torch.stack([_matrix(view, key, side, f"{path}: views[{i}]") for i, view in enumerate(views)])
+               for key, side in (("viewmat", 4), ("K", 3))]  # fmt: skip
     return Cameras(stacked[0], stacked[1], width, height, tuple(map(str, names))).validated(str(path))
+
+
+def _matrix(view: dict[str, Any], key: str, side: int, where: str) -> Tensor:
+    try:
+        found = torch.tensor(view.get(key), dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        found = torch.empty(0)
+    if found.shape != (side, side) or not torch.isfinite(found).all():
+        raise DataError(f"{where}: field '{key}' must be a finite {side} x {side} matrix.")
+    if key == "K" and (found.diag().min() <= 0 or found[2].tolist() != [0, 0, 1]):
+        raise DataError(f"{where}: field 'K' must have positive focal lengths and end in 0 0 1.")
+    return found.float()

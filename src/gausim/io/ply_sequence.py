@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -11,10 +9,10 @@ from pathlib import Path
 from gausim.core import DataError, GaussianScene, SceneError
 from gausim.io.files import write_json
 from gausim.io.ply import load_scene, save_masks, save_scene
+from gausim.io.transforms import positive_field, read_json
 
 # SuperSplat orders files by the number at the end of their names.
 _NAME = re.compile(r"(?P<stem>.+)_(?P<number>\d{4,6})\.ply")
-_LARGEST_FACTS = 1 << 16
 
 
 def save_ply_sequence(folder: Path | str, name: str, frames: Iterable[GaussianScene], fps: float) -> list[Path]:
@@ -99,15 +97,6 @@ def _stem(path: Path) -> str:
 
 
 def _rate(path: Path, fps: float | None) -> float:
-    if fps is None and path.is_file():
-        try:
-            if path.stat().st_size > _LARGEST_FACTS:
-                raise ValueError("too large")
-            fps = json.loads(path.read_text(encoding="utf-8"))["fps"]
-        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            raise DataError(f"{path}: field 'fps' cannot be read ({error}). State the rate (--fps).") from error
-    if fps is None:
+    if fps is None and not path.is_file():
         raise DataError(f"{path}: no such file, so the frame rate is unknown. State it (--fps).")
-    if not isinstance(fps, int | float) or isinstance(fps, bool) or not (math.isfinite(fps) and fps > 0):
-        raise DataError(f"{path}: field 'fps': expected a number > 0, got {str(fps)[:80]}.")
-    return float(fps)
+    return positive_field(read_json(path) if fps is None else {"fps": fps}, "fps", str(path))

@@ -136,6 +136,14 @@ def number_field(fields: dict[str, Any], key: str, where: str) -> float:
     return float(value)
 
 
+def positive_field(fields: dict[str, Any], key: str, where: str) -> float:
+    """A field that must be a positive finite number, or :class:`DataError` that names it."""
+    value = number_field(fields, key, where)
+    if value <= 0:
+        raise DataError(f"{where}: field '{key}' must be a positive number, got {value:g}.")
+    return value
+
+
 def image_name(entry: dict[str, Any], field: str) -> str:
     """The image that an entry names, with its extension (Blender's own files leave it out).
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
@@ -22,17 +21,6 @@ FALLBACK = "mpeg4"
 FINE, SMALL = 16, 21
 
 
-@dataclass(frozen=True)
-class VideoInfo:
-    """What was written: the file, its codec, number of frames and size [pixels]."""
-
-    path: Path
-    codec: str
-    frames: int
-    width: int
-    height: int
-
-
 def video_codec() -> str:
     """H.264 where this PyAV can encode it, else MPEG-4 with a warning that says so."""
     if H264 in av.codecs_available:
@@ -47,8 +35,8 @@ def video_codec() -> str:
 
 def write_video(
     path: Path | str, frames: Iterable[np.ndarray], fps: float, *, codec: str | None = None, quality: int = FINE
-) -> VideoInfo:
-    """Writes (H, W, 3) uint8 RGB frames as MP4, one at a time as they come.
+) -> int:
+    """Writes (H, W, 3) uint8 RGB frames as MP4, one at a time as they come; returns their number.
 
     Odd sizes grow by one repeated row or column, because the chroma planes have half the size.
 
@@ -82,7 +70,7 @@ def write_video(
             container.mux(stream.encode())
     except (FFmpegError, ValueError) as error:
         raise DataError(f"{path}: encoder '{codec}' failed ({error}). Check the folder and the free space.") from error
-    return VideoInfo(path, codec, count, width, height)
+    return count
 
 
 def read_video(path: Path | str) -> Iterator[np.ndarray]:
