@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from itertools import chain
@@ -14,29 +13,13 @@ from av.error import FFmpegError
 
 from gausim.core import DataError
 
-H264 = "libx264"
-# Built into every FFmpeg; larger files, played by nearly everything.
-FALLBACK = "mpeg4"
+H264 = "libx264"  # in the wheels of PyAV
 # Constant rate factor of H.264, lower is better: visually lossless, and half the bytes of that, for pages.
 FINE, SMALL = 16, 21
 
 
-def video_codec() -> str:
-    """H.264 where this PyAV can encode it, else MPEG-4 with a warning that says so."""
-    if H264 in av.codecs_available:
-        return H264
-    warnings.warn(
-        f"this PyAV has no encoder '{H264}': writing MPEG-4 part 2 instead (larger; browsers may not play it). "
-        "The wheels of `pip install av` have it.",
-        stacklevel=2,
-    )
-    return FALLBACK
-
-
-def write_video(
-    path: Path | str, frames: Iterable[np.ndarray], fps: float, *, codec: str | None = None, quality: int = FINE
-) -> int:
-    """Writes (H, W, 3) uint8 RGB frames as MP4, one at a time as they come; returns their number.
+def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float, *, quality: int = FINE) -> int:
+    """Writes (H, W, 3) uint8 RGB frames as MP4 (H.264), one at a time as they come; returns their number.
 
     Odd sizes grow by one repeated row or column, because the chroma planes have half the size.
 
@@ -44,23 +27,21 @@ def write_video(
         path: the file, with suffix .mp4.
         frames: at least one frame, all of one size.
         fps: frames per second.
-        codec: encoder name; :func:`video_codec` chooses when None.
-        quality: constant rate factor of H.264; other encoders keep theirs.
+        quality: constant rate factor.
 
     Raises:
         DataError: no frames, frames of different size or type, or the encoder fails.
     """
-    path, codec = Path(path), codec or video_codec()
-    options = {H264: {"crf": str(quality), "preset": "medium"}, FALLBACK: {"qscale": "2", "b": "12000000"}}
+    path = Path(path)
     first, frames = _peek(path, frames)
     height, width = (n + n % 2 for n in first.shape[:2])
     path.parent.mkdir(parents=True, exist_ok=True)
     count = 0
     try:
         with av.open(str(path), "w") as container:
-            stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
+            stream = container.add_stream(H264, rate=Fraction(fps).limit_denominator(1001))
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-            stream.options = options.get(codec, {})
+            stream.options = {"crf": str(quality), "preset": "medium"}
             for pixels in frames:
                 _check(path, pixels, first.shape)
                 padded = np.pad(pixels, ((0, height - len(pixels)), (0, width - pixels.shape[1]), (0, 0)), mode="edge")
@@ -69,7 +50,10 @@ def write_video(
                 count += 1
             container.mux(stream.encode())
     except (FFmpegError, ValueError) as error:
-        raise DataError(f"{path}: encoder '{codec}' failed ({error}). Check the folder and the free space.") from error
+        raise DataError(
+            f"{path}: encoder '{H264}' failed ({error}). Check the folder and the free space, and that PyAV has the "
+            "encoder (`pip install av`)."
+        ) from error
     return count
 
 
