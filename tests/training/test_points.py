@@ -16,6 +16,7 @@ from gausim.data.records import GroundTruth
 from gausim.losses import ImageLoss, Objective
 from gausim.metrics import point_error
 from gausim.render.reference import ReferenceRenderer
+from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.rollout import States
 from gausim.training.supervision.images import Sources
@@ -154,16 +155,14 @@ def test_a_module_learns_from_points_and_draws_nothing() -> None:
         raise AssertionError("drawn")
 
     module = GausSimModule(
-        model=model,
-        initial_states=sway.Previous(model, (0, 0, 0)),
-        scene_of_sequence=(0, 0, 0),
+        method=SharedSimulator(model, sway.Previous(model, (0, 0, 0)), (0, 0, 0)),
         renderer=refuse,  # type: ignore[arg-type]
         objective=Objective(static_weight=0.0, momentum_weight=0.0, backprop_steps=0),
-        optimizer=replace(sway.OptimizerSettings(), network_lr=1e-3, scene_lr=1e-3, initial_lr=1e-4),
+        optimizer=replace(sway.OptimizerSettings(), network_lr=2e-3, scene_lr=2e-3, initial_lr=2e-4),
         supervision=PointSupervision(sources(lambda number: known[number], model.scenes)),
     )
     optimizer, draws = module.configure_optimizers(), torch.Generator().manual_seed(0)
-    found = [module.optimise([sample(0), sample(1)], optimizer, draws) for _ in range(60)]
+    found = [module.optimise([sample(0), sample(1)], optimizer, draws) for _ in range(30)]
     assert found[0]["ratio_static"] == pytest.approx(1.0) and found[0]["motion_energy"] < 1e-6
     assert found[-1]["ratio_static"] < 0.1 and 0.6 < found[-1]["motion_energy"] < 1.4
     assert float(model.drift[0].detach()) == pytest.approx(0.02, rel=0.3)

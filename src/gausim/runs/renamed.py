@@ -21,13 +21,14 @@ MOVED = {
     "gausim.engine.optim": "gausim.training.optimizers",
     "gausim.engine.panels": "gausim.training.callbacks.panels",
     "gausim.engine.points": "gausim.training.supervision.points",
-    "gausim.engine.run.make_trainer": "gausim.training.trainer.make_trainer",
+    "gausim.engine.run.make_trainer": "gausim.training.trainer.TrainerSettings",
     "gausim.engine.stages": "gausim.training.fitted.stages",
     "gausim.engine.tracks": "gausim.training.supervision.motion_tracks",
     "gausim.engine.wandb_log": "gausim.training.loggers.wandb",
     "gausim.models.elastic": "gausim.models.template.elastic",
     "gausim.models.material": "gausim.models.template.material",
     "gausim.models.simulator": "gausim.models.step.simulator",
+    "gausim.training.trainer.make_trainer": "gausim.training.trainer.TrainerSettings",
 }
 
 
@@ -91,6 +92,8 @@ def with_present_names(config: Any) -> Any:
         IndexError, TypeError, ValueError: levels that cannot be read, or a setting that is no longer supported.
     """
     if isinstance(config, dict):
+        if str(config.get("_target_")).endswith(".ConstantSchedule"):  # constant is what no schedule means
+            return None
         found = {k: _present(v) if k == "_target_" else with_present_names(v) for k, v in config.items()}
         if found.get("_target_") == ELASTIC:
             return _settled(found)

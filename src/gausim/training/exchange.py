@@ -17,7 +17,6 @@ class Exchange:
     """Makes the parts of the ranks the step of one rank; for a rank that is alone, it only keeps the statistics."""
 
     def __init__(self, ranks: Ranks, model: nn.Module) -> None:
-        """Looks for the model's running statistics."""
         self._ranks, self._normalisers = ranks, normalisers_of(model)
         self._begun = False
 

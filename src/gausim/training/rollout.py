@@ -45,7 +45,6 @@ class Views:
     """
 
     def __init__(self) -> None:
-        """Knows no sequence yet."""
         self._keys: dict[tuple[int, tuple[str, ...]], Hashable] = {}
 
     def key(self, sample: SequenceSample) -> Hashable:
@@ -123,7 +122,6 @@ class Looks:
     """The appearance of every scene's foreground, made once and moved to the device on first use."""
 
     def __init__(self, scenes: Sequence[GaussianScene]) -> None:
-        """Keeps the scenes."""
         self._scenes = list(scenes)
         self._made: dict[int, SceneAppearance] = {}
 

@@ -37,7 +37,10 @@ def optimise(
     whole = interleave(learner.ranks.gather([sample.facts for sample in samples]))
     learner.exchange.begin(lambda: _see_first_frame(learner, samples))
     statistics = roll_out(learner, samples, whole, draws)
-    inputs = StepInputs(samples, whole, draws, statistics, learner.ranks, learner.accumulate, learner.rest_loss)
+    inputs = StepInputs(
+        samples, whole, draws, statistics, learner.ranks, learner.accumulate, learner.rest_loss, learner.objective,
+        learner.images, learner.diagonals,
+    )  # fmt: skip
     for term in learner.terms():
         term.descend(inputs)
     weights = [p for p in learner.parameters() if p.requires_grad]
@@ -136,11 +139,11 @@ def _momentum_unit(learner: Learner, samples: list[SequenceSample]) -> float:
 def _read(learner: Learner, samples: list[SequenceSample], whole: list[SampleFacts], found: Found) -> dict[str, float]:
     """Joins the numbers of all ranks, checks them and forms what is logged."""
     parts = learner.ranks.gather((found, [learner.baseline(sample) for sample in samples]))
-    numbers = Found.join([part[0] for part in parts]).numbers(whole, learner.objective.explosion)
+    lasting = Found.join([part[0] for part in parts]).lasting(whole, learner.objective.explosion)
     baselines = interleave([part[1] for part in parts])
     learner.baselines.learn([s.sequence_id for s in whole], baselines)
-    learner.barren = 0 if numbers.images else learner.barren + 1
+    learner.barren = 0 if lasting.images else learner.barren + 1
     if learner.barren >= BARREN_BATCHES:
         far = f"kernels moved beyond {learner.objective.explosion} diagonals in {BARREN_BATCHES} batches in a row"
         raise DivergenceError(describe(0, whole, None, far))
-    return numbers.stats(whole[0].steps, len(whole), baselines)
+    return lasting.stats(whole[0].steps, baselines)
