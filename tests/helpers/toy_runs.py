@@ -23,7 +23,7 @@ TINY = (
     "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
     "data.repeats=2", "data.curriculum.t_max=3", "data.curriculum.t_start=1", "trainer.convergence.held_back=1",
     "trainer.convergence.window=2", "optimizer.schedule.warmup=0.5", "data.batch_size=1",
-    "render=reference", "optimizer.ema_decay=0.9", "loss.input_noise=0.001", "trainer.threads=1",
+    "render=reference", "optimizer.ema_decay=0.9", "trainer.threads=1",
     "trainer.progress=false", "trainer.log_every_n_steps=1", "callbacks.panels=null", "doctor=false",
 )  # fmt: skip
 

@@ -32,6 +32,7 @@ OLD = {
             "passive_frames": 4, "conserve_mass": False,
         }
     },
+    "loss": {"_target_": "gausim.losses.objective.Objective", "input_noise": 0.0, "static_weight": 2.0},
     "optimizer": {"schedule": {"_target_": "gausim.engine.optim.ConstantSchedule"}},
     "trainer": {"_target_": "gausim.training.trainer.make_trainer", "max_epochs": 3, "devices": 2},
     "callbacks": [{"_target_": "gausim.engine.callbacks.Progress"}, {"_target_": "torch.nn.Module"}],
@@ -44,6 +45,7 @@ def test_a_configuration_of_before_is_read_by_present_names(tmp_path) -> None:
     assert [c["_target_"] for c in found["callbacks"]] == [
         "gausim.training.callbacks.progress.Progress", "torch.nn.Module",
     ]  # fmt: skip
+    assert instantiate(found["loss"]).static_weight == 2.0
     assert found["optimizer"] == {"schedule": None}
     assert instantiate(found["trainer"]) == TrainerSettings(devices=2, max_epochs=3)
     simulator = found["model"]["simulator"]

@@ -46,19 +46,6 @@ def test_a_rank_that_is_killed_ends_the_run_and_the_same_command_continues_to_th
 
 
 @pytest.mark.slow
-def test_the_first_rank_is_killed_and_the_same_command_continues_to_the_same_bits(
-    trainings: Trainings, whole: Path
-) -> None:
-    settings = (*TWO, "trainer.max_epochs=3", "callbacks.checkpoint.every_steps=2")
-    assert trainings("first_cut", *settings, **killed(STEP, 3))[0] == -9
-    assert trainings("first_cut", *settings, **killed("gausim.runs.checkpoint._check_written", 2))[0] == -9
-    assert trainings("first_cut", *settings, **killed(STEP, 4))[0] == -9
-    status, output = trainings("first_cut", *settings)
-    assert status == 0, output
-    assert_same_run(trainings.run("first_cut"), whole)
-
-
-@pytest.mark.slow
 def test_two_ranks_learn_what_one_does(trainings: Trainings, whole: Path) -> None:
     status, output = trainings("alone", "trainer=cpu", "data.batch_size=2", "trainer.max_epochs=3")
     assert status == 0, output

@@ -168,27 +168,6 @@ def test_a_module_learns_from_points_and_draws_nothing() -> None:
     assert float(model.drift[0].detach()) == pytest.approx(0.02, rel=0.3)
 
 
-def test_velocities_count_as_much_as_they_are_weighted() -> None:
-    known, made = truth(), states(4, 1)
-    plain_loss, weighted = (
-        PointSupervision(sources(lambda number: known), velocity_weight=w).comparison([sample(0, 5)], batch(1))
-        for w in (0.0, 3.0)
-    )
-    points = torch.cat((known.rest[None], plain(known, made, 0)))
-    off = 100 * (points.diff(dim=0) - known.positions[:5].diff(dim=0)).norm(dim=-1) / SCENE.diagonal
-    expected = plain_loss(made, 0)[0][:, 0] + 3 * off.square().mean(1)
-    torch.testing.assert_close(weighted(made, 0)[0][:, 0], expected)
-    work = PointSupervision(sources(lambda number: known), velocity_weight=3.0).comparison([sample(0, 5)], batch(1))
-    parts = [work(States(*(x[s] for x in made.tensors())), s.start)[0] for s in (slice(0, 2), slice(2, 4))]
-    torch.testing.assert_close(torch.cat(parts)[:, 0], expected)  # across the border of two stretches
-    still = PointSupervision(sources(lambda number: known), velocity_weight=3.0)
-    percent = (100 / SCENE.diagonal) ** 2
-    true = percent * (known.positions - known.rest).square().sum(-1).mean(1)
-    steps = percent * known.positions.diff(dim=0).square().sum(-1).mean(1)
-    assert still.static(sample(0, 4), SCENE.means, 0).losses[1:] == pytest.approx((true[1:5] + 3 * steps[:4]).tolist())
-    assert still.static(sample(0, 4), SCENE.means, 3).losses == pytest.approx((true[3:5] + 3 * steps[2:4]).tolist())
-
-
 def test_energy_of_each_half_counts_by_its_logarithm_in_units_of_the_rest_state() -> None:
     known, made = truth(), states(5, 1)
     plain_loss, weighted = (

@@ -129,20 +129,6 @@ def test_a_collapse_is_warned_of_once(tmp_path: Path, monkeypatch: pytest.Monkey
     assert sum("collapsed" in str(w.message) for w in caught) == 1
 
 
-def test_noise_moves_only_free_kernels_and_depends_on_the_seed() -> None:
-    from gausim.training.rollout import UnitNoise
-
-    module = sway_module()
-    batch = module.model.batch([0, 1])
-    pinned = torch.cat([s.pinned for s in module.simulator.scenes])
-    made = []
-    for seed in (0, 0, 1):
-        noise = UnitNoise(batch, module.simulator.scenes, [0.1, 0.1], seed, [0, 1])
-        made.append(noise(SimState(batch.rest, batch.rest)).positions - batch.rest)
-    assert float(made[0][pinned].abs().max()) == 0.0 and float(made[0][~pinned].abs().min()) > 0.0
-    assert torch.equal(made[0], made[1]) and not torch.equal(made[0], made[2])
-
-
 def test_schedules() -> None:
     halving = HalvingSchedule(first=16, every=2)
     assert [halving.factor(e, 25) for e in (0, 15.9, 16, 17.5, 18, 24)] == [1, 1, 0.5, 0.5, 0.25, 0.5**5]

@@ -170,7 +170,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 def test_one_read_per_optimiser_step(backprop_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     from gausim.kernels.compiled import torch_only
 
-    _, module = pair(Objective(backprop_steps=backprop_steps, input_noise=0.01), 0.01)
+    _, module = pair(Objective(backprop_steps=backprop_steps), 0.01)
     module.images.renderer = blobs
     module.settings = OptimizerSettings(optimizer=torch.optim.SGD, ema_decay=0.9)  # Adam counts steps on the host
     optimizer, batch = module.configure_optimizers(), [sample(0), sample(1)]

@@ -30,7 +30,11 @@ MOVED = {
     "gausim.models.simulator": "gausim.models.step.simulator",
     "gausim.training.trainer.make_trainer": "gausim.training.trainer.TrainerSettings",
 }
-
+# Settings that no longer exist, by the name of what had them; they were off unless asked for.
+GONE = {
+    "Objective": ("input_noise",),
+    **dict.fromkeys(("PointSupervision", "TrackSupervision", "tracks_or_images"), ("velocity_weight",)),
+}
 
 SIMULATOR = "gausim.models.step.simulator.GausSim"
 # Where the arguments of the simulator went, and the names they have there.
@@ -92,9 +96,11 @@ def with_present_names(config: Any) -> Any:
         IndexError, TypeError, ValueError: levels that cannot be read, or a setting that is no longer supported.
     """
     if isinstance(config, dict):
-        if str(config.get("_target_")).endswith(".ConstantSchedule"):  # constant is what no schedule means
+        name = str(config.get("_target_")).rsplit(".", 1)[-1]
+        if name == "ConstantSchedule":  # constant is what no schedule means
             return None
-        found = {k: _present(v) if k == "_target_" else with_present_names(v) for k, v in config.items()}
+        kept = {k: v for k, v in config.items() if k not in GONE.get(name, ())}
+        found = {k: _present(v) if k == "_target_" else with_present_names(v) for k, v in kept.items()}
         if found.get("_target_") == ELASTIC:
             return _settled(found)
         if found.get("_target_") in GROUPS and "discretisation" not in found:

@@ -39,7 +39,7 @@ class GausSimModule(Learner, LightningModule):
         """Takes everything it works with; it builds nothing.
 
         Args:
-            seed: of the static loss's draws and the input noise, together with the step's number.
+            seed: of each step's draws (static loss, free motion), together with its number.
             fraction_every: optimiser steps between measurements of how much of the gradient is of momentum; 0 is never.
             parts: see :class:`~gausim.training.learner.Learner`.
         """
@@ -96,7 +96,7 @@ class GausSimModule(Learner, LightningModule):
         Args:
             samples: this rank's part of the batch; it may be empty where there are several.
             optimizer: from :meth:`configure_optimizers`.
-            draws: of the static loss and the input noise.
+            draws: random numbers of the step: static loss, free motion.
             advance: makes the optimiser's step; its own ``step`` when None.
 
         Returns:

@@ -8,12 +8,11 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from gausim.core import ConfigError, DivergenceError, SimState
+from gausim.core import ConfigError, DivergenceError
 from gausim.data.dataset import SampleFacts, SequenceSample
-from gausim.training.contracts import SceneBatch
 from gausim.training.learner import Learner
 from gausim.training.ranks.ranks import interleave
-from gausim.training.rollout import Explosions, States, UnitNoise, after, describe, windows
+from gausim.training.rollout import Explosions, States, after, describe, windows
 from gausim.training.statistics import Found, Statistics
 from gausim.training.terms.term import StepInputs
 
@@ -78,11 +77,10 @@ def roll_out(
         any(explosions.end(None, start, statistics.reach) for start in range(0, steps, length))
         return statistics
     comparison = learner.supervision.comparison(samples, batch)
-    starts: list[Callable[[SimState], SimState]] = [explosions.restart, *_noise(learner, batch, draws)]
     initial, kept = learner.initial(samples, batch), objective.checkpoint_steps
     per = objective.step_weight(steps) / len(whole)
     own, last = torch.zeros(len(samples), device=device), initial
-    for start, made in windows(learner.simulator, batch, initial, steps, length, starts, checkpoint=kept):
+    for start, made in windows(learner.simulator, batch, initial, steps, length, explosions.restart, checkpoint=kept):
         states = States.of(made)
         if explosions.end(states.positions, start, statistics.reach):
             break
@@ -118,14 +116,6 @@ def _pull(loss: Tensor, network: list[nn.Parameter]) -> Tensor:
     """Gradient of the network by one term."""
     grads = torch.autograd.grad(loss, network, retain_graph=True, allow_unused=True, materialize_grads=True)
     return torch.cat([grad.flatten() for grad in grads])
-
-
-def _noise(learner: Learner, batch: SceneBatch, draws: torch.Generator) -> list[UnitNoise]:
-    if learner.objective.input_noise == 0:
-        return []
-    deviations = [learner.objective.input_noise * d for d in learner.diagonals]
-    places = [learner.ranks.rank + i * learner.ranks.size for i in range(len(batch.members))]
-    return [UnitNoise(batch, learner.simulator.scenes, deviations, draws.initial_seed(), places)]
 
 
 def _momentum_unit(learner: Learner, samples: list[SequenceSample]) -> float:

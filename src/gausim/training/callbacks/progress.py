@@ -84,11 +84,10 @@ class EpochSummary(Callback):
         if means.get("exploded", 0) > 0:
             parts.append(f"exploded {means['exploded']:.0%}")
         parts.append(f"{means['seconds']:.1f} s")
-        fitted = (
-            cast(Any, trainer.lightning_module).method.initial_states is None
-        )  # in stages, which have lengths of their own
         self._paces.append((int(means.get("steps", 0)), means["seconds"]))
-        left = None if fitted else _minutes_left(trainer, self._paces)
+        module = cast(GausSimModule, trainer.lightning_module)
+        # The stages of a fit have lengths of their own.
+        left = None if module.initial_states is None else _minutes_left(trainer, self._paces)
         judged = any(isinstance(c, Convergence) and c.is_learning for c in cast(Any, trainer).callbacks)
         return "  ".join(
             [*parts, *([] if left is None else [f"{'at most' if judged else 'about'} {left:.0f} min left"])]

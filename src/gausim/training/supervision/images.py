@@ -1,4 +1,4 @@
-"""What a rollout is compared with: videos, motion tracked in them (engine.tracks) or true motion (engine.points)."""
+"""What a rollout is compared with: videos, motion tracked in them, or the true motion of points."""
 
 from __future__ import annotations
 

@@ -127,20 +127,13 @@ class TrackSupervision(PointSupervision):
     Frames are tracked when a sample first holds them, so that what the curriculum does not show is not looked at.
     """
 
-    def __init__(
-        self,
-        sources: Sources,
-        *,
-        velocity_weight: float = 0.0,
-        energy_weight: float = 0.3,
-        **tracking: Any,
-    ) -> None:
-        """Prepares the tracker with the settings of :class:`MotionTracker`; the weights are of the loss.
+    def __init__(self, sources: Sources, *, energy_weight: float = 0.3, **tracking: Any) -> None:
+        """Prepares the tracker with the settings of :class:`MotionTracker`; the weight is of the loss.
 
         Raises:
             ConfigError: the model has no smooth motions, or a setting is out of range.
         """
-        super().__init__(sources, velocity_weight=velocity_weight, energy_weight=energy_weight)
+        super().__init__(sources, energy_weight=energy_weight)
         self.tracker = MotionTracker(sources, **tracking)
         for scene_id in range(len(sources.scenes)):
             self.tracker.motions(scene_id)
