@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import ast
 import os
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
 from jaxtyping import _import_hook, install_import_hook
+
+if TYPE_CHECKING:
+    from helpers.toy_runs import Trainings
 
 torch.set_num_threads(1)
 # Tables must not depend on whether this machine happens to have the weights of LPIPS.
@@ -40,6 +45,22 @@ def data_root() -> Path:
     if not path.is_dir():
         pytest.fail(f"GAUSIM_TEST_DATA: expected a directory, got {path}. Correct or unset it.")
     return path
+
+
+@pytest.fixture(scope="session")
+def trainings(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Trainings]:
+    """Runs of `gausim train` in processes of their own, on a toy object."""
+    from helpers.toy_runs import trainings  # not before the checks of types are installed
+
+    base = tmp_path_factory.getbasetemp()
+    with trainings((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "toy_runs") as made:
+        yield made
+
+
+@pytest.fixture(scope="session")
+def toy_run(trainings: Trainings) -> Path:
+    """The directory of a finished run of three epochs, for all tests that need one; not to be changed."""
+    return trainings.whole("whole", "trainer=cpu", "trainer.max_epochs=3")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -23,6 +23,7 @@ from gausim.compose.root import conf_dir
 from gausim.core.errors import ConfigError, SceneError
 from gausim.training.ranks.launch import Crew
 from gausim.training.ranks.layout import Layout, LocalRanks, RanksStrategy
+from gausim.training.trainer import make_trainer
 
 # Values for what a file leaves to the user (`???`), by "group/option".
 MANDATORY: dict[str, list[str]] = {}
@@ -102,7 +103,7 @@ def test_option_builds(option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     if group == "trainer" and config.trainer.devices > 1:
         crew = Crew(Layout(config.trainer.devices, accelerator="cpu"))
         crew.environment = LocalRanks(0, config.trainer.devices, port=1)  # as if the others had started
-        made = instantiate(config.trainer, crew=crew, accelerator="cpu")
+        made = make_trainer(instantiate(config.trainer, accelerator="cpu"), crew=crew)
         assert made.world_size == config.trainer.devices and isinstance(made.strategy, RanksStrategy)
         return
     built = {group: config[group]} if group in config and group not in GLOBAL else config

@@ -16,6 +16,7 @@ from gausim.losses import Objective
 from gausim.models.initial_state import ModalInitialStates
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.render.cpu import CpuRenderer
+from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 
 
@@ -41,7 +42,7 @@ def test_rows_of_the_training_benchmark(backprop_steps: int, tmp_path: Path) -> 
     template = partial(ElasticTemplate, modes=6, neighbours=6)
     model = gausim(scenes, [24.0], radii=(0.3, 0.7), edges="rest", hidden=8, layers=1, template=template)
     module = GausSimModule(
-        model=model, initial_states=ModalInitialStates(model, (0, 0)), scene_of_sequence=(0, 0),
+        method=SharedSimulator(model, ModalInitialStates(model, (0, 0)), (0, 0)),
         renderer=CpuRenderer(threads=1), objective=Objective(backprop_steps=backprop_steps),
     )  # fmt: skip
     before = {name: value.detach().clone() for name, value in module.named_parameters()}

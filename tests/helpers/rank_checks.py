@@ -27,6 +27,7 @@ from gausim.metrics.psnr import PSNR
 from gausim.models.initial_state import FreeInitialStates
 from gausim.render.reference import ReferenceRenderer
 from gausim.runs.checkpoint import digest
+from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.ranks.ranks import Ranks
@@ -50,9 +51,7 @@ def real_module(objective: Objective, dtype: torch.dtype, settings: OptimizerSet
     scenes = [cast(toy_object.toy_scene(), dtype) for _ in range(2)]
     model = gausim(scenes, (24.0, 24.0), layers=1, hidden=8, radii=(0.3, 0.7), clustering="ball", output_scale=0.02)
     module = GausSimModule(
-        model=model,
-        initial_states=FreeInitialStates(model, SCENES),
-        scene_of_sequence=SCENES,
+        method=SharedSimulator(model, FreeInitialStates(model, SCENES), SCENES),
         renderer=ReferenceRenderer(),
         objective=objective,
         optimizer=settings,

@@ -12,6 +12,7 @@ from gausim.core import GaussianScene, Rendered, SimState
 from gausim.data.dataset import SequenceSample
 from gausim.losses import Objective
 from gausim.render.reference import ReferenceRenderer
+from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from helpers import toy_object
@@ -29,15 +30,6 @@ class Sway(nn.Module):
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         return {"network": [self.keep], "scene": list(self.drift)}
-
-    def shared(self) -> dict[str, nn.Module]:
-        return {}
-
-    def own(self, scene_id: int) -> tuple[str, ...]:
-        return (f"drift.{scene_id}",)
-
-    def freeze(self, *, scenes: bool = False) -> None:
-        (self if scenes else self.keep).requires_grad_(False)
 
     def batch(self, scene_ids: list[int]) -> SimpleNamespace:
         members, start = [], 0
@@ -91,9 +83,7 @@ def sample(sequence: int, steps: int = 3, amplitude: float = 0.4) -> SequenceSam
 def sway_module(objective: Objective | None = None, **settings: float) -> GausSimModule:
     model = Sway([toy_object.toy_scene(), toy_object.toy_scene()])
     return GausSimModule(
-        model=model,
-        initial_states=Previous(model, SCENE_OF_SEQUENCE),
-        scene_of_sequence=SCENE_OF_SEQUENCE,
+        method=SharedSimulator(model, Previous(model, SCENE_OF_SEQUENCE), SCENE_OF_SEQUENCE),
         renderer=ReferenceRenderer(),
         objective=objective or Objective(),
         optimizer=OptimizerSettings(**settings),  # type: ignore[arg-type]

@@ -80,5 +80,5 @@ def test_objective_windows_and_chances() -> None:
 def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(ConfigError, match="odd window"):
         ImageLoss(window=4)
-    with pytest.raises(ConfigError, match="input_noise"):
-        Objective(input_noise=-1.0)
+    with pytest.raises(ConfigError, match="mixing_weight"):
+        Objective(mixing_weight=-1.0)

@@ -66,19 +66,6 @@ def test_a_failed_save_is_an_error_and_keeps_the_last_good_file(
     assert list(tmp_path.glob(".*")) == []
 
 
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="permissions do not bind the superuser")
-def test_a_directory_that_became_read_only_stops_the_save(tmp_path: Path) -> None:
-    path = tmp_path / "last.ckpt"
-    AtomicCheckpointIO().save_checkpoint(checkpoint(2.0), path)
-    tmp_path.chmod(0o555)
-    try:
-        with pytest.raises(RunError, match="Permission denied"):
-            AtomicCheckpointIO().save_checkpoint(checkpoint(3.0), path)
-    finally:
-        tmp_path.chmod(0o755)
-    assert float(read_checkpoint(path)["state_dict"]["weight"][0, 0]) == 2.0
-
-
 def test_the_last_checkpoint_leaves_its_predecessor_and_others_do_not(tmp_path: Path) -> None:
     for value in (1.0, 2.0, 3.0):
         for name in ("last.ckpt", "epoch_0001.ckpt"):
@@ -251,10 +238,8 @@ def test_the_average_follows_the_weights_and_is_what_loads() -> None:
         nn.init.constant_(module.weight, value)
         average.update(module.named_parameters())
     saved = {"state_dict": module.state_dict(), "gausim": {"average": average.state_dict()}}
-    averaged, plain = nn.Linear(3, 2), nn.Linear(3, 2)
+    averaged = nn.Linear(3, 2)
     load_weights(averaged, saved)
-    load_weights(plain, saved, averaged=False)
     assert 0.5 < float(averaged.weight[0, 0].detach()) < 1.0
-    assert float(plain.weight[0, 0].detach()) == 1.0
     with pytest.raises(RunError, match="does not fit"):
         load_weights(nn.Linear(4, 2), saved)

@@ -12,12 +12,13 @@ from gausim.compose.config import instantiate
 from gausim.core import RunError
 from gausim.runs.directory import CONFIG, RunDirectory
 from gausim.runs.renamed import ELASTIC, MOVED, with_present_names, with_present_weights
+from gausim.training.trainer import TrainerSettings
 
 
 @pytest.mark.parametrize("new", sorted(MOVED.values()))
 def test_every_new_name_exists(new: str) -> None:
     module, _, name = new.rpartition(".")
-    if name[0].isupper() or name == "make_trainer":
+    if name[0].isupper():
         assert hasattr(importlib.import_module(module), name)
     else:
         importlib.import_module(new)
@@ -31,6 +32,9 @@ OLD = {
             "passive_frames": 4, "conserve_mass": False,
         }
     },
+    "loss": {"_target_": "gausim.losses.objective.Objective", "input_noise": 0.0, "static_weight": 2.0},
+    "optimizer": {"schedule": {"_target_": "gausim.engine.optim.ConstantSchedule"}},
+    "trainer": {"_target_": "gausim.training.trainer.make_trainer", "max_epochs": 3, "devices": 2},
     "callbacks": [{"_target_": "gausim.engine.callbacks.Progress"}, {"_target_": "torch.nn.Module"}],
 }  # fmt: skip
 
@@ -41,6 +45,9 @@ def test_a_configuration_of_before_is_read_by_present_names(tmp_path) -> None:
     assert [c["_target_"] for c in found["callbacks"]] == [
         "gausim.training.callbacks.progress.Progress", "torch.nn.Module",
     ]  # fmt: skip
+    assert instantiate(found["loss"]).static_weight == 2.0
+    assert found["optimizer"] == {"schedule": None}
+    assert instantiate(found["trainer"]) == TrainerSettings(devices=2, max_epochs=3)
     simulator = found["model"]["simulator"]
     assert simulator["_target_"] == "gausim.models.step.simulator.GausSim" and simulator["conserve_mass"] is False
     assert simulator["hierarchy"]["levels"] == [

@@ -93,16 +93,6 @@ def test_chunks_give_what_one_graph_gives(pixels: int, monkeypatch: pytest.Monke
         assert float((ours - plain).norm()) <= 1e-6 * float(plain.norm())
 
 
-def test_chunks_cover_every_state_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    for pixels in (1, 2 * STATE, 5 * STATE, 11 * STATE):
-        monkeypatch.setattr(chunked, "CPU_PIXELS", pixels)
-        seen = torch.zeros(5, 3, dtype=torch.int64)
-        for chunk in Case(steps=5).comparison().chunks(5):
-            assert len(chunk.members) * (chunk.span.stop - chunk.span.start) <= max(1, pixels // STATE)
-            seen[chunk.span, list(chunk.members)] += 1
-        assert torch.equal(seen, torch.ones_like(seen))
-
-
 def test_stretches_continue_where_the_last_one_ended() -> None:
     case = Case(steps=5)
     whole, motion = case.comparison()(case.states, 0)

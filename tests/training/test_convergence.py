@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 import torch
 from helpers import toy_object
 from helpers.simulators import LEVELS, silence
+from helpers.toy_runs import rows as rows_of
 
 from gausim.cli import train as command
 from gausim.compose.build import load_run
@@ -63,7 +63,7 @@ def test_a_run_ends_when_it_no_longer_improves_and_then_sees_all_frames(toy: Pat
     # Nothing is an improvement for this tolerance: the end begins as soon as it can be told.
     settings = ("trainer.convergence.tolerance=0.99", "trainer.max_epochs=40", "optimizer.schedule.decay=0.5")
     run = train(toy, "early", *settings)
-    rows = _rows(run)
+    rows = rows_of(run / "epochs.csv")
     told = [float(row["held_back"]) if row["held_back"] else None for row in rows]
     steps = [float(row["steps"]) for row in rows]
     began = len([e for e in told if e is not None])
@@ -80,35 +80,30 @@ def test_a_run_ends_when_it_no_longer_improves_and_then_sees_all_frames(toy: Pat
 
 def test_where_rates_fall_all_along_nothing_is_held_back_and_nothing_judged(toy: Path) -> None:
     run = train(toy, "falling", "optimizer.schedule.decay=1", "trainer.max_epochs=4")
-    rows = _rows(run)
+    rows = rows_of(run / "epochs.csv")
     assert [float(row["steps"]) for row in rows] == [2.0, 3.0, 3.0, 3.0] and not any(r["held_back"] for r in rows)
     rates = [float(row["lr"]) for row in rows]
     assert rates[1] > rates[2] > rates[3] and "learning" not in json.loads((run / "FINISHED").read_text())
     assert not (run / "before_the_end.ckpt").exists()
 
 
-def _rows(run: Path) -> list[dict[str, str]]:
-    with (run / "epochs.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_a_run_cut_short_goes_on_by_the_same_command_as_if_it_had_had_the_time(
     toy: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     settings = ("trainer.convergence.tolerance=0.0", "trainer.convergence.window=100")
-    run = train(toy, "short", *settings, "trainer.max_epochs=6")
+    run = train(toy, "short", *settings, "trainer.max_epochs=3")
     assert "cut short" in (said := capsys.readouterr().out) and "The same command goes on" in said
-    assert len(_rows(run)) == 6 and read_checkpoint(run / "before_the_end.ckpt")["epoch"] == 3
-    train(toy, "short", *settings, "trainer.max_epochs=6")
-    assert len(_rows(run)) == 12 and json.loads((run / "FINISHED").read_text())["learning"]["cut_short"]
-    whole = train(toy, "long", *settings, "trainer.max_epochs=12")
+    assert len(rows_of(run / "epochs.csv")) == 3 and read_checkpoint(run / "before_the_end.ckpt")["epoch"] == 1
+    train(toy, "short", *settings, "trainer.max_epochs=3")
+    assert len(rows_of(run / "epochs.csv")) == 6 and json.loads((run / "FINISHED").read_text())["learning"]["cut_short"]
+    whole = train(toy, "long", *settings, "trainer.max_epochs=6")
     found, expected = (read_checkpoint(path / "last.ckpt")["state_dict"] for path in (run, whole))
     assert all(torch.equal(found[name], expected[name]) for name in expected)
-    assert [r["held_back"] for r in _rows(run)] == [r["held_back"] for r in _rows(whole)]
+    assert rows_of(run / "epochs.csv") == rows_of(whole / "epochs.csv")
 
 
-def test_the_forecast_is_one_for_a_still_object_and_none_for_the_truth(toy: Path) -> None:
-    run = load_run(train(toy, "judge", "trainer.max_epochs=2"))
+def test_the_forecast_is_one_for_a_still_object_and_none_for_the_truth(toy_run: Path) -> None:
+    run = load_run(toy_run)
     samples = [run.datamodule.training_sample(i, 3) for i in range(2)]
     module = run.module
     for p in module.initial_states.parameters():
@@ -142,8 +137,8 @@ def test_the_verdict(error: float | None, moving: float | None, rate: float | No
 
 def test_what_cannot_be_judged_has_its_epochs(toy: Path) -> None:
     for name, override in (("none", "trainer.convergence=null"), ("paper", "optimizer=paper")):
-        run = train(toy, name, override, "trainer.max_epochs=3")
-        assert [float(row["steps"]) for row in _rows(run)] == [2.0, 3.0, 3.0]
+        run = train(toy, name, override, "trainer.max_epochs=2")
+        assert [float(row["steps"]) for row in rows_of(run / "epochs.csv")] == [2.0, 3.0]
         assert "learning" not in json.loads((run / "FINISHED").read_text())
     with pytest.raises(ConfigError, match="held_back"):
         Convergence(held_back=0)

@@ -19,6 +19,7 @@ from gausim.models.initial_state import FreeInitialStates
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.models.template.template import RestTemplate, Template
 from gausim.render.cpu import CpuRenderer
+from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.terms.free_motion import energy_growth
 
@@ -48,9 +49,6 @@ class Spiral:
         return (state.positions - batch.rest).square().view(2, 6).sum(1)
 
     def batch(self, scene_ids: object) -> object: ...
-    def shared(self) -> object: ...
-    def own(self, scene_id: int) -> object: ...
-    def freeze(self, *, scenes: bool = False) -> object: ...
     def parameter_groups(self) -> object: ...
 
 
@@ -95,7 +93,8 @@ def _module(objective: Objective, template: Callable[..., Template]) -> GausSimM
     for offset in states.offset:
         torch.nn.init.normal_(offset, std=1e-3)
     return GausSimModule(
-        model=model, initial_states=states, scene_of_sequence=SCENE_OF_SEQUENCE, renderer=CpuRenderer(threads=1),
+        method=SharedSimulator(model, states, SCENE_OF_SEQUENCE),
+        renderer=CpuRenderer(threads=1),
         objective=objective,
     )  # fmt: skip
 

@@ -13,13 +13,13 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 
 from gausim.runs.randomness import random_state, restore_random_state
-from gausim.training.callbacks.epoch_table import EpochTable
 from gausim.training.callbacks.progress import EpochSummary
 from gausim.training.callbacks.resume import RunCheckpoint
 from gausim.training.callbacks.time_budget import TimeBudget
 from gausim.training.loggers.files import CsvLog, Resumable, TensorBoardLog
 from gausim.training.loggers.wandb import WandbLog
 from gausim.training.module import GausSimModule
+from gausim.training.table import Table
 
 MODULE = LightningModule()
 
@@ -29,16 +29,16 @@ def draws() -> list[float]:
     return [*own, *torch.rand(2).tolist(), float(torch.randn(()))]
 
 
-def test_rows_of_epochs_done_again_and_torn_ones_are_dropped(tmp_path: Path) -> None:
-    table = EpochTable(tmp_path / "rows.csv", ("epoch", "object", "value"))
+def test_rows_done_again_and_torn_ones_are_dropped(tmp_path: Path) -> None:
+    table = Table(tmp_path / "rows.csv", "epoch", ("epoch", "object", "value"))
     for epoch in (10, 10, 20, 30):
-        table.append({"epoch": epoch, "object": "a", "value": 1 / 3, "unknown": 5})
+        table.append({"epoch": epoch, "object": "a", "value": 0.5, "unknown": 5})
     with (tmp_path / "rows.csv").open("a") as file:
         file.write("4x,")
     table.resume_at(20)
     table.append({"epoch": 30, "object": "b"})
     assert (tmp_path / "rows.csv").read_text().splitlines() == [
-        "epoch,object,value", "10,a,0.33333", "10,a,0.33333", "20,a,0.33333", "30,b,",
+        "epoch,object,value", "10,a,0.5", "10,a,0.5", "20,a,0.5", "30,b,",
     ]  # fmt: skip
 
 
@@ -55,23 +55,23 @@ def test_random_generators_go_on_where_they_were(tmp_path: Path) -> None:
         restore_random_state(outside)
 
 
-def test_the_table_forgets_later_steps_and_torn_rows(tmp_path: Path) -> None:
+def test_the_log_forgets_later_steps_and_grows(tmp_path: Path) -> None:
     first = CsvLog(tmp_path)
     first.resume_at(0)
     for step in (1, 2, 3, 4):
         first.log_metrics({"loss": step / 3}, step=step)
     first.log_metrics({"extra": 7.0}, step=4)
-    with first.path.open("a") as file:
+    with first.table.path.open("a") as file:
         file.write("5,0.")
     second = CsvLog(tmp_path)
     second.resume_at(3)
     second.log_metrics({"loss": 0.5, "late": 1.0}, step=4)
-    lines = second.path.read_text().splitlines()
+    lines = second.table.path.read_text().splitlines()
     assert lines[0] == "step,loss,extra,late" and len(lines) == 5
     assert lines[3] == f"3,{3 / 3},," and lines[4] == "4,0.5,,1.0"
     third = CsvLog(tmp_path)
     third.resume_at(0)  # a run that begins anew
-    assert third.path.read_text().splitlines() == ["step"]
+    assert third.table.path.read_text().splitlines() == ["step"]
     assert isinstance(third, Resumable) and isinstance(TensorBoardLog(tmp_path), Resumable)
 
 
@@ -159,16 +159,3 @@ def test_an_epoch_cut_in_two_counts_both_parts_seconds(monkeypatch: pytest.Monke
     second.on_train_start(trainer, MODULE)
     now[0] += 3.0
     assert second.state_dict() == {"elapsed": 10.0}
-
-
-def test_rows_of_epochs_that_are_done_again_go(tmp_path: Path) -> None:
-    path = tmp_path / "epochs.csv"
-    path.write_text("epoch,step,lr\r\n1,4,0.5\r\n2,8,0.25\r\n3,12,0.125\r\n4,1")
-    trainer = trainer_at(8, folder=tmp_path)
-    trainer.current_epoch = 2
-    EpochSummary(console=False).on_train_start(trainer, MODULE)
-    lines = path.read_text().splitlines()
-    assert lines[0].startswith("epoch,step,") and [line.split(",")[:2] for line in lines[1:]] == [
-        ["1", "4"],
-        ["2", "8"],
-    ]

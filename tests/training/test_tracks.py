@@ -20,6 +20,7 @@ from gausim.models.template.elastic import ElasticTemplate
 from gausim.ops.deformation import polar_rotation
 from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import draw
+from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.supervision.images import Sources
 from gausim.training.supervision.motion_tracks import MotionTracker, TrackSupervision, tracks_or_images
@@ -114,9 +115,7 @@ def test_a_few_steps_of_training_come_nearer_and_keep_the_tracks(
     model: GausSim, sources: Sources, filmed: SequenceSample
 ) -> None:
     module = GausSimModule(
-        model=model,
-        initial_states=ModalInitialStates(model, [0]),
-        scene_of_sequence=[0],
+        method=SharedSimulator(model, ModalInitialStates(model, [0]), [0]),
         renderer=CpuRenderer(),
         optimizer=replace(sway.OptimizerSettings(), template_lr=1e-2, initial_lr=2e-2),
         supervision=TrackSupervision(sources, iterations=20),

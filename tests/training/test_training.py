@@ -21,16 +21,18 @@ from gausim.models.template.elastic import ElasticTemplate
 from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import draw
 from gausim.render.reference import ReferenceRenderer
+from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import CosineSchedule, HalvingSchedule, OptimizerSettings, StableDecaySchedule
-from gausim.training.trainer import make_trainer
+from gausim.training.trainer import TrainerSettings, make_trainer
 
 SCENE_OF_SEQUENCE = sway.SCENE_OF_SEQUENCE
 sample, sway_module = sway.sample, sway.sway_module
 
 
 def fit(module: GausSimModule, batches: list[list[SequenceSample]], tmp_path: Path, epochs: int = 1) -> Trainer:
-    trainer = make_trainer(max_epochs=epochs, accelerator="cpu", progress=False, run_dir=tmp_path, log_every_n_steps=1)
+    settings = TrainerSettings(max_epochs=epochs, accelerator="cpu", progress=False, log_every_n_steps=1)
+    trainer = make_trainer(settings, run_dir=tmp_path)
     loader = torch.utils.data.DataLoader(batches, batch_size=None, collate_fn=lambda x: x)  # type: ignore[arg-type]
     trainer.fit(module, loader)
     return trainer
@@ -40,35 +42,7 @@ def snapshot(module: GausSimModule) -> dict[str, Tensor]:
     return {name: p.detach().clone() for name, p in module.named_parameters()}
 
 
-def test_absent_sequences_and_scenes_do_not_move_in_twenty_steps(tmp_path: Path) -> None:
-    module = sway_module(network_lr=1e-2)
-    fit(module, [[sample(0), sample(1), sample(2)]] * 3, tmp_path / "a")  # every Adam moment is warm
-    before = snapshot(module)
-    fit_again = module.configure_optimizers()
-    assert fit_again is not None
-    trained = [[sample(0)]] * 20
-    warm = [[sample(0), sample(1), sample(2)]] * 3
-    whole = sway_module(network_lr=1e-2)
-    seen: list[dict[str, Tensor]] = []
-    recorded = whole.training_step
-
-    def record(samples: list[SequenceSample], batch_idx: int) -> None:
-        recorded(samples, batch_idx)
-        seen.append(snapshot(whole))
-
-    whole.training_step = record  # type: ignore[method-assign]
-    fit(whole, warm + trained, tmp_path / "b")
-    after_warm, end = seen[2], seen[-1]
-    for name in ("initial_states.values.1", "initial_states.values.2", "model.drift.1"):
-        assert not torch.equal(after_warm[name], snapshot(sway_module())[name])  # it can move
-        torch.testing.assert_close(end[name], after_warm[name], rtol=0, atol=0)
-    for name in ("initial_states.values.0", "model.drift.0", "model.keep"):
-        assert not torch.equal(end[name], after_warm[name])
-    for name, value in before.items():
-        torch.testing.assert_close(value, after_warm[name], rtol=0, atol=0)  # same seed, same steps
-
-
-def deformation_gradients(module: GausSimModule, samples: list[SequenceSample], tmp_path: Path) -> dict[str, Tensor]:
+def loss_gradients(module: GausSimModule, samples: list[SequenceSample], tmp_path: Path) -> dict[str, Tensor]:
     """Gradients of the first optimiser step."""
     kept: dict[str, Tensor] = {}
 
@@ -84,7 +58,7 @@ def deformation_gradients(module: GausSimModule, samples: list[SequenceSample], 
 @pytest.mark.parametrize("backprop_steps", [1, 2, 0])
 def test_windows_stop_gradients_and_nothing_else(backprop_steps: int, tmp_path: Path) -> None:
     objective = Objective(backprop_steps=backprop_steps, static_weight=0.0, momentum_weight=0.0)
-    ours = deformation_gradients(sway_module(objective), [sample(0), sample(2)], tmp_path)
+    ours = loss_gradients(sway_module(objective), [sample(0), sample(2)], tmp_path)
     module = sway_module(objective)
     samples = [sample(0), sample(2)]
     batch = module.model.batch([0, 1])
@@ -108,17 +82,16 @@ def test_windows_stop_gradients_and_nothing_else(backprop_steps: int, tmp_path: 
 
 
 def test_memory_of_one_window_learns_the_drift(tmp_path: Path) -> None:
-    module = sway_module(network_lr=0.0, scene_lr=5e-3, initial_lr=0.0)
-    fit(module, [[sample(0)]] * 40, tmp_path)
+    module = sway_module(network_lr=0.0, scene_lr=1e-2, initial_lr=0.0)
+    fit(module, [[sample(0)]] * 12, tmp_path)
     assert module.model.drift[0] > 0.02
     assert module.summary["excess_static"] < 1.0
     assert 0.0 < module.summary["motion_energy"] < 3.0
 
 
-@pytest.mark.parametrize("poison", [math.nan, math.inf])
-def test_positions_that_break_are_named(poison: float, tmp_path: Path) -> None:
+def test_positions_that_break_are_named(tmp_path: Path) -> None:
     module = sway_module()
-    module.model.poison = poison
+    module.model.poison = math.inf
     with pytest.raises(DivergenceError, match=r"predicted step 1 of 3, sequence toy/seq_0: positions"):
         fit(module, [[sample(0)]], tmp_path)
 
@@ -148,25 +121,12 @@ def test_twenty_barren_batches_are_a_divergence(tmp_path: Path) -> None:
         fit(module, [[sample(0)]] * 25, tmp_path)
 
 
-def test_a_collapse_is_warned_of_once(tmp_path: Path) -> None:
+def test_a_collapse_is_warned_of_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gausim.training.module.COLLAPSE_AFTER", 4)
     module = sway_module(Objective(static_weight=0.0), network_lr=0.0, scene_lr=0.0, initial_lr=0.0)
     with pytest.warns(UserWarning, match="collapsed to the rest state") as caught:
-        fit(module, [[sample(0, steps=1)]] * 50, tmp_path, epochs=4)
+        fit(module, [[sample(0, steps=1)]] * 2, tmp_path, epochs=4)
     assert sum("collapsed" in str(w.message) for w in caught) == 1
-
-
-def test_noise_moves_only_free_kernels_and_depends_on_the_seed() -> None:
-    from gausim.training.rollout import UnitNoise
-
-    module = sway_module()
-    batch = module.model.batch([0, 1])
-    pinned = torch.cat([s.pinned for s in module.simulator.scenes])
-    made = []
-    for seed in (0, 0, 1):
-        noise = UnitNoise(batch, module.simulator.scenes, [0.1, 0.1], seed, [0, 1])
-        made.append(noise(SimState(batch.rest, batch.rest)).positions - batch.rest)
-    assert float(made[0][pinned].abs().max()) == 0.0 and float(made[0][~pinned].abs().min()) > 0.0
-    assert torch.equal(made[0], made[1]) and not torch.equal(made[0], made[2])
 
 
 def test_schedules() -> None:
@@ -191,13 +151,13 @@ def test_clipping_by_group_and_altogether() -> None:
         assert (float(a.grad.norm()), float(b.grad.norm())) == pytest.approx(expected, rel=1e-4)
 
 
-def test_absent_sequences_and_scenes_do_not_move_in_the_real_model(tmp_path: Path) -> None:
+def test_absent_sequences_and_scenes_do_not_move(tmp_path: Path) -> None:
     torch.manual_seed(0)
     scenes = [toy_object.toy_scene(), toy_object.toy_scene()]
     template = partial(ElasticTemplate, modes=6, neighbours=6)
     model = gausim(scenes, [24.0, 24.0], radii=(0.3, 0.7), hidden=8, layers=1, template=template)
     module = GausSimModule(
-        model=model, initial_states=ModalInitialStates(model, SCENE_OF_SEQUENCE), scene_of_sequence=SCENE_OF_SEQUENCE,
+        method=SharedSimulator(model, ModalInitialStates(model, SCENE_OF_SEQUENCE), SCENE_OF_SEQUENCE),
         renderer=CpuRenderer(threads=1), optimizer=OptimizerSettings(),
     )  # fmt: skip
     seen: list[dict[str, Tensor]] = []
@@ -208,7 +168,7 @@ def test_absent_sequences_and_scenes_do_not_move_in_the_real_model(tmp_path: Pat
         seen.append(snapshot(module))
 
     module.training_step = record  # type: ignore[method-assign]
-    fit(module, [[sample(0), sample(1), sample(2)]] * 2 + [[sample(0)]] * 20, tmp_path)
+    fit(module, [[sample(0), sample(1), sample(2)]] * 2 + [[sample(0)]] * 6, tmp_path)
     own = re.compile(r"initial_states\.velocity\.[12]|.*(log_density|attributes)\.1|model\.template\.scenes\.1\..*")
     absent = [name for name in seen[0] if own.fullmatch(name)]
     assert len(absent) > 4
@@ -229,7 +189,7 @@ def test_mixing_counts_in_units_of_the_rest_states_loss() -> None:
                 if "mixing" in name:
                     p.normal_(std=0.1)
         module = GausSimModule(
-            model=model, initial_states=ModalInitialStates(model, [0]), scene_of_sequence=[0],
+            method=SharedSimulator(model, ModalInitialStates(model, [0]), [0]),
             renderer=CpuRenderer(threads=1), optimizer=OptimizerSettings(clip_norm=0.0),
             objective=Objective(mixing_weight=weight, backprop_steps=0, static_weight=0.0),
         )  # fmt: skip
@@ -253,7 +213,7 @@ def test_overfitting_one_sequence_drives_its_loss_down_tenfold(tmp_path: Path) -
     torch.manual_seed(0)
     model = gausim([scene], [24.0], radii=(0.3, 0.7), hidden=16, layers=2, output_scale=0.05, rest_inputs=True)
     module = GausSimModule(
-        model=model, initial_states=FreeInitialStates(model, [0]), scene_of_sequence=[0],
+        method=SharedSimulator(model, FreeInitialStates(model, [0]), [0]),
         renderer=CpuRenderer(threads=1), objective=Objective(backprop_steps=0, static_weight=0.0),
         optimizer=OptimizerSettings(network_lr=3e-3, initial_lr=3e-3, clip_per_group=True, schedule=CosineSchedule()),
     )  # fmt: skip
@@ -271,7 +231,8 @@ def test_overfitting_one_sequence_drives_its_loss_down_tenfold(tmp_path: Path) -
 
 def test_decay_takes_matrices_and_initial_states_of_its_groups_and_nothing_else() -> None:
     matrix, vector, other, state = (nn.Parameter(torch.ones(*shape)) for shape in ((2, 2), (2,), (2, 2), (2,)))
-    settings = OptimizerSettings(template_lr=0.1, network_lr=0.1, initial_lr=0.1, decay={"template": 0.5, "initial": 1})
+    settings = OptimizerSettings(template_lr=0.1, network_lr=0.1, initial_lr=0.1, decay={"template": 0.5, "initial": 1},
+                                 optimizer=torch.optim.AdamW)  # fmt: skip
     optimizer = settings.build({"template": [matrix, vector], "network": [other], "initial": [state]})
     for parameter in (matrix, vector, other, state):
         parameter.grad = torch.zeros_like(parameter)

@@ -20,6 +20,7 @@ from gausim.losses import Objective
 from gausim.models.initial_state import FreeInitialStates
 from gausim.render.reference import ReferenceRenderer
 from gausim.training import step
+from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.supervision import comparison
@@ -31,7 +32,8 @@ def real_module(objective: Objective) -> GausSimModule:
         [toy_object.toy_scene()], [24.0], radii=(0.3, 0.7), edges="rest", hidden=8, layers=2, output_scale=0.1
     )
     return GausSimModule(
-        model=model, initial_states=FreeInitialStates(model, [0]), scene_of_sequence=[0], renderer=blobs,
+        method=SharedSimulator(model, FreeInitialStates(model, [0]), [0]),
+        renderer=blobs,
         objective=objective, optimizer=OptimizerSettings(), fraction_every=0,
     )  # fmt: skip
 
@@ -168,7 +170,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 def test_one_read_per_optimiser_step(backprop_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     from gausim.kernels.compiled import torch_only
 
-    _, module = pair(Objective(backprop_steps=backprop_steps, input_noise=0.01), 0.01)
+    _, module = pair(Objective(backprop_steps=backprop_steps), 0.01)
     module.images.renderer = blobs
     module.settings = OptimizerSettings(optimizer=torch.optim.SGD, ema_decay=0.9)  # Adam counts steps on the host
     optimizer, batch = module.configure_optimizers(), [sample(0), sample(1)]
@@ -196,7 +198,7 @@ def test_the_device_is_not_waited_for(backprop_steps: int) -> None:
         norms = module.settings.clip(optimizer)
     finally:
         torch.cuda.set_sync_debug_mode("default")
-    assert len(statistics.fetch(norms).numbers(facts, 3.0).images) == 3
+    assert len(statistics.fetch(norms).lasting(facts, 3.0).frames) == 3
 
 
 @pytest.mark.gpu

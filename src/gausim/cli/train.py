@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -14,9 +13,10 @@ if TYPE_CHECKING:
     from lightning.pytorch import Trainer
     from omegaconf import DictConfig
 
+    from gausim.core import FittedMethod
     from gausim.data.datamodule import ReadyDataModule
     from gausim.runs.directory import RunDirectory
-    from gausim.training.fitted.fitting import FittedModule
+    from gausim.training.contracts import Transferable
     from gausim.training.module import GausSimModule
     from gausim.training.ranks.launch import Crew
 
@@ -144,12 +144,10 @@ def _evaluate(run: RunDirectory) -> None:
 
 
 def _train(cfg: DictConfig, run: RunDirectory) -> float | None:
+    from gausim.compose.config import instantiate
     from gausim.training.ranks.launch import Crew
-    from gausim.training.ranks.layout import Layout
 
-    known = [field.name for field in fields(Layout)]
-    layout = Layout(**{str(key): value for key, value in cfg.trainer.items() if key in known})
-    with run.noting_failure(), Crew(layout, [sys.executable, "-m", "gausim.cli.rank"]) as crew:
+    with run.noting_failure(), Crew(instantiate(cfg.trainer), [sys.executable, "-m", "gausim.cli.rank"]) as crew:
         if not crew.is_first:  # a scheduler has started it beside the first
             return follow(crew)
         config = _plain(cfg)
@@ -192,10 +190,10 @@ def _fit(
     from gausim.compose import config as _config
     from gausim.training.callbacks.convergence import Convergence
     from gausim.training.callbacks.judge import EpochJudge
-    from gausim.training.fitted.fitting import FittedModule
+    from gausim.training.fitted.fitting import StagedFit
 
     module, datamodule = parts
-    plan = module.plan if isinstance(module, FittedModule) else None
+    plan = module.method.plan if isinstance(module.method, StagedFit) else None
     trainer = make(cfg, run, crew, epochs=None if plan is None else plan.epochs)
     faults: list[str] = []
     for logger in trainer.loggers:
@@ -214,7 +212,7 @@ def _fit(
         epochs = cast(Any, trainer.fit_loop.epoch_progress.current).processed
         pruned = any(isinstance(callback, EpochJudge) and callback.stopped for callback in cast(Any, trainer).callbacks)
         facts: dict[str, Any] = {"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary}
-        if isinstance(module, FittedModule):
+        if plan is not None:
             facts["notes"] = module.notes()
         judged = [c.summary() for c in cast(Any, trainer).callbacks if isinstance(c, Convergence)]
         facts |= {"learning": judged[0]} if judged and judged[0] else {}
@@ -270,11 +268,11 @@ def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None
         RunError: that run is not there, or knows another scene.
     """
     from gausim.core import ConfigError
-    from gausim.training.fitted.fitting import FittedModule
+    from gausim.training.fitted.fitting import StagedFit
     from gausim.training.transfer import load_shared, load_simulator
 
-    if isinstance(module, FittedModule):
-        _take_over_fit(cfg, module, resumed=resumed)
+    if isinstance(module.method, StagedFit):
+        _take_over_fit(cfg, module.method.fitted, resumed=resumed)
         return
     if cfg.init_from == "":
         raise ConfigError("init_from: name the trained run whose network this one starts from (init_from=RUN).")
@@ -284,18 +282,17 @@ def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None
         raise ConfigError("freeze: a network at random would stay so. Name a trained run (init_from=RUN).")
     if cfg.init_from is not None and not resumed:
         load = load_simulator if cfg.freeze == "model" else load_shared
-        load(module.simulator, cfg.init_from, _plain(cfg)["model"])
+        load(cast("Transferable", module.model), cfg.init_from, _plain(cfg)["model"])
     if cfg.freeze:
-        module.simulator.freeze(scenes=cfg.freeze == "model")
+        cast("Transferable", module.model).freeze(scenes=cfg.freeze == "model")
 
 
-def _take_over_fit(cfg: DictConfig, module: FittedModule, *, resumed: bool) -> None:
+def _take_over_fit(cfg: DictConfig, method: FittedMethod, *, resumed: bool) -> None:
     """The same for a fitted method, if it is one that takes over what another has found."""
     from gausim.compose.build import load_run
     from gausim.core import ConfigError, TakesOver
-    from gausim.training.fitted.fitting import FittedModule
+    from gausim.training.fitted.fitting import StagedFit
 
-    method = module.method
     if cfg.init_from is None and cfg.freeze is None:
         return
     if not isinstance(method, TakesOver) or cfg.freeze is not None or not cfg.init_from:
@@ -308,7 +305,7 @@ def _take_over_fit(cfg: DictConfig, module: FittedModule, *, resumed: bool) -> N
         )
     if not resumed:
         source = load_run(cfg.init_from).module
-        method.take_over(source.method if isinstance(source, FittedModule) else source.simulator)
+        method.take_over(source.method.fitted if isinstance(source.method, StagedFit) else source.simulator)
 
 
 def make(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | None = None) -> Trainer:
@@ -322,6 +319,7 @@ def make(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | None =
     """
     from gausim.cli.sweeps.pruning import judges
     from gausim.compose.config import instantiate
+    from gausim.training.trainer import make_trainer
 
     callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node] + judges(cfg)
     wanted = (cfg.logger or {}).values() if crew.is_first else ()
@@ -331,7 +329,8 @@ def make(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | None =
         length["max_minutes"] = cfg.trainer.max_minutes * run.allowances
     if epochs is not None:
         length["max_epochs"] = epochs
-    return instantiate(cfg.trainer, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew, **length)
+    settings = instantiate(cfg.trainer, **length)
+    return make_trainer(settings, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew)
 
 
 def _introduce(
@@ -339,14 +338,14 @@ def _introduce(
 ) -> None:
     import torch
 
-    from gausim.training.fitted.fitting import FittedModule
+    from gausim.training.fitted.fitting import StagedFit
 
     datamodule.setup("fit")
     batches = len(datamodule.train_dataloader())
     epochs = trainer.max_epochs or 0
     device = trainer.strategy.root_device
     ranks = f"{trainer.world_size} ranks, " if trainer.world_size > 1 else ""
-    threads = f"({ranks}{torch.get_num_threads()} threads)"
+    threads = f"({ranks}{(count := torch.get_num_threads())} torch thread{'s' if count != 1 else ''})"
     lines = [f"{'resuming' if resumed else 'training'} on {device} {threads}: {run.path}"]
     for item, scene in zip(datamodule.objects, module.simulator.scenes, strict=True):
         cameras = item.sequences[0].cameras
@@ -356,9 +355,9 @@ def _introduce(
         )
     sizes = {name: sum(p.numel() for p in own) for name, own in module.groups().items()}
     lines.append("  parameters: " + (", ".join(f"{name} {count}" for name, count in sizes.items()) or "none"))
-    if isinstance(module, FittedModule):
-        lines += [f"  {name}: {stage.iterations} iterations per sequence" for name, stage in module.plan.order]
-        lines += [f"  note: {note}" for note in module.method.notes()]
+    if isinstance(module.method, StagedFit):
+        lines += [f"  {name}: {stage.iterations} iterations per sequence" for name, stage in module.method.plan.order]
+        lines += [f"  note: {note}" for note in module.method.fitted.notes()]
         print("\n".join(lines), file=sys.stdout, flush=True)
         return
     kind = type(module.supervision).__name__

@@ -14,10 +14,12 @@ from gausim.compose.data_paths import located
 from gausim.core import ConfigError, Renderer
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData
+from gausim.losses.objective import Objective
 from gausim.runs.checkpoint import check_scenes, load_weights, read_checkpoint
 from gausim.runs.directory import RunDirectory
-from gausim.training.fitted.fitting import FittedModule
+from gausim.training.fitted.fitting import StagedFit
 from gausim.training.fitted.stages import StagedCurriculum
+from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.supervision.images import Sources, Supervision
 
@@ -69,9 +71,7 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
     sources = Sources(scenes, datamodule.index.ground_truth, model.smooth_motions, renderer, objective.image)
     states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
     module = GausSimModule(
-        model=model,
-        initial_states=states,
-        scene_of_sequence=scene_of_sequence,
+        method=SharedSimulator(model, states, scene_of_sequence),
         renderer=renderer,
         objective=objective,
         optimizer=instantiate(config.optimizer),
@@ -88,7 +88,7 @@ def _supervision(config: DictConfig, sources: Sources) -> Supervision | None:
     return made
 
 
-def _build_fit(config: DictConfig) -> tuple[FittedModule, ReadyDataModule]:
+def _build_fit(config: DictConfig) -> tuple[GausSimModule, ReadyDataModule]:
     """The module and the data of a method that is fitted in stages; T and shows per epoch are those of its plan."""
     plan = instantiate(config.model.plan)
     seen = int(config.data.curriculum.t_max)
@@ -97,7 +97,7 @@ def _build_fit(config: DictConfig) -> tuple[FittedModule, ReadyDataModule]:
     datamodule = instantiate(config.data, curriculum=curriculum, repeats=plan.shows, batch_size=alone)
     objects = datamodule.objects
     scenes = [item.scene() for item in objects]
-    method = instantiate(
+    fitted = instantiate(
         config.model.method,
         scenes=scenes,
         fps=[item.fps for item in objects],
@@ -106,11 +106,11 @@ def _build_fit(config: DictConfig) -> tuple[FittedModule, ReadyDataModule]:
     )()
     renderer, image_loss = instantiate(config.render), instantiate(config.loss).image
     sources = Sources(scenes, datamodule.index.ground_truth, lambda scene_id: None, renderer, image_loss)
-    module = FittedModule(
-        method=method,
-        plan=plan,
+    explosion = float(config.loss.explosion)
+    module = GausSimModule(
+        method=StagedFit(fitted, plan, datamodule.curriculum, explosion),
         renderer=renderer,
-        explosion=float(config.loss.explosion),
+        objective=Objective(explosion=explosion),
         supervision=_supervision(config, sources),
         seed=int(config.seed),
     )

@@ -110,15 +110,15 @@ def _method(
     from gausim.models.rollout.dynamics import SceneDynamics
     from gausim.models.step.simulator import GausSim
     from gausim.ops.covariance import kernel_volumes
-    from gausim.training.fitted.fitting import FittedModule
+    from gausim.training.fitted.fitting import StagedFit
 
     module, names = run.module, [record.name for record in item.data.sequences]
     if sequence != REST and sequence not in names:
         raise DataError(f"{item.data.root}: has no sequence '{sequence}'; expected '{REST}' or one of {names}.")
     number = item.first_sequence + (names.index(sequence) if sequence != REST else 0)
-    if isinstance(module, FittedModule):
+    if isinstance(module.method, StagedFit):
         volumes = kernel_volumes(scene.log_scales, scene.volume_scale) * scene.simulated
-        return SimState(scene.means, scene.means), FittedDynamics(module.method, number), volumes, None
+        return SimState(scene.means, scene.means), FittedDynamics(module.method.fitted, number), volumes, None
     if not isinstance(module.model, GausSim):
         raise ConfigError(f"{run.run_dir}: {module.method_name} cannot be simulated by itself. Take a run of gausim.")
     states = cast(Any, module.initial_states)

@@ -24,8 +24,6 @@ class Objective:
         backprop_steps: gradients stop every so many steps; 0 lets them through the whole rollout.
         checkpoint_steps: keep of each step of a rollout its input only and compute it once more in the backward pass;
             same gradients in less memory, for about a third more time of the dynamics.
-        input_noise: standard deviation of the noise added to each unit's position before a step [diagonals of the
-            scene's bounding box]; 0 is off.
         energy_weight: of the energy that free motion beyond the frames seen gains, as a share of what it has, times the
             batch's image loss; 0 is off. The model's template must know an energy; None is 1 where it does, else 0.
         energy_frames: how far that motion goes.
@@ -46,7 +44,6 @@ class Objective:
     over_steps: str = "mean"
     backprop_steps: int = 1
     checkpoint_steps: bool = False
-    input_noise: float = 0.0
     energy_weight: float | None = 0.0
     energy_frames: int = 36
     energy_stretch: int = 12
@@ -62,7 +59,6 @@ class Objective:
             "rest_image_weight",
             "momentum_weight",
             "backprop_steps",
-            "input_noise",
             "energy_weight",
             "mixing_weight",
         )

@@ -168,10 +168,7 @@ def check_scenes(checkpoint: dict[str, Any], scenes: Sequence[GaussianScene], so
     Raises:
         RunError: naming the scenes of both.
     """
-    own = checkpoint.get("gausim")
-    if own is None:
-        raise RunError(f"{source}: expected a checkpoint of gausim, found none of its entries.")
-    trained, given = own["scenes"], fingerprints(scenes)
+    trained, given = checkpoint["gausim"]["scenes"], fingerprints(scenes)
     if trained != given:
         raise RunError(
             f"{source} was trained on {tell(trained)}, but the data holds {tell(given)}. Give the scene it was "
@@ -223,14 +220,13 @@ def averaged_weights(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
     return with_present_weights({**checkpoint["state_dict"], **checkpoint["gausim"]["average"]["values"]})
 
 
-def load_weights(module: nn.Module, checkpoint: dict[str, Any], *, averaged: bool = True) -> None:
+def load_weights(module: nn.Module, checkpoint: dict[str, Any]) -> None:
     """Loads the weights of a checkpoint into a module, the averaged ones where there are any.
 
     Raises:
         RunError: the checkpoint has other parameters than the module.
     """
-    weights = averaged_weights(checkpoint) if averaged else with_present_weights(checkpoint["state_dict"])
     try:
-        module.load_state_dict(weights)
+        module.load_state_dict(averaged_weights(checkpoint))
     except RuntimeError as error:
         raise RunError(f"the checkpoint does not fit the model of its config: {error}") from error

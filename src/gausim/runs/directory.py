@@ -19,12 +19,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from gausim.core import GausSimError, RunError
 from gausim.io.files import remove_leftovers, write_durably
-from gausim.runs.checkpoint import (
-    BEFORE_THE_END,
-    LAST_CHECKPOINT,
-    PREVIOUS_CHECKPOINT,
-    check_resumable,
-)
+from gausim.runs.checkpoint import BEFORE_THE_END, LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, check_resumable
 from gausim.runs.files import sole_writer, unwritable
 from gausim.runs.names import EPOCHS, MLFLOW_ID, MOTION, WANDB_ID
 from gausim.runs.renamed import with_present_names
@@ -36,38 +31,15 @@ FETCHED = "FETCHED"  # in a directory that `gausim fetch` made: from where
 DAMAGED_CHECKPOINT = "last.damaged.ckpt"
 # What may differ when a run is resumed: where it is kept, how it is shown and what computes it, not what is learned.
 FREE_KEYS = (
-    "paths",
-    "logger",
-    "callbacks",
-    "sweep",
-    "task_name",
-    "doctor",
-    "evaluate",
-    "trainer.threads",
-    "render.threads",
-    "trainer.accelerator",
-    "trainer.devices",
-    "trainer.num_nodes",
-    "trainer.timeout_minutes",
-    "trainer.log_every_n_steps",
-    "trainer.progress",
-    "trainer.overwrite",
-)
+    "paths", "logger", "callbacks", "sweep", "task_name", "doctor", "evaluate", "trainer.threads", "render.threads",
+    "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.timeout_minutes",
+    "trainer.log_every_n_steps", "trainer.progress", "trainer.overwrite",
+)  # fmt: skip
 # What `overwrite` removes; anything else in the directory is not ours.
 OWN_FILES = (
-    CONFIG,
-    FINISHED,
-    FAILED,
-    EVENTS,
-    LAST_CHECKPOINT,
-    PREVIOUS_CHECKPOINT,
-    BEFORE_THE_END,
-    DAMAGED_CHECKPOINT,
-    EPOCHS,
-    MOTION,
-    WANDB_ID,
-    MLFLOW_ID,
-)
+    CONFIG, FINISHED, FAILED, EVENTS, LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, BEFORE_THE_END, DAMAGED_CHECKPOINT, EPOCHS,
+    MOTION, WANDB_ID, MLFLOW_ID,
+)  # fmt: skip
 OWN_FOLDERS = ("panels", "snapshots", "tensorboard", "csv", "wandb")
 
 

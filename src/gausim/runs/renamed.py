@@ -21,15 +21,20 @@ MOVED = {
     "gausim.engine.optim": "gausim.training.optimizers",
     "gausim.engine.panels": "gausim.training.callbacks.panels",
     "gausim.engine.points": "gausim.training.supervision.points",
-    "gausim.engine.run.make_trainer": "gausim.training.trainer.make_trainer",
+    "gausim.engine.run.make_trainer": "gausim.training.trainer.TrainerSettings",
     "gausim.engine.stages": "gausim.training.fitted.stages",
     "gausim.engine.tracks": "gausim.training.supervision.motion_tracks",
     "gausim.engine.wandb_log": "gausim.training.loggers.wandb",
     "gausim.models.elastic": "gausim.models.template.elastic",
     "gausim.models.material": "gausim.models.template.material",
     "gausim.models.simulator": "gausim.models.step.simulator",
+    "gausim.training.trainer.make_trainer": "gausim.training.trainer.TrainerSettings",
 }
-
+# Settings that no longer exist, by the name of what had them; they were off unless asked for.
+GONE = {
+    "Objective": ("input_noise",),
+    **dict.fromkeys(("PointSupervision", "TrackSupervision", "tracks_or_images"), ("velocity_weight",)),
+}
 
 SIMULATOR = "gausim.models.step.simulator.GausSim"
 # Where the arguments of the simulator went, and the names they have there.
@@ -91,7 +96,11 @@ def with_present_names(config: Any) -> Any:
         IndexError, TypeError, ValueError: levels that cannot be read, or a setting that is no longer supported.
     """
     if isinstance(config, dict):
-        found = {k: _present(v) if k == "_target_" else with_present_names(v) for k, v in config.items()}
+        name = str(config.get("_target_")).rsplit(".", 1)[-1]
+        if name == "ConstantSchedule":  # constant is what no schedule means
+            return None
+        kept = {k: v for k, v in config.items() if k not in GONE.get(name, ())}
+        found = {k: _present(v) if k == "_target_" else with_present_names(v) for k, v in kept.items()}
         if found.get("_target_") == ELASTIC:
             return _settled(found)
         if found.get("_target_") in GROUPS and "discretisation" not in found:

@@ -36,7 +36,6 @@ class Baselines:
     """Measures each sequence once; later batches look the numbers up."""
 
     def __init__(self, supervision: Supervision) -> None:
-        """Keeps what measures."""
         self._supervision = supervision
         self._known: dict[int, SequenceBaseline] = {}
 

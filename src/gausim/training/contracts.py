@@ -1,4 +1,4 @@
-"""What the engine asks of a simulator that learns: steps over a disjoint graph of several sequences."""
+"""What training asks of a simulator that learns: steps over a disjoint graph of several sequences."""
 
 from __future__ import annotations
 
@@ -70,34 +70,32 @@ class Simulator(Protocol):
 
     def batch(self, scene_ids: Sequence[int]) -> Any:
         """The disjoint graph of one sequence per entry."""
-        ...
 
     def prepare(self, batch: Any) -> Any:
         """What steps of a batch share while no parameter changes; gradients flow through it.
 
         One serves the steps of one stretch: the next backward pass needs another.
         """
-        ...
 
     def step(self, batch: Any, state: SimState, force: Tensor | None = None, prepared: Any = None) -> Any:
         """Predicts the next frame of all members; ``prepared`` is made for this step alone when None."""
-        ...
-
-    def shared(self) -> dict[str, Module]:
-        """What all scenes have in common, by its name within the simulator: networks, statistics of their inputs."""
-        ...
-
-    def own(self, scene_id: int) -> tuple[str, ...]:
-        """What a scene has of its own: prefixes of names in the simulator's state dict."""
-        ...
-
-    def freeze(self, *, scenes: bool = False) -> None:
-        """Keeps what :meth:`shared` names as it is from now on; with ``scenes`` what they have of their own, too."""
-        ...
 
     def parameter_groups(self) -> dict[str, list[Parameter]]:
         """Trainable parameters: ``network`` (shared by all scenes), ``scene`` (densities, attributes), ``template``."""
-        ...
+
+
+@runtime_checkable
+class Transferable(Simulator, Protocol):
+    """A simulator of which another run may take over a part."""
+
+    def shared(self) -> dict[str, Module]:
+        """What all scenes have in common, by its name within the simulator: networks, statistics of their inputs."""
+
+    def own(self, scene_id: int) -> tuple[str, ...]:
+        """What a scene has of its own: prefixes of names in the simulator's state dict."""
+
+    def freeze(self, *, scenes: bool = False) -> None:
+        """Keeps what :meth:`shared` names as it is from now on; with ``scenes`` what they have of their own, too."""
 
 
 @runtime_checkable
@@ -106,7 +104,6 @@ class Hierarchical(Protocol):
 
     def units_of_kernels(self, scene_id: int) -> Sequence[Tensor]:
         """(K,) the unit of every kernel of the scene at each level above the kernels; -1 for those never simulated."""
-        ...
 
 
 @runtime_checkable
@@ -120,11 +117,9 @@ class Energetic(Protocol):
     @property
     def knows_energy(self) -> bool:
         """Whether :meth:`energy` can be asked."""
-        ...
 
     def energy(self, batch: Any, state: SimState, prepared: Any = None) -> Tensor:
         """(S,) energy of every member of the batch, up to a factor per scene; ``prepared`` as in a step."""
-        ...
 
 
 @runtime_checkable
@@ -133,7 +128,6 @@ class Mixing(Protocol):
 
     def mixing(self, scene_id: int) -> Tensor | None:
         """A number per scene, differentiable, 0 at the start; None where no body is learned."""
-        ...
 
 
 @runtime_checkable
@@ -142,8 +136,6 @@ class InitialVelocities(Protocol):
 
     def previous(self, sequence_id: int) -> Tensor:
         """(K, 3) positions one frame before frame 0 [scene units]."""
-        ...
 
     def reach(self, change: float) -> float:
         """How far that frame moves when a parameter changes by ``change`` [diagonals]."""
-        ...

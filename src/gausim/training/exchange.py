@@ -17,7 +17,6 @@ class Exchange:
     """Makes the parts of the ranks the step of one rank; for a rank that is alone, it only keeps the statistics."""
 
     def __init__(self, ranks: Ranks, model: nn.Module) -> None:
-        """Looks for the model's running statistics."""
         self._ranks, self._normalisers = ranks, normalisers_of(model)
         self._begun = False
 
@@ -32,10 +31,8 @@ class Exchange:
     def step(self, weights: Sequence[Parameter], network: Sequence[Parameter], statistics: Statistics) -> None:
         """Adds gradients and what normalisers gathered; a weight that is in no rank's sequences keeps no gradient.
 
-        Args:
-            weights: all that learn, in the same order on all ranks.
-            network: those whose pulls are compared.
-            statistics: of this rank; its pulls become those of all sequences, and their ratio is formed.
+        The pulls in ``statistics``, of the weights of the ``network``, become those of all sequences, and their ratio
+        is formed.
         """
         if self._ranks.size > 1:
             gathered = self._gathered()

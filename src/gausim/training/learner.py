@@ -1,35 +1,42 @@
-"""What a step of the optimiser works on: the training module without Lightning."""
+"""What a step of the optimiser works on: all parts of a training, without Lightning."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Protocol, runtime_checkable
+from collections.abc import Sequence
+from typing import cast
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
-from gausim.core import SimState
+from gausim.core import ConfigError, Renderer, SimState, Trajectory
 from gausim.data.dataset import SequenceSample
 from gausim.losses.objective import Objective
+from gausim.nn.mode import evaluating
+from gausim.render.draw import draw
 from gausim.runs.checkpoint import WeightAverage
 from gausim.training.baseline_metrics import Baselines, SequenceBaseline
 from gausim.training.contracts import SceneBatch, Simulator
 from gausim.training.exchange import Exchange
+from gausim.training.method import Method, Task
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.ranks.ranks import Ranks
-from gausim.training.supervision.images import Supervision
+from gausim.training.rollout import States, windows
+from gausim.training.supervision.images import ImageSupervision, Supervision
 from gausim.training.terms.free_motion import FreeMotion
 from gausim.training.terms.term import Term
 
 
-@runtime_checkable
-class Learner(Protocol):
-    """The parts of a training.
+class Learner(nn.Module):
+    """A method, what is minimised, what predictions are compared with, and what the steps so far have found.
 
     Attributes:
-        objective: weights of the rollout's losses and how far gradients reach.
+        method: what is trained.
+        objective: weights of the losses and how far gradients reach.
         settings: of the optimiser.
         supervision: what predictions are compared with.
+        images: draws predictions, whatever they are compared with.
         baselines: what the rest state scores.
         free_motion: the term that a rollout is continued for.
         diagonals: of the scenes [scene units].
@@ -40,48 +47,113 @@ class Learner(Protocol):
         shown: sequences of the last step.
     """
 
-    objective: Objective
-    settings: OptimizerSettings
-    supervision: Supervision
-    baselines: Baselines
-    free_motion: FreeMotion
-    diagonals: list[float]
-    average: WeightAverage
-    ranks: Ranks
-    exchange: Exchange
-    barren: int
-    shown: int
+    def __init__(
+        self,
+        *,
+        method: Method,
+        renderer: Renderer,
+        objective: Objective | None = None,
+        optimizer: OptimizerSettings | None = None,
+        supervision: Supervision | None = None,
+    ) -> None:
+        super().__init__()
+        self.method, self.model, self.initial_states = method, method.model, method.initial_states
+        self.objective = objective if objective is not None else Objective()
+        self.settings = optimizer if optimizer is not None else OptimizerSettings()
+        self.free_motion = FreeMotion(method.model, self.objective)
+        self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
+        self.images = ImageSupervision(self.simulator.scenes, renderer, self.objective.image)
+        self.supervision: Supervision = self.images if supervision is None else supervision
+        self.baselines = Baselines(self.supervision)
+        self.average = WeightAverage(self.settings.ema_decay)
+        self.ranks, self.barren, self.shown = Ranks(), 0, 0
+        self.exchange = Exchange(self.ranks, method.model)
 
     @property
     def simulator(self) -> Simulator:
         """The model, as what it can do."""
+        return cast(Simulator, self.model)
+
+    @property
+    def renderer(self) -> Renderer:
+        """What draws the predictions."""
+        return self.images.renderer
+
+    def groups(self) -> dict[str, list[nn.Parameter]]:
+        """All parameters by the name that tells how fast they learn."""
+        return self.method.groups()
+
+    def make_optimizer(self) -> Optimizer | None:
+        """One optimiser over all groups; None where nothing learns.
+
+        Raises:
+            ConfigError: a parameter is in no group.
+        """
+        grouped = {id(p) for members in self.groups().values() for p in members}
+        missing = [n for n, p in self.named_parameters() if p.requires_grad and id(p) not in grouped]
+        if missing:
+            raise ConfigError(f"optimizer: parameters in no group: {missing}. Add them to parameter_groups().")
+        return self.method.build(self.settings)
+
+    def take_up(self, task: Task) -> None:
+        """Minimises what a task says from here on."""
+        if task.is_new:
+            self.baselines = Baselines(self.supervision)
+        if task.objective is not None:
+            self.objective, self.images.loss = task.objective, task.objective.image
+        self.settings = task.settings or self.settings
 
     def terms(self) -> Sequence[Term]:
         """Terms of the loss beside the rollout's, in the order of their backward passes."""
+        return self.method.terms()
 
     def measures_fraction(self) -> bool:
         """Whether this step measures how much of the network's gradient is of the momentum loss."""
+        return False
 
-    def network(self) -> list[nn.Parameter]:
-        """Weights of the network that learn."""
-
-    def parameters(self) -> Iterator[nn.Parameter]:
-        """All parameters."""
-
-    def named_parameters(self) -> Iterator[tuple[str, nn.Parameter]]:
-        """The same by name."""
-
-    def initial(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> SimState:
-        """x_0 and x_{-1} of the sequences of a batch."""
+    def accumulate(self, loss: Tensor) -> None:
+        """Adds the gradients of a loss; there are none where nothing learns."""
+        if loss.requires_grad:
+            loss.backward()
 
     def defers(self, device: torch.device) -> bool:
         """Whether reading a number would make the host wait; such reads are put off to the step's end."""
+        return self.method.defers and device.type != "cpu"
 
-    def accumulate(self, loss: Tensor) -> None:
-        """Adds the gradients of a loss to those of the parameters."""
+    def network(self) -> list[nn.Parameter]:
+        """Weights of the network that learn."""
+        return [p for p in self.groups().get("network", []) if p.requires_grad]
 
     def baseline(self, sample: SequenceSample) -> SequenceBaseline:
         """What the rest state scores on a sample's sequence, for at least the sample's frames."""
+        return self.baselines.of(sample, self.simulator.batch([sample.scene_id]).rest)
 
     def rest_loss(self, sample: SequenceSample) -> float:
         """What the rest state scores on the frames of a sample, their mean: the unit of penalties."""
+        losses = self.baseline(sample).static[: sample.steps]
+        return sum(losses) / len(losses)
+
+    def initial(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> SimState:
+        """Where the rollouts of a batch begin."""
+        return self.method.initial(samples, batch)
+
+    @torch.no_grad()
+    def predict(self, sequence_id: int, steps: int) -> Trajectory:
+        """Frames 0..``steps`` of a training sequence.
+
+        Raises:
+            DivergenceError: a position is not finite; names the frame.
+        """
+        return self.method.predict(sequence_id, steps)
+
+    @torch.no_grad()
+    def predict_images(self, sample: SequenceSample) -> Float[Tensor, "F V H W 3"]:
+        """Images of frames 0..T of one training sequence, in evaluation mode."""
+        batch = self.simulator.batch([sample.scene_id])
+        look, units = self.images.looks.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
+        frames = [self.images.rest_image(sample, batch.rest).rgb]
+        with evaluating(self):
+            for _, made in windows(self.simulator, batch, self.initial([sample], batch), sample.steps, 1):
+                states = States.of(made).tensors()
+                frames.append(draw(self.images.renderer, look, *states, units, sample.cameras).rgb)
+        return torch.cat(frames)

@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 from torch.nn import Parameter
-from torch.optim import Adam, AdamW, Optimizer
+from torch.optim import Adam, Optimizer
 
 from gausim.core import ConfigError
 
@@ -23,16 +23,6 @@ class Schedule(Protocol):
 
     def factor(self, epoch: float, epochs: int) -> float:
         """What the learning rates are multiplied by at ``epoch`` (with its fraction) of ``epochs``."""
-        ...
-
-
-@dataclass(frozen=True)
-class ConstantSchedule:
-    """The learning rates stay as they are."""
-
-    def factor(self, epoch: float, epochs: int) -> float:
-        """Always 1."""
-        return 1.0
 
 
 @dataclass(frozen=True)
@@ -87,7 +77,6 @@ class StableDecaySchedule:
     final: float = 0.05
 
     def __post_init__(self) -> None:
-        """Checks the ranges."""
         if self.warmup < 0 or not 0 < self.decay <= 1 or not 0 <= self.final <= 1:
             raise ConfigError(
                 f"optimizer.schedule: expected warmup >= 0, 0 < decay <= 1 and final in [0, 1], got {self}."
@@ -136,8 +125,8 @@ class OptimizerSettings:
         schedule: how they change; constant when None.
         clip_norm: gradients are clipped at this norm; 0 does not clip.
         clip_per_group: clip network, scenes and initial states each by themselves instead of all together.
-        decay: decoupled weight decay (AdamW) by group: of matrices, and of all initial states. What the data say
-            little about returns to zero, where Adam alone would let it wander.
+        decay: weight decay by group: of matrices, and of all initial states; decoupled where the optimiser is AdamW.
+            What the data say little about returns to zero, where Adam alone would let it wander.
         ema_decay: weights of the run are also averaged with this decay per step, and the average is what evaluation
             loads; 0 does not average.
     """
@@ -154,7 +143,6 @@ class OptimizerSettings:
     ema_decay: float = 0.0
 
     def __post_init__(self) -> None:
-        """Checks the ranges."""
         if (
             min(self.network_lr, self.scene_lr, self.template_lr or 0.0, self.initial_lr, self.clip_norm) < 0
             or not 0 <= self.ema_decay < 1
@@ -186,7 +174,7 @@ class OptimizerSettings:
                 own = {"weight_decay": decay} if self.decay else {}
                 if part:
                     made.append({"params": part, "lr": rates[name], "base_lr": rates[name], "name": name, **own})
-        return (self.optimizer or (AdamW if self.decay else Adam))(made)
+        return (self.optimizer or Adam)(made)
 
     def set_rates(self, optimizer: Optimizer, epoch: float, epochs: int) -> float:
         """Sets the learning rates of all groups; returns the schedule's factor."""

@@ -15,7 +15,6 @@ from torch.utils.checkpoint import checkpoint as torch_checkpoint
 
 from gausim.core import Cameras, DivergenceError, GaussianScene, Rendered, Renderer, SimState
 from gausim.data.dataset import SampleFacts, SequenceSample
-from gausim.data.sampler import hash_seed
 from gausim.nn.normaliser import gathering_nothing, normalisers_of
 from gausim.render.draw import SceneAppearance, draw
 from gausim.training.contracts import SceneBatch, Simulator
@@ -45,7 +44,6 @@ class Views:
     """
 
     def __init__(self) -> None:
-        """Knows no sequence yet."""
         self._keys: dict[tuple[int, tuple[str, ...]], Hashable] = {}
 
     def key(self, sample: SequenceSample) -> Hashable:
@@ -123,7 +121,6 @@ class Looks:
     """The appearance of every scene's foreground, made once and moved to the device on first use."""
 
     def __init__(self, scenes: Sequence[GaussianScene]) -> None:
-        """Keeps the scenes."""
         self._scenes = list(scenes)
         self._made: dict[int, SceneAppearance] = {}
 
@@ -142,23 +139,16 @@ def windows(
     initial: SimState,
     steps: int,
     length: int,
-    starts: Sequence[Callable[[SimState], SimState]] = (),
+    restart: Callable[[SimState], SimState] | None = None,
     *,
     checkpoint: bool = False,
 ) -> Iterator[tuple[int, list[PredictedStep]]]:
     """Rolls a batch ``steps`` frames forward, ``length`` at a time.
 
     Gradients flow within a stretch and, from the first one, into the initial state; each stretch starts from detached
-    numbers, so a caller that calls backward after every stretch needs memory for one only.
-
-    Args:
-        model: predicts.
-        batch: the disjoint graph.
-        initial: x_0 and x_{-1} of all members.
-        steps: predicted frames.
-        length: of a stretch.
-        starts: applied, in this order, to the state that each stretch starts from.
-        checkpoint: keep of each step its input only and compute it once more in the backward pass.
+    numbers, so a caller that calls backward after every stretch needs memory for one only. ``restart`` is applied to
+    the state that each stretch starts from; ``checkpoint`` keeps of each step its input only and computes it once more
+    in the backward pass.
 
     Yields:
         The number of frames predicted before the stretch, and its steps.
@@ -166,8 +156,7 @@ def windows(
     state = initial
     for start in range(0, steps, length):
         state = state.detach() if start else state
-        for change in starts:
-            state = change(state)
+        state = state if restart is None else restart(state)
         made: list[PredictedStep] = []
         prepared = None if checkpoint else model.prepare(batch)
         for _ in range(min(length, steps - start)):
@@ -199,48 +188,6 @@ def draw_rest(renderer: Renderer, look: SceneAppearance, rest: Float[Tensor, "K 
     units = torch.zeros(rest.shape[0], dtype=torch.long, device=rest.device)
     with torch.no_grad():
         return draw(renderer, look, rest[None], identity, identity, units, cameras)
-
-
-class UnitNoise:
-    """Moves the units of a batch at random, as the errors of a longer rollout would.
-
-    Kernels of a unit move together: independent noise would average out in every barycentre that the network sees.
-    """
-
-    def __init__(
-        self,
-        batch: SceneBatch,
-        scenes: Sequence[GaussianScene],
-        deviation: Sequence[float],
-        seed: int,
-        places: Sequence[int],
-    ) -> None:
-        """Every member draws by itself, so that its noise does not depend on which rank computes it.
-
-        Args:
-            batch: whose units are moved.
-            scenes: all of them.
-            deviation: one standard deviation per scene [scene units].
-            seed: of the optimiser step.
-            places: of the members among all sequences of the step.
-        """
-        device = batch.rest.device  # numbers drawn on the host would have to be waited for
-        self._batch = batch
-        self._generators = [torch.Generator(device).manual_seed(hash_seed(seed, place)) for place in places]
-        self._scales = []
-        for member in batch.members:
-            scene = scenes[member.scene_id]
-            moves = (scene.simulated & ~scene.pinned).to(batch.rest)
-            self._scales.append(moves[:, None] * deviation[member.scene_id])
-
-    def __call__(self, state: SimState) -> SimState:
-        """The state with its latest positions moved."""
-        parts = []
-        for member, scale, own in zip(self._batch.members, self._scales, self._generators, strict=True):
-            count = member.units.stop - member.units.start
-            noise = torch.randn(count, 3, generator=own, device=scale.device).to(scale)
-            parts.append(noise[member.unit_of_kernel] * scale)
-        return SimState(state.positions + torch.cat(parts), state.previous)
 
 
 def reach(batch: SceneBatch, diagonals: Sequence[float], positions: Float[Tensor, "T K 3"]) -> Float[Tensor, "T S"]:
@@ -282,15 +229,10 @@ class Explosions:
         deferred: torch.device | None,
         ranks: Ranks,
     ) -> None:
-        """Begins a rollout.
+        """Begins a rollout of the samples of all ranks.
 
-        Args:
-            batch: what this rank computes; None for one without sequences.
-            diagonals: of the scenes [scene units].
-            samples: the sequences of the step, over all ranks.
-            limit: what is too far [diagonals of the member's scene].
-            deferred: where reads are put off, the device; else None.
-            ranks: which take part.
+        ``batch`` is what this rank computes, None without sequences; ``limit`` is what is too far [diagonals of the
+        member's scene]; ``deferred`` is the device where reads are put off, else None.
         """
         self._batch, self._diagonals, self._samples = batch, diagonals, samples
         self._limit, self._ranks = limit, ranks

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -19,81 +20,18 @@ Table = list[list[float]]
 
 
 @dataclass(frozen=True)
-class Numbers:
-    """The numbers of a step over all sequences, on the host, as far as the rollout lasted.
-
-    Attributes:
-        images: image loss of each predicted frame (as many as the rollout lasted) and sequence.
-        momentum: momentum loss of each predicted frame.
-        motion: squared change of the predicted images, summed over the batch.
-        static: the static loss, if this batch carried it.
-        growth: of the energy of free motion, mean over sequences, if this batch looked at it.
-        gradient_fraction: the momentum loss's fraction of the network's gradient, where it was measured.
-        gradients: norm of each parameter group's gradient.
-    """
-
-    images: Table
-    momentum: list[float]
-    motion: float
-    static: float | None
-    growth: float | None
-    gradient_fraction: float | None
-    gradients: dict[str, float]
-
-    def stats(self, steps: int, count: int, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:
-        """What is logged of a step.
-
-        Args:
-            steps: predicted steps T.
-            count: sequences of the step.
-            baselines: of each of them.
-        """
-        lasted = len(self.images)
-        stats = {f"grad_{name}": value for name, value in self.gradients.items()}
-        if self.gradient_fraction is not None:
-            stats["momentum_share"] = self.gradient_fraction
-        if self.static is not None:
-            stats["loss_static"] = self.static
-        if self.growth is not None:
-            stats["energy_growth"] = self.growth
-        stats.update(steps=float(steps), exploded=float(lasted < steps))
-        if lasted:
-            stats["loss_momentum"] = sum(self.momentum) / (steps * count)
-            stats["loss_image"] = sum(map(sum, self.images)) / (lasted * count)
-            stats.update(self._compare(baselines))
-        return stats
-
-    def _compare(self, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:
-        """The prediction's losses and motion against the static prediction's and the truth's."""
-        table = self.images
-        floor = static = first = moved = 0.0
-        for baseline in baselines:
-            floor += baseline.floor * len(table)
-            static += sum(baseline.static[: len(table)])
-            moved += sum(baseline.motion[: len(table)])
-            first += baseline.static[0]
-        loss = sum(map(sum, table))
-        return {
-            "ratio_static": loss / max(static, 1e-12),
-            "excess_static": excess(loss, static, floor),
-            "ratio_first": sum(table[0]) / max(first, 1e-12),
-            "motion_energy": self.motion / max(moved, 1e-12),
-        }
-
-
-@dataclass(frozen=True)
 class Found:
-    """What one rank found, on the host, not yet checked.
+    """The numbers of a step on the host, stretch by stretch.
 
     Attributes:
         reach: how far kernels moved, per stretch, step and sequence.
         images: image loss per stretch, step and sequence.
         momentum: momentum loss per stretch and step, summed over sequences.
         motion: squared change of the predicted images per stretch, summed over sequences.
-        static: the static loss of the scenes that are this rank's, if any.
+        static: the static loss of the scenes that are this rank's, if this batch carried it.
         growth: of the energy of free motion, this rank's sequences' part of the mean, if looked at.
-        gradient_fraction: as in :class:`Numbers`, the same on all ranks.
-        gradients: likewise.
+        gradient_fraction: the momentum loss's fraction of the network's gradient, if measured; the same on all ranks.
+        gradients: norm of each parameter group's gradient; likewise.
     """
 
     reach: list[Table]
@@ -113,21 +51,25 @@ class Found:
         held = [part for part in parts if part.reach]  # the others had no sequence
         static = [part.static for part in parts if part.static is not None]
         growth = [part.growth for part in parts if part.growth is not None]
-        return Found(
-            reach=[_beside(tables) for tables in zip(*(s.reach for s in held), strict=True)],
-            images=[_beside(tables) for tables in zip(*(s.images for s in held), strict=True)],
+        return replace(
+            parts[0],
+            reach=[_beside(tables) for tables in zip(*(part.reach for part in held), strict=True)],
+            images=[_beside(tables) for tables in zip(*(part.images for part in held), strict=True)],
             momentum=[
                 [sum(values) for values in zip(*lists, strict=True)]
-                for lists in zip(*(s.momentum for s in held), strict=True)
+                for lists in zip(*(part.momentum for part in held), strict=True)
             ],
-            motion=[sum(values) for values in zip(*(s.motion for s in held), strict=True)],
+            motion=[sum(values) for values in zip(*(part.motion for part in held), strict=True)],
             static=sum(static) if static else None,
             growth=sum(growth) if growth else None,
-            gradient_fraction=parts[0].gradient_fraction,
-            gradients=parts[0].gradients,
         )
 
-    def numbers(self, samples: Sequence[SampleFacts], explosion: float) -> Numbers:
+    @property
+    def frames(self) -> Table:
+        """Image loss of each predicted frame and sequence."""
+        return [row for table in self.images for row in table]
+
+    def lasting(self, samples: Sequence[SampleFacts], explosion: float) -> Found:
         """Ends the rollout at its first explosion and checks that all is finite.
 
         Args:
@@ -137,42 +79,51 @@ class Found:
         Raises:
             DivergenceError: a number is not finite; names the step and the sequence where there is one.
         """
-        lasted = self._lasted(samples, explosion)
-        numbers = Numbers(
-            images=[row for table in self.images[:lasted] for row in table],
-            momentum=[value for values in self.momentum[:lasted] for value in values],
-            motion=sum(self.motion[:lasted]),
-            static=self.static,
-            growth=self.growth,
-            gradient_fraction=self.gradient_fraction if lasted else None,  # of the first stretch
-            gradients=self.gradients,
-        )
-        _check(numbers, samples)
-        return numbers
-
-    def _lasted(self, samples: Sequence[SampleFacts], explosion: float) -> int:
-        """Number of stretches before the one that exploded."""
-        start = 0
-        for number, table in enumerate(self.reach):
+        start = lasted = 0
+        for table in self.reach:
             if check_reach(table, start, samples) > explosion:
-                return number
-            start += len(table)
-        return len(self.reach)
+                break
+            start, lasted = start + len(table), lasted + 1
+        kept = {name: getattr(self, name)[:lasted] for name in ("reach", "images", "momentum", "motion")}
+        fraction = self.gradient_fraction if lasted else None  # of the first stretch
+        found = replace(self, **kept, gradient_fraction=fraction)
+        found._check(samples)
+        return found
+
+    def _check(self, samples: Sequence[SampleFacts]) -> None:
+        momentum = [value for values in self.momentum for value in values]
+        checked: list[tuple[float, int | None, SampleFacts | None, str]] = []
+        for t, row in enumerate(self.frames):
+            checked += [(v, t, sample, "the image loss") for v, sample in zip(row, samples, strict=True)]
+            checked.append((momentum[t], t, None, "the momentum loss"))
+        checked.append((self.static or 0.0, None, None, "the static loss"))
+        checked += [(v, None, None, f"the gradient of group '{name}'") for name, v in self.gradients.items()]
+        for value, step, sample, what in checked:
+            if not abs(value) < float("inf"):
+                raise DivergenceError(describe(step, samples, sample, f"{what} is {value}"))
+
+    def stats(self, steps: int, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:
+        """What is logged of a step of T = ``steps`` predicted frames; the baselines are of its sequences."""
+        frames, count = self.frames, len(baselines)
+        single = {
+            "momentum_share": self.gradient_fraction, "loss_static": self.static, "energy_growth": self.growth,
+        }  # fmt: skip
+        stats = {f"grad_{name}": value for name, value in self.gradients.items()}
+        stats.update({name: value for name, value in single.items() if value is not None})
+        stats.update(steps=float(steps), exploded=float(len(frames) < steps))
+        if frames:
+            stats["loss_momentum"] = sum(value for values in self.momentum for value in values) / (steps * count)
+            stats["loss_image"] = sum(map(sum, frames)) / (len(frames) * count)
+            stats.update(_compare(frames, sum(self.motion), baselines))
+        return stats
 
 
 @dataclass
 class Statistics:
-    """What one optimiser step found, stretch by stretch, on the device.
+    """What one optimiser step found, stretch by stretch, on the device; :class:`Found` says what is what.
 
     Attributes:
-        reach: how far kernels moved (:func:`gausim.training.rollout.reach`).
-        images: image loss per predicted step and sequence.
-        momentum: momentum loss per predicted step.
-        motion: squared change of the predicted images, summed over the batch.
-        static: the static loss, if this batch carries it.
-        growth: of the energy of free motion, if this batch looks at it.
         pulls: gradients of the network by the image losses and by the momentum loss, where their ratio is measured.
-        gradient_fraction: the momentum loss's fraction of the network's gradient.
     """
 
     reach: list[Float[Tensor, "T S"]] = field(default_factory=list)
@@ -185,30 +136,21 @@ class Statistics:
     gradient_fraction: Float[Tensor, ""] | None = None
 
     def fetch(self, norms: Mapping[str, Tensor]) -> Found:
-        """Fetches everything at once.
-
-        Args:
-            norms: norm of each parameter group's gradient.
-        """
-        single = [x for x in (self.static, self.growth, self.gradient_fraction) if x is not None]
-        parts = [*self.reach, *self.images, *self.momentum, *self.motion, *single, *norms.values()]
+        """Fetches everything at once, the norm of each parameter group's gradient too."""
+        series = {name: getattr(self, name) for name in ("reach", "images", "momentum", "motion")}
+        single = {name: getattr(self, name) for name in ("static", "growth", "gradient_fraction")}
+        parts = [x for kept in series.values() for x in kept]
+        parts += [x for x in (*single.values(), *norms.values()) if x is not None]
         device = parts[0].device
-        fetched = iter(torch.cat([p.detach().to(device, torch.float32).reshape(-1) for p in parts]).tolist())
-        reach, images = ([_table(x, fetched) for x in kept] for kept in (self.reach, self.images))
-        momentum = [_take(len(x), fetched) for x in self.momentum]
-        motion = _take(len(self.motion), fetched)
-        static = next(fetched) if self.static is not None else None
-        growth = next(fetched) if self.growth is not None else None
-        fraction = next(fetched) if self.gradient_fraction is not None else None
-        return Found(reach, images, momentum, motion, static, growth, fraction, dict(zip(norms, fetched, strict=True)))
+        numbers = iter(torch.cat([p.detach().to(device, torch.float32).reshape(-1) for p in parts]).tolist())
+        found: dict[str, Any] = {name: [_take(x.shape, numbers) for x in kept] for name, kept in series.items()}
+        found |= {name: None if x is None else next(numbers) for name, x in single.items()}
+        return Found(**found, gradients=dict(zip(norms, numbers, strict=True)))
 
 
-def _take(count: int, fetched: Iterator[float]) -> list[float]:
-    return [next(fetched) for _ in range(count)]
-
-
-def _table(like: Tensor, fetched: Iterator[float]) -> Table:
-    return [_take(like.shape[1], fetched) for _ in range(like.shape[0])]
+def _take(shape: Sequence[int], numbers: Iterator[float]) -> Any:
+    """Numbers in nested lists of a shape."""
+    return [_take(shape[1:], numbers) for _ in range(shape[0])] if shape else next(numbers)
 
 
 def _beside(tables: Sequence[Table]) -> Table:
@@ -216,15 +158,18 @@ def _beside(tables: Sequence[Table]) -> Table:
     return [interleave(rows) for rows in zip(*tables, strict=True)]
 
 
-def _check(numbers: Numbers, samples: Sequence[SampleFacts]) -> None:
-    for t, row in enumerate(numbers.images):
-        for value, sample in zip(row, samples, strict=True):
-            if not abs(value) < float("inf"):
-                raise DivergenceError(describe(t, samples, sample, f"the image loss is {value}"))
-        if not abs(numbers.momentum[t]) < float("inf"):
-            raise DivergenceError(describe(t, samples, None, f"the momentum loss is {numbers.momentum[t]}"))
-    if numbers.static is not None and not abs(numbers.static) < float("inf"):
-        raise DivergenceError(describe(None, samples, None, f"the static loss is {numbers.static}"))
-    for name, value in numbers.gradients.items():
-        if not abs(value) < float("inf"):
-            raise DivergenceError(describe(None, samples, None, f"the gradient of group '{name}' is {value}"))
+def _compare(frames: Table, motion: float, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:
+    """The prediction's losses and motion against the static prediction's and the truth's."""
+    floor = static = first = moved = 0.0
+    for baseline in baselines:
+        floor += baseline.floor * len(frames)
+        static += sum(baseline.static[: len(frames)])
+        moved += sum(baseline.motion[: len(frames)])
+        first += baseline.static[0]
+    loss = sum(map(sum, frames))
+    return {
+        "ratio_static": loss / max(static, 1e-12),
+        "excess_static": excess(loss, static, floor),
+        "ratio_first": sum(frames[0]) / max(first, 1e-12),
+        "motion_energy": motion / max(moved, 1e-12),
+    }

@@ -8,12 +8,11 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from gausim.core import ConfigError, DivergenceError, SimState
+from gausim.core import ConfigError, DivergenceError
 from gausim.data.dataset import SampleFacts, SequenceSample
-from gausim.training.contracts import SceneBatch
 from gausim.training.learner import Learner
 from gausim.training.ranks.ranks import interleave
-from gausim.training.rollout import Explosions, States, UnitNoise, after, describe, windows
+from gausim.training.rollout import Explosions, States, after, describe, windows
 from gausim.training.statistics import Found, Statistics
 from gausim.training.terms.term import StepInputs
 
@@ -37,7 +36,10 @@ def optimise(
     whole = interleave(learner.ranks.gather([sample.facts for sample in samples]))
     learner.exchange.begin(lambda: _see_first_frame(learner, samples))
     statistics = roll_out(learner, samples, whole, draws)
-    inputs = StepInputs(samples, whole, draws, statistics, learner.ranks, learner.accumulate, learner.rest_loss)
+    inputs = StepInputs(
+        samples, whole, draws, statistics, learner.ranks, learner.accumulate, learner.rest_loss, learner.objective,
+        learner.images, learner.diagonals,
+    )  # fmt: skip
     for term in learner.terms():
         term.descend(inputs)
     weights = [p for p in learner.parameters() if p.requires_grad]
@@ -75,11 +77,10 @@ def roll_out(
         any(explosions.end(None, start, statistics.reach) for start in range(0, steps, length))
         return statistics
     comparison = learner.supervision.comparison(samples, batch)
-    starts: list[Callable[[SimState], SimState]] = [explosions.restart, *_noise(learner, batch, draws)]
     initial, kept = learner.initial(samples, batch), objective.checkpoint_steps
     per = objective.step_weight(steps) / len(whole)
     own, last = torch.zeros(len(samples), device=device), initial
-    for start, made in windows(learner.simulator, batch, initial, steps, length, starts, checkpoint=kept):
+    for start, made in windows(learner.simulator, batch, initial, steps, length, explosions.restart, checkpoint=kept):
         states = States.of(made)
         if explosions.end(states.positions, start, statistics.reach):
             break
@@ -117,14 +118,6 @@ def _pull(loss: Tensor, network: list[nn.Parameter]) -> Tensor:
     return torch.cat([grad.flatten() for grad in grads])
 
 
-def _noise(learner: Learner, batch: SceneBatch, draws: torch.Generator) -> list[UnitNoise]:
-    if learner.objective.input_noise == 0:
-        return []
-    deviations = [learner.objective.input_noise * d for d in learner.diagonals]
-    places = [learner.ranks.rank + i * learner.ranks.size for i in range(len(batch.members))]
-    return [UnitNoise(batch, learner.simulator.scenes, deviations, draws.initial_seed(), places)]
-
-
 def _momentum_unit(learner: Learner, samples: list[SequenceSample]) -> float:
     """What the rest state scores on the frames of the batch, over all ranks: the unit of the momentum loss."""
     if learner.objective.momentum_weight == 0:
@@ -136,11 +129,11 @@ def _momentum_unit(learner: Learner, samples: list[SequenceSample]) -> float:
 def _read(learner: Learner, samples: list[SequenceSample], whole: list[SampleFacts], found: Found) -> dict[str, float]:
     """Joins the numbers of all ranks, checks them and forms what is logged."""
     parts = learner.ranks.gather((found, [learner.baseline(sample) for sample in samples]))
-    numbers = Found.join([part[0] for part in parts]).numbers(whole, learner.objective.explosion)
+    lasting = Found.join([part[0] for part in parts]).lasting(whole, learner.objective.explosion)
     baselines = interleave([part[1] for part in parts])
     learner.baselines.learn([s.sequence_id for s in whole], baselines)
-    learner.barren = 0 if numbers.images else learner.barren + 1
+    learner.barren = 0 if lasting.images else learner.barren + 1
     if learner.barren >= BARREN_BATCHES:
         far = f"kernels moved beyond {learner.objective.explosion} diagonals in {BARREN_BATCHES} batches in a row"
         raise DivergenceError(describe(0, whole, None, far))
-    return numbers.stats(whole[0].steps, len(whole), baselines)
+    return lasting.stats(whole[0].steps, baselines)

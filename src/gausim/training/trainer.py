@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -17,25 +18,40 @@ from gausim.training.callbacks.convergence import Convergence
 from gausim.training.callbacks.resume import ExactResume
 from gausim.training.callbacks.time_budget import TimeBudget
 from gausim.training.ranks.launch import Crew
-from gausim.training.ranks.layout import RanksStrategy
+from gausim.training.ranks.layout import Layout, RanksStrategy
+
+
+@dataclass(frozen=True)
+class TrainerSettings(Layout):
+    """How long, how precisely and where a run trains: the keys of ``conf/trainer``.
+
+    Attributes:
+        max_epochs: epochs of the whole run.
+        threads: of torch's operators on the CPU, for each rank; None leaves the process's own number.
+        precision: Lightning's name of it.
+        max_minutes: time budget; None is without.
+        clock: what the budget counts, ``wall`` or ``cpu`` time.
+        log_every_n_steps: optimiser steps between rows of the loggers.
+        progress: whether a progress bar is shown.
+        overwrite: whether an earlier run in the directory is removed.
+        convergence: ends the run when it has learned; None leaves it all of its epochs.
+    """
+
+    max_epochs: int = 120
+    threads: int | None = None
+    precision: str = "32-true"
+    max_minutes: float | None = None
+    clock: str = "wall"
+    log_every_n_steps: int = 20
+    progress: bool = True
+    overwrite: bool = False
+    convergence: Convergence | None = None
 
 
 def make_trainer(
+    settings: TrainerSettings,
     *,
-    max_epochs: int,
-    accelerator: str = "auto",
-    devices: int = 1,
-    num_nodes: int = 1,
-    timeout_minutes: float = 10.0,
-    threads: int | None = None,
-    precision: str = "32-true",
-    max_minutes: float | None = None,
-    clock: str = "wall",
-    log_every_n_steps: int = 20,
-    progress: bool = True,
-    overwrite: bool = False,
-    convergence: Convergence | None = None,
-    run_dir: Path | str | None = None,
+    run_dir: Path | None = None,
     callbacks: Sequence[Callback] = (),
     loggers: Sequence[Logger] = (),
     crew: Crew | None = None,
@@ -43,19 +59,7 @@ def make_trainer(
     """The Lightning trainer of a run.
 
     Args:
-        max_epochs: epochs of the whole run.
-        accelerator: ``auto``, ``cpu`` or ``gpu``.
-        devices: ranks on each machine; more than one need a crew.
-        num_nodes: machines.
-        timeout_minutes: how long ranks wait for each other; :class:`~gausim.training.ranks.layout.Layout` has it.
-        threads: of torch's operators on the CPU, for each rank; None leaves the process's own number.
-        precision: Lightning's name of it.
-        max_minutes: time budget; None is without.
-        clock: what the budget counts, ``wall`` or ``cpu`` time.
-        log_every_n_steps: optimiser steps between rows of the loggers.
-        progress: whether a progress bar is shown.
-        overwrite: what the run directory is prepared with; nothing to the trainer.
-        convergence: ends the run when it has learned; None leaves it all of its epochs.
+        settings: of the run.
         run_dir: where checkpoints, panels and tables go.
         callbacks: further ones.
         loggers: where numbers go.
@@ -65,34 +69,34 @@ def make_trainer(
         ConfigError: more than one rank without a crew.
     """
     environment = crew.environment if crew is not None else None
-    if devices * num_nodes != 1 and environment is None:
+    if settings.size != 1 and environment is None:
         raise ConfigError(
-            f"trainer.devices: expected 1, got {devices} on {num_nodes} machines; several ranks train by `gausim "
-            "train` only, which starts them."
+            f"trainer.devices: expected 1, got {settings.devices} on {settings.num_nodes} machines; several ranks "
+            "train by `gausim train` only, which starts them."
         )
-    if threads is not None:
-        torch.set_num_threads(threads)
+    if settings.threads is not None:
+        torch.set_num_threads(settings.threads)
     keep_freed_memory()
-    own: list[Callback] = [] if convergence is None else [convergence]  # before what tells of its judgement
-    own += [c for c in callbacks if progress or not isinstance(c, ProgressBar)]
-    if max_minutes is not None:
-        own.append(TimeBudget(minutes=max_minutes, clock=clock))
-    own.append(ExactResume())
+    # Convergence stands before what tells of its judgement.
+    own: list[Callback] = [] if settings.convergence is None else [settings.convergence]
+    own += [c for c in callbacks if settings.progress or not isinstance(c, ProgressBar)]
+    if settings.max_minutes is not None:
+        own.append(TimeBudget(minutes=settings.max_minutes, clock=settings.clock))
     return Trainer(
-        max_epochs=max_epochs,
-        accelerator=accelerator,
-        devices=devices,
-        num_nodes=num_nodes,
+        max_epochs=settings.max_epochs,
+        accelerator=settings.accelerator,
+        devices=settings.devices,
+        num_nodes=settings.num_nodes,
         strategy="auto" if environment is None else RanksStrategy(),
-        precision=precision,  # type: ignore[arg-type]
+        precision=settings.precision,  # type: ignore[arg-type]
         logger=list(loggers) or False,
-        callbacks=own,
-        log_every_n_steps=log_every_n_steps,
-        enable_progress_bar=progress,
+        callbacks=[*own, ExactResume()],
+        log_every_n_steps=settings.log_every_n_steps,
+        enable_progress_bar=settings.progress,
         enable_model_summary=False,
         num_sanity_val_steps=0,
         limit_val_batches=0,
         use_distributed_sampler=False,  # the sampler deals out shares itself
-        default_root_dir=str(run_dir) if run_dir is not None else None,
+        default_root_dir=None if run_dir is None else str(run_dir),
         plugins=[AtomicCheckpointIO(), *([] if environment is None else [environment])],
     )

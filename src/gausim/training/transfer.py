@@ -11,20 +11,17 @@ from torch import Tensor, nn
 from gausim.core import ConfigError, RunError
 from gausim.runs.checkpoint import averaged_weights, fingerprints, read_checkpoint, tell
 from gausim.runs.directory import RunDirectory, differing_keys
-from gausim.training.contracts import Simulator
+from gausim.training.contracts import Transferable
 
 # Prefix of the simulator's weights in a checkpoint of the training module.
 _PREFIX = "model."
 _SHOWN = 3
 
 
-def load_shared(simulator: Simulator, run_dir: Path | str, model: Mapping[str, Any]) -> None:
+def load_shared(simulator: Transferable, run_dir: Path | str, model: Mapping[str, Any]) -> None:
     """Loads what a trained run's scenes shared into a simulator of any scenes; everything else of it stays as it is.
 
-    Args:
-        simulator: what is to be trained.
-        run_dir: the trained run; its averaged weights are taken where it averaged.
-        model: the configuration of the simulator, to tell what differs.
+    ``model`` is the configuration of the simulator, to tell what differs.
 
     Raises:
         RunError: there is no run or no readable checkpoint.
@@ -41,13 +38,10 @@ def load_shared(simulator: Simulator, run_dir: Path | str, model: Mapping[str, A
         part.load_state_dict(found[name])
 
 
-def load_simulator(simulator: Simulator, run_dir: Path | str, model: Mapping[str, Any]) -> None:
+def load_simulator(simulator: Transferable, run_dir: Path | str, model: Mapping[str, Any]) -> None:
     """Loads all of a trained simulator into one of some of its scenes, which are told by name, size and positions.
 
-    Args:
-        simulator: of scenes that the run was trained on.
-        run_dir: the trained run; its averaged weights are taken where it averaged.
-        model: the configuration of the simulator, to tell what differs.
+    ``model`` is the configuration of the simulator, to tell what differs.
 
     Raises:
         RunError: there is no run or no readable checkpoint, or it was not trained on a scene.

@@ -2,7 +2,7 @@
 
 A run learns at constant rates, on rollouts that stop short of the last training frames. After each epoch the frames
 held back are foreseen. Once that forecast no longer gets better, or the run's allowance of epochs or minutes nears its
-end, the run finishes: all training frames are shown, and the rates fall (``engine.optim.StableDecaySchedule``).
+end, the run finishes: all training frames are shown, and the rates fall (``training.optimizers.StableDecaySchedule``).
 """
 
 from __future__ import annotations

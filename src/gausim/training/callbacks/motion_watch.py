@@ -20,10 +20,10 @@ from gausim.results.diagnosis import Diagnosis
 from gausim.runs.names import MOTION
 from gausim.runs.randomness import undisturbed
 from gausim.training.callbacks.cadence import has_come, training_data
-from gausim.training.callbacks.epoch_table import EpochTable
 from gausim.training.contracts import Hierarchical
 from gausim.training.module import GausSimModule
 from gausim.training.supervision.points import attach_points
+from gausim.training.table import Table, short
 
 METHOD = "prediction"
 LEVELS = 3
@@ -73,14 +73,14 @@ class MotionWatch(Callback):
             rows = self._look(trainer, pl_module)
         for name, row in rows.items():
             place = {"epoch": trainer.current_epoch + 1, "step": trainer.global_step, "object": name}
-            self._table(trainer).append({**place, **row})
+            self._table(trainer).append({**place, **{key: short(value) for key, value in row.items()}})
         means = {key: _mean([row[key] for row in rows.values() if key in row]) for key in self.COLUMNS[3:]}
         known = {f"motion/{key}": value for key, value in means.items() if np.isfinite(value)}
         for logger in trainer.loggers if known else ():
             logger.log_metrics(known, step=trainer.global_step)
 
-    def _table(self, trainer: Trainer) -> EpochTable:
-        return EpochTable(Path(trainer.default_root_dir) / MOTION, self.COLUMNS)
+    def _table(self, trainer: Trainer) -> Table:
+        return Table(Path(trainer.default_root_dir) / MOTION, "epoch", self.COLUMNS)
 
     def _look(self, trainer: Trainer, module: GausSimModule) -> dict[str, dict[str, float]]:
         rows, first = {}, 0

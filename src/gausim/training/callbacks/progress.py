@@ -17,9 +17,9 @@ from lightning.pytorch.callbacks import RichProgressBar
 from gausim.data.datamodule import ReadyDataModule
 from gausim.runs.names import EPOCHS
 from gausim.training.callbacks.convergence import Convergence
-from gausim.training.callbacks.epoch_table import EpochTable, short
 from gausim.training.callbacks.time_budget import TimeBudget
 from gausim.training.module import GausSimModule
+from gausim.training.table import Table, short
 
 # Epochs that the time left is told from.
 RECENT = 8
@@ -60,7 +60,7 @@ class EpochSummary(Callback):
         means.update(epoch=trainer.current_epoch + 1, step=trainer.global_step, seconds=time.monotonic() - self._began)
         if not trainer.is_global_zero:
             return
-        self._table(trainer).append(means)
+        self._table(trainer).append({name: short(value) for name, value in means.items()})
         if self._console:
             pl_module.print(self._line(trainer, means))
             sys.stdout.flush()  # where output is piped, the epochs of a long run should show as they end
@@ -84,16 +84,17 @@ class EpochSummary(Callback):
         if means.get("exploded", 0) > 0:
             parts.append(f"exploded {means['exploded']:.0%}")
         parts.append(f"{means['seconds']:.1f} s")
-        fitted = hasattr(trainer.lightning_module, "plan")  # in stages, which have lengths of their own
         self._paces.append((int(means.get("steps", 0)), means["seconds"]))
-        left = None if fitted else _minutes_left(trainer, self._paces)
+        module = cast(GausSimModule, trainer.lightning_module)
+        # The stages of a fit have lengths of their own.
+        left = None if module.initial_states is None else _minutes_left(trainer, self._paces)
         judged = any(isinstance(c, Convergence) and c.is_learning for c in cast(Any, trainer).callbacks)
         return "  ".join(
             [*parts, *([] if left is None else [f"{'at most' if judged else 'about'} {left:.0f} min left"])]
         )
 
-    def _table(self, trainer: Trainer) -> EpochTable:
-        return EpochTable(Path(trainer.default_root_dir) / EPOCHS, self.COLUMNS)
+    def _table(self, trainer: Trainer) -> Table:
+        return Table(Path(trainer.default_root_dir) / EPOCHS, "epoch", self.COLUMNS)
 
 
 def _minutes_left(trainer: Trainer, paces: Sequence[tuple[int, float]]) -> float | None:

@@ -88,7 +88,6 @@ class ExactResume(Callback):
     """Restores what Lightning does not: random generators, loggers' rows, and that a run was already over."""
 
     def __init__(self) -> None:
-        """Nothing to set."""
         self._random: dict[str, Any] | None = None
         self._ranks = Ranks()
 

@@ -14,24 +14,23 @@ from gausim.training.module import GausSimModule
 class TimeBudget(Callback):
     """Ends training after so many minutes, resumed runs included; the epoch under way is cut and saved.
 
-    A clock never runs twice alike: with ``drives_schedule`` the learning rates, and without it the number of steps,
-    differ between any two runs. A resumed run is exact in everything else.
+    The learning-rate schedule advances with the budget, so that it comes to its end. A clock never runs twice alike,
+    so the learning rates differ between any two runs. A resumed run is exact in everything else.
     """
 
-    def __init__(self, *, minutes: float, clock: str = "wall", drives_schedule: bool = True) -> None:
+    def __init__(self, *, minutes: float, clock: str = "wall") -> None:
         """Keeps the settings.
 
         Args:
             minutes: the budget.
             clock: ``wall``, or ``cpu`` for processor time of this process.
-            drives_schedule: the learning-rate schedule also advances with the budget, so that it comes to its end.
 
         Raises:
             ConfigError: an unknown clock or a budget that is not positive.
         """
         if clock not in ("wall", "cpu") or not minutes > 0:
             raise ConfigError(f"trainer: expected max_minutes > 0 and clock wall or cpu, got {minutes} and {clock!r}.")
-        self._budget, self._drives = 60.0 * minutes, drives_schedule
+        self._budget = 60.0 * minutes
         self._clock = time.monotonic if clock == "wall" else time.process_time
         self._used, self._mark = 0.0, 0.0
 
@@ -63,7 +62,7 @@ class TimeBudget(Callback):
             trainer.should_stop = True
 
     def _drive(self, pl_module: LightningModule) -> None:
-        if self._drives and isinstance(pl_module, GausSimModule):
+        if isinstance(pl_module, GausSimModule):
             pl_module.time_fraction = min(1.0, self._used / self._budget)
 
     def state_dict(self) -> dict[str, float]:

@@ -43,7 +43,6 @@ class Stage:
     original: int = 0
 
     def __post_init__(self) -> None:
-        """Checks the ranges."""
         if self.iterations < 1 or not self.rates or min(self.rates.values()) <= 0:
             raise ConfigError(
                 "model.plan.stages: expected iterations >= 1 and rates > 0 for at least one group, got "
@@ -83,7 +82,6 @@ class FitPlan:
     optimizer: Callable[..., Optimizer] | None = None
 
     def __post_init__(self) -> None:
-        """Checks the ranges."""
         if self.round < 1:
             raise ConfigError(f"model.plan.round: expected at least 1 iteration, got {self.round}.")
 
@@ -145,7 +143,6 @@ class StagedCurriculum(Curriculum):
     _state: dict[str, float] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Begins at the first stage."""
         super().__post_init__()
         self.enter(0.0)
 

@@ -1,23 +1,23 @@
-"""Loggers that go on where a resumed run goes on: no row twice, none lost up to the checkpoint."""
+"""Loggers that go on where a resumed run goes on: no row twice, none lost up to the checkpoint.
+
+Only the first rank has loggers.
+"""
 
 from __future__ import annotations
 
-import csv
 import io
 import tempfile
-from argparse import Namespace
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import yaml
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
-from lightning.pytorch.utilities import rank_zero_only
 from PIL import Image
 
-from gausim.io.files import write_durably
 from gausim.io.video import read_video, video_rate, write_gif
 from gausim.training.loggers.media import Media
+from gausim.training.table import Table
 
 
 @runtime_checkable
@@ -30,64 +30,30 @@ class Resumable(Protocol):
 
 
 class CsvLog(Logger):
-    """One table ``metrics.csv``; a row is on the disk as soon as it is logged."""
+    """One table ``csv/metrics.csv`` (Lightning's own logger deletes the rows of the process before)."""
+
+    version = ""
 
     def __init__(self, save_dir: str | Path, *, name: str = "csv") -> None:
         """The table goes to ``save_dir/name``."""
         super().__init__()
-        self._name = name
-        self.path = Path(save_dir) / name / "metrics.csv"
-        self._columns: list[str] = []
+        self._name, self.table = name, Table(Path(save_dir) / name / "metrics.csv", "step")
 
     @property
     def name(self) -> str:
         """The folder's name."""
         return self._name
 
-    @property
-    def version(self) -> str:
-        """None: a run has one table."""
-        return ""
-
-    @rank_zero_only
-    def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kwargs: Any) -> None:
+    def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
         """Nothing: the run directory holds its configuration."""
 
-    @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Writes one row; columns not seen before are added to the table."""
-        row: dict[str, Any] = {"step": step, **{name: float(value) for name, value in metrics.items()}}
-        if set(row) <= set(self._columns) and self.path.is_file():
-            with self.path.open("a", newline="") as file:
-                csv.DictWriter(file, self._columns).writerow(row)
-        else:
-            self._rewrite([*self._rows(), row])
+        self.table.append({"step": step, **{name: float(value) for name, value in metrics.items()}})
 
-    @rank_zero_only
     def resume_at(self, step: int) -> None:
-        """Drops the rows of later steps, and a row that was cut while it was written."""
-        if self.path.is_file():
-            whole = [row for row in self._rows() if None not in row and None not in row.values()]
-            self._rewrite([row for row in whole if int(row["step"] or 0) <= step])
-
-    def rows(self) -> list[tuple[int, dict[str, float]]]:
-        """Steps and numbers of the whole table, in the order in which they were logged."""
-        found = ((row.pop("step"), row) for row in self._rows())
-        return [(int(step or 0), {k: float(v) for k, v in row.items() if v}) for step, row in found]
-
-    def _rows(self) -> list[dict[str, Any]]:
-        if not self.path.is_file():
-            return []
-        with self.path.open(newline="") as file:
-            return list(csv.DictReader(file))
-
-    def _rewrite(self, rows: list[dict[str, Any]]) -> None:
-        self._columns = list(dict.fromkeys(["step", *(name for row in rows for name in row)]))
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, self._columns)
-        writer.writeheader()
-        writer.writerows(rows)
-        write_durably(self.path, text.getvalue().encode())
+        """Drops the rows of later steps."""
+        self.table.resume_at(step)
 
 
 class TensorBoardLog(TensorBoardLogger):
@@ -100,13 +66,11 @@ class TensorBoardLog(TensorBoardLogger):
         """The events go to ``save_dir/name``."""
         super().__init__(save_dir, name=name, version="")
 
-    @rank_zero_only
     def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
         """Shows the configuration."""
         text = yaml.safe_dump(dict(params), sort_keys=False)
         self.experiment.add_text("config", "    " + text.replace("\n", "\n    "))  # indented text is code in Markdown
 
-    @rank_zero_only
     def resume_at(self, step: int) -> None:
         """Tells TensorBoard to forget what earlier files hold of later steps."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
@@ -114,7 +78,6 @@ class TensorBoardLog(TensorBoardLogger):
         restart = Event(step=step + 1, session_log=SessionLog(status=SessionLog.START))
         self.experiment.file_writer.add_event(restart)
 
-    @rank_zero_only
     def log_media(self, media: Media) -> None:
         """Shows the media of one step."""
         for name in media.names:

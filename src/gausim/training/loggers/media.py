@@ -14,6 +14,7 @@ from typing import Protocol, runtime_checkable
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+from PIL import Image
 
 from gausim.io.video import write_video
 from gausim.report.pictures.frames import Timeline, error_colors, label_bar, moving_line, space_time_slice, video_frame
@@ -91,14 +92,9 @@ class Clip:
 
 
 def write_media(run: Path, step: int, clips: Sequence[Clip], columns: list[str], rows: list[list[str]]) -> Media:
-    """Writes the media of a step, all or nothing.
+    """Writes the media of an optimiser step into the run directory, all or nothing.
 
-    Args:
-        run: the run directory.
-        step: the optimiser step.
-        clips: the sequences.
-        columns: heads of the table with a row per object.
-        rows: its rows.
+    ``columns`` and ``rows`` are those of the table of objects.
 
     Raises:
         OSError: the disk refuses.
@@ -141,8 +137,8 @@ def _write_clip(folder: Path, clip: Clip) -> None:
     pairs = enumerate(zip(truth, prediction, strict=True))
     frames = (video_frame(t, p, i, timeline, clip.title, height=LEAST_ROWS) for i, (t, p) in pairs)
     write_video(folder / f"{clip.name}.mp4", frames, clip.fps)
-    write_image(folder / f"{clip.name}.frames.png", frame_panel(truth, prediction))
-    write_image(folder / f"{clip.name}.slice.png", slice_panel(truth, prediction))
+    Image.fromarray(frame_panel(truth, prediction)).save(folder / f"{clip.name}.frames.png")
+    Image.fromarray(slice_panel(truth, prediction)).save(folder / f"{clip.name}.slice.png")
     values = [["" if np.isnan(v) else f"{v:.6g}" for v in series] for series in clip.errors.values()]
     rows = [[str(i), *row] for i, row in enumerate(zip(*values, strict=True))]
     write_table(folder / f"{clip.name}.errors.csv", ["frame", *clip.errors], rows)
@@ -186,17 +182,6 @@ def slice_panel(
         tall = np.repeat(wide, max(1, LEAST_ROWS // len(wide)), axis=0)
         parts += [label_bar(name, tall.shape[1]), tall]
     return np.concatenate(parts)
-
-
-def write_image(path: Path, image: UInt8[np.ndarray, "H W 3"]) -> None:
-    """Writes RGB as PNG.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if not cv2.imwrite(str(path), cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2BGR)):
-        raise OSError(f"{path}: cannot be written. Check the folder and the free space.")
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

@@ -6,14 +6,12 @@ import importlib.util
 import math
 import tempfile
 import warnings
-from argparse import Namespace
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
-from lightning.pytorch.loggers import Logger
-from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.loggers import MLFlowLogger
 
 from gausim.core import ConfigError
 from gausim.io.files import write_durably
@@ -29,8 +27,8 @@ if TYPE_CHECKING:
 _PARAMS_AT_ONCE, _LONGEST_PARAM = 100, 6000
 
 
-class MlflowLog(Logger):
-    """MLflow with its tables in one SQLite file; a resumed run continues under the id kept in ``mlflow_id``."""
+class MlflowLog(MLFlowLogger):
+    """Lightning's logger with one SQLite file; a resumed run continues under the id kept in ``mlflow_id``."""
 
     def __init__(
         self, save_dir: str | Path, *, database: str | Path, experiment: str = "gausim", name: str | None = None
@@ -46,119 +44,86 @@ class MlflowLog(Logger):
         Raises:
             ConfigError: MLflow is not installed.
         """
-        super().__init__()
         if importlib.util.find_spec("mlflow") is None:
             raise ConfigError("logger.mlflow: MLflow is not installed. Call `pip install 'gausim[mlflow]'`.")
-        self._folder, self._database = Path(save_dir), Path(database).resolve()
-        self._experiment, self._name = experiment, name
+        self._folder, path = Path(save_dir), Path(database).resolve()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        media = (path.parent / "mlflow_artifacts").as_uri()
+        with undisturbed():
+            super().__init__(experiment, name, f"sqlite:///{path}", artifact_location=media)
         self._config: dict[str, Any] = {}
-        self._client: MlflowClient | None = None
-        self._id = ""
         self._known: dict[str, int] = {}
 
     @property
-    def name(self) -> str:
-        """The experiment."""
-        return self._experiment
+    def experiment(self) -> MlflowClient:
+        """The client of MLflow, with this run begun or gone on with."""
+        if not self._initialized:
+            with undisturbed():
+                self._open()
+            self._initialized = True
+        return self._mlflow_client
 
     @property
     def version(self) -> str:
-        """The run's id; empty before the first number of a new run."""
-        path = self._folder / MLFLOW_ID
-        return path.read_text() if path.is_file() else ""
+        """The run's id, begun if need be."""
+        return str(self.run_id)
 
-    @rank_zero_only
-    def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kwargs: Any) -> None:
-        """Keeps the configuration for the begin of the run."""
-        self._config = dict(vars(params) if isinstance(params, Namespace) else params)
-
-    @rank_zero_only
-    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Logs numbers of a step, those aside that the run has: MLflow forgets nothing, and keeps both."""
-        from mlflow.entities import Metric
-        from mlflow.utils.time import get_current_time_millis
-
-        client, now, at = self._begin(), get_current_time_millis(), step or 0
-        new = {k: float(v) for k, v in metrics.items() if at > self._known.get(_key(k), -1) and math.isfinite(v)}
-        client.log_batch(self._id, metrics=[Metric(_key(k), v, now, at) for k, v in new.items()])
-
-    @rank_zero_only
-    def log_media(self, media: Media) -> None:
-        """Keeps the media of one step as artifacts."""
-        client = self._begin()
-        place = f"media/{media.folder.name}"
-        client.log_artifacts(self._id, str(media.folder), place)
-        for name in media.names:
-            with undisturbed():
-                self._bytes(f"{name}.errors.png", error_plot(media, name), place)
-
-    @rank_zero_only
-    def resume_at(self, step: int) -> None:
-        """Begins, and looks up what the run has of every number."""
-        client = self._begin()
-        for key in client.get_run(self._id).data.metrics:
-            self._known[key] = max(metric.step for metric in client.get_metric_history(self._id, key))
-
-    @rank_zero_only
-    def finalize(self, status: str) -> None:
-        """Ends the run, once."""
-        client, self._client = self._client, None
-        if client is not None:
-            client.set_terminated(self._id, "FAILED" if status == "failed" else "FINISHED")
-
-    def _begin(self) -> MlflowClient:
-        if self._client is None:
-            with undisturbed():
-                self._client = self._open()
-        return self._client
-
-    def _open(self) -> MlflowClient:
+    def _open(self) -> None:
         from mlflow.entities import Param
         from mlflow.exceptions import MlflowException
-        from mlflow.tracking import MlflowClient
 
-        self._database.parent.mkdir(parents=True, exist_ok=True)
-        client = MlflowClient(f"sqlite:///{self._database}")
-        self._id = self.version
-        if self._id:
+        client, id_file = self._mlflow_client, self._folder / MLFLOW_ID
+        if id_file.is_file():
+            self._run_id = id_file.read_text()
             try:
-                client.update_run(self._id, status="RUNNING")
-                return client
+                client.update_run(self._run_id, status="RUNNING")
+                return
             except MlflowException as error:
+                self._run_id = None
                 warnings.warn(
-                    f"{self._database}: has no run {self._id} of {self._folder} ({error}); a new one begins.",
-                    stacklevel=2,
+                    f"{self._tracking_uri}: has no run of {self._folder} ({error}); a new one begins.", stacklevel=2
                 )
-        run = client.create_run(self._experiment_id(client), run_name=self._name)
-        self._id = run.info.run_id
-        write_durably(self._folder / MLFLOW_ID, self._id.encode())
+        try:
+            _ = super().experiment
+        except MlflowException:  # another job of a sweep made the experiment meanwhile
+            _ = super().experiment
+        run = self._run_id or ""
+        write_durably(id_file, run.encode())
         params = [Param(_key(key), value[:_LONGEST_PARAM]) for key, value in _flat(self._config)]
         for start in range(0, len(params), _PARAMS_AT_ONCE):
-            client.log_batch(self._id, params=params[start : start + _PARAMS_AT_ONCE])
-        client.log_text(self._id, yaml.safe_dump(self._config, sort_keys=False), "config.yaml")
-        client.set_tag(self._id, "run_directory", str(self._folder))
-        return client
+            client.log_batch(run, params=params[start : start + _PARAMS_AT_ONCE])
+        client.log_text(run, yaml.safe_dump(self._config, sort_keys=False), "config.yaml")
+        client.set_tag(run, "run_directory", str(self._folder))
 
-    def _experiment_id(self, client: MlflowClient) -> str:
-        from mlflow.exceptions import MlflowException
+    def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
+        """Keeps the configuration for the begin of the run."""
+        self._config = dict(params)
 
-        known = client.get_experiment_by_name(self._experiment)
-        if known is None:
-            try:
-                artifacts = self._database.parent / "mlflow_artifacts"
-                return client.create_experiment(self._experiment, artifact_location=artifacts.as_uri())
-            except MlflowException:  # another job of a sweep was faster
-                known = client.get_experiment_by_name(self._experiment)
-                if known is None:
-                    raise
-        return known.experiment_id
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Logs numbers of a step, those aside that the run has: MLflow forgets nothing, and keeps both."""
+        new = {_key(k): float(v) for k, v in metrics.items() if math.isfinite(v)}
+        super().log_metrics({k: v for k, v in new.items() if (step or 0) > self._known.get(k, -1)}, step)
 
-    def _bytes(self, name: str, content: bytes, place: str) -> None:
-        assert self._client is not None
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / name
-            path.write_bytes(content)
-            self._client.log_artifact(self._id, str(path), place)
+    def log_media(self, media: Media) -> None:
+        """Keeps the media of one step as artifacts."""
+        place = f"media/{media.folder.name}"
+        self.experiment.log_artifacts(self.version, str(media.folder), place)
+        for name in media.names:
+            with undisturbed(), tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / f"{name}.errors.png"
+                path.write_bytes(error_plot(media, name))
+                self.experiment.log_artifact(self.version, str(path), place)
+
+    def resume_at(self, step: int) -> None:
+        """Begins, and looks up what the run has of every number."""
+        client = self.experiment
+        for key in client.get_run(self.version).data.metrics:
+            self._known[key] = max(metric.step for metric in client.get_metric_history(self.version, key))
+
+    def finalize(self, status: str = "success") -> None:
+        """Ends the run, once."""
+        super().finalize(status)
+        self._initialized = False
 
 
 def _key(name: str) -> str:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import torch
 from lightning.fabric.utilities.seed import reset_seed
-from lightning.pytorch.plugins.environments import ClusterEnvironment
+from lightning.pytorch.plugins.environments import LightningEnvironment
 from lightning.pytorch.strategies import DDPStrategy
 from torch import distributed as dist
 
@@ -33,7 +33,6 @@ class Layout:
     timeout_minutes: float = 10.0
 
     def __post_init__(self) -> None:
-        """Checks the numbers."""
         if not all(isinstance(n, int) and n >= 1 for n in (self.devices, self.num_nodes)) or self.timeout_minutes <= 0:
             raise ConfigError(
                 "trainer: expected devices >= 1, num_nodes >= 1 (numbers of ranks and machines) and "
@@ -82,53 +81,22 @@ class Place:
 
     def argv(self) -> list[str]:
         """As arguments of a program."""
-        return [str(x) for x in (self.rank, self.size, self.port, self.backend, self.timeout)]
+        return [str(x) for x in astuple(self)]
 
 
-class LocalRanks(ClusterEnvironment):
+class LocalRanks(LightningEnvironment):
     """Tells Lightning where a rank stands on this machine; no environment variable is read or set."""
 
+    creates_processes_externally = True
+    main_address = LOCALHOST
+
     def __init__(self, rank: int, size: int, port: int) -> None:
-        """Keeps the numbers."""
-        self._rank, self._size, self._port = rank, size, port
-
-    @property
-    def creates_processes_externally(self) -> bool:
-        """True: they run already."""
-        return True
-
-    @property
-    def main_address(self) -> str:
-        """This machine."""
-        return LOCALHOST
-
-    @property
-    def main_port(self) -> int:
-        """Of the first rank's store."""
-        return self._port
-
-    @staticmethod
-    def detect() -> bool:
-        """Never chosen by Lightning itself."""
-        return False
-
-    def world_size(self) -> int:
-        """Number of ranks."""
-        return self._size
-
-    def set_world_size(self, size: int) -> None:
-        """Fixed already."""
-
-    def global_rank(self) -> int:
-        """This rank."""
-        return self._rank
-
-    def set_global_rank(self, rank: int) -> None:
-        """Fixed already."""
+        super().__init__()
+        self._global_rank, self._world_size, self._main_port = rank, size, port
 
     def local_rank(self) -> int:
         """This rank: all are on one machine."""
-        return self._rank
+        return self._global_rank
 
     def node_rank(self) -> int:
         """The only machine."""

@@ -74,14 +74,9 @@ class Ranks:
         return least.bool()
 
     def add(self, tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> list[Tensor | None]:
-        """Sums of tensors over ranks, all of one type in one message.
+        """Sums of tensors over ranks, all of one type in one message: the same bits on every rank.
 
-        Args:
-            tensors: one per entry of ``like``; None counts as zero.
-            like: tensors of the same shape, type and device on all ranks.
-
-        Returns:
-            New tensors, the same bits on every rank; None where no rank has one.
+        None counts as zero, and where no rank has a tensor there is none; ``like`` has the shapes, types and device.
         """
         if self.size == 1:
             return list(tensors)

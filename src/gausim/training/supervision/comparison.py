@@ -58,15 +58,8 @@ class Comparison:
     ) -> None:
         """Binds what stays the same over a rollout.
 
-        Args:
-            renderer: draws.
-            loss: compares.
-            batch: the disjoint graph.
-            groups: the members by scene and cameras.
-            looks: appearance of each group's scene.
-            frames: the true frames 1..T of each member, straight-alpha 8-bit RGBA; members of different groups may
-                differ in views and image size.
-            rest: images of the rest state of each member.
+        ``groups`` are the members by scene and cameras, with the appearance (``looks``) of each group's scene; the true
+        ``frames`` 1..T and images of the ``rest`` state are each member's. Groups may differ in views and image size.
         """
         self._renderer, self._loss, self._batch = renderer, loss, batch
         self._groups, self._looks, self._frames = groups, looks, frames
@@ -75,11 +68,7 @@ class Comparison:
     def __call__(self, states: States, start: int) -> tuple[Float[Tensor, "T S"], Float[Tensor, ""]]:
         """Image loss of each predicted frame and member, and the squared change of the predicted images (summed).
 
-        Differentiable in the states through the losses alone.
-
-        Args:
-            states: T predicted frames.
-            start: frames predicted before them.
+        Differentiable in the states through the losses alone; ``start`` frames were predicted before them.
         """
         losses, motion = _Compare.apply(*states.tensors(), self, start)
         return losses, motion

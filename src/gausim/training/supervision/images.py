@@ -1,4 +1,4 @@
-"""What a rollout is compared with: videos, motion tracked in them (engine.tracks) or true motion (engine.points)."""
+"""What a rollout is compared with: videos, motion tracked in them, or the true motion of points."""
 
 from __future__ import annotations
 
@@ -61,11 +61,9 @@ class Supervision(Protocol):
 
     def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Compare:
         """What compares the rollout of a batch, stretch by stretch."""
-        ...
 
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
         """Scores the rest state on frames ``first`` .. T of a sample."""
-        ...
 
 
 class ImageSupervision:
@@ -79,7 +77,6 @@ class ImageSupervision:
     """
 
     def __init__(self, scenes: Sequence[GaussianScene], renderer: Renderer, loss: ImageLoss) -> None:
-        """Keeps its parts; nothing is drawn yet."""
         self.renderer, self.loss = renderer, loss
         self.looks, self.views = Looks(scenes), Views()
         self._rest: dict[Hashable, Rendered] = {}

@@ -25,7 +25,8 @@ from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.data.records import GroundTruth
 from gausim.ops.deformation import polar_rotation
-from gausim.render.draw import SceneAppearance, draw
+from gausim.render.draw import draw
+from gausim.training.rollout import Looks
 from gausim.training.supervision.comparison import channels
 from gausim.training.supervision.images import Sources
 from gausim.training.supervision.points import PointSupervision
@@ -65,7 +66,7 @@ class MotionTracker:
         self._sources, self._iterations, self._rate = sources, iterations, rate
         self._momentum, self._prior = momentum, prior
         self._motions: dict[int, SmoothMotions] = {}
-        self._looks: dict[int, SceneAppearance] = {}
+        self._looks = Looks(sources.scenes)
 
     def motions(self, scene_id: int) -> SmoothMotions:
         """The smooth motions of a scene.
@@ -102,7 +103,7 @@ class MotionTracker:
 
     def _find(self, sample: SequenceSample, frame: int, guess: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
         loss, renderer = self._sources.loss, self._sources.renderer
-        motions, look = self.motions(sample.scene_id).to(guess), self._look(sample.scene_id).to(guess)
+        motions, look = self.motions(sample.scene_id).to(guess), self._looks.of(sample.scene_id, guess)
         rest = self._sources.scenes[sample.scene_id].means.to(guess)
         target = channels(*composite(sample.frames[frame : frame + 1]), loss)
         place = guess.clone().requires_grad_()
@@ -119,12 +120,6 @@ class MotionTracker:
             optimizer.step()
         return place.detach()
 
-    def _look(self, scene_id: int) -> SceneAppearance:
-        if scene_id not in self._looks:
-            scene = self._sources.scenes[scene_id]
-            self._looks[scene_id] = SceneAppearance.of(scene, scene.foreground)
-        return self._looks[scene_id]
-
 
 class TrackSupervision(PointSupervision):
     """Compares predicted kernels with where they are tracked in the videos.
@@ -132,20 +127,13 @@ class TrackSupervision(PointSupervision):
     Frames are tracked when a sample first holds them, so that what the curriculum does not show is not looked at.
     """
 
-    def __init__(
-        self,
-        sources: Sources,
-        *,
-        velocity_weight: float = 0.0,
-        energy_weight: float = 0.3,
-        **tracking: Any,
-    ) -> None:
-        """Prepares the tracker with the settings of :class:`MotionTracker`; the weights are of the loss.
+    def __init__(self, sources: Sources, *, energy_weight: float = 0.3, **tracking: Any) -> None:
+        """Prepares the tracker with the settings of :class:`MotionTracker`; the weight is of the loss.
 
         Raises:
             ConfigError: the model has no smooth motions, or a setting is out of range.
         """
-        super().__init__(sources, velocity_weight=velocity_weight, energy_weight=energy_weight)
+        super().__init__(sources, energy_weight=energy_weight)
         self.tracker = MotionTracker(sources, **tracking)
         for scene_id in range(len(sources.scenes)):
             self.tracker.motions(scene_id)

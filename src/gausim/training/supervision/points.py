@@ -34,23 +34,16 @@ class PointSupervision:
     Nothing is drawn. Only frames that the sample holds are looked at: those that training on images would see.
     """
 
-    def __init__(
-        self,
-        sources: Sources,
-        *,
-        velocity_weight: float = 0.0,
-        energy_weight: float = 0.0,
-    ) -> None:
+    def __init__(self, sources: Sources, *, energy_weight: float = 0.0) -> None:
         """Keeps its parts.
 
         Args:
             sources: the rest scenes and the true motion.
-            velocity_weight: of the same loss of the steps x_t - x_{t-1}, which counts fast motion more.
             energy_weight: of the squared logarithm of predicted over true motion energy, its mean over the halves of a
                 stretch, times what the rest state scores: a motion that is out of step would else rather stop.
         """
         self._scenes, self._read = sources.scenes, sources.truth
-        self._velocity_weight, self._energy_weight = velocity_weight, energy_weight
+        self._energy_weight = energy_weight
         self._known: dict[int, GroundTruth] = {}
         self._attached: dict[int, Int[Tensor, " P"]] = {}
 
@@ -62,8 +55,8 @@ class PointSupervision:
                 self._attached[sample.scene_id] = attach_points(self._scenes[sample.scene_id], truth.rest)
         attached = [self._attached[sample.scene_id].to(batch.rest.device) for sample in samples]
         scales = [self._scale(sample) for sample in samples]
-        weights = self._velocity_weight, self._energy_weight
-        return _PointComparison(batch, [_on(truth, batch.rest) for truth in truths], attached, scales, *weights)
+        known = [_on(truth, batch.rest) for truth in truths]
+        return _PointComparison(batch, known, attached, scales, self._energy_weight)
 
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
         """Scores the rest state on frames ``first`` .. T of a sample."""
@@ -71,11 +64,6 @@ class PointSupervision:
         positions = truth.positions[first : sample.steps + 1]
         motion = _squared(positions.diff(dim=0))
         losses = _squared(positions - truth.rest) * (1 + self._energy_weight * math.log(1 + 1 / STILL_SHARE) ** 2)
-        if self._velocity_weight:
-            before = truth.positions[max(first - 1, 0) : sample.steps]
-            losses = losses + self._velocity_weight * _squared(
-                positions - torch.cat((before[:1], before))[-len(positions) :]
-            )
         return StaticFigures((self._scale(sample) * losses).tolist(), (self._scale(sample) * motion).tolist())
 
     def _scale(self, sample: SequenceSample) -> float:
@@ -107,11 +95,10 @@ class _PointComparison:
         truths: Sequence[GroundTruth],
         attached: Sequence[Int[Tensor, " _"]],
         scales: Sequence[float],
-        velocity_weight: float,
         energy_weight: float,
     ) -> None:
         self._batch, self._truths, self._scales = batch, truths, scales
-        self._velocity_weight, self._energy_weight = velocity_weight, energy_weight
+        self._energy_weight = energy_weight
         self._kernels, self._units, self._offsets = [], [], []
         for member, truth, kernel in zip(batch.members, truths, attached, strict=True):
             unit = member.unit_of_kernel.to(kernel.device)
@@ -128,10 +115,9 @@ class _PointComparison:
             points = states.positions[:, self._kernels[i]] + turned[..., 0]
             span = slice(start + 1, start + 1 + len(points))
             steps = torch.cat((self._last[i][None], points)).diff(dim=0)
-            loss, true_steps = _squared(points - truth.positions[span]), truth.positions[start : span.stop].diff(dim=0)
-            if self._velocity_weight:
-                loss = loss + self._velocity_weight * _squared(steps - true_steps)
+            loss = _squared(points - truth.positions[span])
             if self._energy_weight:
+                true_steps = truth.positions[start : span.stop].diff(dim=0)
                 still, energies = _squared(truth.positions[span] - truth.rest), (_squared(steps), _squared(true_steps))
                 loss = loss + self._energy_weight * still * _energy_mismatch(*energies)
             losses.append(scale * loss)

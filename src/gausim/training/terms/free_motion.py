@@ -29,17 +29,8 @@ def energy_growth(
     """Lets the motion of a batch go on freely and says by how much its energy grows.
 
     The energy of a vibration in the template's terms is not constant from frame to frame, so the means over stretches
-    of about a period are compared.
-
-    Args:
-        model: has an energy (:meth:`gausim.training.contracts.Energetic.energy`).
-        batch: the disjoint graph.
-        state: from which the motion goes on, at a random size.
-        frames: how far.
-        stretch: frames per stretch; gradients stop at its beginning.
-        draws: the random size.
-
-    A motion that explodes ends without a word: its gradients are not finite.
+    of about a period are compared. The motion goes on from ``state`` at a random size, for ``frames`` frames; gradients
+    stop at the beginning of every ``stretch``. One that explodes ends without a word: its gradients are not finite.
 
     Yields:
         max(0, ln E_k / E_{k-1}) of every member, stretch by stretch from the second on; differentiable.
@@ -99,15 +90,10 @@ class FreeMotion:
         draws: torch.Generator,
         backward: Callable[[Tensor], None],
     ) -> Float[Tensor, ""]:
-        """Backward of the growth, each member's as a share of its image loss; returns the mean growth.
+        """Backward of the growth, each member's in units of its image loss; returns the mean growth.
 
-        Args:
-            batch: the disjoint graph.
-            state: from which the motion goes on.
-            losses: of the members.
-            count: sequences of the step, over all ranks.
-            draws: from :meth:`chosen`.
-            backward: of a loss.
+        The motion goes on from ``state``; ``count`` are the sequences of the step over all ranks, and ``draws`` come
+        from :meth:`chosen`.
         """
         frames, stretch = self._objective.energy_frames, self._objective.energy_stretch
         total = losses.new_zeros(())

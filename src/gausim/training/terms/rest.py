@@ -2,53 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 
 from gausim.core import SimState
-from gausim.data.dataset import SequenceSample
-from gausim.losses.objective import Objective
 from gausim.losses.static import static_loss
 from gausim.training.contracts import Simulator
 from gausim.training.rollout import States
-from gausim.training.supervision.images import ImageSupervision
 from gausim.training.terms.term import StepInputs
 
 
 class RestTerm:
     """One step from the rest state, in some batches: ||x_1 - X||^2 in diagonals, and the image loss of its picture."""
 
-    def __init__(
-        self, simulator: Simulator, objective: Objective, diagonals: Sequence[float], images: ImageSupervision
-    ) -> None:
-        """Keeps what it works with; ``diagonals`` are those of the scenes."""
-        self._simulator, self._objective = simulator, objective
-        self._diagonals, self._images = diagonals, images
+    def __init__(self, simulator: Simulator) -> None:
+        self._simulator = simulator
 
     def descend(self, step: StepInputs) -> None:
         """Backward of both, where the draw says so; a scene's static loss is one rank's."""
-        chance = self._objective.static_chance(step.whole[0].steps)
+        chance = step.objective.static_chance(step.whole[0].steps)
         if float(torch.rand((), generator=step.draws)) >= chance:
             return
-        if self._objective.rest_image_weight and step.samples:
-            self._descend_image(step, step.samples)
+        if step.objective.rest_image_weight and step.samples:
+            self._descend_image(step)
         scene_ids = sorted({s.scene_id for s in step.whole})
         own = scene_ids[step.ranks.rank :: step.ranks.size]
         if not own:
             return
         batch = self._simulator.batch(own)
         made = self._simulator.step(batch, SimState(batch.rest, batch.rest))
-        diagonal = torch.cat([batch.rest.new_full((len(batch.rest[m.kernels]), 1), self._diagonals[m.scene_id])
+        diagonal = torch.cat([batch.rest.new_full((len(batch.rest[m.kernels]), 1), step.diagonals[m.scene_id])
                               for m in batch.members])  # fmt: skip
         loss = static_loss(made.positions, batch.rest, diagonal) / len(scene_ids)
-        if loss.requires_grad:
-            step.backward(self._objective.static_weight * loss)
+        step.backward(step.objective.static_weight * loss)
         step.statistics.static = loss.detach()
 
-    def _descend_image(self, step: StepInputs, samples: Sequence[SequenceSample]) -> None:
-        batch = self._simulator.batch([s.scene_id for s in samples])
+    def _descend_image(self, step: StepInputs) -> None:
+        batch = self._simulator.batch([s.scene_id for s in step.samples])
         made = self._simulator.step(batch, SimState(batch.rest, batch.rest))
-        losses, _ = self._images.at_rest(samples, batch)(States.of([made]), 0)
-        if losses.requires_grad:
-            step.backward(self._objective.rest_image_weight / len(step.whole) * losses.sum())
+        losses, _ = step.images.at_rest(step.samples, batch)(States.of([made]), 0)
+        step.backward(step.objective.rest_image_weight / len(step.whole) * losses.sum())

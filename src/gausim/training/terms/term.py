@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 
 from gausim.data.dataset import SampleFacts, SequenceSample
+from gausim.losses.objective import Objective
 from gausim.training.ranks.ranks import Ranks
 from gausim.training.statistics import Statistics
+from gausim.training.supervision.images import ImageSupervision
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +28,9 @@ class StepInputs:
         ranks: who computes.
         backward: takes a loss to the gradients of the parameters.
         rest_loss: what the rest state scores on the frames of a sample, their mean: the unit of penalties.
+        objective: weights of the terms.
+        images: draws predictions and compares them with frames.
+        diagonals: of the scenes [scene units].
     """
 
     samples: Sequence[SequenceSample]
@@ -35,6 +40,9 @@ class StepInputs:
     ranks: Ranks
     backward: Callable[[Tensor], None]
     rest_loss: Callable[[SequenceSample], float]
+    objective: Objective
+    images: ImageSupervision
+    diagonals: Sequence[float]
 
 
 @runtime_checkable

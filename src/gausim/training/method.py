@@ -1,0 +1,189 @@
+"""What is trained: one simulator that all sequences share, or a method that is fitted to every sequence by itself."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import torch
+from torch import nn
+from torch.optim import Optimizer
+
+from gausim.core import ConfigError, SimState, Trajectory
+from gausim.data.dataset import SequenceSample
+from gausim.losses.objective import Objective
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.training.contracts import InitialVelocities, Simulator
+from gausim.training.optimizers import OptimizerSettings
+from gausim.training.terms.mixing import MixingTerm
+from gausim.training.terms.rest import RestTerm
+from gausim.training.terms.term import Term
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Where in a run a step of the optimiser stands.
+
+    Attributes:
+        epoch: epochs done.
+        batch: batches done of the one under way.
+        batches: of an epoch.
+        epochs: of the whole run.
+        least: fraction of the run that counts as done at least, because its time is spent.
+        most: fraction that counts as done at most, because the end of the run has not begun.
+    """
+
+    epoch: int
+    batch: int
+    batches: float
+    epochs: int
+    least: float = 0.0
+    most: float = 1.0
+
+    @property
+    def done(self) -> float:
+        """Epochs done, for schedules of learning rates."""
+        done = self.epoch + self.batch / max(1.0, self.batches)
+        return min(max(done, self.least * self.epochs), self.most * self.epochs)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What the next step of the optimiser is about.
+
+    Attributes:
+        rate: the learning rate that is logged.
+        objective: what is minimised from now on; None where it stays.
+        settings: of the optimiser, likewise.
+        is_new: whether the rest state has to be scored anew.
+    """
+
+    rate: float
+    objective: Objective | None = None
+    settings: OptimizerSettings | None = None
+    is_new: bool = False
+
+
+class Method(ABC):
+    """A method as training sees it: its parameters, where its rollouts begin, and how fast it learns.
+
+    Attributes:
+        name: its row in tables.
+        extrapolates: whether frames beyond the trained ones are foreseen.
+        model: the simulator of a batch (:class:`gausim.training.contracts.Simulator`).
+        initial_states: parameters of the sequences; None where the model has its own.
+        scene_of_sequence: the scene of each training sequence.
+        learns: whether it has anything to learn.
+        defers: whether numbers may be read at a step's end only, where a device would be waited for.
+        warns: whether a prediction that stands still is worth a warning.
+    """
+
+    name: str
+    extrapolates: bool
+    model: nn.Module
+    initial_states: nn.Module | None
+    scene_of_sequence: Sequence[int]
+    learns, defers, warns = True, True, True
+
+    @abstractmethod
+    def groups(self) -> dict[str, list[nn.Parameter]]:
+        """All parameters by the name that tells how fast they learn."""
+
+    @abstractmethod
+    def build(self, settings: OptimizerSettings) -> Optimizer | None:
+        """The optimiser over all groups; None where nothing learns."""
+
+    @abstractmethod
+    def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, now: Moment) -> Task:
+        """Sets the learning rates, and says what is minimised."""
+
+    @abstractmethod
+    def terms(self) -> Sequence[Term]:
+        """Terms of the loss beside the rollout's, in the order of their backward passes."""
+
+    @abstractmethod
+    def initial(self, samples: Sequence[SequenceSample], batch: Any) -> SimState:
+        """Where the rollouts of a batch begin; gradients flow into it."""
+
+    @abstractmethod
+    def predict(self, sequence_id: int, steps: int) -> Trajectory:
+        """Frames 0..``steps`` of a training sequence.
+
+        Raises:
+            DivergenceError: a position is not finite; names the frame.
+        """
+
+    def end_epoch(self, least: float) -> bool:
+        """Prepares the next epoch; returns whether there is none. ``least`` is as in :class:`Moment`."""
+        return False
+
+    def notes(self) -> list[str]:
+        """What a reader of its figures must know, in sentences."""
+        return []
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a resumed run needs beside parameters; plain containers."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Goes on with it."""
+        self.take_notes(state)
+
+    def take_notes(self, state: Mapping[str, Any]) -> None:  # noqa: B027
+        """As much of it as :meth:`notes` needs."""
+
+
+class SharedSimulator(Method):
+    """A simulator of all scenes and a trainable initial state of every sequence: the paper's method."""
+
+    name, extrapolates = "gausim", True
+    initial_states: nn.Module
+
+    def __init__(self, model: nn.Module, initial_states: nn.Module, scene_of_sequence: Sequence[int]) -> None:
+        """Keeps its parts.
+
+        Args:
+            model: the simulator (see :class:`gausim.training.contracts.Simulator`).
+            initial_states: one parameter per training sequence, in their order.
+            scene_of_sequence: the scene of each training sequence.
+
+        Raises:
+            ConfigError: the initial states do not fit the sequences.
+        """
+        self.model, self.initial_states = model, initial_states
+        self.scene_of_sequence = tuple(scene_of_sequence)
+        count = len(self.scene_of_sequence)
+        if (own := len(list(initial_states.parameters()))) != count:
+            raise ConfigError(f"initial states: {own} parameters for {count} sequences; expected one each.")
+        self._simulator = cast(Simulator, model)
+        self._states = cast(InitialVelocities, initial_states)
+
+    def groups(self) -> dict[str, list[nn.Parameter]]:
+        """Those of the model, and the initial states."""
+        return {**self._simulator.parameter_groups(), "initial": list(self.initial_states.parameters())}
+
+    def build(self, settings: OptimizerSettings) -> Optimizer:
+        """One optimiser over the groups of the model and the initial states."""
+        return settings.build({name: [p for p in own if p.requires_grad] for name, own in self.groups().items()})
+
+    def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, now: Moment) -> Task:
+        """Sets the rates by the schedule."""
+        return Task(settings.network_lr * settings.set_rates(optimizer, now.done, now.epochs))
+
+    def terms(self) -> Sequence[Term]:
+        """The static loss and the penalty on mode mixing."""
+        return RestTerm(self._simulator), MixingTerm(self.model)
+
+    def initial(self, samples: Sequence[SequenceSample], batch: Any) -> SimState:
+        """x_0 (the rest state) and the trainable x_{-1} of the sequences of a batch."""
+        previous = torch.cat([self._states.previous(s.sequence_id) for s in samples])
+        return SimState(batch.rest, previous.to(batch.rest))
+
+    def predict(self, sequence_id: int, steps: int) -> Trajectory:
+        """Frames 0..``steps`` of a training sequence, from its own initial state, for all kernels of its scene."""
+        scene_id = self.scene_of_sequence[sequence_id]
+        previous = self._states.previous(sequence_id)
+        initial = SimState(self._simulator.scenes[scene_id].means.to(previous), previous)
+        return SceneDynamics(cast(Any, self.model), scene_id).rollout(initial, steps)

@@ -1,0 +1,126 @@
+"""`gausim train` on the toy object, as small as it gets: once per session for all who need a trained run."""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from gausim.runs.checkpoint import digest, read_checkpoint
+from helpers import toy_object
+from helpers.simulators import LEVELS
+
+# The smallest run in which everything happens that a resumed run could get wrong.
+TINY = (
+    "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
+    "data.repeats=2", "data.curriculum.t_max=3", "data.curriculum.t_start=1", "trainer.convergence.held_back=1",
+    "trainer.convergence.window=2", "optimizer.schedule.warmup=0.5", "data.batch_size=1",
+    "render=reference", "optimizer.ema_decay=0.9", "trainer.threads=1",
+    "trainer.progress=false", "trainer.log_every_n_steps=1", "callbacks.panels=null", "doctor=false",
+)  # fmt: skip
+
+
+class Trainings:
+    """Trains in processes of their own, which may be killed (see ``killed_runs.py``).
+
+    Attributes:
+        folder: where the runs go.
+    """
+
+    def __init__(self, folder: Path, server: subprocess.Popen[str]) -> None:
+        self.folder, self._server = folder, server
+        self.given = (f"data.root={folder / 'toy'}", f"paths.output_root={folder}", *TINY)
+
+    def order(self, argv: list[str], **death: Any) -> tuple[int, str]:
+        """Exit status (negative: the signal) and output of `gausim train`."""
+        assert self._server.stdin is not None and self._server.stdout is not None
+        self._server.stdin.write(json.dumps({"argv": argv, **death}) + "\n")
+        self._server.stdin.flush()
+        found = json.loads(self._server.stdout.readline())
+        return found["status"], found["output"]
+
+    def __call__(self, name: str, *overrides: str, **death: Any) -> tuple[int, str]:
+        return self.order([*self.given, f"name={name}", *overrides], **death)
+
+    def whole(self, name: str, *overrides: str) -> Path:
+        """A run that nothing disturbs, made once per session; what it said is in ``NAME.txt``."""
+        run = self.run(name)
+        with one_at_a_time(self.folder):
+            if not (run / "FINISHED").exists():
+                status, output = self(name, *overrides)
+                assert status == 0, output
+                (self.folder / f"{name}.txt").write_text(output)
+        return run
+
+    def run(self, name: str) -> Path:
+        """The directory of a run."""
+        return self.folder / name / "seed_0"
+
+
+@contextmanager
+def trainings(folder: Path) -> Iterator[Trainings]:
+    """Trainings in a folder that the processes of a test session share, on a toy object with three sequences."""
+    folder.mkdir(exist_ok=True)
+    with one_at_a_time(folder):
+        if not (folder / "toy").exists():
+            toy = toy_object.ToyObject(folder / "making", toy_object.toy_scene())
+            toy.amplitudes["seq_002"] = 0.3
+            toy_object.write_object(toy).root.rename(folder / "toy")
+    program = [sys.executable, str(Path(__file__).with_name("killed_runs.py"))]
+    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+        yield Trainings(folder, server)
+        assert server.stdin is not None
+        server.stdin.close()
+
+
+@contextmanager
+def one_at_a_time(folder: Path) -> Iterator[None]:
+    """A block that the processes of a test session enter one after the other."""
+    with (folder / "lock").open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    """A table of a run without its seconds."""
+    with path.open(newline="") as file:
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(file)]
+
+
+def killed(target: str, count: int, match: str = "", when: str = "before", rank: int = 0) -> dict[str, Any]:
+    """A death at the count-th call of a function with ``match`` in its arguments, on one of the ranks."""
+    return {"die": [{"target": target, "match": match, "count": count, "when": when, "rank": rank}]}
+
+
+def learned(run: Path) -> dict[str, str]:
+    """Digests of all that a checkpoint holds, seconds aside."""
+    loaded = read_checkpoint(run / "last.ckpt")
+    kept = {k: v for k, v in loaded.items() if k not in ("callbacks", "cost", "digest")}
+    parts = {k: entry if isinstance(entry, dict) else {"": entry} for k, entry in kept.items()}
+    return {f"{k}.{name}": digest(v) for k, entry in parts.items() for name, v in entry.items()}
+
+
+def curves(run: Path) -> dict[str, list[tuple[int, float]]]:
+    """What TensorBoard shows of a run."""
+    events = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0})
+    events.Reload()
+    return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}
+
+
+def assert_same_run(found: Path, expected: Path) -> None:
+    """Everything that two runs have left is the same, bit for bit."""
+    assert learned(found) == learned(expected)
+    for name in ("epochs.csv", "csv/metrics.csv"):
+        table = rows(expected / name)
+        assert len(table) > 1 and rows(found / name) == table
+    assert (found / "FINISHED").read_text() == (expected / "FINISHED").read_text()
+    assert len(curves(expected)) > 10 and curves(found) == curves(expected)
+    assert list(found.glob(".*.tmp")) == []
