@@ -35,6 +35,7 @@ from gausim.metrics import (
     motion_energy,
     point_error,
 )
+from gausim.metrics.flip import NO_PACKAGE, flip_is_installed
 from gausim.metrics.lpips import NO_WEIGHTS, SMALLEST, TOO_SMALL, weights_path
 from gausim.render.draw import SceneAppearance, draw
 from gausim.results.curves import (
@@ -70,16 +71,18 @@ PIXELS_AT_ONCE = 1 << 20
 
 
 def default_metrics(side: int = SMALLEST) -> list[ImageMetric]:
-    """The image metrics of every table; of images of ``side`` pixels LPIPS where :func:`no_lpips` has no objection."""
-    perceptual = [] if no_lpips(side) else [LPIPS()]
-    return [L2(), ForegroundL2(), PSNR(), ForegroundPSNR(), SSIM(), FLIP(), *perceptual]
+    """The image metrics of every table, of images of ``side`` pixels: FLIP and LPIPS where they can be measured."""
+    absent = absent_metrics(side)
+    optional = [metric() for metric in (FLIP, LPIPS) if metric.key not in absent]
+    return [L2(), ForegroundL2(), PSNR(), ForegroundPSNR(), SSIM(), *optional]
 
 
-def no_lpips(side: int) -> str:
-    """Why LPIPS cannot be measured on images of ``side`` pixels; empty where it can."""
+def absent_metrics(side: int) -> dict[str, str]:
+    """Why FLIP and LPIPS cannot be measured on images of ``side`` pixels, by their keys."""
+    absent = {} if flip_is_installed() else {FLIP.key: NO_PACKAGE}
     if side < SMALLEST:
-        return TOO_SMALL
-    return "" if weights_path().is_file() else NO_WEIGHTS
+        return absent | {LPIPS.key: TOO_SMALL}
+    return absent if weights_path().is_file() else absent | {LPIPS.key: NO_WEIGHTS}
 
 
 def evaluate_object(
@@ -180,8 +183,7 @@ class _ObjectMeasure:
         self.views = list(data.views if views is None else views)
         side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
         self.metrics = list(default_metrics(side) if metrics is None else metrics)
-        measured = any(m.key == LPIPS.key for m in self.metrics)
-        self._absent = {} if measured else {LPIPS.key: no_lpips(side) or NO_WEIGHTS}
+        self._absent = absent_metrics(side) if metrics is None else {}
         self.static = StaticDynamics(scene, fps=data.fps)
         self.look = SceneAppearance.of(scene, scene.foreground)
         points = data.rest_points

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from gausim.metrics.flip import NO_FLIP, NO_PACKAGE
 from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.results.summary import MOTION_ENERGY
 
@@ -104,9 +105,9 @@ def footnotes(entry: dict[str, Any], method: str) -> list[str]:
 
 def gaps(summary: dict[str, Any]) -> list[str]:
     """What no table of an evaluation has, and how to get it: sentences."""
-    absent = [entry.get("absent") for entry in summary["objects"].values()]
-    lacks_lpips = any(isinstance(a, dict) and a.get("lpips") == NO_WEIGHTS for a in absent)
-    return [NO_LPIPS] if lacks_lpips else []
+    absent = [found for entry in summary["objects"].values() if isinstance(found := entry.get("absent"), dict)]
+    remedies = {("flip", NO_PACKAGE): NO_FLIP, ("lpips", NO_WEIGHTS): NO_LPIPS}
+    return [remedy for (key, why), remedy in remedies.items() if any(found.get(key) == why for found in absent)]
 
 
 def markdown_table(table: Table) -> str:
