@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
-from gausim.benchmark.harness import Options, Row, medians, peak_resident, torch_threads
+from gausim.benchmark.harness import Options, Row, medians, peak_resident, peak_saved_bytes, torch_threads
 from gausim.core import Rendered, Renderer
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
@@ -23,53 +23,6 @@ from gausim.training.supervision.comparison import Comparison
 
 # Timed calls of what serves as reference only and takes long.
 REFERENCE_ROUNDS = 2
-
-
-class _Kept:
-    """A tensor that the graph holds; says so when the graph lets go of it."""
-
-    def __init__(self, tensor: Tensor, ledger: _Ledger) -> None:
-        # Detached: an operation that saves its own result would hold itself for ever.
-        self.tensor, self._ledger = tensor.detach(), ledger
-        storage = tensor.untyped_storage()
-        self._key = storage.data_ptr()
-        ledger.add(self._key, storage.nbytes())
-
-    def __del__(self) -> None:
-        self._ledger.drop(self._key)
-
-
-class _Ledger:
-    """Bytes of the distinct storages that are held, and the most there were at one time."""
-
-    def __init__(self) -> None:
-        self.now = self.peak = 0
-        self._held: dict[int, list[int]] = {}
-
-    def add(self, key: int, size: int) -> None:
-        entry = self._held.setdefault(key, [0, size])
-        if entry[0] == 0:
-            self.now += size
-            self.peak = max(self.peak, self.now)
-        entry[0] += 1
-
-    def drop(self, key: int) -> None:
-        entry = self._held[key]
-        entry[0] -= 1
-        if entry[0] == 0:
-            self.now -= entry[1]
-            del self._held[key]
-
-
-def peak_saved_bytes(call: Callable[[], object]) -> int:
-    """The most bytes of distinct storages that autograd keeps at one time while ``call`` runs.
-
-    Unlike :func:`gausim.benchmark.harness.saved_bytes` it lets go of what a backward pass inside ``call`` frees.
-    """
-    ledger = _Ledger()
-    with torch.autograd.graph.saved_tensors_hooks(lambda tensor: _Kept(tensor, ledger), lambda kept: kept.tensor):
-        call()
-    return ledger.peak
 
 
 class _Recorder:
@@ -107,7 +60,7 @@ class _Case:
         samples = [index.sample(i, range(steps + 1), v).to(options.device) for i, v in zip(chosen, views, strict=True)]
         module.to(options.device)
         module.train()
-        module.fraction_every = 0  # the share is measured in every fiftieth step
+        module.fraction_every = 0  # the gradients' fractions are measured in every fiftieth step
         optimizer = module.configure_optimizers()
         for group in optimizer.param_groups:
             group["lr"] = 0.0
@@ -243,7 +196,7 @@ def _speed(name: str, case: _Case, options: Options) -> list[Row]:
         "drawing around the renderer (colours, covariances, true frames, motion)": (
             times["compared"] - times["render"] - times["loss"]
         ),
-        "static loss (its share of the batches)": static,
+        "static loss (by its fraction of the batches)": static,
         "clipping, optimiser, average": times["descend"],
     }
     parts["rest"] = whole - sum(parts.values())
