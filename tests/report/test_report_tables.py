@@ -14,9 +14,9 @@ from helpers.report_runs import config, evaluate, make_curves, write_run
 from gausim.report.gather.paper import CONTRAST, TABLES, paper_object
 from gausim.report.gather.runs import find_runs
 from gausim.report.gather.study import make_study
+from gausim.report.render import latex_escape, markdown_escape
 from gausim.report.tables.overview import make_sheets
 from gausim.report.tables.sheets import Sheet
-from gausim.report.text import latex_escape, markdown_escape
 from gausim.report.write import write_report
 
 VOID = {"meta", "img", "br", "link", "hr", "input"}

@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 import pytest
-from helpers.report_runs import config, evaluate, make_curves, write_run
+from helpers.report_runs import NO_HIERARCHY, config, evaluate, make_curves, write_run
 
 from gausim.report.gather.runs import find_runs
 from gausim.report.gather.study import make_study
@@ -16,7 +16,7 @@ from gausim.report.write import write_report
 
 OFF = {
     "none": {}, "no_mass": {"conserve_mass": False}, "no_momentum": {"conserve_momentum": False},
-    "no_hierarchy": {"predicted_levels": [0]},
+    "no_hierarchy": NO_HIERARCHY,
 }  # fmt: skip
 
 

@@ -10,8 +10,8 @@ from typing import Any
 
 from gausim.core import RunError
 from gausim.metrics.lpips import HOW_TO_GET_WEIGHTS, NO_WEIGHTS
-from gausim.report.gather.runs import FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
-from gausim.report.gather.study import Cell, Group, Study, cell, dig, pooled
+from gausim.report.gather.runs import FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord, dig
+from gausim.report.gather.study import Cell, Group, Study, cell, pooled
 from gausim.report.pictures.film import Film, make_film
 from gausim.report.tables.sheets import NOTHING
 from gausim.report.tables.verdict import outcome, sentences

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from gausim.report.gather.runs import BROKEN, EVALUATED, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
+from gausim.report.gather.runs import BROKEN, EVALUATED, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord, dig
 from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import footnotes
 
@@ -236,7 +236,7 @@ def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
     hierarchy = simulator.get("hierarchy")
     levels = hierarchy.get("levels") if isinstance(hierarchy, dict) else None
     alone = levels[0] if isinstance(levels, list) and len(levels) == 1 else None
-    if simulator.get("predicted_levels") == [0] or (isinstance(alone, dict) and alone.get("diameter") == 0):
+    if isinstance(alone, dict) and alone.get("diameter") == 0:
         varied.append("w/o hierarchy")
     ablation = run.config.get("ablation")
     name = ablation.get("name") if isinstance(ablation, dict) else None
@@ -378,10 +378,3 @@ def number(value: Any) -> float | None:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         return None
     return float(value)
-
-
-def dig(node: Any, *keys: str) -> Any:
-    """What nested dictionaries hold under these keys; None where they do not."""
-    for key in keys:
-        node = node.get(key) if isinstance(node, dict) else None
-    return node

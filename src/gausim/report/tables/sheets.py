@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.report.gather import paper
-from gausim.report.gather.runs import RunRecord
-from gausim.report.gather.study import NOT_MEASURED, Cell, Group, Study, Value, cell, dig, pooled, says
+from gausim.report.gather.runs import RunRecord, dig
+from gausim.report.gather.study import NOT_MEASURED, Cell, Group, Study, Value, cell, pooled, says
 from gausim.results.curves import ERROR_3D
 from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import NO_FORESIGHT
@@ -73,6 +74,11 @@ class Line:
     kind: str
     entries: tuple[Entry, ...]
 
+    @property
+    def runs(self) -> list[RunRecord]:
+        """All runs that its entries were computed from."""
+        return list(dict.fromkeys(run for entry in self.entries for run in entry.runs))
+
 
 @dataclass(frozen=True)
 class Sheet:
@@ -93,8 +99,23 @@ class Sheet:
     title: str
     caption: str
     columns: tuple[tuple[str, tuple[str, ...]], ...]
-    lines: tuple[Line, ...] = field(default=())
+    lines: tuple[Line, ...]
     stub: str = ""
+
+    @property
+    def label(self) -> str:
+        """The key in letters and digits."""
+        return re.sub(r"[^A-Za-z0-9]+", "-", self.key)
+
+    @property
+    def has_groups(self) -> bool:
+        """Whether its columns stand under headings."""
+        return any(group for group, _ in self.columns)
+
+    @property
+    def heads(self) -> list[str]:
+        """Headings of all columns, those of their groups before them."""
+        return [f"{group} {sub}".strip() for group, subs in self.columns for sub in subs]
 
 
 def metric_info(study: Study, metric: str) -> dict[str, Any] | None:
