@@ -80,14 +80,3 @@ def test_failures_are_told_and_every_number_links_to_its_runs(sweep: Path, tmp_p
     assert row["seeds"] == "2" and len(row["runs"].split(";")) == 2 and "seed_2" not in row["runs"]
     assert all(row[key] for key in ("config", "commit", "scene_sha256", "manifest_sha256"))
     assert {r["status"] for r in rows if r["row"] == "gausim w/o hierarchy"} == {"failed"}
-
-
-def test_efficiency_stands_side_by_side_with_and_without_hierarchy(sweep: Path) -> None:
-    for seed in (1, 2):
-        run = sweep / "no_hierarchy" / "gausim" / "experiment=tiny,model.simulator.network.layers=2" / f"seed_{seed}"
-        (run / "FAILED").unlink()
-        (run / "FINISHED").write_text("{}")
-        evaluate(run, make_curves(4.0))
-    lines = {line.label: [e.text for e in line.entries] for line in sheets(sweep)["efficiency"].lines}
-    assert lines["gausim"][2:5] == ["0.0120 ± 0.0010", "2.00", "+ 3.9 MB"]
-    assert lines["gausim w/o hierarchy"][2:5] == ["0.0400 ± 0.0010", "2.00", "+ 12.0 MB"]

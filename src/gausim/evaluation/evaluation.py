@@ -93,7 +93,6 @@ def evaluate_object(
     *,
     sequences: Sequence[str] | None = None,
     views: Sequence[str] | None = None,
-    metrics: Sequence[ImageMetric] | None = None,
     advance: Callable[[str], None] | None = None,
 ) -> ObjectCurves:
     """Per-frame figures of every method and reference on every sequence of an object.
@@ -105,14 +104,13 @@ def evaluate_object(
         renderer: draws both predictions and the static reference.
         sequences: names of the sequences to measure; all when None.
         views: names of the cameras to measure in; all when None.
-        metrics: image metrics; :func:`default_metrics` when None.
         advance: called with a sequence's name when it is done.
 
     Raises:
         DataError: an unknown sequence, or broken data.
         RunError: a prediction has another number of frames or kernels than asked for, or is not finite.
     """
-    measure = _ObjectMeasure(data, scene, renderer, views, metrics)
+    measure = _ObjectMeasure(data, scene, renderer, views)
     records = _chosen(data, sequences)
     references = _linear_references(data)
     results: list[Rows] = []
@@ -177,13 +175,11 @@ class _ObjectMeasure:
         scene: GaussianScene,
         renderer: Renderer,
         views: Sequence[str] | None,
-        metrics: Sequence[ImageMetric] | None,
     ) -> None:
         self.data, self.scene, self.renderer = data, scene, renderer
         self.views = list(data.views if views is None else views)
         side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
-        self.metrics = list(default_metrics(side) if metrics is None else metrics)
-        self._absent = absent_metrics(side) if metrics is None else {}
+        self.metrics, self._absent = default_metrics(side), absent_metrics(side)
         self.static = StaticDynamics(scene, fps=data.fps)
         self.look = SceneAppearance.of(scene, scene.foreground)
         points = data.rest_points
@@ -195,8 +191,10 @@ class _ObjectMeasure:
 
     def record(self, methods: Mapping[str, Predict]) -> dict[str, Any]:
         """What is known beside the figures: costs of every method, hashes of the data, what is absent, diagnosis."""
-        levels = {name: getattr(predict, "levels", None) for name, predict in methods.items()}
-        costs = {name: {**meter.summary(), "levels": levels[name]} for name, meter in self._costs.items()}
+        costs = {
+            name: {**meter.summary(), "levels": getattr(methods[name], "levels", None)}
+            for name, meter in self._costs.items()
+        }
         footnotes = {name: found for name, p in methods.items() if (found := getattr(p, "footnotes", None)) is not None}
         sources = data_provenance(self.data)
         facts = {"efficiency": costs, "sources": sources, "absent": self._absent, "footnotes": footnotes}

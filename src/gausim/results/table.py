@@ -76,12 +76,22 @@ def _line(frames: str, row: str, cells: dict[str, Any], infos: dict[str, Any]) -
         if metric == MOTION_ENERGY:
             line.append(_number(cell.get("pooled"), 2))
             continue
-        mean, std = cell.get("mean"), cell.get("std")
-        scale = info["scale"]
-        line.append("" if mean is None else f"{mean * scale:.2f} ± {(std or 0.0) * scale:.2f}")
+        mean = cell.get("mean")
+        line.append("" if mean is None else plus_minus(mean, cell.get("std") or 0.0, scale=info["scale"]))
         if _has_ratio(metric, info):
             line.append(_number(cell.get("ratio"), 3))
     return line
+
+
+def plus_minus(mean: float, deviation: float | None = None, *, scale: float = 1.0, digits: int = 2) -> str:
+    """A figure times ``scale``, and behind it the deviation where there is one."""
+    shown = f"{mean * scale:.{digits}f}"
+    return shown if deviation is None else f"{shown} {spread(deviation * scale, digits)}"
+
+
+def spread(deviation: float, digits: int = 2) -> str:
+    """A deviation as it is printed."""
+    return f"± {deviation:.{digits}f}"
 
 
 def _number(value: float | None, digits: int) -> str:
