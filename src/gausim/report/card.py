@@ -73,7 +73,9 @@ def card(run: RunRecord, facts: CardFacts) -> str:
         tables=lambda name, entry: [markdown_table(table) for table in object_tables(name, entry)],
         asked=[f"{key} {trainer[key]}" for key in ("accelerator", "devices", "threads", "precision") if key in trainer],
         fit=fit if isinstance(fit, Mapping) else None,
-        limitations=list(_limitations(run, facts)),
+        headline=_headline,
+        said=lambda entry: said(entry, _method(entry)),
+        no_foresight=NO_FORESIGHT,
     )
 
 
@@ -114,79 +116,30 @@ def _front_matter(run: RunRecord, facts: CardFacts) -> str:
 def _headline_metrics(entry: dict[str, Any]) -> Iterator[dict[str, Any]]:
     for split in ("seen", "unseen"):
         for group, metric in _HEADLINES.items():
-            mean = _cell(entry, _method(entry), split, group, metric).get("mean")
+            mean = dig(entry["rows"], _method(entry), split, group, metric, "mean")
             if mean is not None:
-                info = entry["metrics"][metric]
+                info, (start, stop) = entry["metrics"][metric], entry["splits"][split]
+                frames = f"{split} frames {start}..{stop - 1}"
                 yield {
                     "type": metric,
-                    "name": f"{info['label']} [{info['unit']}], {_frames(entry, split)}, {GROUP_TITLES[group]}",
+                    "name": f"{info['label']} [{info['unit']}], {frames}, {GROUP_TITLES[group]}",
                     "value": round(mean * info["scale"], 4),
                 }
 
 
+def _headline(entry: dict[str, Any]) -> dict[str, Any] | None:
+    """What the limitations say of the unseen frames: ratios to standing still, and energy."""
+    row = entry["rows"].get(_method(entry), {})
+    for group, metric in _HEADLINES.items():
+        if dig(row, "unseen", group, metric, "mean") is not None:
+            return {
+                "label": entry["metrics"][metric]["label"],
+                "where": GROUP_TITLES[group],
+                "ratios": [dig(row, split, group, metric, "ratio") for split in ("seen", "unseen")],
+                "energy": dig(row, "unseen", group, MOTION_ENERGY, "pooled"),
+            }
+    return None
+
+
 def _method(entry: dict[str, Any]) -> str:
     return str(entry["methods"][0]) if entry["methods"] else ""
-
-
-def _cell(entry: dict[str, Any], row: str, split: str, group: str, metric: str) -> Mapping[str, Any]:
-    return dig(entry["rows"], row, split, group, metric) or {}
-
-
-def _frames(entry: dict[str, Any], split: str) -> str:
-    start, stop = entry["splits"][split]
-    return f"{split} frames {start}..{stop - 1}"
-
-
-def _limitations(run: RunRecord, facts: CardFacts) -> Iterator[str]:
-    names = ", ".join(_objects(run)) or "its own objects"
-    yield (
-        f"It knows {names} and the sequences that it was trained on. New pushes of the same object need `gausim "
-        "adapt`; another object needs a training of its own, which may start from this network (`init_from`)."
-    )
-    yield f"It is one training, with seed {run.seed}; how far seeds differ is not in this card."
-    if not facts.finished:
-        yield "Its training is not finished."
-    if run.summary is None:
-        yield "How well it predicts is not known: it was not evaluated."
-    for name, entry in _objects(run).items():
-        yield from _of_object(name, entry, facts)
-    if not facts.endurance:
-        yield (
-            "How it goes on beyond the recorded frames, and how it answers to forces, was not measured "
-            f"(`gausim evaluate {facts.command} --endurance 1000`)."
-        )
-
-
-def _of_object(name: str, entry: dict[str, Any], facts: CardFacts) -> Iterator[str]:
-    method = _method(entry)
-    group = next(
-        (g for g in _HEADLINES if _cell(entry, method, "unseen", g, _HEADLINES[g]).get("mean") is not None), ""
-    )
-    if group:
-        label = entry["metrics"][_HEADLINES[group]]["label"]
-        ratios = [_cell(entry, method, split, group, _HEADLINES[group]).get("ratio") for split in ("seen", "unseen")]
-        if None not in ratios:
-            yield (
-                f"{name}: in {_frames(entry, 'unseen')} its {label} ({GROUP_TITLES[group]}) is {ratios[1]:.2f} of what "
-                f"standing still has, in the seen ones {ratios[0]:.2f}."
-            )
-        energy = _cell(entry, method, "unseen", group, MOTION_ENERGY).get("pooled")
-        if energy is not None:
-            yield f"{name}: its motion there has {energy:.2f} of the true motion's energy."
-    if "points" not in entry["rows"].get(method, {}).get("seen", {}):
-        yield f"{name}: the true motion in 3D is not known, so it was measured in images only."
-    if not entry["heldout_views"]:
-        yield f"{name}: no view was kept from training, so views from elsewhere were not measured."
-    own = said(entry, method)
-    if own.get("extrapolates") is False:
-        yield f"{name}: {NO_FORESIGHT}"
-    if isinstance(own.get("largest_eigenvalue"), float) and own["largest_eigenvalue"] > 1:
-        yield (
-            f"{name}: linearised at rest, the step lets small motions grow (largest eigenvalue "
-            f"{own['largest_eigenvalue']:.4f})."
-        )
-    for metric, why in entry.get("absent", {}).items():
-        yield f"{name}: {metric} was not computed ({why})."
-    simulated = (facts.data or {}).get(name, {}).get("simulation")
-    if isinstance(simulated, Mapping) and simulated.get("method"):
-        yield f"{name}: its videos are computed ({simulated['method']}), not filmed."
