@@ -156,7 +156,7 @@ def spent_in(parts: Mapping[str, Sequence[tuple[Any, str]]], device: torch.devic
     """Seconds that pass within functions while the block runs, by the name of their part.
 
     Args:
-        parts: for every name the places of its functions: module or class, and attribute. No part calls another.
+        parts: for every name the places of its functions: module or class, and attribute.
         device: is waited for before a clock is read.
     """
     seconds = dict.fromkeys(parts, 0.0)
