@@ -30,7 +30,7 @@ def csv_numbers(study: Study) -> str:
 
 def _lines(study: Study, group: Group, name: str, row: str) -> Iterator[dict[str, object]]:
     is_method = row == group.method
-    line = {
+    line: dict[str, object] = {
         "row": group.label if is_method else f"{row} (with {group.label})",
         "kind": "method" if is_method else "reference",
         "object": name,

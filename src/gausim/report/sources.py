@@ -24,7 +24,7 @@ class Sources:
         self._out, self.runs = out.resolve(), tuple(runs)
         every = [tuple(dict.fromkeys(e.runs)) for sheet in sheets for line in sheet.lines for e in line.entries]
         self.sets = [same for same in dict.fromkeys(every) if len(same) > 1]
-        self._anchors = {(run,): f"run-{i}" for i, run in enumerate(runs, 1)}
+        self._anchors: dict[tuple[RunRecord, ...], str] = {(run,): f"run-{i}" for i, run in enumerate(runs, 1)}
         self._anchors |= {same: f"runs-{i}" for i, same in enumerate(self.sets, 1)}
 
     def anchor(self, runs: Sequence[RunRecord]) -> str:

@@ -301,7 +301,11 @@ def says(group: Group) -> list[str]:
 
 
 # What the seeds of a row must have in common to be compared, and where a summary says it.
-_COMPARED = {"sequences": ("sequences",), "ranges of frames": ("splits",), "rest scenes": ("sources", "scene", "sha256")}
+_COMPARED = {
+    "sequences": ("sequences",),
+    "ranges of frames": ("splits",),
+    "rest scenes": ("sources", "scene", "sha256"),
+}
 
 
 def _notes(groups: Sequence[Group]) -> list[str]:
