@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from gausim.report.gather.study import Study
 from gausim.report.opening import Opening, unanswered
@@ -94,8 +93,8 @@ def _rendered(template: str, content: Content, options: Mapping[str, Any], **mor
 
 
 def _escaping(escape: Callable[[str], str]) -> Callable[[Any], Any]:
-    """What escapes every expression of a template but those it calls safe."""
-    return lambda value: value if isinstance(value, Markup) else escape(str(value))
+    """What escapes every expression of a template but those that it calls safe, which know their own markup."""
+    return lambda value: value if hasattr(value, "__html__") else escape(str(value))
 
 
 def latex_escape(text: str) -> str:
