@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch.optim import Optimizer
@@ -113,7 +114,7 @@ def _speed(name: str, case: _Case, options: Options) -> list[Row]:
 def _parts(case: _Case, options: Options) -> dict[str, float]:
     """Seconds of the parts of a step without the static loss, means over the rounds."""
     module, optimizer = case.module, type(case.optimizer)
-    places = {
+    places: dict[str, list[tuple[Any, str]]] = {
         "rollout": [(type(module.simulator), "prepare"), (type(module.simulator), "step")],
         "comparison": [(Comparison, "__call__")],
         "image loss with its gradient": [(type(module.objective.image), "value_and_gradient")],

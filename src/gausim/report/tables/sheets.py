@@ -225,7 +225,7 @@ def seeds_entry(
         note: what else stands small.
         runs: where the values come from.
     """
-    known = [value for value in values if number(value) is not None]
+    known = [found for value in values if (found := number(value)) is not None]
     if not known:
         return Entry(NOTHING, missing=True, runs=runs)
     text = " ± ".join(form.format(fmean(part)) for part in (known, stds) if part)
