@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 import types
 
 import pytest
 import torch
 
-from gausim.benchmark import Options, Row, medians, peaks, saved_bytes
+from gausim.benchmark import Options, Row, medians, peak_saved_bytes, peaks
+from gausim.benchmark.harness import spent_in
 from gausim.cli import benchmark
 from gausim.core import ConfigError
 
@@ -21,12 +23,29 @@ def test_candidates_are_called_in_turn_and_warm_up_is_not_timed() -> None:
     assert set(result) == {"a", "b"} and all(value >= 0 for value in result.values())
 
 
-def test_saved_bytes_counts_each_kept_storage_once() -> None:
-    x = torch.randn(50, 40, requires_grad=True)
-    # The square keeps x (twice the same storage), the sine keeps its argument, a sum keeps nothing.
-    assert saved_bytes(lambda: (x * x).sin().sum()) == 2 * 50 * 40 * 4
+def test_peak_counts_what_is_held_at_one_time() -> None:
+    x = torch.rand(1000, requires_grad=True)
+
+    def together() -> None:
+        (x.exp().sum() + x.sin().exp().sum()).backward()
+
+    def in_turn() -> None:
+        for _ in range(5):
+            x.exp().sum().backward()
+
+    assert peak_saved_bytes(in_turn) == 4000  # the result of exp, once
+    assert peak_saved_bytes(together) == 3 * 4000  # x for sin, and both results of exp
+    assert peak_saved_bytes(lambda: (x * x).sum()) == 4000  # x twice, the same storage
     with torch.no_grad():
-        assert saved_bytes(lambda: (x * x).sin().sum()) == 0
+        assert peak_saved_bytes(lambda: (x * x).sum()) == 0
+
+
+def test_time_is_told_by_part_and_functions_are_themselves_again() -> None:
+    own = QUICK.__class__.__init__
+    with spent_in({"options": [(Options, "__init__")], "sleep": [(time, "sleep")]}, QUICK.device) as seconds:
+        time.sleep(0.02)
+        assert Options(QUICK.device).rounds == 7
+    assert seconds["sleep"] >= 0.02 > seconds["options"] > 0 and Options.__init__ is own
 
 
 def test_peaks_are_rates_of_a_real_machine() -> None:

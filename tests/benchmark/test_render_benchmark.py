@@ -9,7 +9,7 @@ import torch
 
 from gausim.benchmark import render
 from gausim.benchmark.first_call import in_fresh_process
-from gausim.benchmark.harness import Options, Row, peak_resident
+from gausim.benchmark.harness import Options, Row
 from gausim.benchmark.render_stages import Stages
 from gausim.benchmark.splats import deformed, splats
 from gausim.cli.benchmark import CASES
@@ -40,7 +40,7 @@ def test_every_figure_is_reported(rows: list[Row]) -> None:
         for metric in ("forward", "forward + backward"):
             ratio = found[name, f"{metric}, plain torch"] / found[name, metric]
             assert found[name, f"plain torch / {metric}"] == pytest.approx(ratio)
-        for metric in ("compositing / peak", "compositing, backward / peak", "pixels inside the ellipses"):
+        for metric in ("compositing / peak", "compositing, backward / peak"):
             assert found[name, metric] < 1
     threads = [case for case, metric in found if metric == "one thread / two threads"]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -85,20 +85,13 @@ def test_colours_of_both_forms_are_the_same() -> None:
 def test_pixels_are_counted_as_by_hand() -> None:
     """Every block of two rows of eight pixels evaluates the kernels that reach it, until its last pixel closes."""
     stages = Stages(splats(60, 40, 48))
-    evaluated = inside = 0
+    evaluated = 0
     for band in stages.bands:
         for tile, p in itertools.product(range(len(band.start) - 1), range(8)):
             entries = band.entries[band.start[tile] : band.start[tile + 1]]
             reaching = [packed for packed in entries if (packed >> 4) & 15 <= p <= packed & 15]
-            for packed in reaching[: band.used[tile, p]]:
-                r = band.records[packed >> 8]
-                for x, y in itertools.product(range(8), range(2)):
-                    dx = 8 * (tile % 5) + x + 0.5 - (r[0] + r[1])
-                    dy = band.row_low + 16 * (tile // 5) + 2 * p + y + 0.5 - (r[2] + r[3])
-                    evaluated += 1
-                    inside += r[4] * dx * dx + r[5] * dx * dy + r[6] * dy * dy >= r[11]
+            evaluated += 16 * len(reaching[: band.used[tile, p]])
     assert stages.evaluated() == evaluated > 0
-    assert stages.inside() == pytest.approx(inside, abs=2) and 0 < inside < evaluated
 
 
 def test_the_parts_can_be_repeated_and_draw_the_image() -> None:
@@ -109,12 +102,6 @@ def test_the_parts_can_be_repeated_and_draw_the_image() -> None:
         part()
     assert np.array_equal(stages.images.rgb, before)
     assert np.array_equal(before, scene.forward(CpuRenderer(threads=1)).rgb.numpy())
-
-
-def test_memory_is_this_process_own() -> None:
-    before = peak_resident()
-    block = np.ones(40 << 20, np.uint8)
-    assert peak_resident() >= before and block.nbytes < peak_resident() < 1 << 36
 
 
 def test_the_command_has_every_case() -> None:

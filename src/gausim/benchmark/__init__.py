@@ -1,6 +1,6 @@
 """Measurements of speed and memory, as ratios within one run (docs/performance.md)."""
 
-from gausim.benchmark.harness import Options, Row, medians, peak_resident, saved_bytes
+from gausim.benchmark.harness import Options, Row, medians, peak_resident, peak_saved_bytes
 from gausim.benchmark.peaks import Peaks, peaks
 
-__all__ = ["Options", "Peaks", "Row", "medians", "peak_resident", "peaks", "saved_bytes"]
+__all__ = ["Options", "Peaks", "Row", "medians", "peak_resident", "peak_saved_bytes", "peaks"]

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gausim.benchmark.harness import Options, Row, medians
+from gausim.benchmark.harness import Options, Row, medians, peak_resident, process_memory
 from gausim.core import Cameras
 from gausim.data.frames import ImageSource, PackedSource
 from gausim.data.images import write_rgba
@@ -20,7 +20,7 @@ from gausim.io.packed import HEADER, PIXELS, Crop, read_packed
 from gausim.io.packed_writer import header, write_packed
 from gausim.io.transforms import write_transforms
 
-FPS, FRAMES, VIEWS, CROP_SHARE = 24.0, 16, 4, 0.2
+FPS, FRAMES, VIEWS, CROPPED = 24.0, 16, 4, 0.2
 # READY as the paper has it: sequences, frames, views, width, height.
 PAPER = (30, 100, 6, 960, 540)
 EPOCHS = 3
@@ -56,12 +56,12 @@ def _throughput(folder: Path, size: int, options: Options) -> list[Row]:
         options,
     )
     case, count = f"{FRAMES} frames x {VIEWS} views of {size} x {size}", FRAMES * VIEWS
-    share = read_packed(folder).size / (4 * count * size * size)
+    stored = read_packed(folder).size / (4 * count * size * size)
     return [
         Row(case, "image files", count / times["image files"], "images/s"),
         Row(case, "packed", count / times["packed"], "images/s"),
         Row(case, "packed", times["image files"] / times["packed"], "x", "decoding PNG"),
-        Row(case, "stored", share, "1", "whole images"),
+        Row(case, "stored", stored, "1", "whole images"),
     ]
 
 
@@ -69,7 +69,7 @@ def _large(folder: Path, options: Options) -> list[Row]:
     """Opens a set and reads the training frames of every sequence, several times over."""
     sequences, frames, views, width, height = (3, 20, 2, 96, 54) if options.quick else PAPER
     cameras = _cameras(views, width, height)
-    side = CROP_SHARE**0.5
+    side = CROPPED**0.5
     crop = Crop(0, 0, int(side * width), int(side * height), 0)
     crops = [Crop(0, 0, crop.width, crop.height, view * frames * crop.frame_bytes) for view in range(views)]
     total = views * frames * crop.frame_bytes
@@ -88,7 +88,7 @@ def _large(folder: Path, options: Options) -> list[Row]:
         for source in sources:
             source.read(range(FRAMES), list(range(min(VIEWS, views))))
         spent.append((time.perf_counter() - start) / sequences)
-        resident.append(_resident())
+        resident.append(process_memory("VmRSS") or peak_resident())
     case = f"{sequences} sequences x {frames} frames x {views} views of {width} x {height}"
     return [
         Row(case, "size", sequences * total, "B"),
@@ -96,17 +96,6 @@ def _large(folder: Path, options: Options) -> list[Row]:
         Row(case, f"sample of {FRAMES} frames x {min(VIEWS, views)} views", min(spent), "s"),
         Row(case, f"resident memory, epoch {EPOCHS}", resident[-1] / resident[0], "x", "epoch 1"),
     ]
-
-
-def _resident() -> int:
-    """Memory of this process that lies in the machine's [bytes]."""
-    status = Path("/proc/self/status")
-    if not status.is_file():  # not on Linux: the highest so far
-        from gausim.benchmark.harness import peak_resident
-
-        return peak_resident()
-    line = next(line for line in status.read_text().splitlines() if line.startswith("VmRSS"))
-    return 1024 * int(line.split()[1])
 
 
 def _cameras(views: int, width: int, height: int) -> Cameras:
@@ -121,7 +110,7 @@ def _images(size: int) -> np.ndarray:
     images = np.zeros((VIEWS, FRAMES, size, size, 4), np.uint8)
     y, x = np.mgrid[:size, :size] / size - 0.5
     texture = (60 * np.sin(30 * x) * np.cos(25 * y))[..., None] + rng.normal(120, 6, (VIEWS, 1, size, size, 3))
-    radius = 0.5 * (CROP_SHARE**0.5) - 0.03
+    radius = 0.5 * (CROPPED**0.5) - 0.03
     for frame in range(FRAMES):
         disc = (x - 0.03 * np.sin(0.4 * frame)) ** 2 + y**2 < radius**2
         images[:, frame, ..., 3] = 255 * disc

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -23,8 +26,8 @@ class Row:
         case: what was run, with its sizes.
         metric: what was measured of it.
         value: the figure.
-        unit: its unit; ``x`` for a ratio, ``1`` for a share.
-        reference: what a ratio or share compares with, in words; None for a plain figure.
+        unit: its unit; ``x`` for a ratio, ``1`` for a fraction.
+        reference: what a ratio or fraction compares with, in words; None for a plain figure.
     """
 
     case: str
@@ -87,37 +90,94 @@ def medians(
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-def saved_bytes(call: Callable[[], object]) -> int:
-    """Bytes of the distinct storages that autograd keeps for the backward pass while ``call`` runs.
+class _Kept:
+    """A tensor that the graph holds; says so when the graph lets go of it."""
+
+    def __init__(self, tensor: Tensor, ledger: _Ledger) -> None:
+        # Detached: an operation that saves its own result would hold itself for ever.
+        self.tensor, self._ledger = tensor.detach(), ledger
+        storage = tensor.untyped_storage()
+        self._key = storage.data_ptr()
+        ledger.add(self._key, storage.nbytes())
+
+    def __del__(self) -> None:
+        self._ledger.drop(self._key)
+
+
+class _Ledger:
+    """Bytes of the distinct storages that are held, and the most there were at one time."""
+
+    def __init__(self) -> None:
+        self.now = self.peak = 0
+        self._held: dict[int, list[int]] = {}
+
+    def add(self, key: int, size: int) -> None:
+        entry = self._held.setdefault(key, [0, size])
+        if entry[0] == 0:
+            self.now += size
+            self.peak = max(self.peak, self.now)
+        entry[0] += 1
+
+    def drop(self, key: int) -> None:
+        entry = self._held[key]
+        entry[0] -= 1
+        if entry[0] == 0:
+            self.now -= entry[1]
+            del self._held[key]
+
+
+def peak_saved_bytes(call: Callable[[], object]) -> int:
+    """The most bytes of distinct storages that autograd keeps at one time for backward passes while ``call`` runs.
 
     Counts what the graph holds, whatever the allocator does, so the figure is the same in every run. Parameters and
     inputs that the graph keeps are counted too: they stand on both sides of a ratio.
     """
-    sizes: dict[int, int] = {}
-    held: list[Tensor] = []
-
-    def keep(tensor: Tensor) -> Tensor:
-        storage = tensor.untyped_storage()
-        if storage.data_ptr() not in sizes:
-            sizes[storage.data_ptr()] = storage.nbytes()
-            held.append(tensor)  # an address must not be used twice
-        return tensor
-
-    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
-        result = call()
-    del result
-    return sum(sizes.values())
+    ledger = _Ledger()
+    with torch.autograd.graph.saved_tensors_hooks(lambda tensor: _Kept(tensor, ledger), lambda kept: kept.tensor):
+        call()
+    return ledger.peak
 
 
 def peak_resident() -> int:
     """Largest resident memory of this process so far [bytes]."""
-    status = Path("/proc/self/status")
-    if status.exists():  # getrusage counts what the parent held when it started this process
-        for line in status.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return 1024 * int(line.split()[1])
+    known = process_memory("VmHWM")  # getrusage counts what the parent held when it started this process
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else 1024 * peak
+    return known or (peak if sys.platform == "darwin" else 1024 * peak)
+
+
+def process_memory(field: str, file: str = "/proc/self/status") -> int:
+    """A field of a file of Linux' /proc [bytes]; 0 where the system has none."""
+    lines = Path(file).read_text().splitlines() if Path(file).is_file() else []
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{field}:")), 0)
+
+
+@contextmanager
+def spent_in(parts: Mapping[str, Sequence[tuple[Any, str]]], device: torch.device) -> Iterator[dict[str, float]]:
+    """Seconds that pass within functions while the block runs, by the name of their part.
+
+    Args:
+        parts: for every name the places of its functions: module or class, and attribute.
+        device: is waited for before a clock is read.
+    """
+    seconds = dict.fromkeys(parts, 0.0)
+
+    def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(function)
+        def call(*args: Any, **options: Any) -> Any:
+            synchronise(device)
+            start = time.perf_counter()
+            result = function(*args, **options)
+            synchronise(device)
+            seconds[name] += time.perf_counter() - start
+            return result
+
+        return call
+
+    with ExitStack() as stack:
+        for name, places in parts.items():
+            for owner, attribute in places:
+                stack.enter_context(patch.object(owner, attribute, timed(name, getattr(owner, attribute))))
+        yield seconds
 
 
 @contextmanager

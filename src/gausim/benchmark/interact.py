@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-
 import torch
 from torch import Tensor
 
-from gausim.benchmark.harness import Options, Row, medians, torch_threads
-from gausim.benchmark.step import DEFAULT, TEMPLATE, Bound, cloud, simulator
+from gausim.benchmark.harness import Options, Row, medians, spent_in, torch_threads
+from gausim.benchmark.step import Build, cloud, parts
 from gausim.core import GaussianScene, SimState
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.selections import Ball
 from gausim.interaction.session import Force, MadeWith
 from gausim.models.rollout.dynamics import SceneDynamics
-from gausim.models.step.simulator import GausSim
-from gausim.models.template.material import MaterialTemplate
 from gausim.viewer.coloring import VIEW, Painter
 from gausim.viewer.splats import Placing, pack
 
 SIZES = {False: (2_000, 20_000), True: (300,)}
-FPS = 24.0
-# Parts of a step by what they serve; `constants` are made once per session.
+# Parts of a step by what they serve.
 GROUPS = {
     "graph": ("aggregation", "edges", "features", "normalisers"),
     "network": ("network",),
@@ -31,30 +25,25 @@ GROUPS = {
 SH_DEGREE_3 = 16
 
 
-def run(options: Options) -> list[Row]:
+def run(options: Options, build: Build) -> list[Row]:
     """Simulated frames per second, and the time of a frame divided into parts; weights are those of no training."""
-    rows: list[Row] = []
     with torch_threads(options.threads):
-        for count in SIZES[options.quick]:
-            rows += _frame(count, options)
-    return rows
+        return [row for count in SIZES[options.quick] for row in _frame(count, options, build)]
 
 
-def build(count: int) -> tuple[GaussianScene, GausSim]:
-    """A scene with spherical harmonics of degree 3, and the simulator of ``conf/model/gausim.yaml``."""
+def _scene(count: int) -> GaussianScene:
+    """A scene with spherical harmonics of degree 3."""
     scene = cloud(count, f"cloud{count}")
     colors = 0.2 * torch.randn(count, SH_DEGREE_3, 3, generator=torch.Generator().manual_seed(0))
-    scene = GaussianScene.create(
+    return GaussianScene.create(
         means=scene.means, log_scales=scene.log_scales, quats=scene.quats, opacity_logits=scene.opacity_logits,
         sh=colors, pinned=scene.pinned, name=scene.name,
     )  # fmt: skip
-    model = simulator(scene, FPS, (0.13, 0.4), DEFAULT, template=partial(MaterialTemplate, **TEMPLATE))
-    return scene, model.eval()
 
 
-def _frame(count: int, options: Options) -> list[Row]:
-    scene, model = build(count)
-    model.to(options.device)
+def _frame(count: int, options: Options, build: Build) -> list[Row]:
+    scene = _scene(count)
+    model = build("gausim", scene).eval().to(options.device)
     scene = scene.to(options.device)
     initial, dynamics = SimState(scene.means, scene.means), SceneDynamics(model)
     units = [u.to(options.device) for u in model.units_of_kernels(0)]
@@ -71,21 +60,31 @@ def _frame(count: int, options: Options) -> list[Row]:
         return covars, rgb
 
     covars, rgb = paint()
-    parts = Bound(model, 1, options).parts()
-    candidates: dict[str, Callable[[], object]] = {
-        "step": live.step,
-        "colours": paint,
-        "packing": lambda: pack(live.frame.positions.cpu(), covars, rgb, painter.opacities, placing),
-        **{name: parts[name] for names in GROUPS.values() for name in names},
-    }
-    times = medians(candidates, options, rounds=max(options.rounds, 15), warmup=3)
-    return _rows(f"{count} kernels, {sum(level.count for level in model.hierarchies[0].levels[1:])} units", times)
+    rounds = max(options.rounds, 15)
+    times = medians(
+        {
+            "step": live.step,
+            "colours": paint,
+            "packing": lambda: pack(live.frame.positions.cpu(), covars, rgb, painter.opacities, placing),
+        },
+        options,
+        rounds=rounds,
+        warmup=3,
+    )
+    with torch.no_grad():
+        template = model.prepare(model.batch([0])).template
+    with spent_in(parts(template), options.device) as seconds:
+        for _ in range(rounds):
+            live.step()
+    split = {group: sum(seconds[name] for name in names) / rounds for group, names in GROUPS.items()}
+    return _rows(
+        f"{count} kernels, {sum(level.count for level in model.hierarchies[0].levels[1:])} units", times, split
+    )
 
 
-def _rows(case: str, times: dict[str, float]) -> list[Row]:
-    split = {group: sum(times[name] for name in names) for group, names in GROUPS.items()}
+def _rows(case: str, times: dict[str, float], split: dict[str, float]) -> list[Row]:
     rest = max(0.0, times["step"] - sum(split.values()))
-    split |= {"forces, energy, checks, coarse level": rest, "colours": times["colours"], "packing": times["packing"]}
+    split |= {"forces, energy, checks": rest, "colours": times["colours"], "packing": times["packing"]}
     whole = times["step"] + times["colours"] + times["packing"]
     rows = [
         Row(case, "simulated", 1 / times["step"], "frames/s"),
@@ -93,5 +92,5 @@ def _rows(case: str, times: dict[str, float]) -> list[Row]:
         Row(case, "step", times["step"], "s"),
     ]
     for name, seconds in split.items():
-        rows += [Row(case, name, seconds, "s"), Row(case, f"{name}, share", seconds / whole, "1", "step to packing")]
+        rows += [Row(case, name, seconds, "s"), Row(case, f"{name}, fraction", seconds / whole, "1", "step to packing")]
     return rows

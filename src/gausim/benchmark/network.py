@@ -1,4 +1,4 @@
-"""The graph network against the textbook form: time, share of the matrix product's peak, memory of training."""
+"""The graph network against the textbook form: time, fraction of the matrix product's peak, memory of training."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gausim.benchmark.harness import Options, Row, medians, saved_bytes, torch_threads
+from gausim.benchmark.harness import Options, Row, medians, peak_saved_bytes, torch_threads
 from gausim.benchmark.naive_network import naive_network
 from gausim.benchmark.peaks import peaks
 from gausim.nn.meshgraphnet import MeshGraphNet
@@ -41,9 +41,9 @@ class Size:
 def run(options: Options) -> list[Row]:
     """Forward and forward + backward of every variant, their ratios to the textbook form, and what training keeps.
 
-    Share of the peak: useful operations (:func:`useful_flops`) per second over the rate of the float32 matrix product
-    of :func:`gausim.benchmark.peaks.peaks`, which is torch's. It may exceed 1: float32 layers go through oneDNN, which
-    on some processors is faster than torch's own product, and bfloat16 is faster than float32.
+    Fraction of the peak: useful operations (:func:`useful_flops`) per second over the rate of torch's float32 matrix
+    product (:func:`gausim.benchmark.peaks.peaks`). It may exceed 1: float32 layers go through oneDNN, which on some
+    processors is faster than torch's own product, and bfloat16 is faster than float32.
     """
     size = Size(nodes=60, edges=700, layers=3, hidden=16) if options.quick else Size()
     with torch_threads(options.threads):
@@ -56,7 +56,7 @@ def run(options: Options) -> list[Row]:
         forward = medians({name: functools.partial(_forward, call) for name, call in calls.items()}, options)
         parameters = {name: list(networks.get(name, networks["split fp32"]).parameters()) for name in calls}
         both = medians({n: functools.partial(_gradients, call, parameters[n]) for n, call in calls.items()}, options)
-        kept = {name: float(saved_bytes(call)) for name, call in calls.items() if not name.startswith("compiled")}
+        kept = {name: float(peak_saved_bytes(call)) for name, call in calls.items() if not name.startswith("compiled")}
         gemm = peaks(options).gemm
     case = f"network {size.nodes} nodes, {size.edges} edges, {size.layers} x {size.hidden}"
     flops = useful_flops(networks["split fp32"], size.nodes, size.edges)

@@ -85,8 +85,6 @@ def _parts(name: str, scene: Splats, options: Options) -> list[Row]:
         rows.append(Row(name, f"{part} / peak", flops / times[part] / peak, "1", FMA))
     both = sum(work.values()) / sum(times[part] for part in work)
     rows.append(Row(name, "compositing, both / peak", both / peak, "1", FMA))
-    text = "pixels evaluated; the others stand in the same vector"
-    rows.append(Row(name, "pixels inside the ellipses", stages.inside() / evaluated, "1", text))
     return rows
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from gausim.benchmark.splats import Splats
 from gausim.render.cpu.batch import Band, Batch, Images
-from gausim.render.cpu.binning import TILE_HEIGHT, TILE_WIDTH
 from gausim.render.cpu.raster import BLOCKS, LANES
 
 
@@ -92,23 +91,3 @@ class Stages:
     def evaluated(self) -> int:
         """Pixels for which the two loops evaluate a kernel: sixteen for each that a block of pixels looks at."""
         return LANES * sum(int(band.used[:, :BLOCKS].sum()) for band in self.bands)
-
-    def inside(self) -> int:
-        """Those of them that lie within the kernel's ellipse, where alpha >= 1/255."""
-        return sum(_inside(band, -(-self.batch.width // TILE_WIDTH)) for band in self.bands)
-
-
-def _inside(band: Band, strips: int) -> int:
-    """Pixels within the ellipses of the kernels that the blocks of a band's tiles looked at."""
-    x, y = np.arange(TILE_WIDTH) + np.float32(0.5), np.arange(2) + np.float32(0.5)
-    total = 0
-    for tile in range(band.start.shape[0] - 1):
-        entries = band.entries[band.start[tile] : band.used[tile, BLOCKS]]
-        for p in range(BLOCKS):
-            reach = ((entries >> 4 & 15) <= p) & ((entries & 15) >= p)
-            r = band.records[entries[reach][: band.used[tile, p]] >> 8][:, :, None, None]
-            dx = x - ((r[:, 0] - TILE_WIDTH * (tile % strips)) + r[:, 1])
-            dy = y[:, None] - ((r[:, 2] - (band.row_low + TILE_HEIGHT * (tile // strips) + 2 * p)) + r[:, 3])
-            exponent = dy * (r[:, 6] * dy + r[:, 5] * dx) + r[:, 4] * dx * dx
-            total += int((exponent >= r[:, 11]).sum())
-    return total

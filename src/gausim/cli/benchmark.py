@@ -10,17 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gausim.benchmark.harness import Options, Row
+    from gausim.core import GaussianScene
+    from gausim.models.step.simulator import GausSim
 
 HELP = "Measure the speed of rendering, stepping, training and clustering as ratios within one run."
 
 CASES = {
     "render": "the CPU renderer against plain torch and the peak of the processor, threads, views, compilation",
-    "network": "the graph network against the textbook form: time, memory, share of the matrix-product peak",
+    "network": "the graph network against the textbook form: time, memory, fraction of the matrix-product peak",
     "step": "one predicted frame at the paper's size, with and without hierarchy, part by part",
     "train": "whole optimiser steps, part by part; KEY=VALUE chooses the experiment as in `gausim train`",
     "data": "packed frames against decoding PNG; opening and streaming a set of the paper's size",
     "interact": "an object that is pushed about: simulated frames per second, from the force to the browser's bytes",
-    "cluster": "clusters of bounded diameter and neighbour search",
+    "cluster": "clusters of bounded diameter, against scipy",
 }
 DEFAULT_OVERRIDES = ("experiment=demo",)
 
@@ -109,6 +111,8 @@ def _device(name: str) -> Any:
 
 def _run(name: str, options: Options, overrides: list[str], *, optional: bool) -> list[Row]:
     case = importlib.import_module(f"gausim.benchmark.{name}")
+    if name in ("step", "interact"):
+        return list(case.run(options, simulator_of))
     if name != "train":
         return list(case.run(options))
     from gausim.compose.build import build
@@ -123,6 +127,21 @@ def _run(name: str, options: Options, overrides: list[str], *, optional: bool) -
         print(f"train left out: {error}", file=sys.stderr)
         return []
     return list(case.run(options, module, datamodule))
+
+
+def simulator_of(preset: str, scene: GaussianScene, *settings: str) -> GausSim:
+    """The untrained simulator of ``conf/model/PRESET.yaml`` for a scene at 24 frames per second.
+
+    Args:
+        preset: name of the file.
+        scene: what it simulates.
+        settings: KEY=VALUE of the simulator's own keys.
+    """
+    from gausim.compose.config import compose, instantiate
+
+    config = compose(f"model/{preset}", [f"model.simulator.{setting}" for setting in settings])
+    made: GausSim = instantiate(config.model.simulator)(scenes=[scene], fps=[24.0])
+    return made
 
 
 def _print(name: str, rows: list[Row]) -> None:

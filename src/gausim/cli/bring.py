@@ -17,9 +17,9 @@ from gausim.io.archive import only_folder, remove_tree, unpack
 from gausim.io.download import continue_download
 from gausim.io.files import sha256, write_json
 from gausim.io.registry import Entry
-from gausim.runs.checkpoint import LAST_CHECKPOINT
 from gausim.runs.directory import CONFIG, FETCHED
 from gausim.runs.files import sole_writer
+from gausim.runs.names import LAST_CHECKPOINT
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 

@@ -119,7 +119,7 @@ def _evaluate(run: LoadedRun, arguments: argparse.Namespace) -> list[ObjectCurve
 def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list[str]:
     """Writes what long rollouts of each object's first sequence tell; returns the names of the files."""
     from gausim.compose.predict import endurance, run_objects
-    from gausim.report.tables.endurance import endurance_figure
+    from gausim.report.pictures.endurance import endurance_figure
 
     found = {item.data.name: endurance(run, item, arguments.endurance) for item in run_objects(run, arguments.object)}
     (folder / "endurance.json").write_text(json.dumps(found, indent=1) + "\n")

@@ -27,7 +27,7 @@ def main(argv: list[str]) -> int:
     """
     arguments = _parser().parse_args(argv)
     from gausim.cli.end import end
-    from gausim.report.page import summary_line
+    from gausim.report.render import summary_line
     from gausim.report.write import write_report
 
     out = arguments.out or arguments.dirs[0] / "report"

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gausim.core import Dynamics, SimState
-from gausim.metrics.motion_energy import motion_energy
+from gausim.metrics.motion import motion_energy
 
 # Frames that one figure is the mean of.
 WINDOW = 20

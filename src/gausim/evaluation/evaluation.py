@@ -35,6 +35,7 @@ from gausim.metrics import (
     motion_energy,
     point_error,
 )
+from gausim.metrics.flip import NO_PACKAGE, flip_is_installed
 from gausim.metrics.lpips import NO_WEIGHTS, SMALLEST, TOO_SMALL, weights_path
 from gausim.render.draw import SceneAppearance, draw
 from gausim.results.curves import (
@@ -70,16 +71,18 @@ PIXELS_AT_ONCE = 1 << 20
 
 
 def default_metrics(side: int = SMALLEST) -> list[ImageMetric]:
-    """The image metrics of every table; of images of ``side`` pixels LPIPS where :func:`no_lpips` has no objection."""
-    perceptual = [] if no_lpips(side) else [LPIPS()]
-    return [L2(), ForegroundL2(), PSNR(), ForegroundPSNR(), SSIM(), FLIP(), *perceptual]
+    """The image metrics of every table, of images of ``side`` pixels: FLIP and LPIPS where they can be measured."""
+    absent = absent_metrics(side)
+    optional = [metric() for metric in (FLIP, LPIPS) if metric.key not in absent]
+    return [L2(), ForegroundL2(), PSNR(), ForegroundPSNR(), SSIM(), *optional]
 
 
-def no_lpips(side: int) -> str:
-    """Why LPIPS cannot be measured on images of ``side`` pixels; empty where it can."""
+def absent_metrics(side: int) -> dict[str, str]:
+    """Why FLIP and LPIPS cannot be measured on images of ``side`` pixels, by their keys."""
+    absent = {} if flip_is_installed() else {FLIP.key: NO_PACKAGE}
     if side < SMALLEST:
-        return TOO_SMALL
-    return "" if weights_path().is_file() else NO_WEIGHTS
+        return absent | {LPIPS.key: TOO_SMALL}
+    return absent if weights_path().is_file() else absent | {LPIPS.key: NO_WEIGHTS}
 
 
 def evaluate_object(
@@ -90,7 +93,6 @@ def evaluate_object(
     *,
     sequences: Sequence[str] | None = None,
     views: Sequence[str] | None = None,
-    metrics: Sequence[ImageMetric] | None = None,
     advance: Callable[[str], None] | None = None,
 ) -> ObjectCurves:
     """Per-frame figures of every method and reference on every sequence of an object.
@@ -102,14 +104,13 @@ def evaluate_object(
         renderer: draws both predictions and the static reference.
         sequences: names of the sequences to measure; all when None.
         views: names of the cameras to measure in; all when None.
-        metrics: image metrics; :func:`default_metrics` when None.
         advance: called with a sequence's name when it is done.
 
     Raises:
         DataError: an unknown sequence, or broken data.
         RunError: a prediction has another number of frames or kernels than asked for, or is not finite.
     """
-    measure = _ObjectMeasure(data, scene, renderer, views, metrics)
+    measure = _ObjectMeasure(data, scene, renderer, views)
     records = _chosen(data, sequences)
     references = _linear_references(data)
     results: list[Rows] = []
@@ -174,14 +175,11 @@ class _ObjectMeasure:
         scene: GaussianScene,
         renderer: Renderer,
         views: Sequence[str] | None,
-        metrics: Sequence[ImageMetric] | None,
     ) -> None:
         self.data, self.scene, self.renderer = data, scene, renderer
         self.views = list(data.views if views is None else views)
         side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
-        self.metrics = list(default_metrics(side) if metrics is None else metrics)
-        measured = any(m.key == LPIPS.key for m in self.metrics)
-        self._absent = {} if measured else {LPIPS.key: no_lpips(side) or NO_WEIGHTS}
+        self.metrics, self._absent = default_metrics(side), absent_metrics(side)
         self.static = StaticDynamics(scene, fps=data.fps)
         self.look = SceneAppearance.of(scene, scene.foreground)
         points = data.rest_points
@@ -193,8 +191,10 @@ class _ObjectMeasure:
 
     def record(self, methods: Mapping[str, Predict]) -> dict[str, Any]:
         """What is known beside the figures: costs of every method, hashes of the data, what is absent, diagnosis."""
-        levels = {name: getattr(predict, "levels", None) for name, predict in methods.items()}
-        costs = {name: {**meter.summary(), "levels": levels[name]} for name, meter in self._costs.items()}
+        costs = {
+            name: {**meter.summary(), "levels": getattr(methods[name], "levels", None)}
+            for name, meter in self._costs.items()
+        }
         footnotes = {name: found for name, p in methods.items() if (found := getattr(p, "footnotes", None)) is not None}
         sources = data_provenance(self.data)
         facts = {"efficiency": costs, "sources": sources, "absent": self._absent, "footnotes": footnotes}

@@ -2,27 +2,48 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
+from typing import ClassVar
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torchmetrics import Metric
 
-from gausim.metrics.mean import PooledMean
+Images = Float[Tensor, "B H W 3"]
+Mask = Bool[Tensor, "B H W"]
+PerImage = Float[Tensor, " B"]
 
 
-class ImageMetric(PooledMean):
-    """Mean over images of :meth:`per_image`.
+class ImageMetric(Metric, ABC):
+    """Mean over images of :meth:`per_image`; sums are reduced over ranks, so every rank computes the same mean.
 
-    A subclass is one file that states :meth:`per_image` and how its figure is printed (see :class:`PooledMean`).
+    Attributes:
+        key: name in result files.
+        label: name in tables and figures.
+        scale: tables print the value times this.
+        unit: what the printed number is in.
+        higher_is_better: which way is good.
     """
 
+    key: ClassVar[str]
+    label: ClassVar[str]
+    scale: ClassVar[float] = 1.0
+    unit: ClassVar[str] = ""
+    higher_is_better = False
+    is_differentiable = True
+    full_state_update = False
+
+    total: Tensor
+    count: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+
     @abstractmethod
-    def per_image(
-        self,
-        prediction: Float[Tensor, "B H W 3"],
-        target: Float[Tensor, "B H W 3"],
-        mask: Bool[Tensor, "B H W"],
-    ) -> Float[Tensor, " B"]:
+    def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
         """The metric of every image.
 
         Args:
@@ -34,18 +55,19 @@ class ImageMetric(PooledMean):
             One value per image; NaN where a foreground metric finds no foreground.
         """
 
-    def update(
-        self,
-        prediction: Float[Tensor, "B H W 3"],
-        target: Float[Tensor, "B H W 3"],
-        mask: Bool[Tensor, "B H W"],
-    ) -> None:
+    def update(self, prediction: Images, target: Images, mask: Mask) -> None:
         """Adds a batch of images; images without a value (no foreground) do not count."""
         values = self.per_image(prediction, target, mask)
-        self.add(values[~values.isnan()])
+        known = values[~values.isnan()]
+        self.total += known.detach().double().sum()
+        self.count += known.shape[0]
+
+    def compute(self) -> Float[Tensor, ""]:
+        """Mean over all images seen so far."""
+        return self.total / self.count
 
 
-def masked_mean(values: Float[Tensor, "B H W"], mask: Bool[Tensor, "B H W"]) -> Float[Tensor, " B"]:
+def masked_mean(values: Float[Tensor, "B H W"], mask: Mask) -> PerImage:
     """Mean over the masked pixels of each image; NaN for an image without any."""
     weight = mask.to(values)
     return (values * weight).sum((1, 2)) / weight.sum((1, 2))

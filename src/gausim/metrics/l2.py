@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from jaxtyping import Bool, Float
-from torch import Tensor
-
-from gausim.metrics.image import ImageMetric, masked_mean
+from gausim.metrics.image import ImageMetric, Images, Mask, PerImage, masked_mean
 
 
 class L2(ImageMetric):
@@ -16,29 +13,17 @@ class L2(ImageMetric):
     scale = 1e3
     unit = "1e-3"
 
-    def per_image(
-        self,
-        prediction: Float[Tensor, "B H W 3"],
-        target: Float[Tensor, "B H W 3"],
-        mask: Bool[Tensor, "B H W"],
-    ) -> Float[Tensor, " B"]:
+    def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
         """Mean over the whole image."""
         return (prediction - target).norm(dim=-1).mean((1, 2))
 
 
-class ForegroundL2(ImageMetric):
+class ForegroundL2(L2):
     """The same over the foreground pixels of the true image only, which the black background cannot dilute."""
 
     key = "l2_foreground"
     label = "l2 foreground"
-    scale = 1e3
-    unit = "1e-3"
 
-    def per_image(
-        self,
-        prediction: Float[Tensor, "B H W 3"],
-        target: Float[Tensor, "B H W 3"],
-        mask: Bool[Tensor, "B H W"],
-    ) -> Float[Tensor, " B"]:
+    def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
         """Mean over the foreground."""
         return masked_mean((prediction - target).norm(dim=-1), mask)

@@ -24,7 +24,7 @@ def principal_motions(displacements: Sequence[NDArray], count: int) -> tuple[Arr
         count: at most so many shapes.
 
     Returns:
-        (M, 3 P) orthonormal shapes, and the share (M,) of the squared displacement in each, the largest first.
+        (M, 3 P) orthonormal shapes, and the fraction (M,) of the squared displacement in each, the largest first.
     """
     rows = np.concatenate([d.reshape(len(d), -1) for d in displacements]).astype(np.float64)
     values, vectors = np.linalg.eigh(rows @ rows.T)  # far fewer frames than coordinates
@@ -45,7 +45,7 @@ class Oscillation:
 
     Attributes:
         frequency: [Hz]; 0 where the motion only decays.
-        damping: share of critical damping; negative where it grows, NaN where the motion does not oscillate.
+        damping: fraction of critical damping; negative where it grows, NaN where the motion does not oscillate.
     """
 
     frequency: float

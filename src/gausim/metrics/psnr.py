@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import torch
-from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import log10
 
-from gausim.metrics.image import ImageMetric, masked_mean
+from gausim.metrics.image import ImageMetric, Images, Mask, PerImage, masked_mean
 
 # Identical images would be infinitely good and spoil every mean; 1e-10 caps them at 100 dB.
 SMALLEST_MSE = 1e-10
-
-
-def _decibel(mse: Float[Tensor, " B"]) -> Float[Tensor, " B"]:
-    return -10 * torch.log10(mse.clamp_min(SMALLEST_MSE))
 
 
 class PSNR(ImageMetric):
@@ -24,29 +18,18 @@ class PSNR(ImageMetric):
     unit = "dB"
     higher_is_better = True
 
-    def per_image(
-        self,
-        prediction: Float[Tensor, "B H W 3"],
-        target: Float[Tensor, "B H W 3"],
-        mask: Bool[Tensor, "B H W"],
-    ) -> Float[Tensor, " B"]:
+    def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
         """PSNR of the whole image."""
-        return _decibel((prediction - target).square().mean((1, 2, 3)))
+        return -10 * log10((prediction - target).square().mean((1, 2, 3)).clamp_min(SMALLEST_MSE))
 
 
-class ForegroundPSNR(ImageMetric):
+class ForegroundPSNR(PSNR):
     """The same over the foreground pixels of the true image only."""
 
     key = "psnr_foreground"
     label = "PSNR foreground"
-    unit = "dB"
-    higher_is_better = True
 
-    def per_image(
-        self,
-        prediction: Float[Tensor, "B H W 3"],
-        target: Float[Tensor, "B H W 3"],
-        mask: Bool[Tensor, "B H W"],
-    ) -> Float[Tensor, " B"]:
+    def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
         """PSNR of the foreground."""
-        return _decibel(masked_mean((prediction - target).square().mean(-1), mask))
+        squared = (prediction - target).square().mean(-1)
+        return -10 * log10(masked_mean(squared, mask).clamp_min(SMALLEST_MSE))

@@ -10,14 +10,14 @@ from typing import Any
 
 from gausim.core import RunError
 from gausim.metrics.lpips import HOW_TO_GET_WEIGHTS, NO_WEIGHTS
-from gausim.report.gather.runs import FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
-from gausim.report.gather.study import Cell, Group, Study, cell, dig, pooled
+from gausim.report.gather.runs import FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord, dig
+from gausim.report.gather.study import Cell, Group, Study, cell, pooled
 from gausim.report.pictures.film import Film, make_film
 from gausim.report.tables.sheets import NOTHING
 from gausim.report.tables.verdict import outcome, sentences
 from gausim.results.curves import ERROR_3D, STATIC
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import Table
+from gausim.results.table import Table, plus_minus
 
 # Videos are most of a page's size; the page of a run alone has its video.
 MOST_OPENINGS = 6
@@ -211,8 +211,7 @@ def _ratio(group: Group, name: str, split: str, row: str | None) -> Cell:
 def _text(found: Cell, digits: int, *, spread: bool) -> str:
     if found.value is None:
         return found.status or NOTHING
-    over = found.value.seed_std if spread else None
-    return f"{found.value.mean:.{digits}f}" + ("" if over is None else f" ± {over:.{digits}f}")
+    return plus_minus(found.value.mean, found.value.seed_std if spread else None, digits=digits)
 
 
 def _is_figure(text: str) -> bool:

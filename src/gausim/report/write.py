@@ -9,12 +9,12 @@ from pathlib import Path
 from gausim.io.files import write_durably
 from gausim.report.gather.runs import find_runs
 from gausim.report.gather.study import Study, make_study
+from gausim.report.numbers import csv_numbers
 from gausim.report.opening import Opening, make_openings
-from gausim.report.page import html_page
 from gausim.report.pictures.media import Exhibit, object_figures
+from gausim.report.render import Content, html_page, latex_tables, markdown_report
 from gausim.report.sources import Sources
 from gausim.report.tables.overview import make_sheets
-from gausim.report.text import csv_numbers, latex_tables, markdown_report
 
 PAGE, MARKDOWN, LATEX, NUMBERS = "report.html", "report.md", "tables.tex", "numbers.csv"
 
@@ -72,19 +72,14 @@ def write_report(
         figures, problems = object_figures(study, name)
         exhibits.append((name, figures))
         notes += [f"{name}: {problem}" for problem in dict.fromkeys(problems)]
-    page = html_page(title, study, sheets, sources, openings=openings, left=left, exhibits=exhibits, notes=notes)
+    content = Content(title, study, sheets, sources, openings, left, exhibits, notes)
     texts = {
-        PAGE: page,
-        MARKDOWN: markdown_report(title, study, sheets, sources, openings),
-        LATEX: latex_tables(sheets, sources),
+        PAGE: html_page(content),
+        MARKDOWN: markdown_report(content),
+        LATEX: latex_tables(content),
         NUMBERS: csv_numbers(study),
     }
     out.mkdir(parents=True, exist_ok=True)
-    files = [_write(out / name, text) for name, text in texts.items()]
-    return Report(study, openings, files)
-
-
-def _write(path: Path, text: str) -> Path:
-    """Writes all or nothing, so that a reader never sees half a page."""
-    write_durably(path, text.encode("utf-8", errors="replace"))
-    return path
+    for name, text in texts.items():
+        write_durably(out / name, text.encode("utf-8", errors="replace"))
+    return Report(study, openings, [out / name for name in texts])

@@ -65,13 +65,13 @@ class Diagnosis:
         """Plain data of what was found (see report.summary), or None without a sequence that moves."""
         if not self._truth or not any(np.abs(d).max() > 0 for d in self._truth):
             return None
-        shapes, share = principal_motions(self._truth, MOTIONS)
+        shapes, fraction = principal_motions(self._truth, MOTIONS)
         truth = [coordinates(d, shapes) for d in self._truth]
-        found: dict[str, Any] = {"share": share.tolist(), "frequency": [], "rows": {}}
+        found: dict[str, Any] = {"share": fraction.tolist(), "frequency": [], "rows": {}}
         for name, motions in {TRUTH: self._truth, **self._predicted}.items():
             series = [coordinates(d, shapes) for d in motions]
             frequency, power = spectrum(series, self._fps)
-            rings = [oscillation([s[:, m] for s in series], self._fps) for m in range(len(share))]
+            rings = [oscillation([s[:, m] for s in series], self._fps) for m in range(len(fraction))]
             row: dict[str, Any] = {
                 "spectrum": power.tolist(),
                 "frequencies": [_finite(ring.frequency) for ring in rings],

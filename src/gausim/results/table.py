@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from gausim.metrics.flip import NO_FLIP, NO_PACKAGE
 from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.results.summary import MOTION_ENERGY
 
@@ -75,12 +76,22 @@ def _line(frames: str, row: str, cells: dict[str, Any], infos: dict[str, Any]) -
         if metric == MOTION_ENERGY:
             line.append(_number(cell.get("pooled"), 2))
             continue
-        mean, std = cell.get("mean"), cell.get("std")
-        scale = info["scale"]
-        line.append("" if mean is None else f"{mean * scale:.2f} ± {(std or 0.0) * scale:.2f}")
+        mean = cell.get("mean")
+        line.append("" if mean is None else plus_minus(mean, cell.get("std") or 0.0, scale=info["scale"]))
         if _has_ratio(metric, info):
             line.append(_number(cell.get("ratio"), 3))
     return line
+
+
+def plus_minus(mean: float, deviation: float | None = None, *, scale: float = 1.0, digits: int = 2) -> str:
+    """A figure times ``scale``, and behind it the deviation where there is one."""
+    shown = f"{mean * scale:.{digits}f}"
+    return shown if deviation is None else f"{shown} {spread(deviation * scale, digits)}"
+
+
+def spread(deviation: float, digits: int = 2) -> str:
+    """A deviation as it is printed."""
+    return f"± {deviation:.{digits}f}"
 
 
 def _number(value: float | None, digits: int) -> str:
@@ -104,9 +115,9 @@ def footnotes(entry: dict[str, Any], method: str) -> list[str]:
 
 def gaps(summary: dict[str, Any]) -> list[str]:
     """What no table of an evaluation has, and how to get it: sentences."""
-    absent = [entry.get("absent") for entry in summary["objects"].values()]
-    lacks_lpips = any(isinstance(a, dict) and a.get("lpips") == NO_WEIGHTS for a in absent)
-    return [NO_LPIPS] if lacks_lpips else []
+    absent = [found for entry in summary["objects"].values() if isinstance(found := entry.get("absent"), dict)]
+    remedies = {("flip", NO_PACKAGE): NO_FLIP, ("lpips", NO_WEIGHTS): NO_LPIPS}
+    return [remedy for (key, why), remedy in remedies.items() if any(found.get(key) == why for found in absent)]
 
 
 def markdown_table(table: Table) -> str:

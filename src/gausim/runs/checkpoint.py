@@ -15,9 +15,10 @@ from torch import Tensor, nn
 
 from gausim.core import GaussianScene, RunError
 from gausim.io.files import write_durably
+from gausim.runs.names import LAST_CHECKPOINT
 from gausim.runs.renamed import with_present_weights
 
-LAST_CHECKPOINT, PREVIOUS_CHECKPOINT = "last.ckpt", "last.previous.ckpt"
+PREVIOUS_CHECKPOINT = "last.previous.ckpt"
 BEFORE_THE_END = "before_the_end.ckpt"  # of a run that was cut short: more time goes on from it
 DIGEST = "digest"
 # Raise it when a checkpoint holds something new without which a run would not resume bit for bit.

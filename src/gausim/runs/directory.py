@@ -19,13 +19,22 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from gausim.core import GausSimError, RunError
 from gausim.io.files import remove_leftovers, write_durably
-from gausim.runs.checkpoint import BEFORE_THE_END, LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, check_resumable
+from gausim.runs.checkpoint import BEFORE_THE_END, PREVIOUS_CHECKPOINT, check_resumable
 from gausim.runs.files import sole_writer, unwritable
-from gausim.runs.names import EPOCHS, MLFLOW_ID, MOTION, WANDB_ID
+from gausim.runs.names import (
+    CONFIG,
+    EPOCHS,
+    EVALUATION,
+    FAILED,
+    FINISHED,
+    LAST_CHECKPOINT,
+    MLFLOW_ID,
+    MOTION,
+    WANDB_ID,
+)
 from gausim.runs.renamed import with_present_names
 
-CONFIG, FINISHED, FAILED, LOCK = "config.yaml", "FINISHED", "FAILED", ".lock"
-EVALUATION, EVENTS = "evaluation/metrics.json", "events.jsonl"
+LOCK, EVENTS = ".lock", "events.jsonl"
 GRANTED = "granted more"  # the event of more epochs and minutes
 FETCHED = "FETCHED"  # in a directory that `gausim fetch` made: from where
 DAMAGED_CHECKPOINT = "last.damaged.ckpt"

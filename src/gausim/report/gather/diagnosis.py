@@ -19,7 +19,7 @@ class Motion:
     Attributes:
         spectrum: power per frequency.
         frequencies: of each principal motion [Hz]; NaN where unknown.
-        dampings: share of critical; NaN where it does not oscillate.
+        dampings: fraction of critical; NaN where it does not oscillate.
         phase_error: per frame [degrees]; empty for the truth.
         cosine: of the first velocity to the true one; NaN for the truth.
         levels: error over the static prediction's of the units of each level, the small ones first; empty where there
@@ -49,19 +49,19 @@ class Diagnosis:
     """What is known of the motions of one object.
 
     Attributes:
-        share: of the squared displacement in each principal motion.
+        fraction: of the squared displacement in each principal motion.
         frequency: of the spectra [Hz].
         first_unseen: first frame that training did not see.
         rows: the truth and the predictions.
     """
 
-    share: np.ndarray
+    fraction: np.ndarray
     frequency: np.ndarray
     first_unseen: int
     rows: Mapping[str, Motion]
 
     def frequency_error(self, row: str) -> float:
-        """Mean over principal motions, weighted by their share, of the relative error of the frequency."""
+        """Mean over principal motions, weighted by :attr:`fraction`, of the relative error of the frequency."""
         found, true = self.rows[row].frequencies, self.rows[TRUTH].frequencies
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._mean(np.where(true > 0, np.abs(found / true - 1), np.nan))
@@ -80,8 +80,8 @@ class Diagnosis:
 
     def _mean(self, values: np.ndarray) -> float:
         known = np.isfinite(values)
-        total = float(self.share[known].sum())
-        return float((self.share[known] * values[known]).sum() / total) if total > 0 else float("nan")
+        total = float(self.fraction[known].sum())
+        return float((self.fraction[known] * values[known]).sum() / total) if total > 0 else float("nan")
 
 
 def read_diagnosis(entry: Mapping[str, Any]) -> Diagnosis | None:
@@ -89,22 +89,22 @@ def read_diagnosis(entry: Mapping[str, Any]) -> Diagnosis | None:
     found, splits = entry.get("diagnosis"), entry.get("splits")
     if not isinstance(found, dict) or not isinstance(found.get("rows"), dict) or not isinstance(splits, dict):
         return None
-    share, frequency, seen = _numbers(found.get("share")), _numbers(found.get("frequency")), splits.get("seen")
-    rows = {str(k): _motion(v, len(share), len(frequency)) for k, v in found["rows"].items() if isinstance(v, dict)}
+    fraction, frequency, seen = _numbers(found.get("share")), _numbers(found.get("frequency")), splits.get("seen")
+    rows = {str(k): _motion(v, len(fraction), len(frequency)) for k, v in found["rows"].items() if isinstance(v, dict)}
     known = {name: motion for name, motion in rows.items() if motion is not None}
     if TRUTH not in known or not isinstance(seen, list) or len(seen) != 2 or not isinstance(seen[1], int):
         return None
-    return Diagnosis(share, frequency, seen[1], known)
+    return Diagnosis(fraction, frequency, seen[1], known)
 
 
 def _motion(row: Mapping[str, Any], motions: int, bins: int) -> Motion | None:
     power, frequencies, dampings = (_numbers(row.get(key)) for key in ("spectrum", "frequencies", "dampings"))
     if not bins or not motions or (len(power), len(frequencies), len(dampings)) != (bins, motions, motions):
         return None
-    cosine = number(row.get("velocity_cosine"))
+    (cosine,) = _numbers([row.get("velocity_cosine")])
     phase = _numbers(row.get("phase_error"))
     levels = _numbers(row.get("level_errors"))
-    return Motion(power, frequencies, dampings, phase, float("nan") if cosine is None else cosine, levels)
+    return Motion(power, frequencies, dampings, phase, float(cosine), levels)
 
 
 def _numbers(values: Any) -> np.ndarray:

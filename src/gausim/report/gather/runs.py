@@ -15,13 +15,15 @@ import yaml
 
 from gausim.core import RunError
 from gausim.results.summary import load_summary
+from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT
+from gausim.runs.renamed import with_present_names
 
-CONFIG, FINISHED, FAILED, EPOCHS = "config.yaml", "FINISHED", "FAILED", "epochs.csv"
 # What makes a directory with an unreadable configuration a run nevertheless.
-_TRACES = (FINISHED, FAILED, EPOCHS, "last.ckpt")
+_TRACES = (FINISHED, FAILED, EPOCHS, LAST_CHECKPOINT)
 _KEYS_OF_A_RUN = {"model", "data", "seed"}
 # Keys that do not change what is computed, or that only tell seeds apart.
 _FREE = ("paths", "logger", "callbacks", "sweep", "task_name", "evaluate", "seed", "data.seed", "trainer")
+_DIGITS = 12  # of hashes and commits
 # A refusal instead of a hang on a file that no run writes.
 _LARGEST_CONFIG = 1 << 20
 
@@ -53,8 +55,8 @@ class RunRecord:
 
     @property
     def seed(self) -> Any:
-        """The seed of the configuration."""
-        return self.config.get("seed")
+        """The seed of the configuration, or ``?``."""
+        return self.config.get("seed", "?")
 
     @property
     def settings(self) -> dict[str, str]:
@@ -67,12 +69,48 @@ class RunRecord:
         """First twelve digits of the SHA-256 of the whole configuration, or ``?`` where there is none."""
         if not self.config:
             return "?"
-        return hashlib.sha256(json.dumps(dict(flatten(self.config)), sort_keys=True).encode()).hexdigest()[:12]
+        return hashlib.sha256(json.dumps(dict(flatten(self.config)), sort_keys=True).encode()).hexdigest()[:_DIGITS]
+
+    @property
+    def config_text(self) -> str:
+        """The configuration as YAML."""
+        return yaml.safe_dump(self.config, sort_keys=False)
+
+    @property
+    def checkpoint(self) -> str:
+        """Epoch and updates of the checkpoint that was evaluated, or ``?``."""
+        state = (self.summary or {}).get("run", {})
+        return "?" if state.get("epoch") is None else f"epoch {state['epoch']}, {state.get('updates')} updates"
+
+    @property
+    def commit(self) -> str:
+        """Commit of the program that evaluated it, ``+`` where it was modified; else its version; else ``?``."""
+        commit, version = (dig(self.summary, "provenance", key) for key in ("commit", "gausim"))
+        if isinstance(commit, str):
+            return commit[:_DIGITS] + ("+" if dig(self.summary, "provenance", "modified") else "")
+        return f"gausim {version}" if isinstance(version, str) else "?"
+
+    @property
+    def data_hashes(self) -> dict[str, tuple[str, str]]:
+        """First digits of the hashes of every object's scene and manifest; ``?`` where they were not recorded."""
+        found = {}
+        for name, entry in (self.summary or {}).get("objects", {}).items():
+            both = (dig(entry, "sources", key, "sha256") for key in ("scene", "manifest"))
+            scene, manifest = (digest[:_DIGITS] if isinstance(digest, str) else "?" for digest in both)
+            found[name] = scene, manifest
+        return found
 
     @property
     def is_from_unfinished(self) -> bool:
         """Whether its numbers are those of a checkpoint in the middle of training."""
         return self.summary is not None and self.summary["run"].get("finished") is False
+
+
+def dig(node: Any, *keys: str) -> Any:
+    """What nested dictionaries hold under these keys; None where they do not."""
+    for key in keys:
+        node = node.get(key) if isinstance(node, dict) else None
+    return node
 
 
 def flatten(value: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -157,10 +195,12 @@ def _read_run(folder: Path, name: str) -> RunRecord:
     choices = _choices(folder)
     own = folder / CONFIG if (folder / CONFIG).is_file() else folder / ".hydra" / CONFIG
     try:
-        config = _yaml(own)
+        config = with_present_names(_yaml(own))
     except RunError as error:
         return RunRecord(folder, name, BROKEN, str(error), choices=choices)
-    metrics = folder / "evaluation" / "metrics.json"
+    except (IndexError, TypeError, ValueError) as error:
+        return RunRecord(folder, name, BROKEN, f"{own}: its levels cannot be read ({error}).", choices=choices)
+    metrics = folder / EVALUATION
     if metrics.is_file():
         try:
             summary = check_summary(load_summary(metrics), metrics)
@@ -200,8 +240,7 @@ def _choices(folder: Path) -> dict[str, str]:
         node: Any = _yaml(folder / ".hydra" / "hydra.yaml")
     except RunError:
         return {}
-    for key in ("hydra", "runtime", "choices"):
-        node = node.get(key) if isinstance(node, dict) else None
+    node = dig(node, "hydra", "runtime", "choices")
     return {str(k): str(v) for k, v in node.items()} if isinstance(node, dict) else {}
 
 

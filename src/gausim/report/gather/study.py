@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import statistics
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from gausim.report.gather.runs import BROKEN, EVALUATED, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord
+from gausim.report.gather.runs import BROKEN, EVALUATED, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord, dig
 from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import footnotes
 
@@ -236,7 +237,7 @@ def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
     hierarchy = simulator.get("hierarchy")
     levels = hierarchy.get("levels") if isinstance(hierarchy, dict) else None
     alone = levels[0] if isinstance(levels, list) and len(levels) == 1 else None
-    if simulator.get("predicted_levels") == [0] or (isinstance(alone, dict) and alone.get("diameter") == 0):
+    if isinstance(alone, dict) and alone.get("diameter") == 0:
         varied.append("w/o hierarchy")
     ablation = run.config.get("ablation")
     name = ablation.get("name") if isinstance(ablation, dict) else None
@@ -299,18 +300,23 @@ def says(group: Group) -> list[str]:
     return list(dict.fromkeys(note for entry in entries for note in footnotes(entry, group.method)))
 
 
+# What the seeds of a row must have in common to be compared, and where a summary says it.
+_COMPARED = {
+    "sequences": ("sequences",),
+    "ranges of frames": ("splits",),
+    "rest scenes": ("sources", "scene", "sha256"),
+}
+
+
 def _notes(groups: Sequence[Group]) -> list[str]:
     notes = []
     for group in groups:
         notes += [f"{group.label}: {note}" for note in says(group)]
         for name in group.objects:
             entries = [entry for _, entry in group.entries(name)]
-            if len({json.dumps(e["sequences"]) for e in entries}) > 1:
-                notes.append(f"{group.label}, {name}: the seeds were evaluated on different sequences.")
-            if len({json.dumps(e["splits"]) for e in entries}) > 1:
-                notes.append(f"{group.label}, {name}: the seeds were evaluated on different ranges of frames.")
-            if len({json.dumps(s) for e in entries if (s := dig(e, "sources", "scene", "sha256"))}) > 1:
-                notes.append(f"{group.label}, {name}: the seeds were evaluated on different rest scenes.")
+            for what, keys in _COMPARED.items():
+                if len({json.dumps(found) for e in entries if (found := dig(e, *keys))}) > 1:
+                    notes.append(f"{group.label}, {name}: the seeds were evaluated on different {what}.")
         for same in group.about.values():
             seeds = Counter(str(r.seed) for r in same if r.summary is not None)
             twice = [seed for seed, count in seeds.items() if count > 1]
@@ -361,16 +367,13 @@ def pooled(group: Group, name: str, find: Callable[[dict[str, Any]], Any], metri
     means = [mean for _, mean, _ in valid]
     stds = [std for _, _, std in valid if std is not None]
     std = math.sqrt(sum(s * s for s in stds) / len(stds)) if stds and metric != MOTION_ENERGY else None
-    value = Value(sum(means) / len(means), std, deviation(means), len(means))
+    value = Value(statistics.fmean(means), std, deviation(means), len(means))
     return Cell(value, EVALUATED, tuple(run for run, _, _ in valid))
 
 
 def deviation(values: Sequence[float]) -> float | None:
     """Sample standard deviation (n - 1); None for fewer than two."""
-    if len(values) < 2:
-        return None
-    mean = sum(values) / len(values)
-    return math.sqrt(sum((v - mean) ** 2 for v in values) / (len(values) - 1))
+    return statistics.stdev(values) if len(values) > 1 else None
 
 
 def number(value: Any) -> float | None:
@@ -378,10 +381,3 @@ def number(value: Any) -> float | None:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
         return None
     return float(value)
-
-
-def dig(node: Any, *keys: str) -> Any:
-    """What nested dictionaries hold under these keys; None where they do not."""
-    for key in keys:
-        node = node.get(key) if isinstance(node, dict) else None
-    return node

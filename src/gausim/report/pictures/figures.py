@@ -100,33 +100,53 @@ def _lines(curves: ObjectCurves, row: str, panel: tuple[str, str], sequence: str
     return values if sequence is None else values[[curves.facts.sequences.index(sequence)]]
 
 
+def slices_plot(
+    columns: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], first_unseen: int
+) -> tuple[Figure, list[tuple[str, int]]]:
+    """Space-time slices under one another, through the line that moves most in the first film of a column.
+
+    Args:
+        columns: heading of each, and its films: label and (F, H, W, 3) uint8, of any length.
+        first_unseen: first frame that training did not see; a line marks it.
+
+    Returns:
+        The figure, and the line of each column: ("column" | "row", index).
+    """
+    rows, wide = len(columns[0][1]), len(columns) > 1
+    size = (5.2 * len(columns) if wide else 7.0, 1.5 * rows + 0.6 if wide else 2.6 * rows)
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    grid = figure.subplots(rows, len(columns), squeeze=False)
+    lines = [moving_line(films[0][1]) for _, films in columns]
+    for column, (panels, (title, films), line) in enumerate(zip(grid.T, columns, lines, strict=True)):
+        for axes, (label, frames) in zip(panels, films, strict=True):
+            axes.imshow(space_time_slice(frames, line), aspect="auto", interpolation="nearest")
+            if first_unseen < len(frames):
+                axes.axvline(first_unseen - 0.5, color="#f0962a", linewidth=1.4)
+            axes.set(yticks=[], xlim=(-0.5, len(films[-1][1]) - 0.5))
+            axes.tick_params(labelsize=7, labelbottom=axes is panels[-1])
+            if column == 0:
+                axes.set_ylabel(label, fontsize=8)
+        panels[0].set_title(f"{title}: {line[0]} {line[1]} over time", fontsize=9)
+        panels[-1].set_xlabel("frame (foreseen right of the line)", fontsize=8)
+    return figure, lines
+
+
 def slice_figure(
     truth: np.ndarray | None, prediction: np.ndarray, path: Path, *, title: str, first_unseen: int
 ) -> tuple[str, int]:
-    """Space-time slices of truth above prediction, through the line that moves most in the truth.
+    """Writes space-time slices of truth (without it, of the prediction alone) above prediction; returns their line.
 
     Args:
         truth: (F, H, W, 3) uint8, of any length; without it the prediction chooses the line.
         prediction: (F, H, W, 3) uint8.
         path: PNG to write.
         title: sequence and view.
-        first_unseen: first frame that training did not see; a line marks it.
-
-    Returns:
-        The line: ("column" | "row", index).
+        first_unseen: first frame that training did not see.
     """
-    line = moving_line(prediction if truth is None else truth)
-    images = {"prediction": prediction} if truth is None else {"ground truth": truth, "prediction": prediction}
-    figure = Figure(figsize=(7.0, 2.6 * len(images)), dpi=_DPI, layout="constrained")
-    for axes, (name, frames) in zip(np.ravel(figure.subplots(len(images), 1)), images.items(), strict=True):
-        axes.imshow(space_time_slice(frames, line), aspect="auto", interpolation="nearest")
-        if first_unseen < len(frames):
-            axes.axvline(first_unseen - 0.5, color="#f0962a", linewidth=1.4)
-        axes.set(ylabel=name, xlim=(-0.5, len(prediction) - 0.5), yticks=[])
-    axes.set_xlabel("frame (foreseen right of the line)")
-    figure.suptitle(f"{title}: {line[0]} {line[1]} over time", fontsize=10)
+    films = [] if truth is None else [("ground truth", truth)]
+    figure, lines = slices_plot([(title, [*films, ("prediction", prediction)])], first_unseen)
     save_figure(figure, path)
-    return line
+    return lines[0]
 
 
 def contact_frames(frames: int, first_unseen: int, count: int = 8) -> list[int]:
@@ -134,6 +154,33 @@ def contact_frames(frames: int, first_unseen: int, count: int = 8) -> list[int]:
     edges = {0, min(first_unseen - 1, frames - 1), min(first_unseen, frames - 1), frames - 1}
     even = np.linspace(0, frames - 1, count).round().astype(int).tolist()
     return sorted(edges | {f for f in even if min(abs(f - e) for e in edges) > 2})
+
+
+def panels_plot(
+    rows: Sequence[tuple[str, Sequence[np.ndarray | None]]], heads: Sequence[tuple[str, bool]], *, title: str = ""
+) -> Figure:
+    """Pictures in rows and columns.
+
+    Args:
+        rows: label, and (H, W, 3) uint8 pictures; a place of None stays empty.
+        heads: of the columns, and whether they are foreseen, which an orange heading tells.
+        title: heading.
+    """
+    height, width = next(image.shape[:2] for _, images in rows for image in images if image is not None)
+    size = (1.25 * len(heads), 1.25 * height / width * len(rows) + (0.6 if title else 0.3))
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    grid = figure.subplots(len(rows), len(heads), squeeze=False)
+    for panels, (label, images) in zip(grid, rows, strict=True):
+        for axes, image in zip(panels, images, strict=True):
+            axes.set(xticks=[], yticks=[])
+            if image is not None:
+                axes.imshow(image)
+        panels[0].set_ylabel(label, fontsize=8)
+    for axes, (head, foreseen) in zip(grid[0], heads, strict=True):
+        axes.set_title(head, fontsize=7, color="#c2410c" if foreseen else "black")
+    if title:
+        figure.suptitle(title, fontsize=10)
+    return figure
 
 
 def contact_sheet(
@@ -149,24 +196,13 @@ def contact_sheet(
         first_unseen: first frame that training did not see.
     """
     chosen = contact_frames(len(prediction), first_unseen)
-    names = ["prediction"] if truth is None else ["ground truth", "prediction", "error"]
-    height = 1.25 * prediction.shape[1] / prediction.shape[2]
-    figure = Figure(figsize=(1.25 * len(chosen), height * len(names) + 0.6), dpi=_DPI, layout="constrained")
-    grid = figure.subplots(len(names), len(chosen), squeeze=False)
-    for column, frame in enumerate(chosen):
-        images: dict[str, np.ndarray] = {"prediction": prediction[frame]}
-        if truth is not None and frame < len(truth):
-            images |= {"ground truth": truth[frame], "error": error_colors(truth[frame], prediction[frame])}
-        for axes, name in zip(grid[:, column], names, strict=True):
-            axes.set(xticks=[], yticks=[])
-            if name in images:
-                axes.imshow(images[name])
-            if column == 0:
-                axes.set_ylabel(name, fontsize=8)
-        foreseen = frame >= first_unseen
-        grid[0, column].set_title(str(frame), fontsize=8, color="#c2410c" if foreseen else "black")
-    figure.suptitle(title, fontsize=10)
-    save_figure(figure, path)
+    rows: list[tuple[str, list[np.ndarray | None]]] = [("prediction", [prediction[f] for f in chosen])]
+    if truth is not None:
+        true = [truth[f] if f < len(truth) else None for f in chosen]
+        pairs = zip(true, chosen, strict=True)
+        errors = [None if image is None else error_colors(image, prediction[f]) for image, f in pairs]
+        rows = [("ground truth", true), *rows, ("error", errors)]
+    save_figure(panels_plot(rows, [(str(f), f >= first_unseen) for f in chosen], title=title), path)
 
 
 def picture_grid(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, *, title: str, columns: int) -> None:

@@ -19,21 +19,11 @@ from gausim.io.video import SMALL, write_video
 from gausim.report.gather.diagnosis import read_diagnosis
 from gausim.report.gather.study import Group, Study
 from gausim.report.pictures.diagnosis import diagnosis_plot
-from gausim.report.pictures.figures import contact_frames, error_plot
-from gausim.report.pictures.frames import (
-    Timeline,
-    brighten,
-    label_bar,
-    light_gain,
-    moving_line,
-    space_time_slice,
-    timeline_bar,
-)
+from gausim.report.pictures.figures import contact_frames, error_plot, panels_plot, slices_plot
+from gausim.report.pictures.frames import Timeline, brighten, label_bar, light_gain, timeline_bar
 from gausim.results.curves import POINT_ARRAYS, STATIC, ObjectCurves, load_curves
 from gausim.results.pictures import Pictures, kept_pictures
 
-_DPI = 100
-_BORDER = "#f0962a"
 TRUTH = "ground truth"
 # More predictions than these side by side are too small to see; the tables have them all.
 MOST_METHODS, MOST_VIEWS = 5, 3
@@ -170,57 +160,37 @@ def _lit(members: Sequence[tuple[str, Pictures, np.ndarray]]) -> Shown:
 
 def _slices(shown: Shown) -> Exhibit:
     """Space-time slices through the line that moves most, one row per method and column per camera."""
-    pictures, views = shown.pictures, _some_views(shown.pictures)
-    figure = Figure(figsize=(5.2 * len(views), 1.5 * len(shown.columns) + 0.6), dpi=_DPI, layout="constrained")
-    grid = figure.subplots(len(shown.columns), len(views), squeeze=False)
-    for column, view in enumerate(views):
-        line = moving_line(shown.columns[0][1][:, view])
-        for axes, (label, frames) in zip(grid[:, column], shown.columns, strict=True):
-            axes.imshow(space_time_slice(frames[:, view], line), aspect="auto", interpolation="nearest")
-            axes.axvline(pictures.first_unseen - 0.5, color=_BORDER, linewidth=1.4)
-            axes.set(yticks=[], xlim=(-0.5, len(frames) - 0.5))
-            axes.tick_params(labelsize=7, labelbottom=axes is grid[-1, column])
-            if column == 0:
-                axes.set_ylabel(_short(label), fontsize=8)
-        grid[0, column].set_title(f"{_view_name(pictures, view)}: {line[0]} {line[1]}", fontsize=9)
-        grid[-1, column].set_xlabel("frame (foreseen right of the line)", fontsize=8)
+    pictures = shown.pictures
+    columns = [
+        (_view_name(pictures, view), [(_short(label), frames[:, view]) for label, frames in shown.columns])
+        for view in _some_views(pictures)
+    ]
+    figure, _ = slices_plot(columns, pictures.first_unseen)
     return Exhibit(f"Space-time slices: {pictures.object}", shown.note, "image", _drawn(figure))
 
 
 def _grid(shown: Shown) -> Exhibit:
     """Chosen frames in the first camera, one row per method."""
     pictures, view = shown.pictures, _some_views(shown.pictures)[0]
-    frames = contact_frames(len(pictures.truth), pictures.first_unseen)
-    rows = [(label, [images[f, view] for f in frames]) for label, images in shown.columns]
-    heads = [(str(f), "#c2410c" if f >= pictures.first_unseen else "black") for f in frames]
+    places = [(f, view, str(f)) for f in contact_frames(len(pictures.truth), pictures.first_unseen)]
     title = f"Frames: {pictures.object}, {_view_name(pictures, view)}"
-    return Exhibit(title, f"Orange numbers: foreseen frames. {shown.note}", "image", _panels(rows, heads))
+    return Exhibit(title, f"Orange numbers: foreseen frames. {shown.note}", "image", _panels(shown, places))
 
 
 def _cameras(shown: Shown) -> Exhibit:
     """The last seen, a foreseen and the last frame in several cameras."""
-    pictures, views = shown.pictures, _some_views(shown.pictures)
+    pictures = shown.pictures
     last, border = len(pictures.truth) - 1, pictures.first_unseen
     chosen = sorted({min(border - 1, last), min((border + last) // 2, last), last})
-    rows = [(label, [images[f, v] for f in chosen for v in views]) for label, images in shown.columns]
-    heads = [(f"{_view_name(pictures, v)}, {f}", "#c2410c" if f >= border else "black") for f in chosen for v in views]
+    places = [(f, v, f"{_view_name(pictures, v)}, {f}") for f in chosen for v in _some_views(pictures)]
     title = f"Several cameras: {pictures.object}"
-    return Exhibit(title, f"Camera and frame; orange: foreseen. {shown.note}", "image", _panels(rows, heads))
+    return Exhibit(title, f"Camera and frame; orange: foreseen. {shown.note}", "image", _panels(shown, places))
 
 
-def _panels(rows: Sequence[tuple[str, list[np.ndarray]]], heads: Sequence[tuple[str, str]]) -> str:
-    height, width = rows[0][1][0].shape[:2]
-    size = (1.25 * len(heads), 1.25 * height / width * len(rows) + 0.3)
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-    grid = figure.subplots(len(rows), len(heads), squeeze=False)
-    for line, (label, images) in zip(grid, rows, strict=True):
-        for axes, image in zip(line, images, strict=True):
-            axes.set(xticks=[], yticks=[])
-            axes.imshow(image)
-        line[0].set_ylabel(_short(label), fontsize=8)
-    for axes, (head, color) in zip(grid[0], heads, strict=True):
-        axes.set_title(head, fontsize=7, color=color)
-    return _drawn(figure)
+def _panels(shown: Shown, places: Sequence[tuple[int, int, str]]) -> str:
+    """One row per method; a column's frame, view and heading are given."""
+    rows = [(_short(label), [images[f, v] for f, v, _ in places]) for label, images in shown.columns]
+    return _drawn(panels_plot(rows, [(head, f >= shown.pictures.first_unseen) for f, _, head in places]))
 
 
 def _video(shown: Shown) -> Exhibit:

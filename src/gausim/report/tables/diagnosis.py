@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from gausim.report.gather.diagnosis import Diagnosis, read_diagnosis
 from gausim.report.gather.runs import RunRecord
-from gausim.report.gather.study import Study, deviation
-from gausim.report.tables.sheets import METHOD, MOTION, NOTHING, REFERENCE, Entry, Line, Sheet
+from gausim.report.gather.study import Study
+from gausim.report.tables.sheets import METHOD, MOTION, REFERENCE, Entry, Line, Sheet, seeds_entry
 from gausim.results.curves import TRUTH
 
 
@@ -38,31 +36,23 @@ _HEADS = (
     "error, large parts", "error, small parts",
 )  # fmt: skip
 _CAPTION = (
-    "In the principal motions of the true points, weighted by their share of the squared displacement. Frequency and "
-    "damping: of the oscillation z(t+1) = a z(t) + b z(t-1) that fits all frames best. Phase: root mean square over "
-    "motions of the analytic signals' difference; unrelated motions have 104 degrees. A damping ratio above 1 with "
-    "small phase errors tells a motion that dies away in step; below 1 with large ones, a motion out of step. "
+    "In the principal motions of the true points, weighted by their fraction of the squared displacement. Frequency "
+    "and damping: of the oscillation z(t+1) = a z(t) + b z(t-1) that fits all frames best. Phase: root mean square "
+    "over motions of the analytic signals' difference; unrelated motions have 104 degrees. A damping ratio above 1 "
+    "with small phase errors tells a motion that dies away in step; below 1 with large ones, a motion out of step. "
     "Parts: units of the coarsest and the finest level of the hierarchy, their centres' error over that of rest, in "
     "all frames."
 )
 
 
 def _entries(found: Sequence[tuple[RunRecord, Diagnosis]], row: str) -> tuple[Entry, ...]:
-    runs = tuple(run for run, _ in found)
     columns = (
-        ([d.rows[row].cosine for _, d in found], "{:.2f}", 1.0),
-        ([d.frequency_error(row) for _, d in found], "{:.1f} %", 100.0),
-        ([d.damping_ratio(row) for _, d in found], "{:.2f}", 1.0),
-        ([d.phase(row, seen=True) for _, d in found], "{:.0f}°", 1.0),
-        ([d.phase(row, seen=False) for _, d in found], "{:.0f}°", 1.0),
-        ([d.rows[row].large for _, d in found], "{:.2f}", 1.0),
-        ([d.rows[row].small for _, d in found], "{:.2f}", 1.0),
+        ([d.rows[row].cosine for _, d in found], "{:.2f}"),
+        ([100 * d.frequency_error(row) for _, d in found], "{:.1f} %"),
+        ([d.damping_ratio(row) for _, d in found], "{:.2f}"),
+        ([d.phase(row, seen=True) for _, d in found], "{:.0f}°"),
+        ([d.phase(row, seen=False) for _, d in found], "{:.0f}°"),
+        ([d.rows[row].large for _, d in found], "{:.2f}"),
+        ([d.rows[row].small for _, d in found], "{:.2f}"),
     )
-    entries = []
-    for values, form, scale in columns:
-        known = [scale * v for v in values if np.isfinite(v)]
-        spread = deviation(known)
-        extra = f"± {form.format(spread)}, {len(known)} seeds" if spread is not None else ""
-        text = form.format(sum(known) / len(known)) if known else NOTHING
-        entries.append(Entry(text, extra, missing=not known, runs=runs))
-    return tuple(entries)
+    return tuple(seeds_entry(values, form, runs=tuple(run for run, _ in found)) for values, form in columns)

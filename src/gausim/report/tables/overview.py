@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from statistics import fmean
 from typing import Any
 
 from gausim.report.gather import paper
-from gausim.report.gather.runs import RunRecord
-from gausim.report.gather.study import FULL, NOT_MEASURED, Cell, Group, Study, cell, deviation, number
+from gausim.report.gather.runs import dig
+from gausim.report.gather.study import FULL, NOT_MEASURED, Cell, Group, Study, cell, number
 from gausim.report.tables.diagnosis import diagnosis_sheets
 from gausim.report.tables.sheets import (
     ABLATIONS,
     CONTRAST,
     COST,
     METHOD,
-    NOTHING,
     OLD_EVALUATION,
     PAPER,
     SPLITS,
@@ -26,11 +26,13 @@ from gausim.report.tables.sheets import (
     entry,
     metric_info,
     metric_sheet,
+    plain,
+    seeds_entry,
     split_title,
 )
 from gausim.results.curves import ERROR_3D
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import said
+from gausim.results.table import plus_minus, said
 
 # What ablations are compared by: (metric, views).
 _ABLATED = (
@@ -95,10 +97,10 @@ def _ablation(study: Study, name: str, family: str, groups: Sequence[Group]) -> 
 def _against_full(cells: Sequence[Cell], title: str) -> Line:
     """Relative change of the error against the first column."""
     full = cells[0].value
-    entries = [Entry(NOTHING, missing=True)]
+    entries = [plain("")]
     for c in cells[1:]:
         if full is None or c.value is None or not full.mean:
-            entries.append(Entry(NOTHING, missing=True))
+            entries.append(plain(""))
             continue
         change = c.value.mean - full.mean
         spread = None
@@ -115,150 +117,100 @@ def _paper_ablation(name: str, groups: Sequence[Group], splits: Sequence[str], s
     lines = []
     for column, split in enumerate([splits[0], splits[-1]]):
         found = [paper.ABLATION.get(g.variation) for g in groups]
-        entries = tuple(
-            Entry(f"{f[column][0]:.2f} ± {f[column][1]:.2f}") if f else Entry(NOTHING, missing=True) for f in found
-        )
+        entries = tuple(plain(plus_minus(*f[column]) if f else "") for f in found)
         lines.append(Line(f"l2: {split_title(study, name, split)} (paper)", PAPER, entries))
     return lines
 
 
+_COSTS = ("units per level", "N_F / N_K", "s per frame", "ms per image", "peak memory", "trained in", "held", "on")
+_COSTS_CAPTION = (
+    "N_F / N_K: predicted deformation gradients over kernels. Seconds per predicted frame without drawing (mean ± "
+    "standard deviation over sequences, the first warms up), milliseconds to draw one image. Memory: on a GPU the "
+    "most that CUDA had allocated; on a CPU what the prediction of a sequence adds at most to the memory of the "
+    "process, small: of the first sequence, which also builds the graph and loads compiled code, and the whole "
+    "process, libraries and videos included. Trained in: processor time (wall time) of all sequences and objects "
+    "together; held: the most memory of the training process, or of CUDA. Compare rows of one machine only. Grey: "
+    "the paper's, on Mothorchids, whose seconds are those of a whole forward pass."
+)
+
+
 def efficiency_sheet(study: Study) -> Sheet:
-    """Units per level, share that is predicted, seconds and memory per predicted frame and of training."""
+    """Units per level, fraction that is predicted, seconds and memory per predicted frame and of training."""
     lines = []
     for group in study.groups:
         for name in group.objects:
-            found = [(r, e.get("efficiency")) for r, e in group.entries(name)]
-            costs = [
-                (r, e[group.method]) for r, e in found if isinstance(e, dict) and isinstance(e.get(group.method), dict)
-            ]
             label = group.label if len(study.objects) == 1 else f"{group.label}, {name}"
-            fits = [_fit(entry, group.method) for _, entry in group.entries(name)]
-            lines.append(Line(label, METHOD, _costs(costs, [fit for fit in fits if fit], group.of(name))))
+            lines.append(Line(label, METHOD, _costs(group, name)))
     for method, (seconds, memory) in paper.EFFICIENCY.items():
-        whole = method == "GausSim (paper)"
-        levels = " → ".join(str(n) for n in paper.LEVELS) if whole else NOTHING
-        texts = (
-            levels, "0.05" if whole else NOTHING, f"{seconds:.2f}", NOTHING, f"{memory:.1f} GB", NOTHING, NOTHING,
-            "A100",
-        )  # fmt: skip
-        lines.append(Line(method, PAPER, tuple(Entry(t, missing=t == NOTHING) for t in texts)))
-    heads = ("units per level", "N_F / N_K", "s per frame", "ms per image", "peak memory", "trained in", "held", "on")
-    caption = (
-        "N_F / N_K: predicted deformation gradients over kernels. Seconds per predicted frame without drawing (mean ± "
-        "standard deviation over sequences, the first warms up), milliseconds to draw one image. Memory: on a GPU the "
-        "most that CUDA had allocated; on a CPU what the prediction of a sequence adds at most to the memory of the "
-        "process, small: of the first sequence, which also builds the graph and loads compiled code, and the whole "
-        "process, libraries and videos included. Trained in: processor time (wall time) of all sequences and objects "
-        "together; held: the most memory of the training process, or of CUDA. Compare rows of one machine only. Grey: "
-        "the paper's, on Mothorchids, whose seconds are those of a whole forward pass."
-    )
-    if any(e.text == NOT_MEASURED for line in lines for e in line.entries):
-        caption += f" {OLD_EVALUATION}"
-    return Sheet("efficiency", COST, "Efficiency", caption, (("", heads),), tuple(lines), "method")
+        levels, fraction = (_arrows(paper.LEVELS), "0.05") if method == "GausSim (paper)" else ("", "")
+        texts = (levels, fraction, f"{seconds:.2f}", "", f"{memory:.1f} GB", "", "", "A100")
+        lines.append(Line(method, PAPER, tuple(map(plain, texts))))
+    old = any(e.text == NOT_MEASURED for line in lines for e in line.entries)
+    caption = f"{_COSTS_CAPTION} {OLD_EVALUATION}" if old else _COSTS_CAPTION
+    return Sheet("efficiency", COST, "Efficiency", caption, (("", _COSTS),), tuple(lines), "method")
 
 
-def _costs(
-    costs: Sequence[tuple[RunRecord, dict[str, Any]]], fits: Sequence[dict[str, Any]], runs: tuple[RunRecord, ...]
-) -> tuple[Entry, ...]:
-    if not costs:
-        states = {r.status for r in runs if r.summary is None}
-        text = next(iter(sorted(states)), NOT_MEASURED)
-        return (Entry(text, missing=True, runs=runs), *(Entry(NOTHING, missing=True) for _ in range(7)))
-    used = tuple(r for r, _ in costs)
-    first = costs[0][1]
-    levels = first.get("levels") if isinstance(first.get("levels"), dict) else {}
-    counts = levels.get("counts") if isinstance(levels, dict) else None
-    share = _ratio(levels)
-    seconds = [x for _, c in costs if (x := _in(c, "seconds_per_frame", "mean")) is not None]
-    spreads = [x for _, c in costs if (x := _in(c, "seconds_per_frame", "std")) is not None]
-    drawing = [x for _, c in costs if (x := number(c.get("seconds_per_image"))) is not None]
-    extra = f"± {spread:.4f}, {len(seconds)} seeds" if (spread := deviation(seconds)) is not None else ""
-    mean = f"{_mean(seconds):.4f}" + (f" ± {_mean(spreads):.4f}" if spreads else "") if seconds else NOTHING
-    device = f"{first.get('device', '?')}, {first.get('threads', '?')} threads"
-    texts = (
-        (" → ".join(str(n) for n in counts) if isinstance(counts, list) else NOTHING, ""),
-        (f"{share:.3f}" if share is not None else NOTHING, ""),
-        (mean, extra),
-        (f"{1e3 * _mean(drawing):.2f}" if drawing else NOTHING, ""),
-        _memory([c for _, c in costs]),
-        _minutes(fits),
-        _held(fits),
-        (device, ""),
-    )
-    return tuple(Entry(text, small, missing=text == NOTHING, runs=used) for text, small in texts)
+def _costs(group: Group, name: str) -> tuple[Entry, ...]:
+    """What a group's predictions and trainings cost on an object, in the columns of ``_COSTS``."""
+    entries = group.entries(name)
+    found = [(r, cost) for r, e in entries if isinstance(cost := dig(e, "efficiency", group.method), dict)]
+    if not found:
+        states = sorted({r.status for r in group.of(name) if r.summary is None})
+        missing = Entry(states[0] if states else NOT_MEASURED, missing=True, runs=group.of(name))
+        return (missing, *map(plain, [""] * (len(_COSTS) - 1)))
+    runs, costs = tuple(r for r, _ in found), [cost for _, cost in found]
+    fits = [fit for _, e in entries if number(dig(fit := said(e, group.method).get("fit"), "cpu_seconds"))]
+    levels = dig(costs[0], "levels", "counts")
+    predictions, kernels = (number(dig(costs[0], "levels", key)) for key in ("predictions", "kernels"))
+    wall, processor = _known(fits, "seconds"), _known(fits, "cpu_seconds")
+    note = f"{fmean(wall) / 60:.1f} min of wall time" if wall else ""
+    held = max(_known(fits, "peak_bytes"), default=0.0)
+    return (
+        plain(_arrows(levels) if isinstance(levels, list) else "", runs=runs),
+        plain(f"{predictions / kernels:.3f}" if predictions is not None and kernels else "", runs=runs),
+        seeds_entry(_known(costs, "seconds_per_frame", "mean"), "{:.4f}",
+                    stds=_known(costs, "seconds_per_frame", "std"), runs=runs),
+        plain(f"{1e3 * fmean(drawing):.2f}" if (drawing := _known(costs, "seconds_per_image")) else "", runs=runs),
+        plain(*_memory(costs), runs=runs),
+        seeds_entry([seconds / 60 for seconds in processor], "{:.1f} min", note=note, runs=runs),
+        plain(f"{held / _GIGA:.2f} GB" if held else "", runs=runs),
+        plain(f"{costs[0].get('device', '?')}, {costs[0].get('threads', '?')} threads", runs=runs),
+    )  # fmt: skip
+
+
+def _arrows(counts: Sequence[Any]) -> str:
+    return " → ".join(map(str, counts))
+
+
+def _known(nodes: Sequence[Any], *keys: str) -> list[float]:
+    """The numbers that nodes have under these keys."""
+    return [value for node in nodes if (value := number(dig(node, *keys))) is not None]
 
 
 def _memory(costs: Sequence[dict[str, Any]]) -> tuple[str, str]:
     """What is printed large and small of the memory: of a GPU the peak, of a process what a prediction adds to it."""
     peak, added, first = (
-        max((x for c in costs if (x := _in(c, "memory", f"{key}bytes")) is not None), default=None)
-        for key in ("peak_", "added_", "first_added_")
+        max(_known(costs, "memory", f"{key}bytes"), default=None) for key in ("peak_", "added_", "first_added_")
     )
     if peak is None or added is None:
-        return NOTHING, ""
-    memory = costs[0].get("memory")
-    if isinstance(memory, dict) and str(memory.get("kind", "")).startswith("CUDA"):
+        return "", ""
+    if str(dig(costs[0], "memory", "kind")).startswith("CUDA"):
         return f"{peak / _GIGA:.2f} GB", f"+ {added / _MEGA:.0f} MB"
     if first is None:  # earlier versions: freed memory hid what was added
         return f"{peak / _GIGA:.2f} GB", "whole process"
     return f"+ {added / _MEGA:.1f} MB", f"first + {first / _MEGA:.0f} MB; process {peak / _GIGA:.2f} GB"
 
 
-def _fit(entry: dict[str, Any], method: str) -> dict[str, Any] | None:
-    """What training cost, where the run says so."""
-    fit = said(entry, method).get("fit")
-    return fit if isinstance(fit, dict) and number(fit.get("cpu_seconds")) else None
-
-
-def _minutes(fits: Sequence[dict[str, Any]]) -> tuple[str, str]:
-    """Minutes of processor time, small: of the clock, and their spread."""
-    processor, wall = ([x / 60 for fit in fits if (x := number(fit.get(key)))] for key in ("cpu_seconds", "seconds"))
-    if not processor:
-        return NOTHING, ""
-    small = [f"± {spread:.1f}, {len(processor)} seeds"] if (spread := deviation(processor)) is not None else []
-    small += [f"{_mean(wall):.1f} min of wall time"] if wall else []
-    return f"{_mean(processor):.1f} min", "; ".join(small)
-
-
-def _held(fits: Sequence[dict[str, Any]]) -> tuple[str, str]:
-    most = [x for fit in fits if (x := number(fit.get("peak_bytes")))]
-    return (f"{max(most) / _GIGA:.2f} GB", "") if most else (NOTHING, "")
-
-
-def _ratio(levels: Any) -> float | None:
-    predictions, kernels = (
-        number(levels.get(k)) if isinstance(levels, dict) else None for k in ("predictions", "kernels")
-    )
-    return predictions / kernels if predictions is not None and kernels else None
-
-
-def _in(node: dict[str, Any], outer: str, inner: str) -> float | None:
-    value = node.get(outer)
-    return number(value.get(inner)) if isinstance(value, dict) else None
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
+_CONTRAST = ("mean foreground colour", "its norm", "largest l2 of a pixel")
 
 
 def contrast_sheet(study: Study) -> Sheet:
     """The paper's table of colour contrast, which explains absolute differences between objects."""
-    rows: dict[str, list[Entry]] = {"mean foreground colour": [], "its norm": [], "largest l2 of a pixel": []}
-    grey: dict[str, list[Entry]] = {f"{label} (paper)": [] for label in rows}
-    for name in study.objects:
-        texts, runs = _contrast(study, name)
-        for column, text in zip(rows.values(), texts, strict=True):
-            column.append(Entry(text, missing=text == NOTHING, runs=runs))
-        object_name = paper.paper_object(name)
-        theirs = [NOTHING] * 3
-        if object_name:
-            color, norm, largest = paper.CONTRAST[object_name]
-            theirs = [f"({', '.join(f'{c:.2f}' for c in color)})", f"{norm:.2f}", f"{largest:.2f}"]
-        for column, text in zip(grey.values(), theirs, strict=True):
-            column.append(Entry(text, missing=text == NOTHING))
-    lines = [Line(label, METHOD, tuple(entries)) for label, entries in rows.items()]
-    if any(not e.missing for entries in grey.values() for e in entries):
-        lines += [Line(label, PAPER, tuple(entries)) for label, entries in grey.items()]
+    own = [_contrast(study, name) for name in study.objects]
+    theirs = [tuple(map(plain, _printed(paper.CONTRAST.get(paper.paper_object(name) or "")))) for name in study.objects]
+    lines = [Line(_CONTRAST[i], METHOD, tuple(column[i] for column in own)) for i in range(3)]
+    if any(not e.missing for column in theirs for e in column):
+        lines += [Line(f"{_CONTRAST[i]} (paper)", PAPER, tuple(column[i] for column in theirs)) for i in range(3)]
     caption = (
         "Against the black background. Bright objects get larger absolute errors from the same displacement: compare "
         "errors between objects with this in mind. The largest l2 is that of the first run in this report."
@@ -266,16 +218,21 @@ def contrast_sheet(study: Study) -> Sheet:
     return Sheet("contrast", CONTRAST, "Colour contrast", caption, (("", tuple(study.objects)),), tuple(lines))
 
 
-def _contrast(study: Study, name: str) -> tuple[list[str], tuple[RunRecord, ...]]:
-    for group in study.groups:
-        for run, found in group.entries(name):
-            contrast = found.get("contrast")
-            color = contrast.get("mean_color") if isinstance(contrast, dict) else None
-            values = [number(c) for c in color] if isinstance(color, list) else []
-            norm, largest = (
-                number(contrast.get(k)) if isinstance(contrast, dict) else None for k in ("norm", "max_l2")
-            )
-            if len(values) == 3 and None not in (*values, norm, largest):
-                shown = ", ".join(f"{c:.2f}" for c in values)
-                return [f"({shown})", f"{norm:.2f}", f"{largest:.2f}"], (run,)
-    return [NOTHING] * 3, ()
+def _contrast(study: Study, name: str) -> tuple[Entry, ...]:
+    """The contrast of an object, as the first run has it that recorded one."""
+    for run, found in (item for group in study.groups for item in group.entries(name)):
+        color = dig(found, "contrast", "mean_color")
+        values = [number(value) for value in color] if isinstance(color, list) else []
+        norm, largest = (number(dig(found, "contrast", key)) for key in ("norm", "max_l2"))
+        known = [value for value in (*values, norm, largest) if value is not None]
+        if len(known) == 5:
+            red, green, blue, norm, largest = known
+            return tuple(plain(text, runs=(run,)) for text in _printed(((red, green, blue), norm, largest)))
+    return tuple(map(plain, _printed(None)))
+
+
+def _printed(contrast: tuple[tuple[float, float, float], float, float] | None) -> tuple[str, str, str]:
+    if contrast is None:
+        return "", "", ""
+    color, norm, largest = contrast
+    return f"({', '.join(f'{c:.2f}' for c in color)})", f"{norm:.2f}", f"{largest:.2f}"

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
+from statistics import fmean
 from typing import Any
 
 from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.report.gather import paper
-from gausim.report.gather.runs import RunRecord
-from gausim.report.gather.study import NOT_MEASURED, Cell, Group, Study, Value, cell, dig, pooled, says
+from gausim.report.gather.runs import RunRecord, dig
+from gausim.report.gather.study import NOT_MEASURED, Cell, Group, Study, cell, deviation, number, pooled, says
 from gausim.results.curves import ERROR_3D
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import NO_FORESIGHT
+from gausim.results.table import NO_FORESIGHT, plus_minus, spread
 
 METHOD, REFERENCE, PAPER = "method", "reference", "paper"
 # The splits of the paper; `unseen_all` exists where recordings go on beyond frame 49.
@@ -73,6 +76,11 @@ class Line:
     kind: str
     entries: tuple[Entry, ...]
 
+    @property
+    def runs(self) -> list[RunRecord]:
+        """All runs that its entries were computed from."""
+        return list(dict.fromkeys(run for entry in self.entries for run in entry.runs))
+
 
 @dataclass(frozen=True)
 class Sheet:
@@ -93,8 +101,23 @@ class Sheet:
     title: str
     caption: str
     columns: tuple[tuple[str, tuple[str, ...]], ...]
-    lines: tuple[Line, ...] = field(default=())
+    lines: tuple[Line, ...]
     stub: str = ""
+
+    @property
+    def label(self) -> str:
+        """The key in letters and digits."""
+        return re.sub(r"[^A-Za-z0-9]+", "-", self.key)
+
+    @property
+    def has_groups(self) -> bool:
+        """Whether its columns stand under headings."""
+        return any(group for group, _ in self.columns)
+
+    @property
+    def heads(self) -> list[str]:
+        """Headings of all columns, those of their groups before them."""
+        return [f"{group} {sub}".strip() for group, subs in self.columns for sub in subs]
 
 
 def metric_info(study: Study, metric: str) -> dict[str, Any] | None:
@@ -136,7 +159,7 @@ def metric_sheet(study: Study, metric: str, views: str) -> Sheet | None:
         Line(group.label, METHOD, tuple(entry(c, info, best=n in best[i]) for i, c in enumerate(row)))
         for n, (group, row) in enumerate(zip(study.groups, rows, strict=True))
     ]
-    lines += [*_references(study, columns, metric, views, info), *_floor(study, columns, metric, views, info)]
+    lines += _references(study, columns, metric, views, info)
     lines += _paper_lines(columns, metric, views)
     heads = tuple(
         (name, tuple(split_title(study, name, s) if study.splits(name) else "Seen" for s in splits))
@@ -183,15 +206,37 @@ def entry(c: Cell, info: dict[str, Any], *, best: bool = False) -> Entry:
     """A cell as it is printed."""
     if c.value is None:
         return Entry(c.status or NOTHING, missing=True, runs=c.runs)
-    extra = [f"± {c.value.seed_std * info['scale']:.2f}, {c.value.seeds} seeds"] if c.value.seed_std is not None else []
+    value, scale = c.value, info["scale"]
+    extra = [] if value.seed_std is None else [f"{spread(value.seed_std * scale)}, {value.seeds} seeds"]
     extra += ["unfinished"] if any(r.is_from_unfinished for r in c.runs) else []
-    return Entry(number_text(c.value, info["scale"]), ", ".join(extra), best, runs=c.runs)
+    return Entry(plus_minus(value.mean, value.std, scale=scale), ", ".join(extra), best, runs=c.runs)
 
 
-def number_text(value: Value, scale: float) -> str:
-    """Mean and, where there is one, standard deviation over sequences."""
-    spread = "" if value.std is None else f" ± {value.std * scale:.2f}"
-    return f"{value.mean * scale:.2f}{spread}"
+def seeds_entry(
+    values: Sequence[float | None], form: str, *, stds: Sequence[float] = (), note: str = "",
+    runs: tuple[RunRecord, ...] = (),
+) -> Entry:  # fmt: skip
+    """The mean of one figure per seed as it is printed, and small behind it how far the seeds differ.
+
+    Args:
+        values: of the seeds, those that are known.
+        form: how a figure is printed, as :meth:`str.format` takes it.
+        stds: deviations over sequences.
+        note: what else stands small.
+        runs: where the values come from.
+    """
+    known = [found for value in values if (found := number(value)) is not None]
+    if not known:
+        return Entry(NOTHING, missing=True, runs=runs)
+    text = " ± ".join(form.format(fmean(part)) for part in (known, stds) if part)
+    differ = deviation(known)
+    small = [] if differ is None else [f"± {form.format(differ)}, {len(known)} seeds"]
+    return Entry(text, "; ".join([*small, note] if note else small), runs=runs)
+
+
+def plain(text: str, extra: str = "", *, runs: tuple[RunRecord, ...] = ()) -> Entry:
+    """An entry of a text, or of nothing where it is empty."""
+    return Entry(text or NOTHING, extra, missing=not text, runs=runs)
 
 
 def best_of(cells: Sequence[Cell], metric: str, info: dict[str, Any]) -> set[int]:
@@ -209,34 +254,23 @@ def best_of(cells: Sequence[Cell], metric: str, info: dict[str, Any]) -> set[int
 def _references(
     study: Study, columns: Sequence[tuple[str, list[str]]], metric: str, views: str, info: dict[str, Any]
 ) -> list[Line]:
-    """Rows of the summaries that are no method: the static prediction and others, each distinct one once."""
-    names = dict.fromkeys(
+    """Rows of the summaries that are no method, and in the training views the reconstruction against frame 0.
+
+    What the reconstruction has under the seen frames is what no motion can beat by much.
+    """
+    rows = dict.fromkeys(
         row for g in study.groups for name in study.objects for _, e in g.entries(name)
         for row in e["rows"] if row not in e["methods"]
     )  # fmt: skip
-    lines = []
-    for row in names:
 
-        def find(group: Group, name: str, split: str, row: str = row) -> Cell:
-            return cell(group, name, split, views, metric, row=row)
+    def of_row(group: Group, name: str, split: str, *, row: str) -> Cell:
+        return cell(group, name, split, views, metric, row=row)
 
-        lines += _distinct_lines(row, study, columns, find, info)
-    return lines
+    def of_floor(group: Group, name: str, split: str) -> Cell:
+        return pooled(group, name, lambda e: dig(e, "floor", metric), metric) if split == "seen" else Cell(None)
 
-
-def _floor(
-    study: Study, columns: Sequence[tuple[str, list[str]]], metric: str, views: str, info: dict[str, Any]
-) -> list[Line]:
-    """The reconstruction against frame 0, under the seen frames: what no motion can beat by much."""
-    if views != "train":
-        return []
-
-    def find(group: Group, name: str, split: str) -> Cell:
-        if split != "seen":
-            return Cell(None)
-        return pooled(group, name, lambda e: dig(e, "floor", metric), metric)
-
-    return _distinct_lines(FLOOR, study, columns, find, info)
+    find = {row: partial(of_row, row=row) for row in rows} | ({FLOOR: of_floor} if views == "train" else {})
+    return [line for label, cells in find.items() for line in _distinct_lines(label, study, columns, cells, info)]
 
 
 def _distinct_lines(
@@ -264,12 +298,12 @@ def _distinct_lines(
                 found[key] = joined
         versions.append(list(found.values()))
     lines = []
-    for number in range(max((len(v) for v in versions), default=0)):
+    for place in range(max((len(v) for v in versions), default=0)):
         entries: list[Entry] = []
         for (_, splits), version in zip(columns, versions, strict=True):
-            cells = version[number] if number < len(version) else [Cell(None)] * len(splits)
+            cells = version[place] if place < len(version) else [Cell(None)] * len(splits)
             entries += [entry(c if c.value else Cell(None), info) for c in cells]
-        lines.append(Line(label if number == 0 else f"{label} [{number + 1}]", REFERENCE, tuple(entries)))
+        lines.append(Line(label if place == 0 else f"{label} [{place + 1}]", REFERENCE, tuple(entries)))
     return lines
 
 
@@ -286,6 +320,6 @@ def _paper_lines(columns: Sequence[tuple[str, list[str]]], metric: str, views: s
             late = "unseen_all" if object_name in paper.LATE and "unseen_all" in splits else "unseen"
             for split in splits:
                 pair = None if pairs is None else {"seen": pairs[0], late: pairs[1]}.get(split)
-                entries.append(Entry(f"{pair[0]:.2f} ± {pair[1]:.2f}") if pair else Entry(NOTHING, missing=True))
+                entries.append(plain(plus_minus(*pair) if pair else ""))
         lines.append(Line(method, PAPER, tuple(entries)))
     return lines

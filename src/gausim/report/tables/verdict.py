@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from gausim.report.gather.study import dig, number
+from gausim.report.gather.runs import dig
+from gausim.report.gather.study import number
 from gausim.results.curves import ERROR_3D, STATIC
 from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import said

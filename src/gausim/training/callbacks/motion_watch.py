@@ -13,7 +13,7 @@ from torch import Tensor
 from gausim.core import ConfigError, DivergenceError
 from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth
-from gausim.metrics.motion_energy import motion_energy
+from gausim.metrics.motion import motion_energy
 from gausim.nn.mode import evaluating
 from gausim.report.gather.diagnosis import read_diagnosis
 from gausim.results.diagnosis import Diagnosis

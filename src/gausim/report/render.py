@@ -1,0 +1,125 @@
+"""A report as HTML (one file, no script, nothing from anywhere else), Markdown and LaTeX, from the templates here."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from gausim.report.gather.study import Study
+from gausim.report.opening import Opening, unanswered
+from gausim.report.pictures.frames import FORESEEN, SEEN
+from gausim.report.pictures.media import Exhibit
+from gausim.report.sources import Sources
+from gausim.report.tables.sheets import SECTIONS, Sheet
+
+_LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
+    "|": r"\textbar{}", '"': r"\textquotedbl{}", "±": r"$\pm$", "×": r"$\times$", "–": "--", "→": r"$\to$",
+    "↑": r"$\uparrow$", "↓": r"$\downarrow$", "⁻": "$^{-}$", "¹": "$^{1}$", "²": "$^{2}$", "³": "$^{3}$",
+    "σ": r"$\sigma$", "−": "$-$",
+}  # fmt: skip
+_ANGLES = {
+    "variable_start_string": "<<", "variable_end_string": ">>", "block_start_string": "<%", "block_end_string": "%>",
+    "comment_start_string": "<#", "comment_end_string": "#>",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What a report says.
+
+    Attributes:
+        title: heading.
+        study: what the report is about.
+        sheets: tables.
+        sources: where their numbers link to.
+        openings: first screens, of which one is shown at a time.
+        left: number of first screens that were left out.
+        exhibits: pictures and videos by object.
+        notes: what a reader must know.
+    """
+
+    title: str
+    study: Study
+    sheets: Sequence[Sheet]
+    sources: Sources
+    openings: Sequence[Opening]
+    left: int = 0
+    exhibits: Sequence[tuple[str, list[Exhibit]]] = ()
+    notes: Sequence[str] = ()
+
+
+def html_page(content: Content) -> str:
+    """The page; every text is escaped, and its policy forbids the browser to load anything."""
+    sections = [(name, [sheet for sheet in content.sheets if sheet.section == name]) for name in SECTIONS]
+    return _rendered(
+        "page.html",
+        content,
+        {"autoescape": True},
+        summary=summary_line(content.study),
+        remedies=unanswered(content.study),
+        sections=[(name, own) for name, own in sections if own and content.openings],
+        exhibits=[(name, figures) for name, figures in content.exhibits if figures],
+        seen_color=_rgb(SEEN),
+        foreseen_color=_rgb(FORESEEN),
+    )
+
+
+def markdown_report(content: Content) -> str:
+    """The whole report without its pictures."""
+    # Further seeds of a row have its sentences.
+    told = {opening.title: opening for opening in reversed(content.openings)}
+    options = {"finalize": _escaping(markdown_escape), "lstrip_blocks": True}
+    return _rendered("report.md", content, options, openings=list(reversed(told.values())), notes=content.study.notes)
+
+
+def latex_tables(content: Content) -> str:
+    r"""All tables for ``\input``; needs booktabs, graphicx and xcolor. Comments name the runs of every row."""
+    return _rendered("tables.tex", content, {"finalize": _escaping(latex_escape), **_ANGLES})
+
+
+def _rendered(template: str, content: Content, options: Mapping[str, Any], **more: Any) -> str:
+    loader = PackageLoader("gausim.report")
+    environment = Environment(
+        loader=loader, undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True, **options
+    )
+    return environment.get_template(template).render(vars(content) | more)
+
+
+def _escaping(escape: Callable[[str], str]) -> Callable[[Any], Any]:
+    """What escapes every expression of a template but those that it calls safe, which know their own markup."""
+    return lambda value: value if hasattr(value, "__html__") else escape(str(value))
+
+
+def latex_escape(text: str) -> str:
+    """Text that LaTeX prints as it is, on one line; control characters are dropped."""
+    flat = re.sub(r"\s+", " ", text)
+    return "".join(_LATEX.get(c, c) for c in flat if c.isprintable())
+
+
+def markdown_escape(text: str) -> str:
+    """Text that Markdown prints as it is, also inside a table; backquotes stay, for commands."""
+    flat = re.sub(r"\s+", " ", text)
+    return re.sub(r"([\\*_\[\]|<>#~&])", r"\\\1", flat)
+
+
+def summary_line(study: Study) -> str:
+    """How many runs there are, and in what state."""
+    states = Counter(run.status for run in study.runs)
+    shown = ", ".join(f"{count} {state}" for state, count in states.items())
+    objects = ", ".join(study.objects) or "none"
+    return f"{_counted(len(study.runs), 'run')}: {shown}; {_counted(len(study.groups), 'row')}; objects: {objects}."
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
+def _rgb(color: tuple[int, int, int]) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*color)
