@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from helpers import toy_object
 from helpers.simulators import LEVELS
+from msgspec.structs import replace
 
 from gausim.cli import train
 from gausim.compose.build import load_run

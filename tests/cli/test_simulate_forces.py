@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from helpers import played
+from msgspec.structs import replace
 
 from gausim.cli import main
 from gausim.cli.simulate import command as simulate
@@ -95,7 +95,7 @@ def test_an_initial_state_and_a_changed_model(run, tmp_path: Path, capsys) -> No
         (["--force", "weights=3"], "--force weights=3: 'direction=' is missing"),
         (["--force", "weights=3", "direction=up"], "direction=up: expected x, -x"),
         (["--force", "weights=heavy", "direction=x"], "'heavy': expected a number"),
-        (["--force", "weights=nan", "direction=x"], "expected a finite number"),
+        (["--force", "weights=nan", "direction=x"], "field 'weights': expected float >= 0.0, got 'nan'"),
         (["--force", "weights=11", "direction=x"], "'weights': expected at most 10"),
         (["--force", "weights=1", "direction=x", "weight=2"], "'weight=2': expected KEY=VALUE"),
         (["--force", "weights=1", "direction=x", "weights=2"], "each once"),
@@ -103,7 +103,7 @@ def test_an_initial_state_and_a_changed_model(run, tmp_path: Path, capsys) -> No
         (["--force", "weights=1", "direction=x", "on=unit:7/1"], "level 7: 'toy' has levels 0 to 2"),
         (["--force", "weights=1", "direction=x", "at=1.5"], "'1.5': expected a whole number"),
         (["--force", "weights=1", "direction=x", "at=99"], "at=99: expected 0 to 19"),
-        (["--force", "weights=1", "direction=x", "at=-1"], "field 'at': expected 0"),
+        (["--force", "weights=1", "direction=x", "at=-1"], "field 'at': expected int >= 0"),
         (["--pin"], "expected at least one argument"),
         (["--impulse", "weight_seconds=1", "direction=x"], "'weight_seconds': expected at most"),
         (["--wind", "weights=1", "direction=x", "--metre", "0"], "--metre 0.0: expected more than 0"),

@@ -31,9 +31,8 @@ from gausim.data.images import read_rgba
 from gausim.data.objects import ObjectData
 from gausim.data.records import read_array, read_stills
 from gausim.data.verify import verify
-from gausim.interaction.events import Force, Pin, Reset
 from gausim.interaction.selections import Ball, Kernels
-from gausim.interaction.session import Entry, ForceSession, MadeWith, load_session, save_session
+from gausim.interaction.session import Entry, Force, ForceSession, MadeWith, Pin, Reset, load_session, save_session
 from gausim.io.colmap import read_colmap
 from gausim.io.ply import load_masks, load_points, load_scene
 from gausim.io.ply_sequence import load_ply_sequence, save_ply_sequence

@@ -178,7 +178,7 @@ def chromium(folder: Path, *, size: tuple[int, int] = (1280, 800), more: tuple[s
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
         port = _port(home / "DevToolsActivePort", process)
-        with connect(_page_address(port), max_size=1 << 28, open_timeout=20) as socket:
+        with connect(_page_address(port), max_size=1 << 28, open_timeout=20, ping_interval=None) as socket:
             page = Page(socket)
             page.call("Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1,
                       mobile=False)  # fmt: skip

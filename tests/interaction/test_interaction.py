@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from msgspec.structs import replace as changed
 
 from gausim.core import ConfigError, DataError, DivergenceError, SimState, Steppable, SteppedFrame, Stepper
 from gausim.interaction.interaction import Interaction, replay
@@ -41,16 +42,11 @@ def test_stepping_is_the_rollout_bit_for_bit(make_column, make_simulator, passiv
     assert float((whole.positions[-1] - scene.means).abs().max()) > 1e-3
 
 
-def test_an_interaction_without_events_is_the_rollout(make_column, make_simulator) -> None:
-    scene = make_column()
-    model = make_simulator(scene)
-    initial, dynamics = SimState(scene.means, scene.means * 0.999), SceneDynamics(model)
-    live = Interaction(
-        scene, dynamics, dynamics.masses, initial, made_with=MadeWith.of(scene, model, initial), keep=None
-    )
+def test_an_interaction_without_events_is_the_rollout(make_interaction) -> None:
+    live = make_interaction(keep=None)
     for _ in range(10):
         live.step()
-    assert same(live.trajectory(), dynamics.rollout(initial, 10))
+    assert same(live.trajectory(), live._dynamics.rollout(live._initial, 10))
     assert live.tick == live.frame_number == 10 and live.session().entries == ()
 
 
@@ -90,16 +86,16 @@ def test_replay_wants_what_the_session_was_made_with(make_interaction) -> None:
     live.act(Force(Whole(), X, 1.0))
     live.step()
     session = live.session()
-    other = replace(session, made_with=replace(session.made_with, model_hash="0", run="elsewhere"))
+    other = changed(session, made_with=changed(session.made_with, model_hash="0", run="elsewhere"))
     with pytest.raises(DataError, match="another method or training .run 'elsewhere'"):
         replay(live, other)
     assert same(replay(live, other, other_model=True), replay(live, session))
-    for changed in (
-        replace(session, made_with=replace(session.made_with, scene_hash="0", scene="cup")),
-        replace(session, fps=30.0),
+    for wrong in (
+        changed(session, made_with=changed(session.made_with, scene_hash="0", scene="cup")),
+        changed(session, fps=30.0),
     ):
         with pytest.raises(DataError, match="another scene, 'cup' and not 'column'|30 frames per second and not 24"):
-            replay(live, changed, other_model=True)
+            replay(live, wrong, other_model=True)
     assert make_interaction(seed=1).made_with.model_hash != session.made_with.model_hash
     live.frame = replace(live.frame, positions=torch.zeros(1, 1).expand(1 << 30, 3))
     with pytest.raises(DataError, match="frames take 12 GiB, expected at most 8"):

@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers import chromium
+from helpers.chromium import CTRL, SHIFT, chromium, needs_chromium
 
 pytest.importorskip("viser", reason="the extra 'view' is not installed")
+
+from viser.transforms import SO3
 
 from gausim.cli.view_subject import playable_run, playable_scene, subject_of
 from gausim.core import Trajectory
@@ -30,7 +32,7 @@ from gausim.viewer.app import Subject, Viewer
 from gausim.viewer.guard import Door
 from gausim.viewer.recording import record
 
-chromium, pytestmark = chromium.chromium, chromium.needs_chromium
+pytestmark = needs_chromium
 
 
 @contextmanager
@@ -47,15 +49,7 @@ def on_screen(viewer: Viewer, point: torch.Tensor, size: tuple[int, int] = (1280
     """Where a point of the page's scene is seen [pixels]."""
     client = next(iter(viewer.server.get_clients().values()))
     camera = client.camera
-    w, x, y, z = camera.wxyz
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    seen = rotation.T @ (point.double().numpy() - camera.position)
+    seen = SO3(camera.wxyz).as_matrix().T @ (point.double().numpy() - camera.position)
     focal = size[1] / 2 / np.tan(camera.fov / 2)
     return size[0] / 2 + focal * seen[0] / seen[2], size[1] / 2 + focal * seen[1] / seen[2]
 
@@ -63,7 +57,7 @@ def on_screen(viewer: Viewer, point: torch.Tensor, size: tuple[int, int] = (1280
 def play(viewer: Viewer, page: Any, folder: Path, interaction: Interaction) -> None:
     """Drags the farthest part to the right, and checks what the issue asks for."""
     page.open(viewer.url)
-    page.wait(lambda: "simulated" in page.text() and viewer.live.steps > 3, 60, "the page")
+    page.wait(lambda: "simulated" in page.text() and viewer.live.interaction.tick > 3, 60, "the page")
     hands, live = viewer.hands, viewer.live
     page.picture(folder / "loaded.png")
     # The part that moves most: the one farthest from what is pinned.
@@ -112,7 +106,7 @@ def play(viewer: Viewer, page: Any, folder: Path, interaction: Interaction) -> N
         u for u in page.requests if not u.startswith((viewer.url, "data:", "blob:", viewer.url.replace("http", "ws")))
     ]
     assert not outside, outside
-    assert not live.message and viewer.server.traffic.junk == viewer.server.traffic.failed == 0
+    assert not live.message and viewer.server.junk == viewer.server.failed == 0
 
 
 def test_page_is_dragged_reset_and_replayed(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
@@ -127,21 +121,21 @@ def test_page_brushes_flicks_and_takes_a_session(make_interaction: Callable[...,
     with served(Subject("a column", interaction, sessions=tmp_path)) as viewer, chromium(tmp_path) as page:
         hands, live = viewer.hands, viewer.live
         page.open(viewer.url)
-        page.wait(lambda: "simulated" in page.text() and live.steps > 3, 60, "the page")
+        page.wait(lambda: "simulated" in page.text() and live.interaction.tick > 3, 60, "the page")
         centre = on_screen(viewer, viewer.placing.to_page(interaction.scene.means).mean(0))
         start, end = (centre[0] - 250, centre[1] - 250), (centre[0] + 250, centre[1] + 250)
-        page.press(*start, modifiers=chromium.SHIFT)
-        page.drag_to(start, end, modifiers=chromium.SHIFT)
-        page.release(*end, modifiers=chromium.SHIFT)
+        page.press(*start, modifiers=SHIFT)
+        page.drag_to(start, end, modifiers=SHIFT)
+        page.release(*end, modifiers=SHIFT)
         page.wait(lambda: isinstance(hands.selection, Kernels), 10, "a brushed region")
         assert int(hands.mask.sum()) > 1
         tip = hands._centres(interaction.scene.means)[0]
         start = on_screen(viewer, tip)
         end = (start[0] + 120, start[1])
-        page.press(*start, modifiers=chromium.CTRL)
-        page.drag_to(start, end, modifiers=chromium.CTRL)
+        page.press(*start, modifiers=CTRL)
+        page.drag_to(start, end, modifiers=CTRL)
         assert not interaction.acting, "a flick pulls before it is released"
-        page.release(*end, modifiers=chromium.CTRL)
+        page.release(*end, modifiers=CTRL)
         page.wait(lambda: any(isinstance(e.event, Impulse) for e in interaction.session().entries), 10, "an impulse")
         page.press_button("Pause")
         page.wait(lambda: not live.playing, 10, "a pause")
@@ -157,7 +151,7 @@ def test_page_brushes_flicks_and_takes_a_session(make_interaction: Callable[...,
         broken.write_text("{")
         page.give_file(broken)
         page.wait(lambda: "the file" in live.message, 10, "what is wrong with the file")
-        assert live.is_alive() and viewer.server.traffic.junk == viewer.server.traffic.failed == 0
+        assert live.is_alive() and viewer.server.junk == viewer.server.failed == 0
 
 
 @pytest.mark.slow
@@ -167,9 +161,10 @@ def test_page_looks_from_a_camera_of_the_data_set(make_interaction: Callable[...
     subject = Subject("a column", interaction, cameras=cameras, sessions=tmp_path)
     with served(subject) as viewer, chromium(tmp_path) as page:
         page.open(viewer.url)
-        page.wait(lambda: "simulated" in page.text() and viewer.live.steps > 3, 60, "the page")
+        page.wait(lambda: "simulated" in page.text() and viewer.live.interaction.tick > 3, 60, "the page")
         client = next(iter(viewer.server.get_clients().values()))
         page.press_button("Cameras of the data set", "div, legend, span, p")
+        time.sleep(2.0)  # the folder opens slowly
         page.press_input("Show them")
         page.wait(lambda: all(frustum.visible for frustum in viewer.sights._frustums), 10, "frustums")
         expected = viewer.sights._pose(cameras, 1)[0]
@@ -178,7 +173,7 @@ def test_page_looks_from_a_camera_of_the_data_set(make_interaction: Callable[...
         page.press_button(cameras.names[1], "[role=option]")
         page.wait(lambda: np.linalg.norm(client.camera.position - expected) < 1e-3, 10, "the camera's place")
         page.picture(tmp_path / "from_camera.png")
-        assert viewer.server.traffic.junk == viewer.server.traffic.failed == 0
+        assert viewer.server.junk == viewer.server.failed == 0
 
 
 @pytest.mark.slow

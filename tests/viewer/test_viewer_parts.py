@@ -29,11 +29,11 @@ from gausim.ops.spherical_harmonics import spherical_harmonics_basis
 from gausim.viewer.coloring import BASE, MASS, SPEED, STRAIN, VIEW, Painter, highlighted, hues
 from gausim.viewer.companion import Companion
 from gausim.viewer.hands import first_hit, in_rectangle
-from gausim.viewer.live import Live, Take
+from gausim.viewer.live import Live
 from gausim.viewer.messages import MessageChecker, MessageError
-from gausim.viewer.pipeline import Latest, Rate, Worker
+from gausim.viewer.pipeline import Rate, Worker
 from gausim.viewer.recording import record
-from gausim.viewer.shown import LIVE, Shown
+from gausim.viewer.shown import LIVE, Shown, Take
 from gausim.viewer.splats import SIZE, Placing, half_covariances, pack, unit_centres
 
 # ----------------------------------------------------------------------------------------------------------- packing
@@ -194,29 +194,23 @@ def test_a_ray_takes_the_first_kernel_it_passes() -> None:
 # ----------------------------------------------------------------------------------------------------------- queues
 
 
-def test_only_the_newest_item_waits() -> None:
-    slot: Latest[int] = Latest()
-    for number in range(100):
-        slot.put(number)
-    assert slot.take(0.0) == 99 and slot.dropped == 99 and slot.take(0.0) is None
-
-
-def test_a_worker_outlives_an_error() -> None:
-    slot: Latest[int] = Latest()
-    done = threading.Event()
+def test_a_worker_takes_the_newest_item_and_outlives_an_error() -> None:
+    done, seen = threading.Event(), list[int]()
 
     def work(number: int) -> None:
-        if number == 0:
+        seen.append(number)
+        if number == 99:
             raise ValueError("one bad frame")
         done.set()
 
-    worker = Worker("test", slot, work)
+    worker = Worker("test", work)
+    for number in range(100):
+        worker.put(number)
     worker.start()
-    slot.put(0)
     while worker.failures == 0:
         time.sleep(0.01)
-    slot.put(1)
-    assert done.wait(10) and worker.failures == 1
+    worker.put(7)
+    assert done.wait(10) and worker.failures == 1 and seen == [99, 7]
     worker.stop()
     worker.join(5)
     assert not worker.is_alive()
@@ -224,7 +218,8 @@ def test_a_worker_outlives_an_error() -> None:
 
 def test_a_rate_counts_what_is_recent() -> None:
     rate = Rate(window=0.2)
-    rate.count(10)
+    for _ in range(10):
+        rate.count()
     assert rate.per_second == pytest.approx(50)
     time.sleep(0.25)
     assert rate.per_second == 0

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gausim.compose.predict import RunObject, TrainedPrediction
     from gausim.interaction.interaction import Interaction
     from gausim.viewer.companion import Companion
-    from gausim.viewer.live import Take
+    from gausim.viewer.shown import Take
     from gausim.viewer.subject import Subject
 
 # The model of a bare scene: untrained, its network is silent and the elastic template moves the object alone.
@@ -102,7 +102,7 @@ def playable_scene(
 
 def takes_of(made: Playable, beside: Playable | None, frames: int | None) -> list[Take]:
     """The recorded sequences as the method foresees them, each made when it is first shown."""
-    from gausim.viewer.live import Take
+    from gausim.viewer.shown import Take
 
     if made.predict is None or made.item is None:
         return []

@@ -11,20 +11,12 @@ from scipy.ndimage import median_filter
 from gausim.doctor.evidence import Evidence, Watched
 from gausim.doctor.finding import Finding, listed
 
-NAME = "appearance"
 # Mean slope of the colours within the object [1/255 per reduced pixel] below which it counts as plain.
 _PLAIN = 2.5
-# Relative jumps of the brightness: over time in more than a share of the frames, and of a camera against the others.
+# Relative jumps of the brightness: over time in more than a fraction of the frames, and of a camera against the others.
 _FLICKER, _OFTEN, _BETWEEN = 0.03, 0.1, 0.15
 # What is opaque, and how far from the edge the inside begins [reduced pixels].
 _OPAQUE, _INSIDE = 230, 3
-
-
-def find_appearance_faults(evidence: Evidence) -> Iterator[Finding]:
-    """Measures slopes of the colours and the brightness of the foreground."""
-    yield from _plain(evidence)
-    yield from _flicker(evidence)
-    yield from _between(evidence)
 
 
 def _inside(alpha: np.ndarray) -> np.ndarray:
@@ -32,7 +24,8 @@ def _inside(alpha: np.ndarray) -> np.ndarray:
     return cv2.erode((alpha > _OPAQUE).astype(np.uint8), kernel) > 0
 
 
-def _plain(evidence: Evidence) -> Iterator[Finding]:
+def find_plain(evidence: Evidence) -> Iterator[Finding]:
+    """Colours that hardly change within the object."""
     item, slopes = evidence.first[0], []
     for v in range(len(evidence.views)):
         inside, gray = _inside(item.alpha[0, v]), item.gray[0, v] * 255
@@ -40,7 +33,7 @@ def _plain(evidence: Evidence) -> Iterator[Finding]:
             slopes.append(float(np.hypot(*np.gradient(gray))[inside].mean()))
     if slopes and float(np.median(slopes)) < _PLAIN:
         yield Finding(
-            NAME, "note", "likely",
+            "note", "likely",
             f"The object is plain: its colours change by {np.median(slopes):.1f} of 255 per pixel, so only its outline "
             "tells how it moves.",
             "Training works from outlines too, less exactly. A pattern (paint, stickers, printed cloth) helps.",
@@ -56,27 +49,29 @@ def _brightness(item: Watched, view: int) -> np.ndarray:
         return (item.gray[:, view] * opaque).sum((-1, -2)) / np.where(count > 0, count, np.nan)
 
 
-def _flicker(evidence: Evidence) -> Iterator[Finding]:
-    shares: dict[str, float] = {}
+def find_flicker(evidence: Evidence) -> Iterator[Finding]:
+    """Brightness that jumps from frame to frame."""
+    fractions: dict[str, float] = {}
     for v, view in enumerate(evidence.views):
         jumps = []
         for item in evidence.watched:
             light = _brightness(item, v)
             if len(light) > 4 and np.isfinite(light).all():
                 jumps.append(np.abs(light / np.maximum(median_filter(light, 3, mode="nearest"), 1e-6) - 1) > _FLICKER)
-        shares[view] = float(np.concatenate(jumps).mean()) if jumps else 0.0
-    flickers = [view for view, share in shares.items() if share > _OFTEN]
+        fractions[view] = float(np.concatenate(jumps).mean()) if jumps else 0.0
+    flickers = [view for view, fraction in fractions.items() if fraction > _OFTEN]
     if flickers:
         yield Finding(
-            NAME, "warning", "likely",
+            "warning", "likely",
             f"The brightness of {listed(flickers)} jumps from frame to frame (by more than {_FLICKER:.0%} in "
-            f"{max(shares.values()):.0%} of the frames): automatic exposure, or lamps on mains.",
+            f"{max(fractions.values()):.0%} of the frames): automatic exposure, or lamps on mains.",
             "Film with fixed exposure, at a shutter time that suits the mains (1/50 or 1/100 s at 50 Hz).",
-            {"share": shares},
+            {"share": fractions},
         )  # fmt: skip
 
 
-def _between(evidence: Evidence) -> Iterator[Finding]:
+def find_uneven_cameras(evidence: Evidence) -> Iterator[Finding]:
+    """Brightness that differs from camera to camera."""
     if evidence.rest is None or evidence.fits is None:
         return
     item, drawn, gains = evidence.first[0], evidence.rest[0], {}
@@ -89,7 +84,7 @@ def _between(evidence: Evidence) -> Iterator[Finding]:
     if other:
         told = ", ".join(f"{view} {gains[view] / usual - 1:+.0%}" for view in other)
         yield Finding(
-            NAME, "warning", "likely",
+            "warning", "likely",
             f"Brightness differs between cameras, compared with the rest scene: {told}.",
             "Set exposure and white balance alike and fixed, or correct the pictures of this camera.",
             {"gain": gains},

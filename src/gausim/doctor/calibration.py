@@ -12,10 +12,9 @@ from gausim.doctor.evidence import Evidence
 from gausim.doctor.finding import Finding, listed
 from gausim.doctor.silhouettes import Fit
 
-NAME = "calibration"
 # Below this overlap a silhouette does not lie on the object at all; above the other a reading fits.
 _MISSED, _FITS = 0.5, 0.8
-# Displacements of silhouettes, as shares of the picture's longer side: worth a word, and spoiling a training.
+# Displacements of silhouettes, as fractions of the picture's longer side: worth a word, and spoiling a training.
 _WORTH, _SPOILS = 0.006, 0.012
 # Overlap after the best shift and turn, below which the scene has another shape than the object.
 _SHAPE = 0.85
@@ -25,7 +24,7 @@ def find_calibration_faults(evidence: Evidence) -> Iterator[Finding]:
     """Compares the silhouettes of the rest scene with frame 0, camera by camera, and tries other conventions."""
     if evidence.fits is None:
         yield Finding(
-            NAME, "note", "certain", "There is no rest scene yet, so poses and lenses were not compared with it.",
+            "note", "certain", "There is no rest scene yet, so poses and lenses were not compared with it.",
             f"Make one with `gausim reconstruct {evidence.data.root}` (or give --scene FILE.ply) and run this again.",
         )  # fmt: skip
         return
@@ -77,7 +76,7 @@ def _moved(evidence: Evidence, fits: Sequence[Sequence[Fit]]) -> Iterator[Findin
                 "--images STILLS --sequences FRAMES`), or make the scene again if it is of another object or world."
             )
         sure = "certain" if spoils and min(min(f.aligned for f in r) for r in fits) > _SHAPE else "likely"
-        yield Finding(NAME, "fault" if spoils else "warning", sure, what, remedy, {"views": worth, "pixels": measured})  # type: ignore[arg-type]
+        yield Finding("fault" if spoils else "warning", sure, what, remedy, {"views": worth, "pixels": measured})  # type: ignore[arg-type]
     yield from _shape(evidence, fits)
 
 
@@ -98,7 +97,7 @@ def _shape(evidence: Evidence, fits: Sequence[Sequence[Fit]]) -> Iterator[Findin
     aligned = [float(np.median([fit.aligned for fit in row])) for row in fits]
     if float(np.median(aligned)) < _SHAPE:
         yield Finding(
-            NAME, "warning", "likely",
+            "warning", "likely",
             f"Even at the best shift the rest scene's silhouettes overlap those of frame 0 by {np.median(aligned):.2f} "
             "only: parts are missing in the scene, or frame 0 shows another shape.",
             "Look at views.png (--out DIR). Reconstruct the scene again, or check the masks and that sequences begin "
@@ -116,13 +115,13 @@ def _convention(evidence: Evidence, raw: dict[str, float]) -> Finding:
     start = f"The cameras do not see the rest scene where frame 0 shows the object (mean overlap {now:.2f})."
     if best.overlap > max(_FITS, now + 0.2):
         return Finding(
-            NAME, "fault", "certain",
+            "fault", "certain",
             f"{start} The silhouettes would fit ({best.overlap:.2f}) if transforms.json held {best.name}.",
             f"In every sequences/*/transforms.json {best.remedy}.",
             measured,
         )  # fmt: skip
     return Finding(
-        NAME, "fault", "likely",
+        "fault", "likely",
         f"{start} No convention that is known to be mixed up would make them fit (best: {best.name}, overlap "
         f"{best.overlap:.2f}).",
         "Check that scene and sequences are of one object and one world, and that angles in degrees were turned into "

@@ -11,7 +11,6 @@ from gausim.doctor.coverage import view_directions
 from gausim.doctor.evidence import Evidence, Watched
 from gausim.doctor.finding import Finding
 
-NAME = "clock"
 # Frames by which a camera may be early or late.
 FURTHEST = 8
 # Correlation that a shift must reach, and gain over no shift, of several sequences together and of one alone.
@@ -37,14 +36,14 @@ def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
         return
     if evidence.fits is not None and np.median([[f.overlap for f in row] for row in evidence.fits]) < _SOMEWHERE:
         yield Finding(
-            NAME, "note", "certain", "Whether the cameras are in step was not looked at: their poses are wrong.",
+            "note", "certain", "Whether the cameras are in step was not looked at: their poses are wrong.",
             "Mend the calibration and run this again.",
         )  # fmt: skip
         return
     lags, unsure, guessed = _lags(evidence, items, energies, _REACHED, _GAIN)
     for view in (evidence.views[v] for v in sorted(unsure)):
         yield Finding(
-            NAME, "note", "possible",
+            "note", "possible",
             f"Whether {view} is in step with the other cameras cannot be told: its motion over time is unlike theirs.",
             "Compare it by eye in motion.png (--out DIR).", {"view": view},
         )  # fmt: skip
@@ -188,7 +187,7 @@ def _told(evidence: Evidence, lags: dict[int, int], guessed: set[int], sequences
             f"or give {view} back the {frames} that were cut from its start"
         )  # fmt: skip
         yield Finding(
-            NAME, "warning" if v in guessed else "fault", "possible" if v in guessed else "likely",
+            "warning" if v in guessed else "fault", "possible" if v in guessed else "likely",
             f"{view} is out of step: it shows the motion {frames} {'later' if lag > 0 else 'earlier'} than {against}, "
             f"{place}.",
             f"Number the frames again: {cut}, and cut all cameras to one length. With films: `python -m "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from gausim.io.transforms import OPENGL_TO_OPENCV
 _UNITS = (0.001, 0.01, 0.1, 10.0, 100.0, 1000.0)
 # The focal length is estimated from areas, each time from a better picture.
 _ROUNDS = 4
+_AXES = torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,7 @@ def try_readings(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], camera
     readings = []
     for name, remedy, change in _POSES:
         viewmats = torch.stack([change(pose) for pose in _stored(cameras)]).float()
-        other = Cameras(viewmats, cameras.Ks, cameras.width, cameras.height, cameras.names)
-        readings.append(Reading(name, remedy, _fit(scene, masks, other)))
+        readings.append(Reading(name, remedy, _fit(scene, masks, replace(cameras, viewmats=viewmats))))
     readings.append(_another_lens(scene, masks, cameras))
     return sorted(readings, key=lambda reading: -reading.overlap)
 
@@ -60,23 +60,11 @@ def _fit(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], cameras: Camer
 
 def _stored(cameras: Cameras) -> Float[Tensor, "V 4 4"]:
     """The matrices as the file has them: camera to world, OpenGL axes, as it was read."""
-    return torch.linalg.inv(cameras.viewmats.double()) * torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
+    return torch.linalg.inv(cameras.viewmats.double()) * _AXES
 
 
 def _read(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    return torch.linalg.inv(pose * torch.tensor(OPENGL_TO_OPENCV, dtype=pose.dtype))
-
-
-def _opencv(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    return torch.linalg.inv(pose)
-
-
-def _inverted(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    return pose
-
-
-def _inverted_opengl(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    return torch.tensor(OPENGL_TO_OPENCV, dtype=pose.dtype)[:, None] * pose
+    return torch.linalg.inv(pose * _AXES)
 
 
 def _transposed(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
@@ -93,19 +81,20 @@ def _world(quarter: int) -> Callable[[Tensor], Tensor]:
 
 
 def _unit(factor: float) -> Callable[[Tensor], Tensor]:
-    scale = torch.tensor([1.0, 1.0, 1.0, factor], dtype=torch.float64)
     corner = torch.ones(4, 4, dtype=torch.float64)
-    corner[:3] = scale
+    corner[:3, 3] = factor
     return lambda pose: _read(pose * corner)
 
 
 _POSES: list[tuple[str, str, Callable[[Tensor], Tensor]]] = [
     ("camera-to-world matrices in OpenCV axes (y down, looking along +z)",
-     "negate the second and third column of every transform_matrix (OpenGL axes: y up, looking along -z)", _opencv),
+     "negate the second and third column of every transform_matrix (OpenGL axes: y up, looking along -z)",
+     torch.linalg.inv),
     ("world-to-camera matrices in OpenCV axes",
-     "invert every transform_matrix (it must be camera to world), then negate its second and third column", _inverted),
+     "invert every transform_matrix (it must be camera to world), then negate its second and third column",
+     lambda pose: pose),
     ("world-to-camera matrices in OpenGL axes",
-     "invert every transform_matrix: it must be camera to world", _inverted_opengl),
+     "invert every transform_matrix: it must be camera to world", lambda pose: _AXES[:, None] * pose),
     ("poses whose rotations are transposed",
      "transpose the upper left 3 x 3 part of every transform_matrix", _transposed),
     ("poses of a world whose up is y, while the scene's up is z",
@@ -122,9 +111,7 @@ def _another_lens(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], camer
     """The same poses with the focal length that gives silhouettes of the right size."""
     lenses = cameras.Ks.clone()
     for _ in range(_ROUNDS):
-        drawn = draw_silhouettes(
-            scene, Cameras(cameras.viewmats, lenses, cameras.width, cameras.height, cameras.names)
-        ).alpha
+        drawn = draw_silhouettes(scene, replace(cameras, Ks=lenses)).alpha
         seen = [v for v in range(len(masks)) if drawn[v].sum() > 0 and masks[v].sum() > 0]
         if not seen:
             break
@@ -133,10 +120,9 @@ def _another_lens(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], camer
         lenses[:, 1, 1] *= ratio
     factor = float((lenses[:, 0, 0] / cameras.Ks[:, 0, 0]).median())
     field = math.degrees(2 * math.atan(cameras.width / (2 * float(lenses[:, 0, 0].median()))))
-    found = Cameras(cameras.viewmats, lenses, cameras.width, cameras.height, cameras.names)
     name = f"a focal length {factor:.3g} times the stated one, which makes a field of view of {field:.3g} degrees"
     remedy = (
         f"multiply fl_x and fl_y by {factor:.3g} (they may have been made from an angle in degrees where radians were "
         "expected, or for pictures of another size; then cx and cy are wrong too)"
     )
-    return Reading(name, remedy, _fit(scene, masks, found))
+    return Reading(name, remedy, _fit(scene, masks, replace(cameras, Ks=lenses)))

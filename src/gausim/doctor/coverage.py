@@ -1,4 +1,4 @@
-"""What the cameras see together: directions, and whether the object lies well in their pictures."""
+"""What there is to train on: pins, frames, sequences, and what the cameras see together."""
 
 from __future__ import annotations
 
@@ -7,24 +7,25 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from gausim.core import SceneError
 from gausim.doctor.evidence import Evidence
 from gausim.doctor.finding import Finding, listed
+from gausim.ops.selection import require_pinned
 from gausim.ops.visual_hull import search_cube
 
-NAME = "views"
 # Angle between views below which depth is a guess, and below which it is hardly seen at all [degrees].
 _NARROW, _SAME = 25.0, 10.0
-# Share of the frames in which an object may touch the border.
+# Fraction of the frames in which an object may touch the border.
 _OFTEN = 0.2
-# An object is tiny below this share of the picture's longer side, or this many of its pixels.
-_TINY_SHARE, _TINY_PIXELS = 0.12, 24
+# An object is tiny below this fraction of the picture's longer side, or this many of its pixels.
+_TINY_FRACTION, _TINY_PIXELS = 0.12, 24
 
-
-def find_view_faults(evidence: Evidence) -> Iterator[Finding]:
-    """Looks at the training views' directions and at where the object lies in every view."""
-    yield from _directions(evidence)
-    yield from _border(evidence)
-    yield from _tiny(evidence)
+# The paper's number of seen frames, and what is short of learning anything.
+_SEEN, _FEWEST_SEEN = 16, 6
+# Fewer sequences than this hold too few directions of motion.
+_SEQUENCES = 4
+# A scene of which so large a fraction is held has little left to move.
+_MOSTLY_PINNED = 0.9
 
 
 def view_directions(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
@@ -49,13 +50,14 @@ def seen_angle(directions: np.ndarray) -> float:
     return math.degrees(math.acos(min(1.0, max(0.0, 1 - 2 * least))))
 
 
-def _directions(evidence: Evidence) -> Iterator[Finding]:
+def find_like_directions(evidence: Evidence) -> Iterator[Finding]:
+    """Training views along nearly one line."""
     names = list(evidence.data.train_views)
     directions = view_directions(evidence)[0][[evidence.views.index(name) for name in names]]
     angle = seen_angle(directions)
     if len(names) == 1:
         yield Finding(
-            NAME, "fault", "certain",
+            "fault", "certain",
             f"There is one training view only ({names[0]}): motion towards it and away from it is not seen.",
             "Film with at least two cameras, better four, 40 degrees or more apart, or move a held-out view to "
             "'train_views' of dataset.json.",
@@ -63,7 +65,7 @@ def _directions(evidence: Evidence) -> Iterator[Finding]:
         )  # fmt: skip
     elif angle < _NARROW:
         yield Finding(
-            NAME, "fault" if angle < _SAME else "warning", "certain",
+            "fault" if angle < _SAME else "warning", "certain",
             f"The training views {listed(names)} look along nearly the same line ({angle:.0f} degrees): depth is "
             f"{'not seen' if angle < _SAME else 'hardly seen'}.",
             "Move a camera to the side, so that at least two look at the object 40 to 140 degrees apart.",
@@ -71,17 +73,18 @@ def _directions(evidence: Evidence) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _border(evidence: Evidence) -> Iterator[Finding]:
+def find_cut_off(evidence: Evidence) -> Iterator[Finding]:
+    """Objects cut off at the border of a picture."""
     for v, view in enumerate(evidence.views):
         masks = np.concatenate([item.alpha[:, v] > 127 for item in evidence.watched])
         sides = {"top": masks[:, 0], "bottom": masks[:, -1], "left": masks[:, :, 0], "right": masks[:, :, -1]}
         often = {side: float(rim.any(-1).mean()) for side, rim in sides.items()}
-        cut = [side for side, share in often.items() if share > _OFTEN]
+        cut = [side for side, fraction in often.items() if fraction > _OFTEN]
         if not cut:
             continue
         moves = any(bool((sides[side] != sides[side][:1]).any()) for side in cut)
         yield Finding(
-            NAME, "warning", "likely" if moves else "possible",
+            "warning", "likely" if moves else "possible",
             f"The object is cut off at the {listed(cut)} of {view} in {max(often.values()):.0%} of the frames"
             f"{'' if moves else ', where nothing moves'}.",
             "Move the camera back or turn it. Where only a part that is held leaves the picture, this does no harm.",
@@ -89,7 +92,8 @@ def _border(evidence: Evidence) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _tiny(evidence: Evidence) -> Iterator[Finding]:
+def find_tiny(evidence: Evidence) -> Iterator[Finding]:
+    """Objects that fill too little of a picture."""
     for v, view in enumerate(evidence.views):
         lengths = []
         for alpha in (item.alpha[0, v] > 127 for item in evidence.first):
@@ -99,11 +103,61 @@ def _tiny(evidence: Evidence) -> Iterator[Finding]:
         if not lengths:
             continue
         length, longer = float(np.median(lengths)), max(evidence.first[0].alpha.shape[-2:])
-        if length < _TINY_SHARE * longer or length / evidence.scale < _TINY_PIXELS:
+        if length < _TINY_FRACTION * longer or length / evidence.scale < _TINY_PIXELS:
             yield Finding(
-                NAME, "warning", "certain",
+                "warning", "certain",
                 f"The object is tiny in {view}: {length / evidence.scale:.0f} pixels, {length / longer:.0%} of the "
                 "picture's longer side.",
                 "Film from nearer or with a longer lens, or crop the pictures (and shift cx, cy, w and h with them).",
                 {"view": view, "pixels": length / evidence.scale},
             )  # fmt: skip
+
+
+def find_pins(evidence: Evidence) -> Iterator[Finding]:
+    """Scenes of which nothing or nearly everything is pinned."""
+    scene = evidence.scene
+    if scene is None:
+        return
+    try:
+        require_pinned(scene)
+    except SceneError as error:
+        sentence, _, remedy = str(error).partition(". ")
+        yield Finding(
+            "fault", "certain", f"{sentence.rstrip('.')}.",
+            remedy or "Pin fewer kernels: --pin-below with a lower height.",
+            {"pinned": int(scene.pinned.sum()), "simulated": int(scene.simulated.sum())},
+        )  # fmt: skip
+        return
+    fraction = float(scene.pinned.sum()) / float(scene.simulated.sum())
+    if fraction > _MOSTLY_PINNED:
+        yield Finding(
+            "warning", "possible",
+            f"{fraction:.0%} of the simulated kernels are pinned: hardly anything is left to move.",
+            "Pin only what is held in the videos (`gausim inspect SCENE.ply` draws it in grey).", {"share": fraction},
+        )  # fmt: skip
+
+
+def find_few_frames(evidence: Evidence) -> Iterator[Finding]:
+    """Training frames too few to hold a swing."""
+    seen = len(evidence.data.train_frames)
+    if seen < _SEEN:
+        yield Finding(
+            "warning", "likely" if seen < _FEWEST_SEEN else "possible",
+            f"Training sees {seen} frames of each sequence only (field 'train_frames' of dataset.json); the paper sees "
+            f"{_SEEN}. Less than a swing says little about stiffness and damping.",
+            f"Record longer sequences, or set 'train_frames' to [0, {_SEEN}]; `data.curriculum.t_max` must stay below.",
+            {"frames": seen},
+        )  # fmt: skip
+
+
+def find_few_sequences(evidence: Evidence) -> Iterator[Finding]:
+    """Sequences too few to hold many directions of motion."""
+    sequences = evidence.sequences
+    if sequences < _SEQUENCES:
+        yield Finding(
+            "warning", "possible",
+            f"There {'is one sequence' if sequences == 1 else f'are {sequences} sequences'} only: pushes in directions "
+            "that were never filmed will be predicted badly.",
+            "Record more, pushed at different places and in different directions (the paper has 30, the examples 8 to "
+            "12).", {"sequences": sequences},
+        )  # fmt: skip

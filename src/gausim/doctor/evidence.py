@@ -49,8 +49,9 @@ class Watched:
         return self.rgb.mean(-1, dtype=np.float32) / np.float32(255)
 
 
+@dataclass(eq=False)
 class Evidence:
-    """What is known of one object.
+    """What is known of one object; :func:`gather` reads it.
 
     Attributes:
         data: its facts.
@@ -61,18 +62,12 @@ class Evidence:
         first: frame 0 of sequences, these and more.
     """
 
-    def __init__(
-        self,
-        data: ObjectData,
-        sequences: int,
-        scene: GaussianScene | None,
-        scale: float,
-        watched: tuple[Watched, ...],
-        first: tuple[Watched, ...],
-    ) -> None:
-        """Holds what was read; see :func:`gather`."""
-        self.data, self.sequences, self.scene, self.scale = data, sequences, scene, scale
-        self.watched, self.first = watched, first
+    data: ObjectData
+    sequences: int
+    scene: GaussianScene | None
+    scale: float
+    watched: tuple[Watched, ...]
+    first: tuple[Watched, ...]
 
     @property
     def views(self) -> tuple[str, ...]:

@@ -6,24 +6,31 @@ from dataclasses import dataclass, replace
 
 from gausim.core import DataError, GaussianScene
 from gausim.data.objects import ObjectData
-from gausim.doctor.appearance import find_appearance_faults
+from gausim.doctor.appearance import find_flicker, find_plain, find_uneven_cameras
 from gausim.doctor.calibration import find_calibration_faults
 from gausim.doctor.clock import find_clock_faults
-from gausim.doctor.coverage import find_view_faults
+from gausim.doctor.coverage import (
+    find_cut_off,
+    find_few_frames,
+    find_few_sequences,
+    find_like_directions,
+    find_pins,
+    find_tiny,
+)
 from gausim.doctor.evidence import Evidence, Tick, gather
-from gausim.doctor.extent import find_extent_faults
 from gausim.doctor.finding import SEVERITIES, Check, Finding
 from gausim.doctor.masks import find_mask_faults
-from gausim.doctor.motion import find_motion_faults
+from gausim.doctor.motion import find_odd_motion, find_unrest
 
 CHECKS = (
-    Check("extent", find_extent_faults),
-    Check("masks", find_mask_faults),
-    Check("calibration", find_calibration_faults, needs=("masks",)),
-    Check("views", find_view_faults, needs=("masks", "calibration")),
-    Check("clock", find_clock_faults, needs=("masks",)),
-    Check("motion", find_motion_faults, needs=("masks",)),
-    Check("appearance", find_appearance_faults, needs=("masks", "calibration")),
+    Check("pins", (find_pins,)),
+    Check("extent", (find_few_frames, find_few_sequences)),
+    Check("masks", (find_mask_faults,)),
+    Check("calibration", (find_calibration_faults,), needs=("masks",)),
+    Check("views", (find_like_directions, find_cut_off, find_tiny), needs=("masks", "calibration")),
+    Check("clock", (find_clock_faults,), needs=("masks",)),
+    Check("motion", (find_unrest, find_odd_motion), needs=("masks",)),
+    Check("appearance", (find_plain, find_flicker, find_uneven_cameras), needs=("masks", "calibration")),
 )
 
 
@@ -64,7 +71,7 @@ def examine(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Examin
         evidence = gather(data, scene, tick)
     except DataError as error:
         remedy = "Mend this file; `gausim verify` without --quick finds all others that cannot be read."
-        return Examination((Finding("files", "fault", "certain", str(error), remedy),), {}, None)
+        return Examination((Finding("fault", "certain", str(error), remedy, check="files"),), {}, None)
     findings: list[Finding] = []
     spoilt: set[str] = set()
     left_out: dict[str, str] = {}
@@ -74,7 +81,7 @@ def examine(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Examin
         if blocking is not None:
             left_out[check.name] = blocking
             continue
-        found = list(check.run(evidence))
+        found = [replace(finding, check=check.name) for finder in check.finders for finding in finder(evidence)]
         findings += found
         if any(finding.severity == "fault" for finding in found):
             spoilt.add(check.name)

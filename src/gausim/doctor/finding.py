@@ -19,20 +19,20 @@ class Finding:
     """One thing that was found.
 
     Attributes:
-        check: the check that found it.
         severity: "fault" where it would ruin a training, "warning" where it costs quality, "note" otherwise.
         sureness: how sure it is.
         what: what is wrong, in a sentence that names cameras, sequences and files.
         remedy: what to do.
         measured: the numbers behind it, for programs.
+        check: the check that found it, which :func:`gausim.doctor.examine.examine` fills in.
     """
 
-    check: str
     severity: Severity
     sureness: Sureness
     what: str
     remedy: str
     measured: Mapping[str, Any] = field(default_factory=dict)
+    check: str = ""
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,12 @@ class Check:
 
     Attributes:
         name: what it examines.
-        run: finds; every check has this signature.
+        finders: look for one kind of fault each; all have this signature.
         needs: checks whose faults would make this one see ghosts; it is left out after such a fault.
     """
 
     name: str
-    run: Callable[[Evidence], Iterator[Finding]]
+    finders: tuple[Callable[[Evidence], Iterator[Finding]], ...]
     needs: tuple[str, ...] = ()
 
 

@@ -11,7 +11,6 @@ from gausim.doctor.evidence import Evidence
 from gausim.doctor.finding import Finding, listed
 from gausim.doctor.silhouettes import overlap
 
-NAME = "masks"
 # Foreground along the picture's border: an object may touch it, but does not run all around.
 _AROUND, _EVERYWHERE = 0.8, 0.999
 # Standard deviation of the colours along the border of a uniform background, and how far red, green and blue lie apart
@@ -21,14 +20,14 @@ _UNIFORM, _COLOURED = 8.0, 40.0
 _FAINT, _AWAY, _HAZE = 26, 6, 0.02
 # Relative jump of a mask's area against the frames around it, and the radius of these.
 _JUMP, _RADIUS = 0.15, 2
-# Share of empty frames from which on a training is spoilt.
+# Fraction of empty frames from which on a training is spoilt.
 _MANY = 0.1
 
 
 def find_mask_faults(evidence: Evidence) -> Iterator[Finding]:
     """Compares alpha with what a mask of one object looks like."""
     around = {view: [_border(item.alpha[0, v]) for item in evidence.first] for v, view in enumerate(evidence.views)}
-    full = [view for view, shares in around.items() if np.median(shares) > _AROUND]
+    full = [view for view, fractions in around.items() if np.median(fractions) > _AROUND]
     if full:
         yield _inverted_or_absent(evidence, full)
         return
@@ -38,7 +37,7 @@ def find_mask_faults(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _border(alpha: np.ndarray) -> float:
-    """Share of the picture's border that is foreground."""
+    """Fraction of the picture's border that is foreground."""
     rim = np.concatenate((alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
     return float((rim > 127).mean())
 
@@ -63,14 +62,12 @@ def _inverted_or_absent(evidence: Evidence, views: list[str]) -> Finding:
         f"{fits['overlap']:.2f}." if known else ""
     )  # fmt: skip
     return Finding(
-        NAME,
-        "fault",
-        "certain" if known else "likely",
+        "fault", "certain" if known else "likely",
         f"The masks of {listed(views)} are inverted: alpha keeps the border of the picture and leaves out its middle, "
         f"so the background would be trained on and not the object.{proof}",
         "Write 255 - alpha into the images (alpha 255 is the object), or segment again.",
         {"views": views, "border": _AROUND, **fits},
-    )
+    )  # fmt: skip
 
 
 def _not_cut_out(evidence: Evidence, views: list[str], index: list[int]) -> Finding:
@@ -80,14 +77,12 @@ def _not_cut_out(evidence: Evidence, views: list[str], index: list[int]) -> Find
     looks = "uniform" if spread < _UNIFORM else "not uniform"
     backend = "chroma" if spread < _UNIFORM and hue > _COLOURED else "background, --backend onnx or --backend sam2"
     return Finding(
-        NAME,
-        "fault",
-        "certain",
+        "fault", "certain",
         f"Nothing is cut out in {listed(views)}: alpha is 255 all over the picture, so the background, which is "
         f"{looks}, would be taken for the object.",
         f"Make masks: `python -m data_prep.segment PICTURES --out OUT --backend {backend}`.",
         {"views": views, "border_deviation": spread},
-    )
+    )  # fmt: skip
 
 
 def _empty(evidence: Evidence) -> Iterator[Finding]:
@@ -95,41 +90,36 @@ def _empty(evidence: Evidence) -> Iterator[Finding]:
         shown = np.concatenate([item.alpha[:, v].max((-1, -2)) > 0 for item in evidence.watched])
         first = next((f"{i.name} frame {f}" for i in evidence.watched for f in range(len(i.alpha))
                       if not i.alpha[f, v].any()), "")  # fmt: skip
-        share = 1 - float(shown.mean())
-        if share == 0:
+        empty = 1 - float(shown.mean())
+        if empty == 0:
             continue
-        never = share == 1
+        told = "never shows the object" if empty == 1 else f"does not show the object in {empty:.0%} of the frames"
         yield Finding(
-            NAME,
-            "fault" if share > _MANY else "warning",
-            "certain",
-            f"{view} {'never shows the object' if never else f'does not show the object in {share:.0%} of the frames'}"
-            f": the mask is empty (first: {first}).",
+            "fault" if empty > _MANY else "warning", "certain",
+            f"{view} {told}: the mask is empty (first: {first}).",
             f"Segment {view} again; where it does not see the object, take it out of dataset.json (field 'views').",
-            {"view": view, "empty": share},
-        )
+            {"view": view, "empty": empty},
+        )  # fmt: skip
 
 
 def _haze(evidence: Evidence) -> Iterator[Finding]:
     kernel = np.ones((2 * _AWAY + 1, 2 * _AWAY + 1), np.uint8)
-    shares: dict[str, float] = {}
+    fractions: dict[str, float] = {}
     for v, view in enumerate(evidence.views):
         found = []
         for alpha in (item.alpha[0, v] for item in evidence.first):
             near = cv2.dilate((alpha > 127).astype(np.uint8), kernel) > 0
             found.append(float(((alpha > 0) & (alpha <= _FAINT) & ~near).mean()))
-        shares[view] = float(np.median(found))
-    hazy = [view for view, share in shares.items() if share > _HAZE]
+        fractions[view] = float(np.median(found))
+    hazy = [view for view, fraction in fractions.items() if fraction > _HAZE]
     if hazy:
         yield Finding(
-            NAME,
-            "warning",
-            "certain",
+            "warning", "certain",
             f"A haze of faint alpha (1 to {_FAINT} of 255) lies around the object in {listed(hazy)}, over up to "
-            f"{max(shares.values()):.0%} of the picture. All alpha above 0 counts as foreground.",
+            f"{max(fractions.values()):.0%} of the picture. All alpha above 0 counts as foreground.",
             "Set alpha below 0.1 to 0 in the images, or segment again with `--floor 0.1`.",
-            {"haze": shares},
-        )
+            {"haze": fractions},
+        )  # fmt: skip
 
 
 def _blinking(evidence: Evidence) -> Iterator[Finding]:
@@ -145,10 +135,8 @@ def _blinking(evidence: Evidence) -> Iterator[Finding]:
             jumps += [f"{item.name} frame {f}" for f in np.nonzero(off)[0] if area[f] > 0]
         if jumps:
             yield Finding(
-                NAME,
-                "warning",
-                "likely",
+                "warning", "likely",
                 f"The mask of {view} jumps in size by more than {_JUMP:.0%} for a frame or two: {listed(jumps)}.",
                 "Look at these frames; segment them again (`--radius 3` mends what flashes up or drops out).",
                 {"view": view, "frames": len(jumps)},
-            )
+            )  # fmt: skip

@@ -13,7 +13,6 @@ from gausim.doctor.finding import Finding, listed
 from gausim.doctor.silhouettes import overlap
 from gausim.metrics.oscillation import coordinates, principal_motions, spectrum
 
-NAME = "motion"
 # Frames whose optical flow against frame 0 is looked at, per view, and the part of the foreground that counts.
 _FLOW_FRAMES, _QUANTILE = 6, 95
 # Pixels of the pictures below which nothing moves, and below which motion is hidden by noise and mask edges.
@@ -22,7 +21,7 @@ _STILL, _SMALL = 0.2, 1.0
 _AT_REST, _FAR_FROM_REST = 0.95, 0.85
 # Pictures are reduced to this length for the spectrum, of so many principal motions [pixels].
 _SPECTRUM_LONGEST, _MOTIONS = 48, 3
-# Shares of the frame rate: faster motion is not resolved well, or not at all (0.5 is Nyquist's).
+# Fractions of the frame rate: faster motion is not resolved well, or not at all (0.5 is Nyquist's).
 _FAST, _TOO_FAST = 0.2, 0.34
 # Swings within the frames that were watched, below which there is no telling how fast they are.
 _CYCLES = 2.0
@@ -37,36 +36,29 @@ _USUAL_RATES = (
 _RATE_TOLERANCE = 2e-3
 
 
-def find_motion_faults(evidence: Evidence) -> Iterator[Finding]:
-    """Measures displacement, frame 0 and frequency."""
-    yield from _begins_at_rest(evidence)
+def find_odd_motion(evidence: Evidence) -> Iterator[Finding]:
+    """Too little motion to be seen, or too fast or slow for the frame rate."""
     moving = {item.name: _displacements(item, evidence.scale) for item in evidence.watched}
-    largest = max(float(d.max()) for d in moving.values())
-    if largest < _STILL:
+    largest = {name: float(d.max()) for name, d in moving.items()}
+    if max(largest.values()) < _STILL:
         yield Finding(
-            NAME, "fault", "certain",
-            f"Nothing moves: no part of the object leaves its place by more than {largest:.2f} pixels in any of "
-            f"{len(moving)} sequences.",
+            "fault", "certain",
+            f"Nothing moves: no part of the object leaves its place by more than {max(largest.values()):.2f} pixels in "
+            f"any of {len(moving)} sequences.",
             "Record sequences in which the object is set off, or check that the frames are not one picture repeated.",
-            {"pixels": largest},
+            {"pixels": max(largest.values())},
         )  # fmt: skip
         return
-    yield from _amount(evidence, moving)
-    yield from _rates(evidence)
-
-
-def _amount(evidence: Evidence, moving: dict[str, np.ndarray]) -> Iterator[Finding]:
-    largest = {name: float(d.max()) for name, d in moving.items()}
     still = [name for name, pixels in largest.items() if pixels < _STILL]
     if still:
         yield Finding(
-            NAME, "warning", "certain", f"Nothing moves in {listed(still)}.",
+            "warning", "certain", f"Nothing moves in {listed(still)}.",
             "Leave these sequences out; they teach nothing.", {"pixels": largest},
         )  # fmt: skip
     typical = float(np.median([p for p in largest.values() if p >= _STILL]))
     if typical < _SMALL:
         yield Finding(
-            NAME, "warning", "likely",
+            "warning", "likely",
             f"The motion is smaller than a pixel (at most {typical:.2f} pixels): noise and the edges of the masks are "
             "as large.",
             "Push harder, film from nearer, or at a higher resolution.", {"pixels": largest},
@@ -75,11 +67,12 @@ def _amount(evidence: Evidence, moving: dict[str, np.ndarray]) -> Iterator[Findi
         here = max(float(d[:, v].max()) for d in moving.values())
         if here < _STILL and len(evidence.views) > 1:
             yield Finding(
-                NAME, "fault", "likely",
+                "fault", "likely",
                 f"{view} shows no motion (at most {here:.2f} pixels), while others show {typical:.1f}: it may be one "
                 "picture repeated.", f"Export the frames of {view} again, or take it out of dataset.json.",
                 {"view": view, "pixels": here},
             )  # fmt: skip
+    yield from _rates(evidence)
 
 
 def _displacements(item: Watched, scale: float) -> np.ndarray:
@@ -97,7 +90,8 @@ def _displacements(item: Watched, scale: float) -> np.ndarray:
     return found
 
 
-def _begins_at_rest(evidence: Evidence) -> Iterator[Finding]:
+def find_unrest(evidence: Evidence) -> Iterator[Finding]:
+    """Sequences whose frame 0 is not the rest state."""
     overlaps = _first_overlaps(evidence)
     off = {name: value for name, value in overlaps.items() if value < _AT_REST}
     if not off:
@@ -105,7 +99,7 @@ def _begins_at_rest(evidence: Evidence) -> Iterator[Finding]:
     worst = min(off.values())
     against = "those of the other sequences" if evidence.fits is None else "the rest scene and other sequences"
     yield Finding(
-        NAME, "fault" if worst < _FAR_FROM_REST else "warning", "likely",
+        "fault" if worst < _FAR_FROM_REST else "warning", "likely",
         f"Frame 0 is not at rest in {listed(list(off))}: its silhouettes overlap {against} by {worst:.2f} only. A "
         "prediction starts from the rest scene, so it would begin at the wrong place.",
         "Begin each sequence at the last frame before the object is set off, or leave the sequence out.",
@@ -184,11 +178,11 @@ def _rates(evidence: Evidence) -> Iterator[Finding]:
     fps, found = evidence.data.fps, swing(evidence)
     measured = {"frequency": found.dominant, "cycles": found.cycles, "fps": fps}
     swings = found.cycles >= _CYCLES
-    share = found.dominant / fps
-    if swings and share > _FAST:
+    pace = found.dominant / fps  # swings per frame
+    if swings and pace > _FAST:
         yield Finding(
-            NAME, "fault" if share > _TOO_FAST else "warning", "likely",
-            f"The object swings at about {found.dominant:.2g} Hz, once in {1 / share:.1f} frames at {fps:g} frames per "
+            "fault" if pace > _TOO_FAST else "warning", "likely",
+            f"The object swings at about {found.dominant:.2g} Hz, once in {1 / pace:.1f} frames at {fps:g} frames per "
             "second: that is too fast for steps of a frame.",
             "Film at a higher rate (five frames per swing or more), or keep every frame of the film.", measured,
         )  # fmt: skip
@@ -196,7 +190,12 @@ def _rates(evidence: Evidence) -> Iterator[Finding]:
     plausible = not swings or _SLOWEST <= found.dominant <= _FASTEST
     if usual and plausible:
         if swings:
-            yield _noted(found, fps)
+            yield Finding(
+                "note", "likely",
+                f"The object swings at about {found.dominant:.2g} Hz, once in {fps / found.dominant:.0f} frames at "
+                f"{fps:g} frames per second.",
+                "None is needed. If it swings faster or slower by the eye, 'fps' of dataset.json is wrong.", measured,
+            )  # fmt: skip
         return
     reason = f"{fps:g} frames per second is no usual rate of a camera" if not usual else ""
     if swings:
@@ -205,18 +204,8 @@ def _rates(evidence: Evidence) -> Iterator[Finding]:
     others = ", ".join(f"{found.dominant * rate / fps:.2g} Hz at {rate}" for rate in (24, 30, 60, 120, 240))
     check = f" By a stopwatch: it would be {others}." if swings else ""
     yield Finding(
-        NAME, "warning", "possible" if plausible else "likely",
+        "warning", "possible" if plausible else "likely",
         f"{reason}: field 'fps' of dataset.json may be wrong. Velocities, stiffness and damping scale with it.",
         "Set 'fps' in dataset.json and every sequences/*/transforms.json to the rate of the frames that are there (a "
         f"film of 120 of which every fifth frame was kept has 24).{check}", measured,
-    )  # fmt: skip
-
-
-def _noted(found: Swing, fps: float) -> Finding:
-    return Finding(
-        NAME, "note", "likely",
-        f"The object swings at about {found.dominant:.2g} Hz, once in {fps / found.dominant:.0f} frames at {fps:g} "
-        "frames per second.",
-        "None is needed. If it swings faster or slower by the eye, 'fps' of dataset.json is wrong.",
-        {"frequency": found.dominant, "cycles": found.cycles, "fps": fps},
     )  # fmt: skip

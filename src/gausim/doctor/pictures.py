@@ -37,7 +37,7 @@ def draw_pictures(evidence: Evidence, out: Path, tick: Tick) -> list[tuple[str, 
     drawn: list[tuple[str, str, Callable[[Evidence], Figure]]] = [
         ("views.png", "Frame 0 of the first sequence in every view; orange: outline of the rest scene, drawn by the "
          "camera that the file states. Both must lie on each other.", _views),
-        ("motion.png", "Change from frame to frame within the foreground, as a share of each camera's largest. "
+        ("motion.png", "Change from frame to frame within the foreground, as a fraction of each camera's largest. "
          "Onset and peaks must lie above each other in all cameras.", _motion),
         ("spectrum.png", "Power of the change of the pictures by frequency; grey: faster than a fifth of the frame "
          "rate.", _spectrum),
@@ -63,8 +63,8 @@ def _views(evidence: Evidence) -> Figure:
         axes.set_axis_off()
         if v >= count:
             continue
-        share = item.alpha[0, v, ..., None] / 255
-        axes.imshow((item.rgb[0, v] + (1 - share) * _BEHIND).clip(0, 255).astype(np.uint8))
+        cover = item.alpha[0, v, ..., None] / 255
+        axes.imshow((item.rgb[0, v] + (1 - cover) * _BEHIND).clip(0, 255).astype(np.uint8))
         title = evidence.views[v]
         if evidence.rest is not None and evidence.fits is not None:
             if evidence.rest[0].alpha[v].max() > 0.5:

@@ -36,12 +36,12 @@ class Arrow:
 def arrows_of(live: Interaction) -> list[Arrow]:
     """The forces that act before the next step, longer the stronger they are."""
     found = []
-    for mask, acceleration, name in live.pushes():
+    for amount, acceleration, name in live.pushes():
         vector = torch.tensor(acceleration)
         size = float(vector.norm()) / live.gravity
         if size == 0:
             continue
-        start = live.frame.positions[mask].mean(0).cpu()
+        start = live.frame.positions[amount > 0].mean(0).cpu()
         length = (_SHORT + (_LONG - _SHORT) * min(1.0, size / live.most_force)) * live.scene.diagonal
         found.append(Arrow(start, start + vector / vector.norm() * length, f"{name} {size:.2g} weights"))
     return found

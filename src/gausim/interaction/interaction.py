@@ -68,6 +68,7 @@ class Interaction:
         gravity: acceleration that makes a weight of a mass [scene units / s^2].
         most_force: the largest force, and the largest sum of them on a kernel [weights].
         broken: why the simulation stopped; None while it goes on.
+        masses: of the kernels, up to a common factor.
     """
 
     def __init__(
@@ -109,11 +110,11 @@ class Interaction:
         self.scene, self.made_with, self.units = scene, made_with, tuple(units)
         self.gravity, self.most_force, self.seed = gravity, most_force, seed
         self._dynamics, self._initial, self._farthest = dynamics, initial, farthest
-        self._masses = masses.to(initial.positions)
+        self.masses = masses.to(initial.positions)
         self._rest = scene.means.to(initial.positions)
         self._free = (scene.simulated & ~scene.pinned).to(self._rest.device)
         self._diagonal = scene.diagonal
-        self._exposure = exposure(scene, self._masses, self._free)
+        self._exposure = exposure(scene, self.masses, self._free)
         self._frames: deque[SteppedFrame] = deque(maxlen=keep)
         self.restart()
 
@@ -187,11 +188,6 @@ class Interaction:
         return self._stepper.unit_of_kernel
 
     @property
-    def masses(self) -> Float[Tensor, " K"]:
-        """Masses of the kernels, up to a common factor."""
-        return self._masses
-
-    @property
     def fps(self) -> float:
         """Frames per second."""
         return self._stepper.fps
@@ -221,15 +217,15 @@ class Interaction:
         """Names of the forces that act."""
         return tuple(self._forces)
 
-    def pushes(self) -> list[tuple[Bool[Tensor, " K"], tuple[float, float, float], str]]:
-        """What acts before the next step: kernels, acceleration [scene units / s^2] and kind."""
-        found = [(push.mask, push.acceleration, "force") for push in self._forces.values()]
-        found += [(push.mask, push.acceleration, "impulse") for push in self._impulses]
-        if self._wind is not None:
-            found.append((self._free, scaled(self._wind.direction, self._wind_strength() * self.gravity), "wind"))
+    def pushes(self) -> list[tuple[Float[Tensor, " K"], tuple[float, float, float], str]]:
+        """What acts before the next step: how much on each kernel, acceleration [scene units / s^2] and kind."""
+        found = [(push.mask.to(self._rest), push.acceleration, "force") for push in self._forces.values()]
+        found += [(push.mask.to(self._rest), push.acceleration, "impulse") for push in self._impulses]
         if self._steady is not None:
             steady = scaled(self._steady.direction, self._steady.weights * self.gravity)
-            found.append((self._free, steady, "gravity"))
+            found.append((self._free.to(self._rest), steady, "gravity"))
+        if self._wind is not None:
+            found.append((self._exposure, scaled(self._wind.direction, self._wind_strength() * self.gravity), "wind"))
         return found
 
     def act(self, event: Event) -> None:
@@ -293,24 +289,19 @@ class Interaction:
 
     def _force(self) -> Float[Tensor, "K 3"] | None:
         """Sum of all that acts on every kernel [mass scene units / s^2]; None if nothing does."""
-        if not (self._forces or self._impulses or self._steady or self._wind):
+        pushes = self.pushes()
+        if not pushes:
             return None
         acceleration = torch.zeros_like(self._rest)
-        for push in (*self._forces.values(), *self._impulses):
-            acceleration += push.mask[:, None] * acceleration.new_tensor(push.acceleration)
-        if self._steady is not None:
-            acceleration += acceleration.new_tensor(scaled(self._steady.direction, self._steady.weights * self.gravity))
-        if self._wind is not None:
-            blown = acceleration.new_tensor(scaled(self._wind.direction, self._wind_strength() * self.gravity))
-            acceleration += self._exposure[:, None] * blown
+        for amount, vector, _ in pushes:
+            acceleration += amount[:, None] * acceleration.new_tensor(vector)
         most = self.most_force * self.gravity
         acceleration *= (most / acceleration.norm(dim=-1, keepdim=True).clamp_min(most)).clamp_max(1.0)
-        return acceleration * (self._masses * (self._free & ~self.held))[:, None]
+        return acceleration * (self.masses * (self._free & ~self.held))[:, None]
 
     def _wind_strength(self) -> float:
         """Of the wind now, gusts included [weights]."""
-        if self._wind is None:
-            return 0.0
+        assert self._wind is not None
         seconds = self.tick / self.fps
         waves = (math.sin(2 * math.pi * f * seconds + p) for f, p in zip(_GUSTS, self._phases, strict=True))
         return self._wind.weights * (1 + self._wind.gusts * sum(waves) / len(_GUSTS))
@@ -363,9 +354,8 @@ def replay(
     wrong = differences(interaction, session)
     if wrong and not (other_model and all(allowed for _, allowed in wrong)):
         raise DataError("session: " + "; ".join(text for text, _ in wrong) + ". Replay it with what it was made with.")
-    size = (
-        session.steps * 4 * (interaction.frame.positions.numel() + 2 * interaction.frame.deformation_gradients.numel())
-    )
+    frame = interaction.frame
+    size = session.steps * 4 * (frame.positions.numel() + 2 * frame.deformation_gradients.numel())
     if size > _MOST_BYTES:
         raise DataError(f"session: its {session.steps} frames take {size >> 30} GiB, expected at most 8. Shorten it.")
     interaction.gravity, interaction.seed = session.gravity, session.seed
@@ -384,13 +374,13 @@ def replay(
 def differences(interaction: Interaction, session: ForceSession) -> list[tuple[str, bool]]:
     """What a session was made with and this is not, in words; and whether it can be replayed all the same."""
     made, here = session.made_with, interaction.made_with
-    found = []
-    if made.scene_hash != here.scene_hash:
-        found.append((f"it is of another scene, '{made.scene}' and not '{here.scene}'", False))
-    if session.fps != interaction.fps:
-        found.append((f"it has {session.fps:g} frames per second and not {interaction.fps:g}", False))
-    if made.model_hash != here.model_hash:
-        found.append((f"it was made with another method or training (run '{made.run}')", True))
-    if made.initial_hash != here.initial_hash:
-        found.append((f"it begins at another state, '{made.initial}' and not '{here.initial}'", True))
-    return found
+    found = [
+        (made.scene_hash != here.scene_hash, f"it is of another scene, '{made.scene}' and not '{here.scene}'", False),
+        (session.fps != interaction.fps,
+         f"it has {session.fps:g} frames per second and not {interaction.fps:g}", False),
+        (made.model_hash != here.model_hash,
+         f"it was made with another method or training (run '{made.run}')", True),
+        (made.initial_hash != here.initial_hash,
+         f"it begins at another state, '{made.initial}' and not '{here.initial}'", True),
+    ]  # fmt: skip
+    return [(text, allowed) for differs, text, allowed in found if differs]

@@ -28,11 +28,10 @@ class Push:
 def exposure(scene: GaussianScene, masses: Tensor, free: Tensor) -> Float[Tensor, " K"]:
     """Acceleration of a kernel by wind over the mean one of the object: cross-section over mass, V^(2/3) / m."""
     volume = kernel_volumes(scene.log_scales, scene.volume_scale).to(masses)
-    share = volume.pow(2 / 3) / masses.clamp_min(torch.finfo(masses.dtype).tiny)
-    share = torch.where(free, share, torch.zeros_like(share))
-    mean = (share * masses).sum() / (masses * free).sum()
-    share = torch.where(free, (share / mean).clamp(1 / _EXPOSURE, _EXPOSURE), torch.zeros_like(share))
-    return share * ((masses * free).sum() / (share * masses).sum())
+    over_mass = torch.where(free, volume.pow(2 / 3) / masses.clamp_min(torch.finfo(masses.dtype).tiny), 0.0)
+    mean = (over_mass * masses).sum() / (masses * free).sum()
+    bounded = torch.where(free, (over_mass / mean).clamp(1 / _EXPOSURE, _EXPOSURE), 0.0)
+    return bounded * ((masses * free).sum() / (bounded * masses).sum())
 
 
 def scaled(direction: tuple[float, float, float], length: float) -> tuple[float, float, float]:

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from typing import Annotated, Any
 
+import msgspec
 import torch
 from jaxtyping import Bool, Int
+from msgspec import Meta
 from torch import Tensor
 
 from gausim.core import ConfigError, GaussianScene
+from gausim.interaction.checked import Checked, Natural, Vector
 
 # Kernels that a list may name; more is a defect of the file, not a scene.
 MOST_KERNELS = 10_000_000
 
 
-@dataclass(frozen=True)
-class Whole:
+class Whole(Checked, frozen=True):
     """All simulated kernels."""
 
     def mask(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]]) -> Bool[Tensor, " K"]:
@@ -31,8 +31,7 @@ class Whole:
         return {"whole": True}
 
 
-@dataclass(frozen=True)
-class Unit:
+class Unit(Checked, frozen=True):
     """The kernels of one unit of the hierarchy.
 
     Attributes:
@@ -40,12 +39,8 @@ class Unit:
         index: of the unit within its level.
     """
 
-    level: int
-    index: int
-
-    def __post_init__(self) -> None:
-        if min(self.level, self.index) < 0:
-            raise ConfigError(f"selection: expected level and unit >= 0, got {self.level} and {self.index}.")
+    level: Natural
+    index: Natural
 
     def mask(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]]) -> Bool[Tensor, " K"]:
         """True for the kernels of the unit.
@@ -78,20 +73,18 @@ class Unit:
         return {"level": self.level, "unit": self.index}
 
 
-@dataclass(frozen=True)
-class Kernels:
+class Kernels(Checked, frozen=True):
     """Listed kernels.
 
     Attributes:
         numbers: of the kernels in the scene, ascending.
     """
 
-    numbers: tuple[int, ...]
+    numbers: Annotated[tuple[Natural, ...], Meta(min_length=1, max_length=MOST_KERNELS)]
 
     def __post_init__(self) -> None:
-        if not self.numbers or min(self.numbers) < 0:
-            raise ConfigError("selection: field 'kernels': expected at least one kernel, all numbers >= 0.")
-        object.__setattr__(self, "numbers", tuple(sorted(set(self.numbers))))
+        Checked.__post_init__(self)
+        msgspec.structs.force_setattr(self, "numbers", tuple(sorted(set(self.numbers))))
 
     def mask(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]]) -> Bool[Tensor, " K"]:
         """True for these kernels.
@@ -118,8 +111,7 @@ class Kernels:
         return {"kernels": ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in ranges)}
 
 
-@dataclass(frozen=True)
-class Ball:
+class Ball(Checked, frozen=True):
     """Simulated kernels whose rest position lies in a ball.
 
     Attributes:
@@ -127,13 +119,8 @@ class Ball:
         radius: its radius [diagonals of the scene].
     """
 
-    centre: tuple[float, float, float]
-    radius: float
-
-    def __post_init__(self) -> None:
-        vector("centre", self.centre)
-        if not 0 < self.radius < math.inf:
-            raise ConfigError(f"selection: field 'radius': expected a number > 0 [diagonals], got {self.radius!r}.")
+    centre: Vector
+    radius: Annotated[float, Meta(gt=0, lt=1e9)]
 
     def mask(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]]) -> Bool[Tensor, " K"]:
         """True for the kernels inside.
@@ -165,15 +152,15 @@ def selection_from_json(value: Any) -> Selected:
     Raises:
         ConfigError: it is something else; names the field.
     """
-    fields = set(value) if isinstance(value, Mapping) else set()
-    if fields == {"whole"} and value["whole"] is True:
-        return Whole()
-    if fields == {"level", "unit"}:
-        return Unit(whole("level", value["level"]), whole("unit", value["unit"]))
-    if fields == {"kernels"}:
-        return parse_kernels(value["kernels"])
-    if fields == {"centre", "radius"}:
-        return Ball(vector("centre", value["centre"]), number("radius", value["radius"]))
+    match value:
+        case {"whole": True, **more} if not more:
+            return Whole()
+        case {"level": level, "unit": index, **more} if not more:
+            return Unit(level, index)
+        case {"kernels": text, **more} if not more:
+            return parse_kernels(text)
+        case {"centre": centre, "radius": radius, **more} if not more:
+            return Ball(centre, radius)
     raise ConfigError(
         'field \'on\': expected {"whole": true}, {"level": L, "unit": I}, {"kernels": "0-9, 12"} or '
         f'{{"centre": [x, y, z], "radius": R}}, got {str(value)[:80]}.'
@@ -186,11 +173,8 @@ def parse_kernels(text: Any) -> Kernels:
     Raises:
         ConfigError: the text is of another form, or names too many.
     """
-    expected = "field 'kernels': expected numbers and ranges, e.g. \"0-9, 12\""
-    if not isinstance(text, str):
-        raise ConfigError(f"{expected}, got {str(text)[:80]}.")
-    numbers: list[int] = []
-    for part in text.split(","):
+    expected, numbers = "field 'kernels': expected numbers and ranges, e.g. \"0-9, 12\"", list[int]()
+    for part in str(text).split(","):
         match = re.fullmatch(r"\s*(\d{1,9})(?:\s*-\s*(\d{1,9}))?\s*", part, re.ASCII)
         if not match:
             raise ConfigError(f"{expected}, got {part[:80]!r}.")
@@ -199,37 +183,3 @@ def parse_kernels(text: Any) -> Kernels:
             raise ConfigError(f"{expected} with at most {MOST_KERNELS} kernels, got {part[:80]!r}.")
         numbers.extend(range(first, last + 1))
     return Kernels(tuple(numbers))
-
-
-def number(name: str, value: object) -> float:
-    """A finite number.
-
-    Raises:
-        ConfigError: it is something else; names the field.
-    """
-    if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
-        raise ConfigError(f"field '{name}': expected a finite number, got {str(value)[:80]}.")
-    return float(value)
-
-
-def whole(name: str, value: object) -> int:
-    """A whole number.
-
-    Raises:
-        ConfigError: it is something else; names the field.
-    """
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise ConfigError(f"field '{name}': expected a whole number, got {str(value)[:80]}.")
-    return value
-
-
-def vector(name: str, value: object) -> tuple[float, float, float]:
-    """Three finite numbers.
-
-    Raises:
-        ConfigError: they are something else; names the field.
-    """
-    if not isinstance(value, list | tuple) or len(value) != 3:
-        raise ConfigError(f"field '{name}': expected three numbers, got {str(value)[:80]}.")
-    x, y, z = (number(name, item) for item in value)
-    return x, y, z

@@ -1,4 +1,4 @@
-"""Force sessions: everything that was done to an object, as a file that people can read, edit and replay.
+"""What can be done to an object, and force sessions: all that was done to one, as a file to read, edit and replay.
 
 JSON, one event a line. Forces are multiples of the weight of what they act on, a weight being its mass times the
 acceleration ``gravity`` of the header; frames count steps since the session began.
@@ -9,46 +9,135 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import torch
+from msgspec import Meta
 from torch import Tensor
 from torch.nn import Module
 
 from gausim.core import ConfigError, DataError, GaussianScene, SimState
-from gausim.interaction.events import (
-    KINDS,
-    MOST_NAME,
-    MOST_STEPS,
-    Event,
-    Force,
-    Gravity,
-    Impulse,
-    Pin,
-    Release,
-    Reset,
-    Unpin,
-    Wind,
-)
-from gausim.interaction.selections import number, selection_from_json, vector, whole
+from gausim.interaction.checked import Checked, Natural, Vector, made
+from gausim.interaction.selections import Selected, Whole, selection_from_json
 from gausim.io.files import write_durably
 
-__all__ = [
-    "FORMAT", "KINDS", "MOST_BYTES", "MOST_EVENTS", "MOST_STEPS", "Entry", "Event", "Force", "ForceSession", "Gravity",
-    "Impulse", "MadeWith", "Pin", "Release", "Reset", "Unpin", "Wind", "digest", "load_session", "parse_session",
-    "save_session",
-]  # fmt: skip
-
 FORMAT = "gausim.session/1"
-MOST_BYTES, MOST_EVENTS = 64 << 20, 200_000
+MOST_BYTES, MOST_EVENTS, MOST_STEPS = 64 << 20, 200_000, 100_000
+_Amount = Annotated[float, Meta(ge=0, lt=1e9)]
+_Positive = Annotated[float, Meta(gt=0, lt=1e9)]
+_Name = Annotated[str, Meta(min_length=1, max_length=200)]
+_Text = Annotated[str, Meta(max_length=200)]
 
 
-@dataclass(frozen=True)
-class Entry:
+class _Done(Checked, frozen=True):
+    """Something that is done; a direction may have any length but zero."""
+
+    def __post_init__(self) -> None:
+        Checked.__post_init__(self)
+        direction = getattr(self, "direction", (1.0,))
+        if not 1e-12 < math.hypot(*direction) < 1e12:
+            raise ConfigError(f"field 'direction': expected a vector that is not zero, got {direction}.")
+
+
+class Force(_Done, frozen=True):
+    """A force that lasts until it is released, or some frames; one of the same name takes the place of the last.
+
+    Attributes:
+        on: what it acts on; pinned kernels of it feel nothing.
+        direction: of any length but zero.
+        weights: its size [weights of the free kernels that it acts on].
+        frames: how long it lasts; None: until it is released.
+        name: by which it is released.
+    """
+
+    on: Selected
+    direction: Vector
+    weights: _Amount
+    frames: Annotated[int, Meta(ge=1, le=MOST_STEPS)] | None = None
+    name: _Name = "force"
+
+
+class Release(_Done, frozen=True):
+    """Ends the force of a name, or all forces.
+
+    Attributes:
+        name: of the force; None: all of them.
+    """
+
+    name: _Name | None = None
+
+
+class Impulse(_Done, frozen=True):
+    """A push within one frame.
+
+    Attributes:
+        on: what it acts on.
+        direction: of any length but zero.
+        weight_seconds: its size; 1 gives the speed that weight gives in a second.
+    """
+
+    on: Selected
+    direction: Vector
+    weight_seconds: _Amount
+
+
+class Gravity(_Done, frozen=True):
+    """Gravity besides that in which the object was recorded, until the next one.
+
+    Attributes:
+        direction: of any length but zero.
+        weights: its size [weights of the object]; 0 for none.
+    """
+
+    direction: Vector
+    weights: _Amount
+
+
+class Wind(_Done, frozen=True):
+    """A wind, until the next one: a force on every kernel that goes with its cross-section.
+
+    Attributes:
+        direction: in which it blows; of any length but zero.
+        weights: its force on the whole object, in the mean over time [weights of the object]; 0 for none.
+        gusts: how much it rises and falls, in 0..1.
+    """
+
+    direction: Vector
+    weights: _Amount
+    gusts: Annotated[float, Meta(ge=0, le=1)] = 0.0
+
+
+class Pin(_Done, frozen=True):
+    """Holds kernels where they are.
+
+    Attributes:
+        on: what is held.
+    """
+
+    on: Selected
+
+
+class Unpin(_Done, frozen=True):
+    """Lets go of kernels that were pinned by hand; those that the scene pins stay so.
+
+    Attributes:
+        on: what is let go.
+    """
+
+    on: Selected = Whole()
+
+
+class Reset(_Done, frozen=True):
+    """Back to the initial state, with no force, wind, gravity or pin."""
+
+
+Event = Force | Release | Impulse | Gravity | Wind | Pin | Unpin | Reset
+KINDS: dict[str, type] = {t.__name__.lower(): t for t in (Force, Release, Impulse, Gravity, Wind, Pin, Unpin, Reset)}
+
+
+class Entry(Checked, frozen=True):
     """An event and when it happens.
 
     Attributes:
@@ -56,12 +145,11 @@ class Entry:
         event: what happens.
     """
 
-    at: int
+    at: Natural
     event: Event
 
 
-@dataclass(frozen=True)
-class MadeWith:
+class MadeWith(Checked, frozen=True):
     """What a session was recorded with; hashes tell whether a replay gives the same bits.
 
     Attributes:
@@ -73,12 +161,12 @@ class MadeWith:
         run: name of the run.
     """
 
-    scene: str
-    scene_hash: str
-    model_hash: str
-    initial_hash: str
-    initial: str = "rest"
-    run: str = ""
+    scene: _Text
+    scene_hash: _Text
+    model_hash: _Text
+    initial_hash: _Text
+    initial: _Text = "rest"
+    run: _Text = ""
 
     @staticmethod
     def of(
@@ -113,8 +201,7 @@ class MadeWith:
         )
 
 
-@dataclass(frozen=True)
-class ForceSession:
+class ForceSession(Checked, frozen=True):
     """What was done to an object, and for how long.
 
     Attributes:
@@ -127,21 +214,14 @@ class ForceSession:
     """
 
     made_with: MadeWith
-    fps: float
-    steps: int
-    entries: tuple[Entry, ...]
-    gravity: float
-    seed: int = 0
+    fps: _Positive
+    steps: Annotated[int, Meta(ge=0, le=MOST_STEPS)]
+    entries: tuple[Any, ...]
+    gravity: _Positive
+    seed: Natural = 0
 
     def __post_init__(self) -> None:
-        for name in ("fps", "gravity"):
-            value = getattr(self, name)
-            if not 0 < value < math.inf:
-                raise ConfigError(f"field '{name}': expected a number > 0, got {value!r}.")
-        if not 0 <= self.steps <= MOST_STEPS:
-            raise ConfigError(f"field 'steps': expected 0 to {MOST_STEPS}, got {self.steps!r}.")
-        if not 0 <= self.seed < 1 << 63:
-            raise ConfigError(f"field 'seed': expected a whole number >= 0, got {self.seed!r}.")
+        Checked.__post_init__(self)
         if len(self.entries) > MOST_EVENTS:
             raise ConfigError(f"field 'events': expected at most {MOST_EVENTS}, got {len(self.entries)}.")
         last = 0
@@ -156,10 +236,9 @@ class ForceSession:
 
 def save_session(session: ForceSession, path: Path | str) -> None:
     """Writes a session, one event a line; replaces the file atomically."""
-    path = Path(path)
     header = {
         "format": FORMAT,
-        "made_with": {f.name: getattr(session.made_with, f.name) for f in fields(session.made_with)},
+        "made_with": msgspec.structs.asdict(session.made_with),
         "fps": session.fps,
         "gravity": session.gravity,
         "seed": session.seed,
@@ -168,7 +247,7 @@ def save_session(session: ForceSession, path: Path | str) -> None:
     lines = [f"  {json.dumps(name)}: {json.dumps(value, allow_nan=False)}" for name, value in header.items()]
     events = ",\n".join("    " + json.dumps(_to_json(entry), allow_nan=False) for entry in session.entries)
     lines.append('  "events": [' + (f"\n{events}\n  ]" if events else "]"))
-    write_durably(path, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
+    write_durably(Path(path), ("{\n" + ",\n".join(lines) + "\n}\n").encode())
 
 
 def load_session(path: Path | str) -> ForceSession:
@@ -198,75 +277,52 @@ def parse_session(text: str, source: str = "session") -> ForceSession:
         DataError: as :func:`load_session`.
     """
     try:
-        value = json.loads(text, object_pairs_hook=_unique, parse_constant=_no_constant, parse_int=_integer)
-        return _session(value)
+        value = msgspec.json.decode(text)
+        found = value.get("format") if isinstance(value, dict) else type(value).__name__
+        if found != FORMAT:
+            raise ConfigError(f"field 'format': expected {FORMAT!r}, got {str(found)[:80]!r}.")
+        return _session({name: item for name, item in value.items() if name != "format"})
     except RecursionError:
         raise DataError(f"{source}: is nested too deeply. Write the session again.") from None
-    except (ConfigError, ValueError) as error:
+    except msgspec.DecodeError as error:
+        raise DataError(f"{source}: {error}. Correct it, or record the session again.") from error
+    except ConfigError as error:
         raise DataError(f"{source}: {error} Correct it, or record the session again.") from error
 
 
-def _session(value: Any) -> ForceSession:
-    names = {"format", "made_with", "fps", "gravity", "seed", "steps", "events"}
-    if not isinstance(value, dict) or value.get("format") != FORMAT:
-        found = value.get("format") if isinstance(value, dict) else type(value).__name__
-        raise ConfigError(f"field 'format': expected {FORMAT!r}, got {str(found)[:80]!r}.")
-    _exactly(value, names)
-    made = value["made_with"]
-    if not isinstance(made, dict):
-        raise ConfigError("field 'made_with': expected an object of texts.")
-    _exactly(made, {f.name for f in fields(MadeWith)})
-    if not isinstance(value["events"], list):
+def _session(value: dict[str, Any]) -> ForceSession:
+    events, made_with = value.pop("events", None), value.pop("made_with", None)
+    if not isinstance(events, list):
         raise ConfigError("field 'events': expected a list.")
+    if not isinstance(made_with, dict):
+        raise ConfigError("field 'made_with': expected an object of texts.")
+    try:
+        value["made_with"] = made(MadeWith, made_with)
+    except ConfigError as error:
+        raise ConfigError(f"field 'made_with': {error}") from error
     entries = []
-    for place, item in enumerate(value["events"][: MOST_EVENTS + 1]):
+    for place, item in enumerate(events[: MOST_EVENTS + 1]):
         try:
             entries.append(_entry(item))
         except ConfigError as error:
             raise ConfigError(f"event {place}: {error}") from error
-    return ForceSession(
-        MadeWith(**{name: _text(f"made_with.{name}", text) for name, text in made.items()}),
-        number("fps", value["fps"]),
-        whole("steps", value["steps"]),
-        tuple(entries),
-        number("gravity", value["gravity"]),
-        whole("seed", value["seed"]),
-    )
+    session: ForceSession = made(ForceSession, value | {"entries": tuple(entries)})
+    return session
 
 
 def _entry(item: Any) -> Entry:
     if not isinstance(item, dict):
         raise ConfigError("expected an object with fields 'at' and 'do'.")
-    kind = KINDS.get(item["do"]) if isinstance(item.get("do"), str) else None
-    if kind is None:
-        raise ConfigError(f"field 'do': expected one of {', '.join(KINDS)}, got {str(item.get('do'))[:80]!r}.")
-    known = {f.name for f in fields(kind)}
-    _exactly(item, {"at", "do", *known})
-    if kind is Force:
-        _text("name", item["name"])  # only a release may leave it open
-    return Entry(whole("at", item["at"]), kind(**{name: _READERS[name](item[name]) for name in known}))
-
-
-def _text(name: str, value: object) -> str:
-    if not isinstance(value, str) or len(value) > MOST_NAME:
-        raise ConfigError(f"field '{name}': expected a text of at most {MOST_NAME} characters, got {str(value)[:80]}.")
-    return value
-
-
-# How each field of an event is read; its range is the event's own business.
-_READERS: dict[str, Callable[[Any], Any]] = {
-    "on": selection_from_json,
-    "direction": partial(vector, "direction"),
-    "weights": partial(number, "weights"),
-    "weight_seconds": partial(number, "weight_seconds"),
-    "gusts": partial(number, "gusts"),
-    "frames": lambda value: None if value is None else whole("frames", value),
-    "name": lambda value: None if value is None else _text("name", value),
-}
+    at, do = item.pop("at", None), item.pop("do", None)
+    if not isinstance(do, str) or do not in KINDS:
+        raise ConfigError(f"field 'do': expected one of {', '.join(KINDS)}, got {str(do)[:80]!r}.")
+    if "on" in item:
+        item["on"] = selection_from_json(item["on"])
+    return Entry(at, made(KINDS[do], item))
 
 
 def _to_json(entry: Entry) -> dict[str, Any]:
-    values = {f.name: getattr(entry.event, f.name) for f in fields(entry.event)}
+    values = msgspec.structs.asdict(entry.event)
     if "on" in values:
         values["on"] = values["on"].to_json()
     return {"at": entry.at, "do": type(entry.event).__name__.lower(), **values}
@@ -283,28 +339,3 @@ def digest(*parts: str | Tensor) -> str:
             result.update(f"tensor {value.dtype} {tuple(value.shape)};".encode())
             result.update(value.view(-1).view(torch.uint8).numpy().tobytes() if value.numel() else b"")
     return result.hexdigest()[:32]
-
-
-def _exactly(value: Mapping[str, Any], names: set[str]) -> None:
-    missing, unknown = sorted(names - set(value)), sorted(set(value) - names)
-    if missing or unknown:
-        raise ConfigError(
-            f"expected the fields {', '.join(sorted(names))}; missing: {missing}, unknown: {str(unknown)[:200]}."
-        )
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    result = dict(pairs)
-    if len(result) != len(pairs):
-        raise ConfigError("a field stands there twice.")
-    return result
-
-
-def _no_constant(text: str) -> None:
-    raise ConfigError(f"expected finite numbers, got {text}.")
-
-
-def _integer(text: str) -> int:
-    if len(text) > 20:
-        raise ConfigError(f"expected numbers of at most 20 digits, got {text[:30]}...")
-    return int(text)

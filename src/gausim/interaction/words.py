@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from gausim.interaction.selections import Selected
     from gausim.interaction.session import Entry
 
-_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 # Radius of the ball about the tip [diagonals].
 _TIP = 0.15
 # What each kind of event needs to be told, and what it may be told besides.
@@ -65,18 +64,18 @@ def has_forces(arguments: argparse.Namespace) -> bool:
 
 
 def entries_of(arguments: argparse.Namespace, scene: GaussianScene) -> list[Entry]:
-    """The events of the command line in the order of their time.
+    """The events of the command line in the order of their time; forces last beside each other by names of their own.
 
     Raises:
         ConfigError: a word is unknown, missing or wrong; names the option.
     """
-    entries = [entry_of(kind, words, scene) for kind in _WORDS for words in getattr(arguments, kind)]
-    entries = [_named(entry, number) for number, entry in enumerate(entries)]
+    given = [(kind, words) for kind in _WORDS for words in getattr(arguments, kind)]
+    entries = [entry_of(kind, words, scene, name=f"force {number}") for number, (kind, words) in enumerate(given)]
     return sorted(entries, key=lambda entry: entry.at)
 
 
-def entry_of(kind: str, words: Sequence[str], scene: GaussianScene) -> Entry:
-    """One event of the command line.
+def entry_of(kind: str, words: Sequence[str], scene: GaussianScene, *, name: str = "force") -> Entry:
+    """One event of the command line; ``name`` is that of a force.
 
     Raises:
         ConfigError: a word is unknown, missing or wrong; names the option.
@@ -84,19 +83,25 @@ def entry_of(kind: str, words: Sequence[str], scene: GaussianScene) -> Entry:
     from gausim.interaction.session import KINDS, Entry
 
     needed, allowed = _WORDS[kind]
+    read: dict[str, Callable[[str], Any]] = {
+        "on": lambda text: parse_part(text, scene), "direction": parse_direction, "frames": _whole, "at": _whole,
+    }  # fmt: skip
     try:
-        values = _values(words, (*needed, *allowed))
-        missing = [name for name in needed if name not in values]
+        values: dict[str, Any] = {"at": 0} | ({"name": name} if kind == "force" else {})
+        if kind in ("force", "impulse"):
+            values["on"] = parse_part("whole", scene)
+        texts: dict[str, str] = {}
+        for word in words:
+            key, equals, text = word.partition("=")
+            if not equals or key not in (*needed, *allowed) or key in texts:
+                known = ", ".join((*needed, *allowed))
+                raise ConfigError(f"'{word}': expected KEY=VALUE, each once, with a key of {known}.")
+            texts[key] = text
+        missing = [key for key in needed if key not in texts]
         if missing:
             raise ConfigError(f"'{missing[0]}=' is missing. Expected {_HELP[kind]}.")
-        at = _whole(values.pop("at", "0"))
-        read: dict[str, Callable[[str], Any]] = {
-            "on": lambda text: parse_part(text, scene), "direction": parse_direction, "frames": _whole,
-        }  # fmt: skip
-        made = {name: read.get(name, _number)(text) for name, text in values.items()}
-        if kind in ("force", "impulse"):
-            made.setdefault("on", parse_part("whole", scene))
-        return Entry(at, KINDS[kind](**made))
+        values |= {key: read.get(key, _number)(text) for key, text in texts.items()}
+        return Entry(values.pop("at"), KINDS[kind](**values))
     except ConfigError as error:
         raise ConfigError(f"--{kind} {' '.join(words)}: {error}") from error
 
@@ -113,7 +118,9 @@ def parse_part(text: str, scene: GaussianScene) -> Selected:
     if kind == "whole" and not rest:
         return Whole()
     if kind == "tip":
-        return _tip(scene, _number(rest) if rest else _TIP)
+        free = scene.means[scene.simulated & ~scene.pinned]
+        x, y, z = free[(free - scene.means[scene.pinned].mean(0)).norm(dim=-1).argmax()].tolist()
+        return Ball((x, y, z), _number(rest) if rest else _TIP)
     if kind == "unit" and rest.count("/") == 1:
         level, _, index = rest.partition("/")
         return Unit(_whole(level), _whole(index))
@@ -128,46 +135,23 @@ def parse_part(text: str, scene: GaussianScene) -> Selected:
 
 
 def parse_direction(text: str) -> tuple[float, float, float]:
-    """Reads ``x``, ``-z`` or ``X,Y,Z``.
+    """Reads ``x``, ``+x``, ``-z`` or ``X,Y,Z``.
 
     Raises:
         ConfigError: it is of another form.
     """
-    sign, name = (-1.0, text[1:]) if text.startswith("-") else (1.0, text)
-    if name in _AXES:
-        x, y, z = _AXES[name]
-        return sign * x, sign * y, sign * z
-    parts = text.split(",")
-    if len(parts) != 3:
+    if (name := text[-1:]) in "xyz" and text in (name, f"+{name}", f"-{name}"):
+        x, y, z = ((-1.0 if text[0] == "-" else 1.0) * (name == axis) for axis in "xyz")
+    elif text.count(",") == 2:
+        x, y, z = map(_number, text.split(","))
+    else:
         raise ConfigError(f"direction={text}: expected x, -x, y, -y, z, -z or X,Y,Z.")
-    x, y, z = map(_number, parts)
     return x, y, z
 
 
-def _tip(scene: GaussianScene, radius: float) -> Selected:
-    from gausim.interaction.selections import Ball
-
-    free = scene.means[scene.simulated & ~scene.pinned]
-    root = scene.means[scene.pinned].mean(0)
-    x, y, z = free[(free - root).norm(dim=-1).argmax()].tolist()
-    return Ball((x, y, z), radius)
-
-
-def _values(words: Sequence[str], known: Sequence[str]) -> dict[str, str]:
-    values: dict[str, str] = {}
-    for word in words:
-        name, equals, text = word.partition("=")
-        if not equals or name not in known or name in values:
-            raise ConfigError(f"'{word}': expected KEY=VALUE, each once, with a key of {', '.join(known)}.")
-        values[name] = text
-    return values
-
-
 def _number(text: str) -> float:
-    from gausim.interaction.selections import number
-
     try:
-        return number("number", float(text))
+        return float(text)
     except ValueError:
         raise ConfigError(f"'{text}': expected a number.") from None
 
@@ -177,14 +161,3 @@ def _whole(text: str) -> int:
         return int(text)
     except ValueError:
         raise ConfigError(f"'{text}': expected a whole number.") from None
-
-
-def _named(entry: Entry, number: int) -> Entry:
-    """Forces of the command line last beside each other, so each has a name of its own."""
-    from dataclasses import replace
-
-    from gausim.interaction.session import Force
-
-    return replace(entry, event=replace(entry.event, name=f"force {number}")) if isinstance(
-        entry.event, Force
-    ) else entry  # fmt: skip

@@ -11,11 +11,12 @@ import torch
 from jaxtyping import UInt32
 
 from gausim.viewer.coloring import VIEW, Legend, Painter, highlighted
-from gausim.viewer.guard import Door, GuardedServer
+from gausim.viewer.guard import Door
 from gausim.viewer.hands import Hands
 from gausim.viewer.live import Live
 from gausim.viewer.page import Page
-from gausim.viewer.pipeline import Latest, Worker
+from gausim.viewer.pipeline import Worker
+from gausim.viewer.server import GuardedServer
 from gausim.viewer.shown import Shown
 from gausim.viewer.sights import Sights
 from gausim.viewer.splats import SIZE, Placing, pack
@@ -55,11 +56,10 @@ class Viewer:
         self.server = GuardedServer(door, label="gausim")
         self.placing = Placing.of(scene)
         self._painter = Painter(scene, subject.interaction.units, subject.interaction.masses)
-        self._companion = subject.companion
-        self._painted: Latest[_Painted] = Latest()
-        self._simulated: Latest[Shown] = Latest()
+        paint, send = self.workers = (Worker("paint", self._paint), Worker("send", self._send))
+        self._painted = send.put
         self.live = Live(
-            subject.interaction, self._simulated.put, takes=subject.takes, companion=subject.companion,
+            subject.interaction, paint.put, takes=subject.takes, companion=subject.companion,
             watched=lambda: bool(self.server.get_clients()),
         )  # fmt: skip
         self.server.scene.set_up_direction(f"{'' if subject.up.startswith('-') else '+'}{subject.up}")  # type: ignore[arg-type]
@@ -75,13 +75,10 @@ class Viewer:
         self._viewed = 0.0
         self._place_beside(subject)
         first = self._paint_now(self.live.shown())
-        self.server.traffic.frame_bytes = first.buffer.nbytes
+        self.server.frame_bytes = first.buffer.nbytes
         self._splats = self._add("/splats", first.buffer)
         self._beside = self._add("/beside", first.beside) if first.beside is not None else None
         self.server.on_client_connect(self._connected)
-        self.workers = (
-            Worker("paint", self._simulated, self._paint), Worker("send", self._painted, self._send),
-        )  # fmt: skip
 
     def _place_beside(self, subject: Subject) -> None:
         if subject.companion is None:
@@ -90,7 +87,7 @@ class Viewer:
         at = (float(offset[0]), float(offset[1]), float(offset[2]))
         self._other_placing = Placing(self.placing.centre, self.placing.scale, at)
         self._other_painter = Painter(other.scene, other.units, other.masses)
-        top = float((self._other_placing.to_page(other.scene.means.float()) @ self.sights.vertical).max())
+        top = float((self._other_placing.to_page(other.scene.means.float()).numpy() @ self.sights.up).max())
         above = offset + (top + 0.06 * SIZE) * self.sights.up
         self.server.scene.add_label("/name_beside", subject.companion.name, position=above, anchor="bottom-center")
 
@@ -149,26 +146,25 @@ class Viewer:
 
     @torch.no_grad()
     def _paint_now(self, shown: Shown) -> _Painted:
-        mode = self.page.mode
-        eye = self.placing.to_scene(self.eye)
-        covars, rgb, legend = self._painter(shown.frame, shown.unit_of_kernel, shown.speed, mode, eye)
-        if self.page.highlight:
-            nobody = torch.zeros_like(self.hands.mask)
-            rgb = highlighted(rgb, self.hands.mask, nobody if shown.held is None else shown.held.cpu())
-        buffer = pack(shown.frame.positions.cpu(), covars, rgb, self._painter.opacities, self.placing)
-        return _Painted(shown, legend, buffer, self._paint_beside(shown, mode))
+        legend, buffer = self._packed(self._painter, self.placing, shown, highlight=self.page.highlight)
+        beside = None
+        if shown.beside is not None:
+            _, beside = self._packed(self._other_painter, self._other_placing, shown.beside)
+        return _Painted(shown, legend, buffer, beside)
 
-    def _paint_beside(self, shown: Shown, mode: str) -> np.ndarray | None:
-        other = shown.beside
-        if other is None or self._companion is None:
-            return None
-        known = mode if mode in self._other_painter.modes else VIEW
-        eye = self._other_placing.to_scene(self.eye)
-        covars, rgb, _ = self._other_painter(other.frame, other.unit_of_kernel, other.speed, known, eye)
-        return pack(other.frame.positions.cpu(), covars, rgb, self._other_painter.opacities, self._other_placing)
+    def _packed(
+        self, painter: Painter, placing: Placing, shown: Shown, *, highlight: bool = False
+    ) -> tuple[Legend, UInt32[np.ndarray, "K 8"]]:
+        mode = self.page.mode if self.page.mode in painter.modes else VIEW
+        eye = placing.to_scene(self.eye)
+        covars, rgb, legend = painter(shown.frame, shown.unit_of_kernel, shown.speed, mode, eye)
+        if highlight:
+            held = torch.zeros_like(self.hands.mask) if shown.held is None else shown.held.cpu()
+            rgb = highlighted(rgb, self.hands.mask, held)
+        return legend, pack(shown.frame.positions.cpu(), covars, rgb, painter.opacities, placing)
 
     def _paint(self, shown: Shown) -> None:
-        self._painted.put(self._paint_now(shown))
+        self._painted(self._paint_now(shown))
 
     def _send(self, painted: _Painted) -> None:
         with self.server.atomic():
@@ -179,6 +175,6 @@ class Viewer:
                     self._beside.buffer = painted.beside
             self.hands.follow(painted.shown)
         paused = not self.live.playing  # then this may be the last frame for long
-        displayed = 0.0 if paused else self.server.traffic.displayed
+        displayed = 0.0 if paused else self.server.displayed
         self.page.refresh(painted.shown, painted.legend, displayed, now=paused)
         self.sights.refresh(painted.shown, now=paused)

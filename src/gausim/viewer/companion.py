@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any, cast
+import msgspec
 
 from gausim.core import ConfigError, DivergenceError
 from gausim.interaction.interaction import Interaction
-from gausim.interaction.selections import Ball, Kernels, Whole
+from gausim.interaction.selections import Kernels, Unit
 from gausim.interaction.session import Event
-from gausim.viewer.shown import Shown
 
 
 class Companion:
@@ -27,9 +25,9 @@ class Companion:
     def act(self, event: Event, leader: Interaction) -> None:
         """Does what was done to the leader; units become lists of kernels, as the hierarchies differ."""
         on = getattr(event, "on", None)
-        if on is not None and not isinstance(on, Whole | Ball | Kernels):
+        if isinstance(on, Unit):
             chosen = on.mask(leader.scene, leader.units).nonzero()[:, 0].tolist()
-            event = cast(Event, replace(cast(Any, event), on=Kernels(tuple(chosen))))
+            event = msgspec.structs.replace(event, on=Kernels(tuple(chosen)))
         try:
             self.interaction.act(event)
             self.message = ""
@@ -38,25 +36,16 @@ class Companion:
 
     def step(self) -> None:
         """One frame on, unless it broke."""
-        if self.interaction.broken is not None:
-            return
         try:
-            self.interaction.step()
+            if self.interaction.broken is None:
+                self.interaction.step()
         except (DivergenceError, ConfigError) as error:
             self.message = str(error)
 
-    def reset(self) -> None:
-        """Back to its initial state."""
-        self.interaction.reset()
+    def begin(self, *, anew: bool) -> None:
+        """Back to its initial state, within the session or in a new one."""
+        if anew:
+            self.interaction.restart()
+        else:
+            self.interaction.reset()
         self.message = ""
-
-    def restart(self) -> None:
-        """A new session."""
-        self.interaction.restart()
-        self.message = ""
-
-    def shown(self) -> Shown:
-        """Its latest frame."""
-        now = self.interaction
-        speed = (now.state.positions - now.state.previous).norm(dim=-1) * now.fps
-        return Shown(now.frame, now.unit_of_kernel, speed)

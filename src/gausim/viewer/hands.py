@@ -6,17 +6,21 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from trimesh import Trimesh
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+from viser.transforms import SO3
 
 from gausim.core import ConfigError
 from gausim.interaction.selections import Kernels, Selected, Unit, Whole
 from gausim.interaction.session import Force, Impulse, Release
-from gausim.viewer.handles import invisible_octahedron
 from gausim.viewer.live import Live
 from gausim.viewer.shown import Shown
 from gausim.viewer.splats import SIZE, Placing, unit_centres
@@ -46,7 +50,6 @@ class Hands:
         scene = live.interaction.scene
         self._free = (scene.simulated & ~scene.pinned).cpu()
         self._units, self._masses = [u.cpu() for u in units], masses.float().cpu()
-        self._counts = [int(u.max()) + 1 for u in self._units]
         self._shown_handles, self._moved = False, 0.0
         self._pick: Any = None
         self._lock = threading.Lock()
@@ -65,12 +68,12 @@ class Hands:
     @property
     def level_names(self) -> tuple[str, ...]:
         """What a click can pick."""
-        return (*(f"Level {i + 1}: {n} units" for i, n in enumerate(self._counts)), WHOLE)
+        return (*(f"Level {i + 1}: {int(u.max()) + 1} units" for i, u in enumerate(self._units)), WHOLE)
 
     @property
     def first_level(self) -> str:
         """What a click picks at first: the largest parts, if there are any."""
-        return self.level_names[max(0, len(self._counts) - 1)]
+        return self.level_names[max(0, len(self._units) - 1)]
 
     def choose_level(self, name: str) -> None:
         """Handles for the units of another level.
@@ -80,56 +83,44 @@ class Hands:
         """
         if name not in self.level_names:
             raise ConfigError(f"{name!r}: expected one of {', '.join(self.level_names)}.")
-        index = self.level_names.index(name)
+        level = self.level_names.index(name)
+        rest = self._live.interaction.scene.means
         with self._lock:
-            self._level = index if index < len(self._units) else None
-            free = torch.zeros(self._count, dtype=torch.bool)
-            free[self._index[self._free & (self._index >= 0)]] = True
-            self._movable = free.nonzero()[:, 0]
-            self._radii = self._handle_radii()
+            self._level = level if level < len(self._units) else None
+            # The handle of each kernel, and the handles that can move.
+            self._index = self._units[level] if level < len(self._units) else torch.where(self._free, 0, -1)
+            self._count = int(self._index.max()) + 1
+            self._movable = self._index[self._free & (self._index >= 0)].unique()
             if self._pick is not None:
                 self._pick.remove()
-            self._pick = self._make_handles()
+            self._make_handles(self._centres(rest).numpy(), self._handle_radii(rest.float().cpu()).numpy())
         self._moved = 0.0
-
-    @property
-    def _index(self) -> Tensor:
-        """The handle of each kernel at the chosen level."""
-        return self._units[self._level] if self._level is not None else torch.where(self._free, 0, -1)
-
-    @property
-    def _count(self) -> int:
-        return self._counts[self._level] if self._level is not None else 1
 
     def _centres(self, positions: Tensor) -> Tensor:
         centres = unit_centres(positions.float().cpu(), self._index, self._masses, self._count)
         return self._placing.to_page(centres)[self._movable]
 
-    def _handle_radii(self) -> Tensor:
+    def _handle_radii(self, rest: Tensor) -> Tensor:
         """Handles as wide as their units, so that a unit is hit where it is seen [page units]."""
-        rest = self._live.interaction.scene.means.float().cpu()
         centres = unit_centres(rest, self._index, self._masses, self._count)
         inside = self._index >= 0
         away = (rest[inside] - centres[self._index[inside]]).norm(dim=-1)
         widest = torch.zeros(self._count).scatter_reduce(0, self._index[inside], away, "amax")
         return (0.8 * widest * self._placing.scale).clamp(0.008 * SIZE, 0.2 * SIZE)[self._movable]
 
-    def _make_handles(self) -> Any:
+    def _make_handles(self, centres: np.ndarray, radii: np.ndarray) -> None:
         # What is picked must stand before the old handles are gone: the index an event carries is one of these.
-        count = len(self._movable)
-        centres = self._centres(self._live.interaction.scene.means).numpy()
-        handle = self._server.scene.add_batched_glb(
-            "/handles", invisible_octahedron(), np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)), centres,
-            batched_scales=self._radii.numpy(), lod="off", cast_shadow=False, receive_shadow=False,
+        self._pick = self._server.scene.add_batched_glb(
+            "/handles", invisible_octahedron(), np.tile(np.array([1, 0, 0, 0], np.float32), (len(centres), 1)), centres,
+            batched_scales=radii, lod="off", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
         self._dots = self._server.scene.add_point_cloud(
             "/dots", centres, (255, 120, 0), point_size=0.012 * SIZE, point_shape="circle",
             visible=self._shown_handles,
         )  # fmt: skip
         # No click on the handles: viser outlines what can be clicked. Clicks are found along their ray instead.
-        handle.on_drag("left")(self._dragged)
-        handle.on_drag("left", modifier="cmd/ctrl")(self._flicked)
-        return handle
+        self._pick.on_drag("left")(self._dragged)
+        self._pick.on_drag("left", modifier="cmd/ctrl")(self._flicked)
 
     def show_handles(self, visible: bool) -> None:
         """Makes the handles visible, or invisible as they are."""
@@ -174,21 +165,17 @@ class Hands:
                 return f"the whole object, {count} kernels that can move"
         return f"{count} kernels"
 
-    def _selected_by(self, instance: int | None) -> Selected | None:
-        if instance is None or not 0 <= instance < len(self._movable):
-            return None
-        return Whole() if self._level is None else Unit(self._level + 1, int(self._movable[instance]))
-
     async def _clicked(self, event: Any) -> None:
         if self._page is None:
             return
         kernel = first_hit(self._page, self._reach, event.ray_origin, event.ray_direction, self._free)
         if kernel is None:
             self.select(None)
-        elif self._level is None:
-            self.select(Whole())
         elif int(self._index[kernel]) >= 0:
-            self.select(Unit(self._level + 1, int(self._index[kernel])))
+            self.select(self._part(int(self._index[kernel])))
+
+    def _part(self, index: int) -> Selected:
+        return Whole() if self._level is None else Unit(self._level + 1, index)
 
     async def _brushed(self, event: Any) -> None:
         if self._page is None:
@@ -201,9 +188,10 @@ class Hands:
 
     def _grasp(self, event: Any) -> None:
         """A drag that begins on what is not selected selects it."""
-        chosen = self._selected_by(event.instance_index)
-        if chosen is None:
+        index = event.instance_index
+        if event.phase != "start" or index is None or not 0 <= index < len(self._movable):
             return
+        chosen = self._part(int(self._movable[index]))
         mask = chosen.mask(self._live.interaction.scene, self._units).cpu() & self._free
         if not bool((mask & self.mask).any()):
             self.select(chosen)
@@ -216,25 +204,23 @@ class Hands:
 
     async def _dragged(self, event: Any) -> None:
         name = f"drag-{event.client_id}"
-        if event.phase == "start":
-            self._grasp(event)
+        self._grasp(event)
         direction, weights = self.pull(event.start_position, event.end_position)
         on = self.selection
         if event.phase == "end" or on is None:
-            self._hide()
+            self._label.visible = False
             self._live.do(lambda: self._live.act(Release(name)))
         elif weights > 1e-4:
             self._point(event, f"{weights:.2f} x weight")
             self._live.do(lambda: self._live.act(Force(on, direction, weights, name=name)))
 
     async def _flicked(self, event: Any) -> None:
-        if event.phase == "start":
-            self._grasp(event)
+        self._grasp(event)
         direction, weights = self.pull(event.start_position, event.end_position)
         amount = min(weights * _FLICK, self._live.interaction.most_force / self._live.interaction.fps)
         on = self.selection
         if event.phase == "end":
-            self._hide()
+            self._label.visible = False
             if on is not None and weights > 1e-4:
                 self._live.do(lambda: self._live.act(Impulse(on, direction, amount)))
         elif on is not None:
@@ -242,12 +228,21 @@ class Hands:
 
     def _point(self, event: Any, text: str) -> None:
         with self._server.atomic():
-            self._label.position = event.end_position
-            self._label.text = text
-            self._label.visible = True
+            self._label.position, self._label.text, self._label.visible = event.end_position, text, True
 
-    def _hide(self) -> None:
-        self._label.visible = False
+
+@cache
+def invisible_octahedron() -> bytes:
+    """A binary glTF of a transparent unit octahedron, which catches the pointer.
+
+    A mesh of opacity 0 still hides the splats behind it, which are drawn last and tested against the depth; glTF
+    materials that blend are loaded as ones that leave the depth alone.
+    """
+    corners = [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]
+    faces = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
+    clear = PBRMaterial(alphaMode="BLEND", baseColorFactor=[255, 255, 255, 0], doubleSided=True)
+    mesh = Trimesh(corners, faces, visual=TextureVisuals(material=clear))
+    return bytes(mesh.export(file_type="glb"))  # type: ignore[arg-type]
 
 
 def first_hit(
@@ -287,14 +282,7 @@ def in_rectangle(
         low: left upper corner, in 0..1 of the picture.
         high: right lower corner.
     """
-    w, x, y, z = (float(v) for v in camera.wxyz)
-    rotation = points.new_tensor(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    rotation = torch.from_numpy(SO3(np.asarray(camera.wxyz, float)).as_matrix()).to(points)
     seen = (points - points.new_tensor([float(v) for v in camera.position])) @ rotation
     half = math.tan(float(camera.fov) / 2)
     depth = seen[:, 2].clamp_min(1e-6)

@@ -9,66 +9,20 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import replace
 
-import torch
-
-from gausim.core import ConfigError, DivergenceError, GausSimError, SteppedFrame, Trajectory
+from gausim.core import ConfigError, DivergenceError, GausSimError, Trajectory
 from gausim.interaction.interaction import Interaction, differences
-from gausim.interaction.session import Entry, Event, ForceSession, Release
+from gausim.interaction.session import Event, ForceSession, Release
 from gausim.viewer.companion import Companion
 from gausim.viewer.pipeline import Rate
-from gausim.viewer.shown import LIVE, Shown
+from gausim.viewer.shown import LIVE, Shown, Take, shown_frame
 
 # Commands that wait; more at once come from no hand.
 _MOST_COMMANDS = 1024
 # Frames of the timeline of the live simulation take at most so much memory [bytes].
 _HISTORY_BYTES = 128 << 20
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, eq=False)
-class Take:
-    """A trajectory that can be played: what a method foresees of a sequence.
-
-    Attributes:
-        name: what it is called on the page.
-        load: makes it, when it is first asked for.
-        sequence: the recorded sequence that it foresees, or None.
-        beside: makes what the other method foresees of the same, or None.
-    """
-
-    name: str
-    load: Callable[[], Trajectory]
-    sequence: str | None = None
-    beside: Callable[[], Trajectory] | None = None
-
-
-@dataclass(eq=False)
-class _Script:
-    """A session that is being played back."""
-
-    pending: deque[Entry]
-    steps: int
-    done: int = 0
-
-
-@dataclass(eq=False)
-class _Recorded:
-    """A take that has been loaded."""
-
-    take: Take
-    trajectory: Trajectory
-    beside: Trajectory | None
-    number: int = 0
-    fps: float = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.fps = self.trajectory.fps
-
-    def shown(self) -> Shown:
-        beside = _of(self.beside, self.number, "beside") if self.beside is not None else None
-        return _of(self.trajectory, self.number, self.take.name, beside)
 
 
 class Live(threading.Thread):
@@ -82,8 +36,6 @@ class Live(threading.Thread):
         pace: speed of time; 1 is real time.
         source: what is shown.
         rate: simulated steps per second.
-        seconds: time spent stepping.
-        steps: steps made.
     """
 
     def __init__(
@@ -110,13 +62,13 @@ class Live(threading.Thread):
         self._commands: queue.Queue[Callable[[], None]] = queue.Queue(_MOST_COMMANDS)
         self._overrun = self._stopping = False
         self.message, self.playing, self.pace, self.source = "", True, 1.0, LIVE
-        self.rate, self.seconds, self.steps = Rate(), 0.0, 0
+        self.rate = Rate()
         frame = interaction.frame
         size = 4 * (2 * frame.positions.numel() + 2 * frame.deformation_gradients.numel())
         self._history: deque[Shown] = deque(maxlen=max(32, min(3000, _HISTORY_BYTES // size)))
-        self._place: int | None = None  # on the live timeline; None: its end
-        self._script: _Script | None = None
-        self._recorded: dict[str, _Recorded] = {}
+        self._place: int | None = None  # on the timeline; None: its end, where the live simulation goes on
+        self._script: ForceSession | None = None  # a session that is played back
+        self._loaded: dict[str, tuple[Trajectory, Trajectory | None]] = {}
         self._remember()
 
     # ------------------------------------------------------------------------------------- from any thread
@@ -136,7 +88,7 @@ class Live(threading.Thread):
 
     def run(self) -> None:
         """Simulates until :meth:`stop`."""
-        self._show()
+        self._publish(self.shown())
         due = time.monotonic()
         while not self._stopping:
             going = self.playing and self._watched()
@@ -145,13 +97,10 @@ class Live(threading.Thread):
                 due = time.monotonic()
                 continue
             self._guarded(self.advance)
-            self._show()
-            due = max(due + 1 / (self._fps * self.pace), time.monotonic() - 0.2)
+            self._publish(self.shown())
+            fps = self.interaction.fps if self.source == LIVE else self._loaded[self.source][0].fps
+            due = max(due + 1 / (fps * self.pace), time.monotonic() - 0.2)
             self._take_commands(due - time.monotonic())
-
-    @property
-    def _fps(self) -> float:
-        return self.interaction.fps if self.source == LIVE else self._recorded[self.source].fps
 
     def _take_commands(self, wait: float) -> None:
         """Runs what waits, for at least so many seconds."""
@@ -164,7 +113,7 @@ class Live(threading.Thread):
                 break
             self._guarded(command)
             if not self.playing:
-                self._show()
+                self._publish(self.shown())
         if self._overrun:
             self._overrun = False
             self.message = "Too much at once: all forces were let go."
@@ -186,29 +135,21 @@ class Live(threading.Thread):
     def advance(self) -> None:
         """One frame on."""
         if self.source != LIVE:
-            recorded = self._recorded[self.source]
-            recorded.number = (recorded.number + 1) % recorded.trajectory.frames
+            self._place = ((self._place or 0) + 1) % self._loaded[self.source][0].frames
             return
         self._place = None
-        script = self._script
-        if script is not None:
-            self._feed(script)
-            if script.done == script.steps:
+        if self._script is not None:
+            while self._pending and self._pending[0].at == self.interaction.tick:
+                self._act(self._pending.popleft().event)
+            if self.interaction.tick == self._script.steps:
+                self.message = f"The session is over: {self._script.steps} frames."
                 self._script, self.playing = None, False
-                self.message = f"The session is over: {script.steps} frames."
                 return
-            script.done += 1
-        start = time.perf_counter()
         self.interaction.step()
-        self.seconds, self.steps = self.seconds + time.perf_counter() - start, self.steps + 1
         self.rate.count()
         if self.companion is not None:
             self.companion.step()
         self._remember()
-
-    def _feed(self, script: _Script) -> None:
-        while script.pending and script.pending[0].at == script.done:
-            self._act(script.pending.popleft().event)
 
     def _act(self, event: Event) -> None:
         self.interaction.act(event)
@@ -229,9 +170,11 @@ class Live(threading.Thread):
 
     def play(self) -> None:
         """Time goes on."""
-        if self.source == LIVE and self.interaction.broken is not None:
-            raise DivergenceError(self.interaction.broken)
-        self.playing, self._place = True, None
+        if self.source == LIVE:
+            if self.interaction.broken is not None:
+                raise DivergenceError(self.interaction.broken)
+            self._place = None
+        self.playing = True
 
     def pause(self) -> None:
         """Time stands."""
@@ -244,24 +187,22 @@ class Live(threading.Thread):
 
     def reset(self) -> None:
         """Back to the beginning of what is shown; ends a session that is played back."""
-        self.message, self._script = "", None
-        if self.source != LIVE:
-            self._recorded[self.source].number = 0
-            return
-        self.interaction.reset()
-        if self.companion is not None:
-            self.companion.reset()
-        self._forget()
+        self.message, self._script, self._place = "", None, None
+        if self.source == LIVE:
+            self._begin(anew=False)
 
     def begin(self) -> None:
         """A new session: what was recorded is forgotten."""
         self.message, self._script, self.source = "", None, LIVE
-        self.interaction.restart()
-        if self.companion is not None:
-            self.companion.restart()
-        self._forget()
+        self._begin(anew=True)
 
-    def _forget(self) -> None:
+    def _begin(self, *, anew: bool) -> None:
+        if anew:
+            self.interaction.restart()
+        else:
+            self.interaction.reset()
+        if self.companion is not None:
+            self.companion.begin(anew=anew)
         self._history.clear()
         self._place = None
         self._remember()
@@ -275,31 +216,25 @@ class Live(threading.Thread):
         wrong = differences(self.interaction, session)
         if any(not allowed for _, allowed in wrong):
             raise ConfigError("session: " + "; ".join(text for text, _ in wrong) + ".")
-        self.begin()
         self.interaction.gravity, self.interaction.seed = session.gravity, session.seed
-        self._script = _Script(deque(session.entries), session.steps)
+        self.begin()
+        self._script, self._pending = session, deque(session.entries)
         self.playing = True
         self.message = "Playing a session back" + "".join(f"; {text}, so the motion differs" for text, _ in wrong) + "."
 
     def choose(self, source: str) -> None:
         """Shows the live simulation or a take, which is made when it is first asked for."""
-        if source != LIVE and source not in self._recorded:
+        if source != LIVE and source not in self._loaded:
             take = next((t for t in self.takes if t.name == source), None)
             if take is None:
                 raise ConfigError(f"{source!r}: expected {LIVE!r} or one of {[t.name for t in self.takes]}.")
-            beside = take.beside() if take.beside is not None else None
-            self._recorded[source] = _Recorded(take, take.load(), beside)
-        self.source, self._place, self._script = source, None, None
-        self.message = ""
+            self._loaded[source] = take.load(), take.beside() if take.beside is not None else None
+        self.source, self._place, self._script, self.message = source, None, None, ""
 
     def scrub(self, number: int) -> None:
         """Shows a frame of the timeline; time stands."""
-        self.playing = False
-        if self.source == LIVE:
-            self._place = max(0, min(number, len(self._history) - 1))
-        else:
-            recorded = self._recorded[self.source]
-            recorded.number = max(0, min(number, recorded.trajectory.frames - 1))
+        frames = len(self._history) if self.source == LIVE else self._loaded[self.source][0].frames
+        self.playing, self._place = False, max(0, min(number, frames - 1))
 
     def set_pace(self, pace: float) -> None:
         """Sets the speed of time; 1 is real time."""
@@ -310,34 +245,17 @@ class Live(threading.Thread):
     # ------------------------------------------------------------------------------------- frames
 
     def _remember(self) -> None:
-        now = self.interaction
-        held = now.held if bool(now.held.any()) else None
-        speed = (now.state.positions - now.state.previous).norm(dim=-1) * now.fps
-        beside = self.companion.shown() if self.companion is not None else None
-        self._history.append(Shown(now.frame, now.unit_of_kernel, speed, held, beside=beside))
-
-    def _show(self) -> None:
-        self._publish(self.shown())
+        beside = Shown.of(self.companion.interaction) if self.companion is not None else None
+        self._history.append(Shown.of(self.interaction, beside))
 
     def shown(self) -> Shown:
         """The frame that is shown."""
         if self.source != LIVE:
-            return self._recorded[self.source].shown()
+            first, second = self._loaded[self.source]
+            place = self._place or 0
+            beside = shown_frame(second, place, "beside") if second is not None else None
+            return shown_frame(first, place, self.source, beside)
         last = len(self._history) - 1
         place = last if self._place is None else min(self._place, last)
-        kept = self._history[place]
         held = self.interaction.held if bool(self.interaction.held.any()) else None
-        return Shown(kept.frame, kept.unit_of_kernel, kept.speed, held, place, last, LIVE, kept.beside)
-
-
-def _of(trajectory: Trajectory, number: int, name: str, beside: Shown | None = None) -> Shown:
-    frame = SteppedFrame(
-        trajectory.positions[number], trajectory.deformation_gradients[number], trajectory.rotations[number]
-    )  # fmt: skip
-    before = trajectory.positions[max(0, number - 1)]
-    speed = (frame.positions - before).norm(dim=-1) * trajectory.fps
-    if not bool(torch.isfinite(frame.positions).all()):
-        raise DivergenceError(f"{name}: frame {number} is not finite.")
-    return Shown(
-        frame, trajectory.unit_of_kernel, speed, None, number, trajectory.frames - 1, name, beside
-    )  # fmt: skip
+        return replace(self._history[place], held=held, number=place, last=last)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import html
-import math
 import time
 from collections.abc import Callable
 from datetime import datetime
@@ -11,16 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from gausim.core import GausSimError
+from gausim.interaction.selections import Selected
 from gausim.interaction.session import Event, Gravity, Impulse, Pin, Release, Unpin, Wind, parse_session, save_session
+from gausim.interaction.words import parse_direction
 from gausim.viewer.coloring import VIEW, Legend, gradient_css
 from gausim.viewer.hands import Hands
 from gausim.viewer.live import Live
 from gausim.viewer.shown import LIVE, Shown
 
-AXES = {
-    "+x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "+y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
-    "+z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0),
-}  # fmt: skip
+AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 # Said while forces act in part only.
 _AT_LIMIT = "At the limit of what was learned: the forces act only in part. Pull less for what would really happen."
 # Files that one run of the viewer writes at most.
@@ -64,77 +62,76 @@ class Page:
             repaint: called when colours change.
             forget_scales: called when colour scales begin anew.
         """
-        self._server, self._live, self._hands, self._sessions = server, live, hands, sessions
-        self._repaint, self._forget_scales, self._down = repaint, forget_scales, down
+        self._live, self._hands, self._sessions = live, hands, sessions
+        self._repaint, self._forget_scales, self._down, self._title = repaint, forget_scales, down, title
         self.mode, self.highlight, self.saved = VIEW, True, list[Path]()
         self._refreshed, self._modes, self._note = 0.0, modes, ""
-        self._last_status = self._last_legend = ""
         gui = server.gui
         self._status = gui.add_html("")
         tabs = gui.add_tab_group()
-        with tabs.add_tab("Play"):
-            self._play_tab(gui, title)
-        with tabs.add_tab("Push"):
-            self._push_tab(gui)
-        with tabs.add_tab("Look"):
-            self._look_tab(gui)
-        with tabs.add_tab("Session"):
-            self._session_tab(gui)
+        works = {"Play": self._play_tab, "Push": self._push_tab, "Look": self._look_tab, "Session": self._session_tab}
+        for name, build in works.items():
+            with tabs.add_tab(name):
+                build(gui)
         hands.notice = self._selected
 
     # ------------------------------------------------------------------------------------- building
 
-    def _play_tab(self, gui: Any, title: str) -> None:
-        gui.add_html(f"<div style='padding:0 .6em;font-size:.85em'><b>{html.escape(title)}</b></div>")
-        sources = (LIVE, *(take.name for take in self._live.takes))
+    def _play_tab(self, gui: Any) -> None:
+        live = self._live
+        gui.add_html(f"<div style='padding:0 .6em;font-size:.85em'><b>{html.escape(self._title)}</b></div>")
+        sources = (LIVE, *(take.name for take in live.takes))
         self._source = gui.add_dropdown("Shows", sources, initial_value=LIVE, hint="Recordings cannot be pushed.")
-        self._on_choice(self._source, sources, lambda name: self._do(lambda: self._live.choose(name)))
-        works = {
-            "Play": self._live.play, "Pause": self._live.pause, "Step": self._live.step_once, "Reset": self._reset,
-        }  # fmt: skip
-        time_group = gui.add_button_group("Time", tuple(works))
-        self._on_press_of(time_group, works)
-        self._pace = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0, hint="1 is real time")
-        self._on_number(self._pace, 0.1, 4.0, lambda v: self._do(lambda: self._live.set_pace(v)))
+        self._on_change(self._source, sources, lambda name: live.do(lambda: live.choose(name)))
+        works = {"Play": live.play, "Pause": live.pause, "Step": live.step_once, "Reset": self._reset}
+        self._on_press_of(gui.add_button_group("Time", tuple(works)), works)
+        pace = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0, hint="1 is real time")
+        self._on_change(pace, (0.1, 4.0), lambda value: live.do(lambda: live.set_pace(value)))
         self._timeline = gui.add_slider("Frame", 0, 1, 1, 0, hint="The timeline; moving it stops time.")
-        self._on_number(self._timeline, 0, 1 << 20, lambda v: self._do(lambda: self._live.scrub(int(v))))
+        self._on_change(self._timeline, (0, 1 << 20), lambda value: live.do(lambda: live.scrub(int(value))))
 
     def _push_tab(self, gui: Any) -> None:
         hands = self._hands
         gui.add_html(_small("Drag a part to pull at it; with Ctrl to flick it. Shift and drag brushes a region."))
         level = gui.add_dropdown("Picks", hands.level_names, initial_value=hands.first_level)
-        self._on_choice(level, hands.level_names, lambda name: self._now(lambda: hands.choose_level(name)))
+        self._on_change(level, hands.level_names, self._choose_level)
         self._chosen = gui.add_html("")
         self._selected()
         gain = gui.add_slider("Pull", 0.5, 20.0, 0.5, hands.gain, hint="Weights of the part per diagonal of drag")
-        self._on_number(gain, 0.5, 20.0, lambda v: setattr(hands, "gain", v))
+        self._on_change(gain, (0.5, 20.0), lambda value: setattr(hands, "gain", value))
         works = {"Pin": lambda: self._on_selection(Pin), "Unpin": lambda: self._on_selection(Unpin)}
         self._on_press_of(gui.add_button_group("Selection", tuple(works)), works)
         self._on_press(gui.add_button("Let go of everything"), self._let_go)
         with gui.add_folder("Impulse", expand_by_default=False):
             self._amount = gui.add_slider("Weight s", 0.0, 0.3, 0.01, 0.1, hint="1 gives the speed of 1 s of weight")
-            self._toward = gui.add_dropdown("Towards", tuple(AXES), initial_value="+x")
-            self._on_press(gui.add_button("Push once"), self._push_once)
-        self._strength: dict[str, tuple[Any, Any]] = {}
-        for name, axis, kind in (("Wind", "+x", Wind), ("Gravity", self._down, Gravity)):
-            with gui.add_folder(name, expand_by_default=False):
-                strength = gui.add_slider(f"{name} [weights]", 0.0, 3.0, 0.05, 0.0)
-                toward = gui.add_dropdown(f"{name} towards", tuple(AXES), initial_value=axis)
-                self._strength[name] = (strength, toward)
-                self._steady(strength, toward, kind)
+            self._toward = gui.add_dropdown("Towards", AXES, initial_value="+x")
+            self._on_press(gui.add_button("Push once"), lambda: self._on_selection(self._impulse))
+        self._strengths = [self._steady(gui, "Wind", "+x", Wind), self._steady(gui, "Gravity", self._down, Gravity)]
+
+    def _steady(self, gui: Any, name: str, axis: str, kind: type[Wind] | type[Gravity]) -> Any:
+        with gui.add_folder(name, expand_by_default=False):
+            strength = gui.add_slider(f"{name} [weights]", 0.0, 3.0, 0.05, 0.0)
+            toward = gui.add_dropdown(f"{name} towards", AXES, initial_value=axis)
+
+        def blow(_: object) -> None:
+            event = kind(parse_direction(toward.value), float(strength.value))
+            self._live.do(lambda: self._live.act(event))
+
+        self._on_change(strength, (0.0, 3.0), blow)
+        self._on_change(toward, AXES, blow)
+        return strength
 
     def _look_tab(self, gui: Any) -> None:
         choice = gui.add_dropdown("Colours", self._modes, initial_value=self.mode)
-        self._on_choice(choice, self._modes, self._recolour)
+        self._on_change(choice, self._modes, self._recolour)
         self._legend = gui.add_html("")
         handles = gui.add_checkbox("Show the handles", False, hint="What is picked: one per part")
-        self._on_switch(handles, self._hands.show_handles)
-        highlight = gui.add_checkbox("Selection in orange", True)
-        self._on_switch(highlight, self._mark)
+        self._on_change(handles, (False, True), self._hands.show_handles)
+        self._on_change(gui.add_checkbox("Selection in orange", True), (False, True), self._mark)
 
     def _session_tab(self, gui: Any) -> None:
         gui.add_html(_small("Everything done to the object is recorded and can be replayed bit for bit."))
-        self._on_press(gui.add_button("Save the session"), None, direct=self._save)
+        gui.add_button("Save the session").on_click(self._save)
         upload = gui.add_upload_button("Load and play a session", mime_type="application/json")
         upload.on_upload(self._load)
         self._on_press(gui.add_button("Begin a new session"), self._begin)
@@ -142,82 +139,39 @@ class Page:
 
     # ------------------------------------------------------------------------------------- callbacks
 
-    def _do(self, command: Callable[[], None]) -> None:
-        self._live.do(command)
-
-    def _now(self, work: Callable[[], None]) -> None:
-        """Does something that is not the simulation's; what is wrong with it is said on the page."""
-        try:
-            work()
-            self._note = ""
-        except GausSimError as error:
-            self._note = str(error)
-
-    def _on_press(
-        self, button: Any, work: Callable[[], None] | None, *, direct: Callable[[Any], None] | None = None
-    ) -> None:
-        async def pressed(event: Any) -> None:
-            if direct is not None:
-                self._do(lambda: direct(event))
-            elif work is not None:
-                self._do(work)
+    def _on_press(self, button: Any, work: Callable[[], None]) -> None:
+        async def pressed(_: Any) -> None:
+            self._live.do(work)
 
         button.on_click(pressed)
 
     def _on_press_of(self, group: Any, works: dict[str, Callable[[], None]]) -> None:
-        async def pressed(event: Any) -> None:
+        async def pressed(_: Any) -> None:
             if group.value in works:
-                self._do(works[group.value])
+                self._live.do(works[group.value])
 
         group.on_click(pressed)
 
     @staticmethod
-    def _on_number(handle: Any, low: float, high: float, work: Callable[[float], None]) -> None:
+    def _on_change(handle: Any, known: tuple[Any, ...], work: Callable[[Any], None]) -> None:
+        """Does something with a value from the browser that is one of the known, or a number between two of them."""
         good = [handle.value]
 
-        async def moved(event: Any) -> None:
+        async def changed(event: Any) -> None:
             if event.client is None:
                 return  # set by this program
             value = handle.value
-            if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            if any(isinstance(item, str | bool) for item in known):
+                right = value in known
+            else:
+                right = isinstance(value, int | float) and not isinstance(value, bool) and known[0] <= value <= known[1]
+            if right:
+                good[0] = value
+                work(value)
+            else:
                 handle.value = good[0]
-                return
-            good[0] = value
-            work(value)
 
-        handle.on_update(moved)
-
-    @staticmethod
-    def _on_choice(handle: Any, known: tuple[str, ...], work: Callable[[str], None]) -> None:
-        good = [handle.value]
-
-        async def chosen(event: Any) -> None:
-            if event.client is None:
-                return
-            if handle.value not in known:
-                handle.value = good[0]
-                return
-            good[0] = handle.value
-            work(handle.value)
-
-        handle.on_update(chosen)
-
-    @staticmethod
-    def _on_switch(handle: Any, work: Callable[[bool], None]) -> None:
-        async def switched(event: Any) -> None:
-            if event.client is not None:
-                work(bool(handle.value))
-
-        handle.on_update(switched)
-
-    def _steady(self, strength: Any, toward: Any, kind: type[Wind] | type[Gravity]) -> None:
-        def blow(_: object) -> None:
-            value, axis = float(strength.value), toward.value
-            if math.isfinite(value) and 0 <= value <= 3 and axis in AXES:
-                self._do(lambda: self._live.act(kind(AXES[axis], value)))
-
-        self._on_number(strength, 0.0, 3.0, blow)
-        self._on_choice(toward, tuple(AXES), blow)
+        handle.on_update(changed)
 
     # ------------------------------------------------------------------------------------- what they do
 
@@ -240,22 +194,25 @@ class Page:
     def _calm(self) -> None:
         """Sliders show that nothing acts."""
         self._forget_scales()
-        for strength, _ in self._strength.values():
+        for strength in self._strengths:
             strength.value = 0.0
 
-    def _on_selection(self, kind: Callable[[Any], Event]) -> None:
-        if self._hands.selection is None:
-            self._live.message = "Nothing is selected: click a part first."
-            return
-        self._live.act(kind(self._hands.selection))
+    def _choose_level(self, name: str) -> None:
+        try:
+            self._hands.choose_level(name)
+            self._note = ""
+        except GausSimError as error:
+            self._note = str(error)
 
-    def _push_once(self) -> None:
-        amount, axis = float(self._amount.value), self._toward.value
+    def _on_selection(self, kind: Callable[[Selected], Event]) -> None:
         if self._hands.selection is None:
             self._live.message = "Nothing is selected: click a part first."
-        elif 0 < amount <= 0.3 and axis in AXES:
-            most = self._live.interaction.most_force / self._live.interaction.fps
-            self._live.act(Impulse(self._hands.selection, AXES[axis], min(amount, most)))
+        else:
+            self._live.act(kind(self._hands.selection))
+
+    def _impulse(self, on: Selected) -> Impulse:
+        most = self._live.interaction.most_force / self._live.interaction.fps
+        return Impulse(on, parse_direction(self._toward.value), min(float(self._amount.value), most))
 
     def _recolour(self, mode: str) -> None:
         self.mode = mode
@@ -270,7 +227,10 @@ class Page:
         self._chosen.content = _small(f"Selected: {self._hands.described()}.")
         self._repaint()
 
-    def _save(self, event: Any) -> None:
+    async def _save(self, event: Any) -> None:
+        self._live.do(lambda: self._save_for(event.client))
+
+    def _save_for(self, client: Any) -> None:
         if len(self.saved) >= _MOST_FILES:
             self._live.message = f"{_MOST_FILES} sessions were saved already; start the viewer again to save more."
             return
@@ -284,23 +244,21 @@ class Page:
             return
         self.saved.append(path)
         self._saved_text.content = _small(f"Saved {path} ({session.steps} frames, {len(session.entries)} events).")
-        if event.client is not None:
-            event.client.send_file_download(name, path.read_bytes(), save_immediately=True)
+        if client is not None:
+            client.send_file_download(name, path.read_bytes(), save_immediately=True)
 
     async def _load(self, event: Any) -> None:
-        file = event.target.value
+        self._live.do(lambda: self._play_file(event.target.value.content))
 
-        def load() -> None:
-            try:
-                text = file.content.decode("utf-8")
-            except UnicodeDecodeError:
-                self._live.message = "The file is no text in UTF-8; expected a session that gausim saved."
-                return
-            self._live.replay(parse_session(text, "the file"))
-            self._source.value = LIVE
-            self._calm()
-
-        self._do(load)
+    def _play_file(self, content: bytes) -> None:
+        try:
+            text = content.decode("utf-8")
+        except UnicodeDecodeError:
+            self._live.message = "The file is no text in UTF-8; expected a session that gausim saved."
+            return
+        self._live.replay(parse_session(text, "the file"))
+        self._source.value = LIVE
+        self._calm()
 
     # ------------------------------------------------------------------------------------- bringing up to date
 
@@ -314,8 +272,8 @@ class Page:
             self._timeline.max = max(shown.last, 1)
             self._timeline.value = shown.number
         self._write(shown, displayed)
-        if (text := _legend(legend)) != self._last_legend:
-            self._legend.content = self._last_legend = text
+        if (text := _legend(legend)) != self._legend.content:
+            self._legend.content = text
 
     def _write(self, shown: Shown, displayed: float) -> None:
         live = self._live
@@ -335,8 +293,8 @@ class Page:
             )
             + "</div>"
         )  # fmt: skip
-        if text != self._last_status:
-            self._status.content = self._last_status = text
+        if text != self._status.content:
+            self._status.content = text
 
 
 def _small(text: str) -> str:

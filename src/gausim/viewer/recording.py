@@ -12,7 +12,8 @@ import torch
 from gausim.core import DataError, DivergenceError, GaussianScene, SteppedFrame, Trajectory
 from gausim.io.files import write_durably
 from gausim.viewer.coloring import BASE, VIEW, Painter
-from gausim.viewer.guard import Door, GuardedServer
+from gausim.viewer.guard import Door
+from gausim.viewer.server import GuardedServer
 from gausim.viewer.splats import SIZE, Placing, pack
 
 # Buffers of all frames are held at once, and a page holds them in base64 [bytes].

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import html
 import math
 import time
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
+from viser.transforms import SO3
 
 from gausim.core import Cameras, GausSimError
+from gausim.interaction.words import parse_direction
 from gausim.viewer.shown import LIVE, Shown
 from gausim.viewer.splats import SIZE, Placing
 
 if TYPE_CHECKING:
     from gausim.viewer.subject import Subject
 
-_UP = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 _FREE = "Free"
 # Video frames are drawn so often at most [times per second].
 _PICTURES = 6.0
@@ -30,7 +31,6 @@ class Sights:
 
     Attributes:
         up: vertical direction.
-        vertical: the same as a tensor.
         forward: where one looks at first.
         first_position: from where [page units].
         aside: where a companion stands from the object [page units]; zero without one.
@@ -41,8 +41,7 @@ class Sights:
         self._server, self._placing, self._films = server, placing, subject.films
         self._cameras = subject.cameras
         self._takes = {take.name: take.sequence for take in subject.takes}
-        self.up = np.array(_UP[subject.up], float)
-        self.vertical = torch.tensor(self.up, dtype=torch.float32)
+        self.up = np.array(parse_direction(subject.up))
         self.first_position, target, fov = self._first()
         self.forward = (target - self.first_position) / np.linalg.norm(target - self.first_position)
         self.aside = np.zeros(3)
@@ -84,7 +83,7 @@ class Sights:
         rotation = view[:3, :3].T.numpy()
         position = self._placing.to_page(cameras.centers[index].float().cpu()).double().numpy()
         fov = 2 * math.atan(cameras.height / 2 / float(cameras.Ks[index, 1, 1]))
-        return position, quaternion(rotation), rotation[:, 2], -rotation[:, 1], fov
+        return position, SO3.from_matrix(rotation).wxyz, rotation[:, 2], -rotation[:, 1], fov
 
     def _add_cameras(self, cameras: Cameras) -> None:
         gui = self._server.gui
@@ -93,18 +92,10 @@ class Sights:
             frustums = gui.add_checkbox("Show them", False)
         for index in range(len(cameras.names)):
             position, wxyz, _, _, fov = self._pose(cameras, index)
-            self._frustums.append(
-                self._server.scene.add_camera_frustum(
-                    f"/cameras/{index}",
-                    fov=fov,
-                    aspect=cameras.width / cameras.height,
-                    scale=0.12 * SIZE,
-                    wxyz=wxyz,
-                    position=position,
-                    color=(60, 110, 200),
-                    visible=False,
-                )  # fmt: skip
-            )
+            self._frustums.append(self._server.scene.add_camera_frustum(
+                f"/cameras/{index}", fov=fov, aspect=cameras.width / cameras.height, scale=0.12 * SIZE, wxyz=wxyz,
+                position=position, color=(60, 110, 200), visible=False,
+            ))  # fmt: skip
 
         async def chosen(event: Any) -> None:
             if event.client is not None and choice.value in cameras.names:
@@ -151,8 +142,7 @@ class Sights:
         on = bool(self._on.value) and sequence is not None and view in self._films.views
         self._picture.visible = on
         if not on or sequence is None:
-            hint = "Choose a recording under Play to compare." if self._on.value else ""
-            self._say(hint)
+            self._say("Choose a recording under Play to compare." if self._on.value else "")
             return
         try:
             truth = self._films.truth(sequence, view, shown.number)
@@ -166,16 +156,6 @@ class Sights:
         self._picture.image = np.concatenate((left, line, drawn), 1)
 
     def _say(self, text: str) -> None:
-        import html
-
         content = f"<div style='padding:0 .6em;font-size:.8em'>{html.escape(text)}</div>" if text else ""
         if self._said.content != content:
             self._said.content = content
-
-
-def quaternion(rotation: np.ndarray) -> np.ndarray:
-    """Unit quaternion w x y z of a rotation matrix."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(rotation).as_quat()
-    return np.array([w, x, y, z])

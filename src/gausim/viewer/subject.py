@@ -10,7 +10,7 @@ from gausim.core import Cameras
 from gausim.interaction.interaction import Interaction
 from gausim.viewer.companion import Companion
 from gausim.viewer.films import Films
-from gausim.viewer.live import Take
+from gausim.viewer.shown import Take
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -62,6 +61,8 @@ def simulate_forces(run: LoadedRun, arguments: argparse.Namespace) -> int:
 
 def _prepared(run: LoadedRun, arguments: argparse.Namespace) -> tuple[ForceSession, Interaction, RunObject]:
     """What to do, with what, and to which object."""
+    from msgspec.structs import replace
+
     from gausim.compose.live import REST, open_interaction
     from gausim.compose.predict import run_objects
     from gausim.interaction.interaction import STANDARD_GRAVITY, differences
