@@ -21,7 +21,7 @@ from data_prep.common.progress import Tick, bars, silent
 from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
-    from data_prep.scenes.gathered import Gathered
+    from data_prep.ready.gathered import Gathered
 
 # Raise when the same inputs and settings give another result than before.
 REVISION = 1
@@ -69,7 +69,7 @@ def assemble(
     """Runs the stage.
 
     Args:
-        pictures: folders with posed RGBA pictures, see :func:`data_prep.scenes.gathered.gather`.
+        pictures: folders with posed RGBA pictures, see :func:`data_prep.ready.gathered.gather`.
         out: folder of the result, in the layout of docs/data.md.
         options: what the pictures do not say.
         scene: the rest scene (PLY, its masks beside it), or the folder of the stage that made it.
@@ -84,7 +84,7 @@ def assemble(
         ConfigError: an option does not suit the pictures.
     """
     from data_prep.common.stage import Stage, run_stage
-    from data_prep.scenes.gathered import gather
+    from data_prep.ready.gathered import gather
 
     options = options or AssembleOptions()
     found = gather(pictures)
@@ -111,7 +111,7 @@ def dataset_facts(found: Gathered, options: AssembleOptions, name: str) -> dict[
         DataError: cameras or rates of the sequences differ, or a sequence is too short.
         ConfigError: an option does not suit the pictures.
     """
-    from data_prep.scenes.gathered import common_rate, common_views
+    from data_prep.ready.gathered import common_rate, common_views
 
     given = _checked(found.facts)
     views = common_views(found.sequences)
@@ -233,12 +233,12 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
     ]
     if results["scene"]:
         return "\n".join([*lines, f"train       gausim train data=object data.root={out} name={facts['name']}"])
-    return "\n".join([*lines, f"scene       none yet: python -m data_prep.reconstruct {out} --out DIR"])
+    return "\n".join([*lines, f"scene       none yet: gausim prepare reconstruct {out} --out DIR"])
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m data_prep.assemble", description=__doc__.replace("``", ""),
+        prog="gausim prepare assemble", description=__doc__.replace("``", ""),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument(

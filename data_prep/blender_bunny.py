@@ -1,6 +1,6 @@
 """Makes the paper's synthetic set with Blender: an elastic object, set off by pokes and drags, filmed all around.
 
-Run ``python -m data_prep.blender_bunny --mesh bunny.obj``. Any OBJ or PLY mesh will do. Blender's soft body moves it
+Run ``gausim prepare blender_bunny --mesh bunny.obj``. Any OBJ or PLY mesh will do. Blender's soft body moves it
 and Cycles renders it, in a Python environment that is created at the first run (about 1 GB in the user's cache
 directory) and is no part of gausim's own. What was interrupted goes on picture by picture; the same settings give the
 same bytes.
@@ -103,7 +103,7 @@ def _plan(arguments: argparse.Namespace) -> Plan:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m data_prep.blender_bunny", description=__doc__.replace("``", ""),
+        prog="gausim prepare blender_bunny", description=__doc__.replace("``", ""),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--mesh", type=Path, required=True, metavar="FILE", help="surface of the object, OBJ or PLY")

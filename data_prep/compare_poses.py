@@ -37,7 +37,7 @@ def read_poses(path: Path, images: Path | None = None) -> dict[str, np.ndarray]:
     except DataError:
         if images is None:
             raise
-        from data_prep.cameras.sources import factors, match_matrices, read_matrix
+        from data_prep.capture.cameras.sources import factors, match_matrices, read_matrix
         from data_prep.common.photos import list_images
 
         found = match_matrices(path, list_images(images))
@@ -70,7 +70,7 @@ def _by_stem(poses: dict[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m data_prep.compare_poses",
+        prog="gausim prepare compare_poses",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -89,7 +89,7 @@ def comparison(poses: Path, reference: Path, images: Path | None) -> str:
     """
     import numpy as np
 
-    from data_prep.cameras.world import compare
+    from data_prep.capture.cameras.world import compare
 
     mine, other = (read_poses(path, images) for path in (poses, reference))
     names = sorted(set(mine) & set(other))

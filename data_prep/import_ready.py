@@ -22,7 +22,7 @@ from gausim.core.errors import ConfigError, DataError
 from gausim.io.files import write_json
 
 if TYPE_CHECKING:
-    from data_prep.scenes.ready import ReadyFiles
+    from data_prep.ready.authors import ReadyFiles
 
 # Raise when the same inputs and settings give another result than before.
 REVISION = 1
@@ -83,7 +83,7 @@ def import_ready(
         SceneError: the point cloud is no 3DGS scene, or a mask marks nothing.
     """
     from data_prep.common.stage import Stage, run_stage
-    from data_prep.scenes.ready import find_files
+    from data_prep.ready.authors import find_files
 
     files = find_files(root, image_masks, video_masks)
     unknown = sorted(set(options.heldout) - set(files.views))
@@ -96,8 +96,8 @@ def import_ready(
 
 
 def _make(work: Path, files: ReadyFiles, options: ReadyOptions, tick: Tick) -> dict[str, Any]:
-    from data_prep.cameras.output import Straighteners, write_points, write_sequence, write_stills
-    from data_prep.scenes.ready import sequence_poses
+    from data_prep.capture.cameras.output import Straighteners, write_points, write_sequence, write_stills
+    from data_prep.ready.authors import sequence_poses
 
     straighteners = Straighteners()
     results: dict[str, Any] = {"stills": len(files.stills), "sequences": {}, "left_out": files.left_out}
@@ -141,8 +141,8 @@ def _scene(work: Path, files: ReadyFiles, options: ReadyOptions) -> dict[str, in
     """Writes the scene with its masks, where there is one, and returns how many kernels they mark."""
     import torch
 
-    from data_prep.scenes.ready import read_pins
-    from data_prep.scenes.selections import read_points
+    from data_prep.ready.authors import read_pins
+    from data_prep.ready.selections import read_points
     from gausim.io.ply import load_scene, save_scene
     from gausim.ops.selection import NearPoints, apply_masks
 
@@ -193,7 +193,7 @@ def summary(results: Mapping[str, Any]) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m data_prep.import_ready",
+        prog="gausim prepare import_ready",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -1,6 +1,6 @@
 """Several cameras' films of each sequence to synchronised, lossless frames.
 
-Run ``python -m data_prep.ingest FILMS --out OUT``. Cameras are put on one clock by their time code, else by their
+Run ``gausim prepare ingest FILMS --out OUT``. Cameras are put on one clock by their time code, else by their
 sound, else by a flash that all saw, else by given offsets; a camera that ends up more than half a frame from where it
 should be is refused by name. The output is sequences/seq_000/cam_0/0000.png and so on (8-bit RGB), a sheet per sequence
 to check the synchronisation by eye, and a manifest with every camera's facts.
@@ -24,10 +24,10 @@ from gausim.io.files import write_durably, write_json
 if TYPE_CHECKING:
     import numpy as np
 
+    from data_prep.capture.films.film import Film
+    from data_prep.capture.films.sync import Alignment, Offsets
+    from data_prep.capture.films.takes import Take
     from data_prep.common.progress import Tick
-    from data_prep.films.film import Film
-    from data_prep.films.sync import Alignment, Offsets
-    from data_prep.films.takes import Take
 
 # Raise when the same films and settings give other frames than before.
 REVISION = 1
@@ -76,7 +76,7 @@ def ingest(
     """Writes synchronised frames of all sequences.
 
     Args:
-        films: folder or list file, see :func:`data_prep.films.takes.find_takes`.
+        films: folder or list file, see :func:`data_prep.capture.films.takes.find_takes`.
         out: directory of the result.
         options: what is chosen.
         force: replace a result of other films or settings.
@@ -88,8 +88,8 @@ def ingest(
     Raises:
         DataError: a film is unusable, or the films do not go together.
     """
+    from data_prep.capture.films.takes import find_takes
     from data_prep.common.stage import Stage, run_stage
-    from data_prep.films.takes import find_takes
 
     options = options or Options()
     takes = find_takes(films)
@@ -130,7 +130,7 @@ def _one_take(take: Take, folder: Path, options: Options, advance: Tick | None) 
             film, alignment.frames[camera], folder / camera, options.max_side,
             lambda done, i=i: advance and advance(take.source, i * total // len(films) + done, total),  # type: ignore[misc]
         )  # fmt: skip
-    from data_prep.films.sheet import write_sheet
+    from data_prep.capture.films.sheet import write_sheet
 
     write_sheet(folder / "sync.png", thumbnails, found)
     write_json(marker, found)
@@ -146,8 +146,8 @@ def synchronise(take: Take, options: Options) -> tuple[dict[str, Film], Alignmen
     Raises:
         DataError: a film is unusable, or the films do not go together.
     """
-    from data_prep.films.film import probe
-    from data_prep.films.sync import facts
+    from data_prep.capture.films.film import probe
+    from data_prep.capture.films.sync import facts
 
     films = {camera: probe(path) for camera, path in take.films.items()}
     try:
@@ -166,8 +166,8 @@ def synchronise(take: Take, options: Options) -> tuple[dict[str, Film], Alignmen
 
 
 def _placed(take: Take, films: Mapping[str, Film], options: Options) -> tuple[Offsets, Alignment]:
-    from data_prep.films.sync import align, measure
-    from data_prep.films.takes import offset_seconds
+    from data_prep.capture.films.sync import align, measure
+    from data_prep.capture.films.takes import offset_seconds
 
     given = {}
     for name, text in (take.offsets or options.offsets or {}).items():
@@ -210,7 +210,7 @@ def _write_camera(
     """Writes the frames of one camera that are not there yet; returns a small grey picture of each."""
     import cv2
 
-    from data_prep.films.film import pictures, upright
+    from data_prep.capture.films.film import pictures, upright
 
     places: dict[int, list[int]] = {}
     for place, index in enumerate(indices):
@@ -286,7 +286,7 @@ def _parser() -> argparse.ArgumentParser:
     from data_prep.common.command import add_result
 
     parser = argparse.ArgumentParser(
-        prog="python -m data_prep.ingest", description=__doc__.split("\n")[0],
+        prog="gausim prepare ingest", description=__doc__.split("\n")[0],
         epilog=LAYOUT, formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument(

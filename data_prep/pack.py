@@ -1,6 +1,6 @@
 """Packs an object's sequences for streaming: only the foreground's part of each view, as bytes that need no decoding.
 
-Run ``python -m data_prep.pack ROOT --out STORE``. STORE is a data set of its own, which every command takes; frames are
+Run ``gausim prepare pack ROOT --out STORE``. STORE is a data set of its own, which every command takes; frames are
 read from it where they lie, so that training never holds it in memory. ``gausim verify STORE`` checks it.
 """
 
@@ -61,7 +61,7 @@ def pack(root: Path, out: Path, *, margin: int = 2, force: bool = False, tick: T
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m data_prep.pack", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="gausim prepare pack", description=__doc__.split("\n")[0])
     parser.add_argument("root", type=Path, metavar="ROOT", help="directory of the object (dataset.json, sequences/)")
     parser.add_argument(
         "--margin", type=int, default=2, metavar="PIXELS",

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from data_prep.cameras.material import Material, Sources
+from data_prep.capture.cameras.material import Material, Sources
 from data_prep.common.command import add_result, headline, told
 from data_prep.common.progress import Tick, silent
 from gausim.core.errors import DataError
@@ -23,10 +23,10 @@ from gausim.io.files import replacing
 if TYPE_CHECKING:
     import numpy as np
 
-    from data_prep.cameras.mapping import MappingOptions
-    from data_prep.cameras.output import Straighteners
-    from data_prep.cameras.sources import Posed
-    from data_prep.cameras.world import Similarity
+    from data_prep.capture.cameras.mapping import MappingOptions
+    from data_prep.capture.cameras.output import Straighteners
+    from data_prep.capture.cameras.sources import Posed
+    from data_prep.capture.cameras.world import Similarity
     from gausim.io.colmap_files import PointTable
 
 # Raise when the same inputs and settings give another result than before.
@@ -93,9 +93,9 @@ def _make(
     work: Path, sources: Sources, material: Material, mapping: MappingOptions, world: WorldOptions, tick: Tick
 ) -> dict[str, Any]:
     """Does the stage's work in ``work``."""
-    from data_prep.cameras.mapping import forget
-    from data_prep.cameras.output import Straighteners, key_of, write_points, write_stills
-    from data_prep.cameras.report import draw_cameras, reprojection
+    from data_prep.capture.cameras.mapping import forget
+    from data_prep.capture.cameras.output import Straighteners, key_of, write_points, write_stills
+    from data_prep.capture.cameras.report import draw_cameras, reprojection
 
     found, points, results = _found(work, sources, material, mapping, tick)
     move, results["world"] = _world(found, points, world, mapped=sources.kind == "mapping")
@@ -124,7 +124,7 @@ def _write_sequences(
 
     ``used`` gets the keys of the images that are fixed cameras, and so no stills.
     """
-    from data_prep.cameras.output import key_of, write_sequence
+    from data_prep.capture.cameras.output import key_of, write_sequence
 
     by_name = {key_of(shot.photo.name): shot for shot in moved}
     sequences, left_out = {}, {}
@@ -153,7 +153,7 @@ def _write_sequences(
 def _cameras_of(
     folder: Path, names: Sequence[str], by_name: dict[str, Posed], used: set[str]
 ) -> tuple[dict[str, Posed], list[str]]:
-    from data_prep.cameras.output import sequence_cameras
+    from data_prep.capture.cameras.output import sequence_cameras
 
     cameras, missing = sequence_cameras(folder, by_name, names)
     used.update(k for name in cameras for k in (f"{folder.name}/{name}", name) if k in by_name)
@@ -161,7 +161,7 @@ def _cameras_of(
 
 
 def _colors(found: list[Posed], points: PointTable, sources: Sources) -> np.ndarray:
-    from data_prep.cameras.report import point_colors
+    from data_prep.capture.cameras.report import point_colors
 
     return points.rgb if sources.kind == "colmap" else point_colors(found, points)
 
@@ -170,7 +170,7 @@ def _found(
     work: Path, sources: Sources, material: Material, mapping: MappingOptions, tick: Tick
 ) -> tuple[list[Posed], PointTable, dict[str, Any]]:
     """Poses in the world that they were found in, points, and what is to be told of them."""
-    from data_prep.cameras import sources as pose_sources
+    from data_prep.capture.cameras import sources as pose_sources
     from gausim.io.colmap import find_colmap, read_colmap
 
     points = pose_sources.no_points()
@@ -192,9 +192,9 @@ def _map(
     work: Path, material: Material, options: MappingOptions, tick: Tick
 ) -> tuple[list[Posed], PointTable, dict[str, Any]]:
     """Poses by structure from motion of the stills and the first frames of all videos."""
-    from data_prep.cameras.mapping import map_photos
-    from data_prep.cameras.report import failures
-    from data_prep.cameras.sources import from_model
+    from data_prep.capture.cameras.mapping import map_photos
+    from data_prep.capture.cameras.report import failures
+    from data_prep.capture.cameras.sources import from_model
     from data_prep.common.photos import list_images, open_photo
     from gausim.io.colmap import read_colmap
 
@@ -235,7 +235,7 @@ def _world(
     found: list[Posed], points: PointTable, options: WorldOptions, *, mapped: bool
 ) -> tuple[Similarity, dict[str, Any]]:
     """The transform to the world that was asked for, and what is to be told of it."""
-    from data_prep.cameras.world_options import place
+    from data_prep.capture.cameras.world_options import place
 
     return place(found, points, up=options.up, distances=options.distances, mapped=mapped)
 
@@ -243,7 +243,7 @@ def _world(
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     arguments = _parser().parse_args(argv)
-    from data_prep.cameras.mapping import MappingOptions
+    from data_prep.capture.cameras.mapping import MappingOptions
     from data_prep.common.progress import bars
 
     def run() -> str:
@@ -290,7 +290,7 @@ def _summary(out: Path, manifest: dict[str, Any]) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m data_prep.poses", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="gausim prepare poses", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add_result(parser)
     group = parser.add_argument_group("what is posed")

@@ -98,7 +98,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m data_prep.reconstruct", description=__doc__,
+        prog="gausim prepare reconstruct", description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("root", type=Path, metavar="ROOT", help="folder with transforms.json or dataset.json")

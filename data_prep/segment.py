@@ -1,6 +1,6 @@
 """Foreground masks: pictures or films to RGBA with straight alpha, and overlays to check them by eye.
 
-Run ``python -m data_prep.segment PICTURES --out OUT --backend …`` on a folder of pictures, on what ``ingest`` made, or
+Run ``gausim prepare segment PICTURES --out OUT --backend …`` on a folder of pictures, on what ``ingest`` made, or
 on a film. Every picture becomes a PNG of the same name and folder whose alpha is the mask; overlays/ holds a film, a
 sheet and figures of each folder.
 """
@@ -12,8 +12,8 @@ import json
 import math
 import shutil
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,10 +23,11 @@ from gausim.io.files import write_durably, write_json
 if TYPE_CHECKING:
     import numpy as np
 
+    from data_prep.capture.masks.backend import Backend
+    from data_prep.capture.masks.cleanup import Cleanup
+    from data_prep.capture.masks.clips import Clip
+    from data_prep.capture.masks.segmenters import MaskOf, Segmenter
     from data_prep.common.progress import Tick
-    from data_prep.masks.cleanup import Cleanup
-    from data_prep.masks.clips import Clip
-    from data_prep.masks.segmenters import MaskOf, Segmenter
 
 # Raise when the same pictures and settings give other masks than before.
 REVISION = 1
@@ -34,27 +35,6 @@ BACKENDS = ("alpha", "background", "chroma", "onnx", "sam2")
 RAW, FRAMES, OVERLAYS = ".raw", ".frames", "overlays"
 # Below this overlap with the mask before, a frame is worth a look.
 STEADY = 0.8
-
-
-@dataclass(frozen=True)
-class Backend:
-    """A way to tell foreground from background, with what its result depends on.
-
-    Attributes:
-        name: of the backend.
-        make: makes the segmenter; called once, and only if there is something to do.
-        soft: masks have soft edges of their own; others are softened along the picture's edges.
-        settings: what was chosen (plain data).
-        inputs: files it reads besides the pictures.
-        packages: libraries whose versions may matter.
-    """
-
-    name: str
-    make: Callable[[], Segmenter]
-    soft: bool = False
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    inputs: Mapping[str, Path] = field(default_factory=dict)
-    packages: tuple[str, ...] = ()
 
 
 def segment(
@@ -86,8 +66,8 @@ def segment(
     Raises:
         DataError: a picture is unusable, or a folder's masks are all empty.
     """
+    from data_prep.capture.masks.clips import film_frames, find_clips, is_film
     from data_prep.common.stage import Stage, run_stage
-    from data_prep.masks.clips import film_frames, find_clips, is_film
 
     film = is_film(source)
     if not film and not source.is_dir():
@@ -137,7 +117,7 @@ class _Run:
 
     def clip(self, clip: Clip) -> dict[str, Any]:
         """Makes a clip's files; its figures, written last, say that it is complete."""
-        from data_prep.masks.overlays import write_overlays
+        from data_prep.capture.masks.overlays import write_overlays
 
         marker = self._work / OVERLAYS / f"{clip.flat}.json"
         if marker.is_file():
@@ -155,7 +135,7 @@ class _Run:
         """The backend's masks, each an 8-bit file; those of an interrupted attempt are kept."""
         import numpy as np
 
-        from data_prep.masks.clips import write_picture
+        from data_prep.capture.masks.clips import write_picture
 
         mask_of: MaskOf | None = None
         for i in range(len(clip)):
@@ -172,8 +152,8 @@ class _Run:
         """Cleans the masks, writes RGBA, and returns figures."""
         import numpy as np
 
-        from data_prep.masks.cleanup import cleaned, matte, overlap, steady
-        from data_prep.masks.clips import read_picture, write_picture
+        from data_prep.capture.masks.cleanup import cleaned, matte, overlap, steady
+        from data_prep.capture.masks.clips import read_picture, write_picture
 
         def raw(index: int) -> np.ndarray:
             return read_picture(self._raw(clip, index))[..., 0].astype(np.float32) / 255
@@ -236,11 +216,11 @@ def _figures(clip: Clip, coverage: list[float], overlaps: list[float], border: l
 
 def _rate(source: Path) -> float:
     """Frames per second of the overlay: the film's, ingest's, or 24."""
+    from data_prep.capture.masks.clips import is_film
     from data_prep.common.stage import MANIFEST, read_manifest
-    from data_prep.masks.clips import is_film
 
     if is_film(source):
-        from data_prep.films.film import probe
+        from data_prep.capture.films.film import probe
 
         return float(probe(source).rate)
     if (source / MANIFEST).is_file():
@@ -277,9 +257,9 @@ def _carry(files: Mapping[str, Path], work: Path, pictures: Mapping[str, Path]) 
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     arguments = _parser().parse_args(argv)
+    from data_prep.capture.masks.options import make_backend, make_cleanup
     from data_prep.common.command import headline, told
     from data_prep.common.progress import bars
-    from data_prep.masks.options import make_backend, make_cleanup
 
     def run() -> str:
         backend, cleanup = make_backend(arguments), make_cleanup(arguments)
@@ -314,9 +294,9 @@ def _some(what: str, names: list[str]) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from data_prep.masks.options import add_options
+    from data_prep.capture.masks.options import add_options
 
-    parser = argparse.ArgumentParser(prog="python -m data_prep.segment", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="gausim prepare segment", description=__doc__.split("\n")[0])
     add_options(parser, BACKENDS)
     return parser
 

@@ -52,7 +52,7 @@ def select(
     Args:
         scene: 3DGS scene (PLY).
         out: folder of the result.
-        selections: by mask, texts as :func:`data_prep.scenes.selections.parse_selection` reads them; other masks stay.
+        selections: by mask, texts as :func:`data_prep.ready.selections.parse_selection` reads them; other masks stay.
         masks: its masks so far; those beside the scene when None.
         up: axis drawn upwards, with a minus sign where it points down.
         size: of each picture [pixels].
@@ -67,7 +67,7 @@ def select(
         ConfigError: nothing is selected.
     """
     from data_prep.common.stage import Stage, run_stage
-    from data_prep.scenes.selections import parse_selection
+    from data_prep.ready.selections import parse_selection
     from gausim.io.ply import masks_path
 
     unknown = sorted(set(selections) - set(MASKS))
@@ -164,7 +164,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
-        prog="python -m data_prep.select", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="gausim prepare select", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scene", type=Path, metavar="SCENE", help="3DGS scene (PLY)")
     add_result(parser)

@@ -1,6 +1,6 @@
 """Makes the embedded synthetic data set: elastic puddings and flowers, filmed by several cameras.
 
-Run ``python -m data_prep.synthesize``. Bodies move by MuJoCo's finite elements (none of gausim's own models), carry
+Run ``gausim prepare synthesize``. Bodies move by MuJoCo's finite elements (none of gausim's own models), carry
 Gaussians in their cells, and are photographed by the reference renderer. Everything follows from the settings and the
 seed; a set that is already there with the same settings is left alone.
 """
@@ -81,7 +81,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m data_prep.synthesize", description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(prog="gausim prepare synthesize", description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, default=Path("data/synthetic"), help="folder of the set (%(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of everything random (%(default)s)")
     parser.add_argument("--quick", action="store_true", help="a tiny set, for tests")

@@ -32,7 +32,7 @@ class Stage:
     """One stage with everything that its result depends on.
 
     Attributes:
-        name: of the stage, as in ``python -m data_prep.NAME``.
+        name: of the stage, as in ``gausim prepare NAME``.
         revision: raised when the same inputs and settings give another result than before.
         inputs: files it reads, by the names that the manifest gives them.
         settings: everything that was chosen; plain data (as JSON knows it).

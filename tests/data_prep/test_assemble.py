@@ -20,7 +20,7 @@ from helpers import toy_object
 
 from data_prep.assemble import AssembleOptions, assemble, main
 from data_prep.common.stage import read_manifest
-from data_prep.prepare import main as prepare_main
+from data_prep.dataset import main as prepare_main
 from gausim.core import Cameras, ConfigError, DataError
 from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule

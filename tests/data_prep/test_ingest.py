@@ -19,12 +19,12 @@ import cv2
 import numpy as np
 import pytest
 
+from data_prep.capture.films.film import probe
+from data_prep.capture.films.sync import align, measure
+from data_prep.capture.films.takes import find_takes, offset_seconds
+from data_prep.capture.films.timecode import label_of_frame
 from data_prep.common.photos import natural
 from data_prep.common.stage import read_manifest
-from data_prep.films.film import probe
-from data_prep.films.sync import align, measure
-from data_prep.films.takes import find_takes, offset_seconds
-from data_prep.films.timecode import label_of_frame
 from data_prep.ingest import Options, ingest, main
 from gausim.core import DataError
 

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 import torch
 
-from data_prep.common.stage import read_manifest
-from data_prep.masks.cleanup import (
+from data_prep.capture.masks.backend import Backend
+from data_prep.capture.masks.cleanup import (
     UNTOUCHED,
     Cleanup,
     cleaned,
@@ -27,11 +27,12 @@ from data_prep.masks.cleanup import (
     soften,
     steady,
 )
-from data_prep.masks.clips import find_clips, read_picture
-from data_prep.masks.onnx_segmenter import OnnxSegmenter
-from data_prep.masks.sam2_segmenter import Prompt, Sam2Segmenter, load_predictor, make_prompt
-from data_prep.masks.segmenters import BackgroundSegmenter, ChromaSegmenter
-from data_prep.segment import Backend, main, segment
+from data_prep.capture.masks.clips import find_clips, read_picture
+from data_prep.capture.masks.onnx_segmenter import OnnxSegmenter
+from data_prep.capture.masks.sam2_segmenter import Prompt, Sam2Segmenter, load_predictor, make_prompt
+from data_prep.capture.masks.segmenters import BackgroundSegmenter, ChromaSegmenter
+from data_prep.common.stage import read_manifest
+from data_prep.segment import main, segment
 from gausim.core import ConfigError, DataError
 
 SIZE = 96, 72

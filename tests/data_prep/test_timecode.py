@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import pytest
 
-from data_prep.films.timecode import label_of_frame, parse_timecode
+from data_prep.capture.films.timecode import label_of_frame, parse_timecode
 from gausim.core import DataError
 
 NTSC = Fraction(30000, 1001)

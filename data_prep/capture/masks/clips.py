@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from data_prep.capture.films.takes import FILMS
 from data_prep.common.photos import SUFFIXES, natural
-from data_prep.films.takes import FILMS
 from gausim.core import DataError
 from gausim.io.files import write_durably
 from gausim.io.pixels import decode
@@ -94,7 +94,7 @@ def _drawn_by_a_stage(path: Path) -> bool:
 
 def film_frames(film: Path, folder: Path) -> None:
     """Writes a film's frames, upright, as 0000.png and so on; those that are there are kept."""
-    from data_prep.films.film import pictures, probe, upright
+    from data_prep.capture.films.film import pictures, probe, upright
 
     facts = probe(film)
     if len(list(folder.glob("*.png"))) == len(facts):

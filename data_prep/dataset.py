@@ -6,7 +6,7 @@
       poses: {images: photos/flower, sequences: "{ingest}"}
       segment: {pictures: "{poses}", backend: onnx, onnx: isnet.onnx}
 
-Keys are the options of ``python -m data_prep.STAGE`` (films, pictures, scene of select, and root are arguments of its
+Keys are the options of ``gausim prepare STAGE`` (films, pictures, scene of select, and root are arguments of its
 command); ``true`` is a flag, a list several values. ``{STAGE}`` in a value is the directory of an earlier stage; a text
 that names a file or folder beside the configuration becomes its path. A stage that runs twice has a name of its own
 each time: ``segment-films`` beside ``segment``. A stage whose result is there already is not run again; what was
@@ -107,7 +107,7 @@ def prepare(config: Path, *, force: bool = False) -> int:
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     parser = argparse.ArgumentParser(
-        prog="python -m data_prep.prepare", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="gausim prepare dataset", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("config", type=Path, metavar="CONFIG.yaml", help="what to run")
     parser.add_argument("--force", action="store_true", help="replace results of other inputs or settings")

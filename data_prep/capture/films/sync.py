@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from data_prep.films.film import SOUND_RATE, Film, pictures, sound
-from data_prep.films.flash import Flash, brightness, flash_lag, flashes
-from data_prep.films.sound import sound_lag
+from data_prep.capture.films.film import SOUND_RATE, Film, pictures, sound
+from data_prep.capture.films.flash import Flash, brightness, flash_lag, flashes
+from data_prep.capture.films.sound import sound_lag
 from gausim.core import DataError
 
 METHODS = ("timecode", "audio", "flash", "offsets")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from data_prep.cameras.lenses import Straightened, straighten
-from data_prep.cameras.sources import Posed, fitted
+from data_prep.capture.cameras.lenses import Straightened, straighten
+from data_prep.capture.cameras.sources import Posed, fitted
 from data_prep.common.photos import Photo, list_images, open_photo, read_photo, write_png
 from data_prep.common.progress import Tick
 from gausim.core.errors import DataError

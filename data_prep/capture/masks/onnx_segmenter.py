@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from data_prep.masks.clips import Clip
-from data_prep.masks.segmenters import MaskOf
+from data_prep.capture.masks.clips import Clip
+from data_prep.capture.masks.segmenters import MaskOf
 from gausim.core import ConfigError, DataError
 
 ACTIVATIONS = ("none", "sigmoid", "minmax")
@@ -69,7 +69,7 @@ class OnnxSegmenter:
             )
 
     def open(self, clip: Clip) -> MaskOf:
-        """See :class:`data_prep.masks.segmenters.Segmenter`."""
+        """See :class:`data_prep.capture.masks.segmenters.Segmenter`."""
         return lambda index: self.mask(clip.rgb(index))
 
     def mask(self, rgb: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from data_prep.masks.clips import Clip, read_picture, sampled
+from data_prep.capture.masks.clips import Clip, read_picture, sampled
 from gausim.core import DataError
 
 MaskOf = Callable[[int], np.ndarray]

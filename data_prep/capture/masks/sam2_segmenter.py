@@ -15,8 +15,8 @@ from typing import Any, Protocol
 import cv2
 import numpy as np
 
-from data_prep.masks.clips import Clip
-from data_prep.masks.segmenters import MaskOf
+from data_prep.capture.masks.clips import Clip
+from data_prep.capture.masks.segmenters import MaskOf
 from gausim.core import ConfigError, DataError
 from gausim.io.plain_json import parse_json
 
@@ -54,7 +54,7 @@ class VideoPredictor(Protocol):
 
 
 class Sam2Segmenter:
-    """SAM 2's video predictor behind the protocol of :class:`data_prep.masks.segmenters.Segmenter`."""
+    """SAM 2's video predictor behind the protocol of :class:`data_prep.capture.masks.segmenters.Segmenter`."""
 
     def __init__(self, predictor: VideoPredictor, prompts: Mapping[str, Prompt], *, device: str = "cpu") -> None:
         """Takes a predictor and prompts.
@@ -67,7 +67,7 @@ class Sam2Segmenter:
         self._predictor, self._prompts, self._device = predictor, prompts, device
 
     def open(self, clip: Clip) -> MaskOf:
-        """See :class:`data_prep.masks.segmenters.Segmenter`; the pictures are followed once, as they are asked for."""
+        """See :class:`data_prep.capture.masks.segmenters.Segmenter`; the pictures are followed once, as they are asked for."""
         height, width = clip.rgb(0).shape[:2]
         prompt = _fitting(self._prompts.get(clip.name, self._prompts.get("")), clip, width, height)
         masks = self._follow(clip, prompt, (height, width))

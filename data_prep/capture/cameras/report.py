@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from data_prep.cameras.lenses import project
-from data_prep.cameras.sources import Posed
-from data_prep.cameras.world import centers
+from data_prep.capture.cameras.lenses import project
+from data_prep.capture.cameras.sources import Posed
+from data_prep.capture.cameras.world import centers
 from data_prep.common.photos import Photo, read_photo
 from gausim.io.colmap_files import PointTable
 

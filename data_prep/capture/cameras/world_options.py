@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from data_prep.cameras.sources import Posed
-from data_prep.cameras.world import (
+from data_prep.capture.cameras.sources import Posed
+from data_prep.capture.cameras.world import (
     Similarity,
     centers,
     identity,

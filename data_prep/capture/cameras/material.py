@@ -90,12 +90,12 @@ def _taken_over(sources: Sources) -> dict[str, Path]:
         names = [image.name for image in read_colmap(folder).images]
         return {**colmap_files(folder), **{f"images/{name}": sources.images / name for name in names}}
     if sources.transforms is not None:
-        from data_prep.cameras.sources import read_lens_transforms
+        from data_prep.capture.cameras.sources import read_lens_transforms
 
         posed = read_lens_transforms(sources.transforms)
         return {"transforms": sources.transforms, **{f"images/{p.photo.name}": p.photo.path for p in posed}}
     if sources.projections is not None:
-        from data_prep.cameras.sources import matrix_files_of
+        from data_prep.capture.cameras.sources import matrix_files_of
 
         assert sources.images is not None
         images = {f"images/{p.name}": p for p in list_images(sources.images)}

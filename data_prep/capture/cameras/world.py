@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from data_prep.cameras.lenses import project, rays_of
+from data_prep.capture.cameras.lenses import project, rays_of
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.colmap import ColmapCamera
 

@@ -1,4 +1,4 @@
-"""The options of ``python -m data_prep.segment``, and what they choose."""
+"""The options of ``gausim prepare segment``, and what they choose."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from data_prep.common.command import add_result
 from gausim.core import ConfigError
 
 if TYPE_CHECKING:
-    from data_prep.masks.cleanup import Cleanup
-    from data_prep.segment import Backend
+    from data_prep.capture.masks.backend import Backend
+    from data_prep.capture.masks.cleanup import Cleanup
 
 
 def add_options(parser: argparse.ArgumentParser, backends: tuple[str, ...]) -> None:
@@ -94,7 +94,7 @@ def _cleanup_options(group: Any) -> None:
 
 def make_cleanup(arguments: argparse.Namespace) -> Cleanup:
     """What is done to the masks; the backend decides what is usual."""
-    from data_prep.masks.cleanup import UNTOUCHED, Cleanup
+    from data_prep.capture.masks.cleanup import UNTOUCHED, Cleanup
 
     usual = UNTOUCHED if arguments.backend == "alpha" else Cleanup()
     chosen = {name: getattr(arguments, name) for name in Cleanup.__dataclass_fields__}
@@ -113,15 +113,15 @@ def make_backend(arguments: argparse.Namespace) -> Backend:
 
 
 def _alpha(arguments: argparse.Namespace) -> Backend:
-    from data_prep.masks.segmenters import AlphaSegmenter
-    from data_prep.segment import Backend
+    from data_prep.capture.masks.backend import Backend
+    from data_prep.capture.masks.segmenters import AlphaSegmenter
 
     return Backend("alpha", AlphaSegmenter, soft=True)
 
 
 def _background(arguments: argparse.Namespace) -> Backend:
-    from data_prep.masks.segmenters import BackgroundSegmenter
-    from data_prep.segment import Backend
+    from data_prep.capture.masks.backend import Backend
+    from data_prep.capture.masks.segmenters import BackgroundSegmenter
 
     plate, threshold, refine = arguments.plate, arguments.threshold, not arguments.no_grabcut
     plates = [] if plate is None else sorted(p for p in plate.rglob("*") if p.is_file()) if plate.is_dir() else [plate]
@@ -134,8 +134,8 @@ def _background(arguments: argparse.Namespace) -> Backend:
 
 
 def _chroma(arguments: argparse.Namespace) -> Backend:
-    from data_prep.masks.segmenters import ChromaSegmenter
-    from data_prep.segment import Backend
+    from data_prep.capture.masks.backend import Backend
+    from data_prep.capture.masks.segmenters import ChromaSegmenter
 
     key, refine = arguments.key, not arguments.no_grabcut
     settings = {"key": key, "grabcut": refine}
@@ -143,8 +143,8 @@ def _chroma(arguments: argparse.Namespace) -> Backend:
 
 
 def _onnx(arguments: argparse.Namespace) -> Backend:
-    from data_prep.masks.onnx_segmenter import OnnxSegmenter
-    from data_prep.segment import Backend
+    from data_prep.capture.masks.backend import Backend
+    from data_prep.capture.masks.onnx_segmenter import OnnxSegmenter
 
     if arguments.onnx is None:
         raise ConfigError("--backend onnx: name the network with --onnx FILE.")
@@ -157,8 +157,8 @@ def _onnx(arguments: argparse.Namespace) -> Backend:
 
 
 def _sam2(arguments: argparse.Namespace) -> Backend:
-    from data_prep.masks.sam2_segmenter import Sam2Segmenter, load_predictor, make_prompt, read_prompts
-    from data_prep.segment import Backend
+    from data_prep.capture.masks.backend import Backend
+    from data_prep.capture.masks.sam2_segmenter import Sam2Segmenter, load_predictor, make_prompt, read_prompts
 
     if arguments.sam2_checkpoint is None:
         raise ConfigError("--backend sam2: name the weights with --sam2-checkpoint FILE.")

@@ -15,7 +15,7 @@ import numpy as np
 from av.error import FFmpegError
 from av.sidedata.sidedata import Type as SideData
 
-from data_prep.films.timecode import Timecode, parse_timecode
+from data_prep.capture.films.timecode import Timecode, parse_timecode
 from gausim.core import DataError
 
 # Rates that cameras have; a measured rate that fits one of them is that one.

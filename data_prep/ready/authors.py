@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from data_prep.cameras.sources import Posed, fitted
+from data_prep.capture.cameras.sources import Posed, fitted
 from data_prep.common.photos import Photo, list_images, natural, open_photo
 from gausim.core.errors import DataError
 from gausim.io.colmap import ColmapImage, ColmapModel, colmap_files, find_colmap, read_colmap

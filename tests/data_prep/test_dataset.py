@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import pytest
 from helpers import toy_object
 
-from data_prep import prepare as command
-from data_prep.prepare import Job, plan, prepare
+from data_prep import dataset as command
+from data_prep.dataset import Job, plan, prepare
 from gausim.core import ConfigError
 from gausim.data.verify import verify
 
