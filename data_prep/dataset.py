@@ -15,7 +15,6 @@ interrupted goes on.
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import re
 import sys
@@ -24,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from data_prep.common.command import stage_parser
 from gausim.core.errors import ConfigError, GausSimError
 
 # Stages in the order in which they make sense, with the arguments that have no option's name.
@@ -41,17 +41,11 @@ STAGES = {
 
 @dataclass(frozen=True)
 class Job:
-    """One stage to run.
+    """One stage to run."""
 
-    Attributes:
-        name: what the configuration calls it; its result is the folder of that name.
-        stage: which one.
-        arguments: of its command, the directory of the result included.
-    """
-
-    name: str
-    stage: str
-    arguments: tuple[str, ...]
+    name: str  # what the configuration calls it; its result is the folder of that name
+    stage: str  # which one
+    arguments: tuple[str, ...]  # of its command, the directory of the result included
 
 
 def plan(config: Path) -> list[Job]:
@@ -84,15 +78,7 @@ def plan(config: Path) -> list[Job]:
 
 
 def prepare(config: Path, *, force: bool = False) -> int:
-    """Runs what a configuration lists; stops at the first stage that fails.
-
-    Args:
-        config: the YAML file.
-        force: replace results of other inputs or settings.
-
-    Returns:
-        The exit status of the last stage that ran.
-    """
+    """Runs what a configuration lists; stops at the first stage that fails."""
     jobs = plan(config)
     for number, job in enumerate(jobs, 1):
         print(f"[{number}/{len(jobs)}] {job.name}", flush=True)
@@ -106,9 +92,7 @@ def prepare(config: Path, *, force: bool = False) -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="gausim prepare dataset", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = stage_parser("dataset", __doc__, result=False)
     parser.add_argument("config", type=Path, metavar="CONFIG.yaml", help="what to run")
     parser.add_argument("--force", action="store_true", help="replace results of other inputs or settings")
     arguments = parser.parse_args(argv)

@@ -12,11 +12,7 @@ Tick = Callable[[str, int, int], None]
 
 @contextmanager
 def bars(waiting: str | None = None) -> Iterator[Tick]:
-    """A function that is told (step, done, of how many); each step has a bar until it is done. Threads may call it.
-
-    Args:
-        waiting: what is shown until the first step begins.
-    """
+    """A function that is told (step, done, of how many); each step has a bar until it is done. Threads may call it."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

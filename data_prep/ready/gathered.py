@@ -17,19 +17,12 @@ TRANSFORMS, FACTS, POINTS = "transforms.json", "dataset.json", "points.npz"
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """Posed pictures of one object, before they are brought together.
+    """Posed pictures of one object, before they are brought together."""
 
-    Attributes:
-        stills: those of the rest state; None where there are none.
-        sequences: by name.
-        facts: what a ``dataset.json`` beside them says already.
-        points: points to begin a reconstruction with, where there are some.
-    """
-
-    stills: PosedImages | None
-    sequences: Mapping[str, PosedImages]
-    facts: Mapping[str, Any]
-    points: Path | None
+    stills: PosedImages | None  # those of the rest state; None where there are none
+    sequences: Mapping[str, PosedImages]  # by name
+    facts: Mapping[str, Any]  # what a ``dataset.json`` beside them says already
+    points: Path | None  # points to begin a reconstruction with, where there are some
 
     def files(self) -> Iterator[tuple[str, Path]]:
         """Every file to copy, by its name in the assembled object."""
@@ -46,9 +39,6 @@ class Gathered:
 
 def gather(folders: Sequence[Path]) -> Gathered:
     """Looks for posed pictures; what a later folder has replaces what an earlier one has by the same name.
-
-    Args:
-        folders: results of ``segment``, ``poses`` or ``import_ready``, or folders laid out like them.
 
     Raises:
         DataError: a folder holds nothing posed, a ``transforms.json`` is malformed, or a picture has no alpha.
@@ -93,9 +83,7 @@ def _posed(folder: Path) -> PosedImages:
     for frame in {frame.path.parent: frame for frame in reversed(posed.frames)}.values():
         header = read_header(frame.path)
         if header is None:
-            what = (
-                "cannot be read as an image" if frame.path.is_file() else "not found, though transforms.json names it"
-            )
+            what = "cannot be read as an image" if frame.path.is_file() else "not found, but transforms.json names it"
             raise DataError(f"{frame.path}: {what}. Export it again.")
         if header.mode != "RGBA":
             raise DataError(

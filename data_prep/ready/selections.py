@@ -61,25 +61,27 @@ def parse_selection(text: str) -> tuple[Selection, list[Path]]:
         raise SceneError(f"selection '{text}': {error}.") from error
     files: list[Path] = []
     chosen: Selection | None = None
-    joint, negate, at = "and", False, 0
-    expected_term = True
-    while at < len(words):
-        word = words[at]
-        if word in ("and", "or") and not expected_term:
-            joint, expected_term, at = word, True, at + 1
-        elif word == "not" and expected_term:
-            negate, at = not negate, at + 1
-        elif expected_term:
-            end = next((i for i in range(at, len(words)) if words[i] in _JOINTS), len(words))
-            term = _term(words[at:end], text, files)
-            term = ~term if negate else term
-            chosen = term if chosen is None else (chosen & term if joint == "and" else chosen | term)
-            negate, expected_term, at = False, False, end
-        else:
-            raise _wrong(text, f"'{word}' where 'and' or 'or' should stand")
-    if chosen is None or expected_term:
-        raise _wrong(text, "a term is missing at the end")
-    return chosen, files
+    while words:
+        joint = "and"
+        if chosen is not None:
+            joint = words.pop(0)
+            if joint not in ("and", "or"):
+                raise _wrong(text, f"'{joint}' where 'and' or 'or' should stand")
+        negate = False
+        while words and words[0] == "not":
+            negate = not negate
+            words.pop(0)
+        end = next((i for i, word in enumerate(words) if word in _JOINTS), len(words))
+        if not words or not end:
+            break
+        term = _term(words[:end], text, files)
+        term = ~term if negate else term
+        chosen = term if chosen is None else (chosen & term if joint == "and" else chosen | term)
+        words = words[end:]
+    else:
+        if chosen is not None:
+            return chosen, files
+    raise _wrong(text, "a term is missing")
 
 
 def read_points(path: Path) -> np.ndarray:

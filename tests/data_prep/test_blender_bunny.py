@@ -118,17 +118,6 @@ def test_the_set_is_read_and_verified(mesh: Path, tmp_path: Path) -> None:
     assert make_set(mesh, tmp_path / "set", PLAN, lambda: pytest.fail("asked for Blender"))["made"] is False
 
 
-def test_a_scene_beside_the_set_is_no_fault_but_a_changed_picture_is(mesh: Path, tmp_path: Path) -> None:
-    make_set(mesh, tmp_path / "set", PLAN, FakeBlender)
-    (tmp_path / "set" / "scene.json").write_text("{}")
-    assert verify(tmp_path / "set") == []
-    picture = tmp_path / "set" / "sequences" / "seq_001" / "cam_0" / "0002.png"
-    data = bytearray(picture.read_bytes())
-    data[-1] ^= 1  # of the last checksum: decoders do not mind
-    picture.write_bytes(data)
-    assert [fault.where for fault in verify(tmp_path / "set")] == ["sequences/seq_001/cam_0/0002.png"]
-
-
 @pytest.mark.parametrize("die_at", [0, 5, 23, 30, 58])
 def test_what_was_interrupted_goes_on_with_what_is_missing(mesh: Path, tmp_path: Path, die_at: int) -> None:
     make_set(mesh, tmp_path / "whole", PLAN, FakeBlender)
@@ -158,13 +147,6 @@ def test_several_workers_give_the_same_bytes_and_the_first_error_ends_all(mesh: 
         make_set(mesh, tmp_path / "set", PLAN, lambda: FakeBlender(skip="cam_1/0003.png"), workers=3)
 
 
-def test_settings_decide_what_is_made(mesh: Path, tmp_path: Path) -> None:
-    make_set(mesh, tmp_path / "set", PLAN, FakeBlender)
-    with pytest.raises(DataError, match="--force"):
-        make_set(mesh, tmp_path / "set", replace(PLAN, seed=1), FakeBlender)
-    assert make_set(mesh, tmp_path / "set", replace(PLAN, seed=1), FakeBlender, force=True)["settings"]["seed"] == 1
-
-
 @pytest.mark.parametrize(
     ("change", "what"),
     [
@@ -181,7 +163,7 @@ def test_settings_decide_what_is_made(mesh: Path, tmp_path: Path) -> None:
 )
 def test_impossible_plans_are_refused(change: dict[str, Any], what: str) -> None:
     with pytest.raises(ConfigError, match=what):
-        replace(PLAN, **change).checked()
+        replace(PLAN, **change)
 
 
 def test_pushes_are_of_their_number_and_act_on_the_upper_part(surface: Surface) -> None:

@@ -98,12 +98,6 @@ def test_photos_become_poses(photos: Path, mapped: Path) -> None:
     assert not (mapped / "mapping").exists() and (mapped / "colmap" / "sparse" / "0" / "images.bin").is_file()
 
 
-def test_the_same_again_is_left_alone(photos: Path, mapped: Path) -> None:
-    assert find_poses(mapped, Sources(images=photos), mapping=OPTIONS)["made"] is False
-    with pytest.raises(DataError, match="other settings"):
-        find_poses(mapped, Sources(images=photos), mapping=MappingOptions())
-
-
 def test_interrupted_matching_goes_on_to_the_same_result(
     photos: Path, mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,14 +16,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Straightened:
-    """A pinhole camera and the way to it.
+    """A pinhole camera and the way to it."""
 
-    Attributes:
-        intrinsics: (3, 3) float64 K of the pinhole camera [pixels]; its image has the size of the photo.
-        maps: (H, W) float32 columns and rows of the photo that its pixels show; None where nothing changes.
-    """
-
-    intrinsics: np.ndarray
+    intrinsics: np.ndarray  # (3, 3) float64 K of the pinhole camera [pixels]; its image has the size of the photo
+    # (H, W) float32 columns and rows of the photo that its pixels show; None where nothing changes
     maps: tuple[np.ndarray, np.ndarray] | None
 
     def __call__(self, pixels: np.ndarray) -> np.ndarray:

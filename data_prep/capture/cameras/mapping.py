@@ -14,9 +14,12 @@ from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
+import cv2
 import numpy as np
+import pycolmap
 
-from data_prep.common.photos import Photo, read_photo
+from data_prep.common.command import Options, option
+from data_prep.common.photos import Photo, read_photo, reduced
 from data_prep.common.progress import Tick
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.colmap_files import PARAMETERS
@@ -24,6 +27,8 @@ from gausim.io.files import replacing, write_durably
 from gausim.io.npz import read_npz
 
 SEED = 0
+# Folder of what only an interrupted run needs.
+SCRATCH = "mapping"
 # Matched between two commits of the database; an interruption loses no more.
 PAIRS_AT_ONCE = 32
 # COLMAP's guess of a focal length nobody knows, times the longer side.
@@ -35,59 +40,45 @@ _WEAKER = 0.5
 
 
 @dataclass(frozen=True)
-class MappingOptions:
-    """How poses are found.
+class MappingOptions(Options):
+    """How poses are found."""
 
-    Attributes:
-        camera_model: COLMAP's name of the lens model.
-        intrinsics: ``shared`` by all photos of one camera, or ``per-image`` (zoom, refocusing phones).
-        matching: ``exhaustive`` (every pair) or ``sequential`` (each with the next ones; photos taken in order).
-        overlap: with how many of the next photos, in sequential matching.
-        features: at most so many per photo.
-        feature_size: photos are reduced to this longer side for their features [pixels].
-        focal: focal length of all cameras where it is known; None to read it from the photos or guess [pixels].
-        thorough: features that survive oblique views (affine, over several sizes), weaker ones too, and a second search
-            for matches along the lines that the first ones give; several times as slow, for few photos far apart.
-        threads: more than one is faster and repeatable only up to rounding.
-    """
-
-    camera_model: str = "SIMPLE_RADIAL"
-    intrinsics: str = "shared"
-    matching: str = "exhaustive"
-    overlap: int = 10
-    features: int = 4096
-    feature_size: int = 1600
-    focal: float | None = None
-    thorough: bool = False
-    threads: int = 1
+    camera_model: str = option("SIMPLE_RADIAL", "of COLMAP: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE ... (%(default)s)")
+    intrinsics: str = option(
+        "shared", "one lens for all photos of a camera, or per image where it zooms or refocuses (%(default)s)",
+        choices=("shared", "per-image"),
+    )  # fmt: skip
+    focal: float | None = option(
+        None, "focal length where it is known (default: EXIF, else a guess)", least=1e-6, most=1e6, metavar="PIXELS"
+    )
+    matching: str = option(
+        "exhaustive", "every pair, or each photo with the next ones (%(default)s)", choices=("exhaustive", "sequential")
+    )
+    overlap: int = option(10, "next photos in sequential matching (%(default)s)", least=1, metavar="N")
+    features: int = option(4096, "at most so many per photo (%(default)s)", least=1, metavar="N")
+    feature_size: int = option(1600, "longer side they are found at (%(default)s)", least=64, metavar="PIXELS")
+    # Features that survive oblique views (affine, over several sizes), weaker ones too, and a second search for matches
+    # along the lines that the first ones give.
+    thorough: bool = option(False, "for few photos from places far apart: finds more, takes far longer")
+    threads: int = option(1, "more: faster, repeatable up to rounding (%(default)s)", least=1, metavar="N")
 
     def __post_init__(self) -> None:
         """Checks names and numbers."""
+        super().__post_init__()
         if self.camera_model not in PARAMETERS:
-            raise ConfigError(f"camera model '{self.camera_model}': expected one of {', '.join(PARAMETERS)}.")
+            raise ConfigError(f"--camera-model '{self.camera_model}': expected one of {', '.join(PARAMETERS)}.")
         if self.intrinsics not in ("shared", "per-image") or self.matching not in ("exhaustive", "sequential"):
             raise ConfigError(f"intrinsics '{self.intrinsics}' or matching '{self.matching}' is none that there is.")
-        if min(self.overlap, self.features, self.threads) < 1 or self.feature_size < 64:
-            raise ConfigError("overlap, features and threads must be at least 1, the feature size at least 64.")
-        if self.focal is not None and not 0 < self.focal < 1e6:
-            raise ConfigError(f"focal length {self.focal:g}: expected pixels, more than 0.")
 
 
 @dataclass(frozen=True)
 class Mapped:
-    """What came out beside the model itself.
+    """What came out beside the model itself."""
 
-    Attributes:
-        folder: of the COLMAP model with most images, in the photos' names.
-        features: number of features per photo.
-        matches: per photo, inliers of all its verified pairs.
-        others: numbers of images of the models that could not be joined with it.
-    """
-
-    folder: Path
-    features: dict[str, int]
-    matches: dict[str, int]
-    others: tuple[int, ...]
+    folder: Path  # of the COLMAP model with most images, in the photos' names
+    features: dict[str, int]  # number of features per photo
+    matches: dict[str, int]  # per photo, inliers of all its verified pairs
+    others: tuple[int, ...]  # numbers of images of the models that could not be joined with it
 
 
 def map_photos(
@@ -95,23 +86,14 @@ def map_photos(
 ) -> Mapped:
     """Finds the poses of photos.
 
-    Args:
-        photos: at least three.
-        cameras: for each photo's name, which camera took it.
-        work: folder for features, matches and the model (``colmap/sparse/0``); what is there is used.
-        options: how.
-        tick: told of the progress.
-
     Raises:
         DataError: no two photos fit together.
     """
-    import pycolmap
-
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
     if len(photos) < _SMALLEST_MODEL:
         raise DataError(f"{len(photos)} photos: expected at least {_SMALLEST_MODEL}; the paper takes 200.")
     count = {p.name: _extract(p, work, options, tick, i, len(photos)) for i, p in enumerate(photos)}
-    database = work / "mapping" / "database.db"
+    database = work / SCRATCH / "database.db"
     if not database.is_file():
         _fill(database, photos, cameras, work, options)
     _match(database, photos, work, options, tick)
@@ -121,27 +103,15 @@ def map_photos(
     return Mapped(folder, count, matches, tuple(sizes[1:]))
 
 
-def forget(work: Path) -> None:
-    """Deletes what only an interrupted run needs."""
-    shutil.rmtree(work / "mapping", ignore_errors=True)
-
-
 def _features_file(work: Path, number: int) -> Path:
-    return work / "mapping" / f"{number:06d}.npz"
+    return work / SCRATCH / f"{number:06d}.npz"
 
 
 def _extract(photo: Photo, work: Path, options: MappingOptions, tick: Tick, number: int, total: int) -> int:
     """Writes the features of one photo and returns their number."""
-    import cv2
-    import pycolmap
-
     path = _features_file(work, number)
     if not path.is_file():
-        gray = cv2.cvtColor(read_photo(photo)[..., :3], cv2.COLOR_BGR2GRAY)
-        scale = min(1.0, options.feature_size / max(gray.shape))
-        if scale < 1:
-            size = max(1, round(photo.width * scale)), max(1, round(photo.height * scale))
-            gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+        gray = reduced(cv2.cvtColor(read_photo(photo)[..., :3], cv2.COLOR_BGR2GRAY), options.feature_size)
         settings = pycolmap.FeatureExtractionOptions()
         settings.num_threads, settings.use_gpu, settings.max_image_size = options.threads, False, max(gray.shape)
         settings.sift.max_num_features = options.features
@@ -161,8 +131,6 @@ def _extract(photo: Photo, work: Path, options: MappingOptions, tick: Tick, numb
 
 def _fill(path: Path, photos: Sequence[Photo], cameras: Mapping[str, str], work: Path, options: MappingOptions) -> None:
     """Writes COLMAP's database: cameras, photos (named by their number) and features."""
-    import pycolmap
-
     known: dict[tuple, int] = {}
     for rest in path.parent.glob(f".{path.stem}.tmp*"):
         rest.unlink()  # of an attempt that was killed
@@ -200,14 +168,12 @@ def _pairs(count: int, options: MappingOptions) -> Iterator[tuple[int, int]]:
 
 
 def _match(database: Path, photos: Sequence[Photo], work: Path, options: MappingOptions, tick: Tick) -> None:
-    import pycolmap
-
     matching, verification = pycolmap.FeatureMatchingOptions(), pycolmap.TwoViewGeometryOptions()
     matching.num_threads, matching.use_gpu = options.threads, False
     verification.ransac.random_seed = SEED
     matching.guided_matching = options.thorough
     pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = work / "mapping" / "pairs.txt"
+    pairing.match_list_path = work / SCRATCH / "pairs.txt"
     pairs = list(_pairs(len(photos), options))
     with pycolmap.Database.open(database) as file:
         number = {image.name: image.image_id for image in file.read_all_images()}
@@ -224,8 +190,6 @@ def _match(database: Path, photos: Sequence[Photo], work: Path, options: Mapping
 
 
 def _inliers(database: Path, photos: Sequence[Photo]) -> dict[str, int]:
-    import pycolmap
-
     sums = {photo.name: 0 for photo in photos}
     with pycolmap.Database.open(database) as file:
         names = {image.image_id: photos[int(image.name)].name for image in file.read_all_images()}
@@ -237,8 +201,6 @@ def _inliers(database: Path, photos: Sequence[Photo]) -> dict[str, int]:
 
 def _mapped(database: Path, photos: Sequence[Photo], folder: Path, options: MappingOptions, tick: Tick) -> list[int]:
     """Runs the incremental mapping, writes the largest model, and returns the sizes of all, largest first."""
-    import pycolmap
-
     settings = pycolmap.IncrementalPipelineOptions()
     settings.num_threads, settings.random_seed = options.threads, SEED
     settings.mapper.num_threads, settings.mapper.random_seed = options.threads, SEED

@@ -5,35 +5,47 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from data_prep.capture.cameras.sources import (
+    Posed,
+    from_model,
+    matrix_files_of,
+    no_points,
+    photos_of_model,
+    read_lens_transforms,
+    read_projections,
+)
+from data_prep.common.command import Options, option
 from data_prep.common.photos import Photo, list_images, natural, open_photo
 from data_prep.common.stage import MANIFEST, read_manifest
 from gausim.core.errors import ConfigError, DataError
+from gausim.io.colmap import colmap_files, find_colmap, read_colmap
+from gausim.io.colmap_files import PointTable
 
 
 @dataclass(frozen=True)
-class Sources:
-    """What poses are made of.
+class Sources(Options):
+    """What poses are made of."""
 
-    Attributes:
-        images: folder of photos (stills of the rest state); None where there are only videos.
-        sequences: the result of the stage ``ingest``, or a folder with one folder per sequence and camera in it.
-        colmap: a COLMAP model to take over.
-        transforms: a ``transforms.json`` to take over; its images are where it says.
-        projections: a folder of projection matrices to take over.
-        scale: size of the photos over the size that the projection matrices are for.
-        fps: of the sequences; None where ingest says it.
-    """
-
-    images: Path | None = None
-    sequences: Path | None = None
-    colmap: Path | None = None
-    transforms: Path | None = None
-    projections: Path | None = None
-    scale: float = 1.0
-    fps: float | None = None
+    images: Path | None = option(None, "photos of the rest state", metavar="DIR")
+    sequences: Path | None = option(
+        None, "result of ingest, or folders SEQ/CAM of frames; cameras stand still through a sequence, and its first "
+        "frame shows the rest state", metavar="DIR",
+    )  # fmt: skip
+    fps: float | None = option(None, "frames per second of the sequences (default: what ingest says)", metavar="RATE")
+    colmap: Path | None = option(
+        None, "COLMAP model to take over, binary or text, for --images of any size", metavar="DIR"
+    )
+    transforms: Path | None = option(
+        None, "transforms.json to take over, also with OPENCV or OPENCV_FISHEYE distortion", metavar="FILE"
+    )
+    projections: Path | None = option(
+        None, "3 x 4 matrices to take over, as text: NAME.txt or NAME_P.txt for NAME.jpg", metavar="DIR"
+    )
+    scale: float = option(1.0, "size of the photos / size the matrices are for (%(default)s)")
 
     def __post_init__(self) -> None:
         """Checks that they go together."""
+        super().__post_init__()
         taken = [n for n in ("colmap", "transforms", "projections") if getattr(self, n) is not None]
         if len(taken) > 1:
             raise ConfigError(f"--{' and --'.join(taken)}: poses come from one of them; give one.")
@@ -48,19 +60,15 @@ class Sources:
 
 @dataclass(frozen=True)
 class Material:
-    """Files that are read.
+    """What was found in the sources."""
 
-    Attributes:
-        stills: photos whose poses are to be found.
-        sequences: the folders of sequences with the names of their cameras.
-        fps: frames per second of the sequences.
-        inputs: all files by the names that the manifest gives them.
-    """
-
-    stills: tuple[Photo, ...]
-    sequences: dict[Path, tuple[str, ...]]
-    fps: float | None
-    inputs: dict[str, Path]
+    stills: tuple[Photo, ...]  # photos whose poses are to be found
+    # poses that are taken over, with their points; None where they are to be found
+    posed: tuple[list[Posed], PointTable] | None
+    coloured: bool  # the points that are taken over have colours
+    sequences: dict[Path, tuple[str, ...]]  # the folders of sequences with the names of their cameras
+    fps: float | None  # frames per second of the sequences
+    inputs: dict[str, Path]  # all files that are read, by the names that the manifest gives them
 
     @staticmethod
     def of(sources: Sources) -> Material:
@@ -69,38 +77,36 @@ class Material:
         Raises:
             DataError: something that was named is missing or malformed.
         """
-        inputs, stills = _taken_over(sources), []
-        if sources.images is not None and sources.kind == "mapping":
-            stills = [open_photo(path, path.name) for path in list_images(sources.images)]
-        inputs.update({f"images/{photo.name}": photo.path for photo in stills})
+        stills: tuple[Photo, ...] = ()
+        posed, inputs = _taken_over(sources)
+        if sources.images is not None and posed is None:
+            stills = tuple(open_photo(path, path.name) for path in list_images(sources.images))
+            inputs = {f"images/{photo.name}": photo.path for photo in stills}
         folders, fps = _sequences(sources)
         for folder, cameras in folders.items():
             for camera in cameras:
                 inputs.update({f"{folder.name}/{camera}/{p.name}": p for p in list_images(folder / camera)})
-        return Material(tuple(stills), folders, fps, inputs)
+        return Material(stills, posed, sources.colmap is not None, folders, fps, inputs)
 
 
-def _taken_over(sources: Sources) -> dict[str, Path]:
-    """Inputs of poses that are taken over, with the photos they name."""
-    if sources.colmap is not None:
-        from gausim.io.colmap import colmap_files, find_colmap, read_colmap
-
-        assert sources.images is not None
+def _taken_over(sources: Sources) -> tuple[tuple[list[Posed], PointTable] | None, dict[str, Path]]:
+    """Poses that somebody else found, and the files that say so, with their photos."""
+    if sources.kind == "mapping":
+        return None, {}
+    points = no_points()
+    if sources.colmap is not None and sources.images is not None:
         folder = find_colmap(sources.colmap)
-        names = [image.name for image in read_colmap(folder).images]
-        return {**colmap_files(folder), **{f"images/{name}": sources.images / name for name in names}}
-    if sources.transforms is not None:
-        from data_prep.capture.cameras.sources import read_lens_transforms
-
-        posed = read_lens_transforms(sources.transforms)
-        return {"transforms": sources.transforms, **{f"images/{p.photo.name}": p.photo.path for p in posed}}
-    if sources.projections is not None:
-        from data_prep.capture.cameras.sources import matrix_files_of
-
-        assert sources.images is not None
-        images = {f"images/{p.name}": p for p in list_images(sources.images)}
-        return {**images, **{f"projections/{p.name}": p for p in matrix_files_of(sources.projections)}}
-    return {}
+        model = read_colmap(folder)
+        posed, points = from_model(model, photos_of_model(model, sources.images)), model.points
+        files = colmap_files(folder)
+    elif sources.transforms is not None:
+        posed, files = read_lens_transforms(sources.transforms), {"transforms": sources.transforms}
+    else:
+        assert sources.projections is not None and sources.images is not None
+        posed = read_projections(sources.projections, sources.images, sources.scale)
+        files = {f"images/{p.name}": p for p in list_images(sources.images)}
+        files.update({f"projections/{p.name}": p for p in matrix_files_of(sources.projections)})
+    return (posed, points), {**files, **{f"images/{shot.photo.name}": shot.photo.path for shot in posed}}
 
 
 def _sequences(sources: Sources) -> tuple[dict[Path, tuple[str, ...]], float | None]:

@@ -10,32 +10,76 @@ import numpy as np
 
 from data_prep.capture.cameras.lenses import Straightened, straighten
 from data_prep.capture.cameras.sources import Posed, fitted
-from data_prep.common.photos import Photo, list_images, open_photo, read_photo, write_png
+from data_prep.common.photos import Photo, list_images, open_photo, read_photo, write_image
 from data_prep.common.progress import Tick
 from gausim.core.errors import DataError
 from gausim.io.colmap_files import PointTable
 from gausim.io.files import replacing, write_durably
-
-MaskOf = Callable[[Path], Path | None]
-
-
-def no_mask(path: Path) -> None:
-    """There is no mask of this image."""
+from gausim.io.pixels import read_header
 
 
-class Straighteners:
-    """Straightens photos of a few cameras; the maps of each are made once."""
+class PosedWriter:
+    """Writes stills and sequences of one object without distortion; the maps of each lens are made once.
 
-    def __init__(self) -> None:
-        """Starts with none."""
+    Attributes:
+        bare: names of what has images without alpha: ``stills``, sequences.
+    """
+
+    def __init__(self, tick: Tick, mask_of: Callable[[Path], Path | None] = lambda path: None) -> None:
+        """Takes whom to tell of the progress, and what gives the file of a photo's mask, which becomes its alpha."""
+        self._tick, self._mask_of = tick, mask_of
         self._known: dict[tuple, Straightened] = {}
+        self.bare: set[str] = set()
 
-    def __call__(self, posed: Posed) -> Straightened:
-        """The way from this photo to its pinhole camera.
+    def stills(self, out: Path, posed: Sequence[Posed]) -> None:
+        """Writes ``images/*.png`` and ``transforms.json``; images that are there already stay.
 
         Raises:
-            DataError: its lens cannot be straightened; names the photo.
+            DataError: the photos differ in size, two would get one name, a lens cannot be straightened, or a mask has
+                another size than its photo.
         """
+        check_one_size([shot.photo for shot in posed])
+        files: dict[str, str] = {}
+        for shot in posed:
+            path = Path(shot.photo.name)
+            name = "_".join((*path.parent.parts, path.stem)).replace("..", "_") + ".png"
+            if name in files:
+                raise DataError(f"{shot.photo.path}: '{files[name]}' and '{path}' would both be images/{name}.")
+            files[name] = shot.photo.name
+        for i, (name, shot) in enumerate(zip(files, posed, strict=True)):
+            self._image(out / "images" / name, shot.photo, self._straight(shot), "stills")
+            self._tick("images", i + 1, len(posed))
+        entries = [{"file_path": f"images/{name}", "source": source} for name, source in files.items()]
+        self._transforms(out / "transforms.json", posed, entries, None)
+
+    def sequence(self, out: Path, folders: Mapping[str, Path], cameras: Mapping[str, Posed], fps: float | None) -> int:
+        """Writes the frames of a sequence with their fixed cameras, and returns their number.
+
+        Raises:
+            DataError: cameras differ in size or in number of frames, or a frame or a mask is of another size.
+        """
+        check_one_size([shot.photo for shot in cameras.values()])
+        frames = {name: list_images(folders[name]) for name in cameras}
+        counts = {name: len(paths) for name, paths in frames.items()}
+        if len(set(counts.values())) > 1:
+            raise DataError(
+                f"{out.name}: cameras have different numbers of frames ({counts}). Make them again with ingest."
+            )
+        entries, posed = [], []
+        for name, shot in cameras.items():
+            straight = self._straight(shot)
+            for number, path in enumerate(frames[name]):
+                frame = open_photo(path, path.name)
+                check_one_size([shot.photo, frame])
+                self._image(out / name / f"{number:04d}.png", frame, straight, out.name)
+                entries.append({"file_path": f"{name}/{number:04d}.png", "camera": name, "frame": number})
+                posed.append(shot)
+                self._tick(out.name, len(posed), sum(counts.values()))
+        self._transforms(out / "transforms.json", posed, entries, fps)
+        return next(iter(counts.values()))
+
+    def _straight(self, posed: Posed) -> Straightened:
+        """The way from this photo to its pinhole camera."""
         camera = posed.camera
         key = (camera.model, camera.width, camera.height, camera.params.tobytes())
         if key not in self._known:
@@ -45,60 +89,35 @@ class Straighteners:
                 raise DataError(f"{posed.photo.path}: {error}") from error
         return self._known[key]
 
+    def _image(self, target: Path, photo: Photo, straight: Straightened, what: str) -> None:
+        """Writes one photo without distortion, unless it is there, and remembers if it has no alpha."""
+        if target.is_file():
+            header = read_header(target)
+            alpha = header is not None and header.mode == "RGBA"
+        else:
+            pixels, mask = read_photo(photo), self._mask_of(photo.path)
+            if mask is not None:
+                pixels = np.concatenate((pixels[..., :3], _read_mask(mask, photo)), axis=-1)
+            write_image(target, straight(pixels))
+            alpha = pixels.shape[2] == 4
+        if not alpha:
+            self.bare.add(what)
 
-def write_stills(
-    out: Path,
-    posed: Sequence[Posed],
-    straighteners: Straighteners,
-    tick: Tick,
-    *,
-    mask_of: MaskOf = no_mask,
-    bare: set[str] | None = None,
-) -> None:
-    """Writes ``images/*.png`` and ``transforms.json``; images that are there already stay.
+    def _transforms(self, path: Path, posed: Sequence[Posed], entries: list, fps: float | None) -> None:
+        import torch
 
-    Args:
-        out: where.
-        posed: the photos.
-        straighteners: of the run.
-        tick: told of the progress.
-        mask_of: file of a photo's mask, which becomes its alpha.
-        bare: gets ``stills`` where a photo has no alpha.
+        from gausim.core import Cameras
+        from gausim.io.transforms import write_transforms
 
-    Raises:
-        DataError: the photos differ in size, two would get one name, or a mask has another size than its photo.
-    """
-    check_one_size([shot.photo for shot in posed])
-    files: dict[str, str] = {}
-    for shot in posed:
-        name = f"{_flat(shot.photo.name)}.png"
-        if name in files:
-            raise DataError(f"{shot.photo.path}: '{files[name]}' and '{shot.photo.name}' would both be images/{name}.")
-        files[name] = shot.photo.name
-    for i, (name, shot) in enumerate(zip(files, posed, strict=True)):
-        if not _write_image(out / "images" / name, shot.photo, straighteners(shot), mask_of) and bare is not None:
-            bare.add("stills")
-        tick("images", i + 1, len(posed))
-    entries = [{"file_path": f"images/{name}", "source": source} for name, source in files.items()]
-    _write_transforms(out / "transforms.json", posed, straighteners, entries, None)
-
-
-def _write_image(target: Path, photo: Photo, straight: Straightened, mask_of: MaskOf) -> bool:
-    """Writes one photo without distortion, unless it is there, and tells whether it has alpha."""
-    if target.is_file():
-        return _has_alpha(target)
-    pixels, mask = read_photo(photo), mask_of(photo.path)
-    if mask is not None:
-        pixels = np.concatenate((pixels[..., :3], _read_mask(mask, photo)), axis=-1)
-    write_png(target, straight(pixels))
-    return pixels.shape[2] == 4
-
-
-def _has_alpha(path: Path) -> bool:
-    from PIL import Image
-
-    with Image.open(path) as image:
-        return image.mode == "RGBA"
+        cameras = Cameras(
+            torch.from_numpy(np.stack([shot.viewmat for shot in posed])).float(),
+            torch.from_numpy(np.stack([self._straight(shot).intrinsics for shot in posed])).float(),
+            posed[0].photo.width,
+            posed[0].photo.height,
+            tuple(shot.photo.name for shot in posed),
+        )
+        with replacing(path, typed=True) as temporary:
+            write_transforms(temporary, cameras.validated(str(path)), entries, fps=fps)
 
 
 def _read_mask(path: Path, photo: Photo) -> np.ndarray:
@@ -110,11 +129,6 @@ def _read_mask(path: Path, photo: Photo) -> np.ndarray:
     return mask[..., 3:] if mask.shape[2] == 4 else mask.max(-1, keepdims=True)
 
 
-def _flat(name: str) -> str:
-    path = Path(name)
-    return "_".join((*path.parent.parts, path.stem)).replace("..", "_")
-
-
 def check_one_size(photos: Sequence[Photo]) -> None:
     """Raises :class:`DataError` naming a photo whose size is not that of the first."""
     for photo in photos:
@@ -123,76 +137,6 @@ def check_one_size(photos: Sequence[Photo]) -> None:
                 f"{photo.path}: is {photo.width}x{photo.height}, {photos[0].path.name} is "
                 f"{photos[0].width}x{photos[0].height}; use photos of one size, all upright or all lengthwise."
             )
-
-
-def write_sequence(
-    out: Path,
-    folders: Mapping[str, Path],
-    cameras: Mapping[str, Posed],
-    fps: float | None,
-    straighteners: Straighteners,
-    tick: Tick,
-    *,
-    mask_of: MaskOf = no_mask,
-    bare: set[str] | None = None,
-) -> int:
-    """Writes the frames of a sequence without distortion, with their fixed cameras, and returns their number.
-
-    Args:
-        out: folder of the sequence in the result.
-        folders: per camera the folder of its frames.
-        cameras: poses by the cameras' names.
-        fps: frames per second where known.
-        straighteners: of the run.
-        tick: told of the progress.
-        mask_of: file of a frame's mask, which becomes its alpha.
-        bare: gets the sequence's name where a frame has no alpha.
-
-    Raises:
-        DataError: cameras differ in size or in number of frames, or a frame or a mask is of another size.
-    """
-    check_one_size([shot.photo for shot in cameras.values()])
-    frames = {name: list_images(folders[name]) for name in cameras}
-    counts = {name: len(paths) for name, paths in frames.items()}
-    if len(set(counts.values())) > 1:
-        raise DataError(
-            f"{out.name}: cameras have different numbers of frames ({counts}). Make them again with ingest."
-        )
-    total, done = sum(counts.values()), 0
-    entries, posed = [], []
-    for name, shot in cameras.items():
-        straight = straighteners(shot)
-        for number, path in enumerate(frames[name]):
-            frame = open_photo(path, path.name)
-            check_one_size([shot.photo, frame])
-            alpha = _write_image(out / name / f"{number:04d}.png", frame, straight, mask_of)
-            if not alpha and bare is not None:
-                bare.add(out.name)
-            entries.append({"file_path": f"{name}/{number:04d}.png", "camera": name, "frame": number})
-            posed.append(shot)
-            done += 1
-            tick(out.name, done, total)
-    _write_transforms(out / "transforms.json", posed, straighteners, entries, fps)
-    return next(iter(counts.values()))
-
-
-def _write_transforms(
-    path: Path, posed: Sequence[Posed], straighteners: Straighteners, entries: list, fps: float | None
-) -> None:
-    import torch
-
-    from gausim.core import Cameras
-    from gausim.io.transforms import write_transforms
-
-    cameras = Cameras(
-        torch.from_numpy(np.stack([shot.viewmat for shot in posed])).float(),
-        torch.from_numpy(np.stack([straighteners(shot).intrinsics for shot in posed])).float(),
-        posed[0].photo.width,
-        posed[0].photo.height,
-        tuple(shot.photo.name for shot in posed),
-    )
-    with replacing(path, typed=True) as temporary:
-        write_transforms(temporary, cameras.validated(str(path)), entries, fps=fps)
 
 
 def write_points(path: Path, points: PointTable, xyz: np.ndarray, colors: np.ndarray) -> None:
@@ -218,8 +162,7 @@ def sequence_cameras(
     """
     found, missing = {}, []
     for name in cameras:
-        wanted = (f"{folder.name}/{name}", name)
-        shot = next((posed[w] for w in wanted if w in posed), None)
+        shot = posed.get(f"{folder.name}/{name}") or posed.get(name)
         if shot is None:
             missing.append(name)
             continue

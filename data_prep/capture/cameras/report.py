@@ -16,22 +16,26 @@ from gausim.io.colmap_files import PointTable
 
 # Fewer features than this are a photo without texture, fewer inliers one that no other photo shares a view with.
 _FEW_FEATURES, _FEW_MATCHES = 300, 60
-# Errors above this are told [pixels]; COLMAP itself drops observations beyond 4.
-GOOD_ERROR = 1.0
+
+
+def _observations(shot: Posed, points: PointTable) -> tuple[np.ndarray, np.ndarray]:
+    """Which of a photo's (m,) keypoints show a point of the table, and the rows of these points."""
+    order = np.argsort(points.ids, kind="stable")
+    place = np.searchsorted(points.ids, shot.point_ids, sorter=order).clip(max=max(len(order) - 1, 0))
+    rows = order[place] if len(order) else np.zeros(0, int)
+    known = points.ids[rows] == shot.point_ids if len(order) else np.zeros(len(shot.point_ids), bool)
+    return known, rows[known] if len(order) else rows
 
 
 def reprojection(posed: Sequence[Posed], points: PointTable) -> dict[str, Any]:
     """Distances between where photos show points and where their cameras see them [pixels], over all observations."""
-    order = np.argsort(points.ids, kind="stable")
-    ids = points.ids[order]
-    per_image, every = {}, []
+    per_image: dict[str, float | None] = {}
+    every = []
     for shot in posed:
-        index = np.searchsorted(ids, shot.point_ids).clip(max=max(len(ids) - 1, 0))
-        known = ids[index] == shot.point_ids if len(ids) else np.zeros(len(shot.point_ids), bool)
+        known, rows = _observations(shot, points)
         if not known.any():
             continue
-        seen = project(shot.camera, shot.viewmat, points.xyz[order[index[known]]])
-        error = np.linalg.norm(seen - shot.xy[known], axis=1)
+        error = np.linalg.norm(project(shot.camera, shot.viewmat, points.xyz[rows]) - shot.xy[known], axis=1)
         # Behind the camera there is no pixel; that is worse than any error that could be written.
         error = error[np.isfinite(error)]
         every.append(error)
@@ -39,12 +43,8 @@ def reprojection(posed: Sequence[Posed], points: PointTable) -> dict[str, Any]:
     if not every:
         return {"observations": 0, "mean": None, "median": None, "per_image": {}}
     errors = np.concatenate(every)
-    return {
-        "observations": len(errors),
-        "mean": float(errors.mean()),
-        "median": float(np.median(errors)),
-        "per_image": per_image,
-    }
+    means = {"mean": float(errors.mean()), "median": float(np.median(errors))}
+    return {"observations": len(errors), **means, "per_image": per_image}
 
 
 def failures(
@@ -58,32 +58,27 @@ def failures(
             continue
         count, inliers = features[photo.name], matches[photo.name]
         if count < _FEW_FEATURES:
-            remedy = (
-                "few features: blurred, dark or without texture; take it again, or put printed cloth into the scene"
-            )
+            remedy = "few features: blurred, dark, without texture; take it again, or put printed cloth into the scene"
         elif inliers < _FEW_MATCHES:
             remedy = "no other photo shows enough of the same: photos in between, --thorough, or --matching exhaustive"
         else:
-            remedy = (
-                "matches fit no camera: the scene moved, mirrors or repeats itself, or the lens model is too simple"
-            )
+            remedy = "matches fit no camera: the scene moved, mirrors or repeats itself, or the lens model is wrong"
         failed.append({"name": photo.name, "features": count, "matches": inliers, "remedy": remedy})
     return failed
 
 
 def point_colors(posed: Sequence[Posed], points: PointTable) -> np.ndarray:
     """(P, 3) uint8 RGB: the mean of the pixels that show each point."""
-    order = np.argsort(points.ids, kind="stable")
-    ids = points.ids[order]
-    total, count = np.zeros((len(ids), 3)), np.zeros(len(ids))
+    total, count = np.zeros((len(points.ids), 3)), np.zeros(len(points.ids))
     for shot in posed:
-        index = np.searchsorted(ids, shot.point_ids).clip(max=max(len(ids) - 1, 0))
-        known = ids[index] == shot.point_ids if len(ids) else np.zeros(len(shot.point_ids), bool)
+        known, rows = _observations(shot, points)
+        if not known.any():
+            continue
         pixels = read_photo(shot.photo)
         x = shot.xy[known, 0].astype(int).clip(0, shot.photo.width - 1)
         y = shot.xy[known, 1].astype(int).clip(0, shot.photo.height - 1)
-        np.add.at(total, order[index[known]], pixels[y, x, 2::-1])
-        np.add.at(count, order[index[known]], 1)
+        np.add.at(total, rows, pixels[y, x, 2::-1])
+        np.add.at(count, rows, 1)
     return np.round(total / np.maximum(count, 1)[:, None]).astype(np.uint8)
 
 

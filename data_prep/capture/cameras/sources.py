@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 
 from data_prep.common.photos import Photo, list_images, open_photo
 from gausim.core.errors import ConfigError, DataError
@@ -26,21 +27,13 @@ _DECOMPOSED = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """One photo with its pose and lens.
+    """One photo with its pose and lens."""
 
-    Attributes:
-        photo: the file.
-        camera: its lens, for the photo's own size.
-        viewmat: (4, 4) float64 world to camera, OpenCV axes.
-        xy: (m, 2) float64 pixels of the photo that show points.
-        point_ids: (m,) int64 which points.
-    """
-
-    photo: Photo
-    camera: ColmapCamera
-    viewmat: np.ndarray
-    xy: np.ndarray
-    point_ids: np.ndarray
+    photo: Photo  # the file
+    camera: ColmapCamera  # its lens, for the photo's own size
+    viewmat: np.ndarray  # (4, 4) float64 world to camera, OpenCV axes
+    xy: np.ndarray  # (m, 2) float64 pixels of the photo that show points
+    point_ids: np.ndarray  # (m,) int64 which points
 
 
 def no_points() -> PointTable:
@@ -160,11 +153,6 @@ def read_projections(folder: Path, images: Path, scale: float) -> list[Posed]:
 
     ``00006.txt``, ``00006_P.txt`` or ``00006.P`` belongs to ``00006.jpg`` and to ``00006._c.jpg``.
 
-    Args:
-        folder: of the matrices; images without one are left out, matrices without image are not read.
-        images: folder of the images.
-        scale: size of the images over the size that the matrices are for.
-
     Raises:
         DataError: fewer than three images have a matrix, two claim one, or a matrix is malformed or no camera's.
         ConfigError: the scale is not positive.
@@ -244,13 +232,12 @@ def factors(matrix: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
         DataError: it is no camera's.
     """
     p = matrix * np.sign(np.linalg.det(matrix[:, :3]))
-    # P = [M | m], M = K R: the inverse's QR decomposition has the factors the other way around.
     if not np.linalg.cond(p[:, :3]) < 1e9:
         raise DataError(f"{where}: the matrix is singular; expected K [R | t] of a camera.")
-    q, r = np.linalg.qr(np.linalg.inv(p[:, :3]))
-    signs = np.sign(np.diag(r))
-    k, viewmat = np.linalg.inv(r * signs[:, None]), np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = (q * signs).T, np.linalg.solve(k, p[:, 3])
+    k, rotation = scipy.linalg.rq(p[:, :3])
+    signs = np.sign(np.diag(k))
+    k, viewmat = k * signs, np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = signs[:, None] * rotation, np.linalg.solve(k, p[:, 3])
     error = np.abs(k @ viewmat[:3] - p).max() / np.abs(p).max()
     if not error < _DECOMPOSED or np.linalg.det(viewmat[:3, :3]) < 0:
         raise DataError(f"{where}: cannot be decomposed into K [R | t]; expected the matrix of a camera.")

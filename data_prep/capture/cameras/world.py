@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from data_prep.capture.cameras.lenses import project, rays_of
 from gausim.core.errors import ConfigError, DataError
@@ -41,11 +42,6 @@ class Similarity:
         return Similarity(other.scale * self.scale, other.rotation @ self.rotation, other.points(self.shift[None])[0])
 
 
-def identity() -> Similarity:
-    """The transform that changes nothing."""
-    return Similarity(1.0, np.eye(3), np.zeros(3))
-
-
 def centers(viewmats: np.ndarray) -> np.ndarray:
     """(n, 3) camera centres of world-to-camera matrices (n, 4, 4)."""
     return -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
@@ -73,9 +69,7 @@ def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
 def compare(viewmats: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """How far poses (n, 4, 4) are from reference poses of the same images, after similarity alignment of their centres.
 
-    Returns:
-        Mean and largest distance of the centres as per cent of the reference's size (the largest distance between two
-        of its centres), and mean and largest angle between the orientations [degree].
+    Distances of the centres are per cent of the largest distance between two of the reference's; angles are in degrees.
     """
     mine, truth = centers(viewmats), centers(reference)
     move = fit_similarity(mine, truth)
@@ -124,13 +118,8 @@ def up_of_plane(viewmats: np.ndarray) -> np.ndarray:
 
 def upright(up: np.ndarray) -> np.ndarray:
     """The smallest rotation (3, 3) that turns a unit vector (3,) to z."""
-    z = np.array([0.0, 0.0, 1.0])
-    cosine = float(up @ z)
-    if cosine < -1 + 1e-12:
-        return np.diag([1.0, -1.0, -1.0])
-    x, y, w = np.cross(up, z)
-    cross = np.array([[0, -w, y], [w, 0, -x], [-y, x, 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + cosine)
+    rotation: np.ndarray = Rotation.align_vectors([[0.0, 0.0, 1.0]], [up])[0].as_matrix()
+    return rotation
 
 
 def looked_at(viewmats: np.ndarray) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ from data_prep.capture.cameras.sources import Posed
 from data_prep.capture.cameras.world import (
     Similarity,
     centers,
-    identity,
     looked_at,
     metres_per_unit,
     triangulate,
@@ -20,6 +20,7 @@ from data_prep.capture.cameras.world import (
     up_of_plane,
     upright,
 )
+from data_prep.common.command import Options, option
 from gausim.core.errors import ConfigError
 from gausim.io.colmap_files import PointTable
 
@@ -28,42 +29,44 @@ _PICK = re.compile(r"(.+)@(-?[0-9.]+),(-?[0-9.]+)")
 _DISAGREEMENT = 0.05
 
 
+@dataclass(frozen=True)
+class WorldOptions(Options):
+    """The world that poses are brought to."""
+
+    up: str | None = option(
+        None, "turn z up: by the mean up of the 'cameras' (default for found poses), the 'plane' of their centres, a "
+        "vector X,Y,Z, or 'keep' (default for poses that are taken over)", metavar="RULE",
+    )  # fmt: skip
+    distance: tuple[tuple[str, str, str], ...] = option(
+        (), "known distance; A and B are ids of points.npz or PHOTO@X,Y+PHOTO@X,Y; repeatable", nargs=3,
+        action="append", metavar=("A", "B", "METRES"),
+    )  # fmt: skip
+
+
 def place(
-    found: Sequence[Posed],
-    points: PointTable,
-    *,
-    up: str | None,
-    distances: Sequence[tuple[str, str, str]],
-    mapped: bool,
+    found: Sequence[Posed], points: PointTable, options: WorldOptions, *, mapped: bool
 ) -> tuple[Similarity, dict[str, Any]]:
     """The transform from the found world to the wanted one, and what the manifest says of it.
 
-    A world found from photos has neither up, origin nor scale: it is turned upright, its origin becomes the point that
-    the cameras look at, and without known distances the cameras are one unit from it on average. A world that is taken
-    over stays as it is unless something is asked for.
-
-    Args:
-        found: poses.
-        points: their points; ``ids`` may mark distances.
-        up: ``cameras``, ``plane``, ``keep`` or ``X,Y,Z``; None is ``cameras`` for a found world, else ``keep``.
-        distances: (point, point, metres); a point is an id, or ``PHOTO@X,Y+PHOTO@X,Y`` in pixels of the photos.
-        mapped: whether the world was found from photos.
+    A world found from photos (``mapped``) has neither up, origin nor scale: it is turned upright, its origin becomes
+    the point that the cameras look at, and without known distances the cameras are one unit from it on average. A world
+    that is taken over stays as it is unless something is asked for.
 
     Raises:
         ConfigError: an option is malformed, or distances disagree.
         DataError: up cannot be told from the cameras, or picks do not meet.
     """
     viewmats = np.stack([shot.viewmat for shot in found])
-    rule = up if up is not None else ("cameras" if mapped else "keep")
-    move = _turned(rule, viewmats)
-    facts: dict[str, Any] = {"up": "z" if rule != "keep" else "as given", "up_rule": rule}
-    facts["gravity_direction"] = [0.0, 0.0, -1.0] if rule != "keep" else None
+    rule = options.up if options.up is not None else ("cameras" if mapped else "keep")
+    kept = rule == "keep"
+    move = Similarity(1.0, np.eye(3) if kept else upright(_up(rule, viewmats)), np.zeros(3))
+    facts: dict[str, Any] = {"up": "as given" if kept else "z", "up_rule": rule}
+    facts["gravity_direction"] = None if kept else [0.0, 0.0, -1.0]
     if mapped:
         middle = looked_at(viewmats)
         move = Similarity(1.0, move.rotation, -move.rotation @ middle)
-    if distances:
-        pairs = [_distance(found, points, *entry) for entry in distances]
-        scale, off = metres_per_unit(pairs)
+    if options.distance:
+        scale, off = metres_per_unit([_distance(found, points, *entry) for entry in options.distance])
         if off > _DISAGREEMENT:
             raise ConfigError(f"--distance: the distances disagree by {100 * off:.1f} %; check what was marked.")
         facts.update(unit="metres", distances_disagree=off)
@@ -77,21 +80,18 @@ def place(
     return move, facts
 
 
-def _turned(rule: str, viewmats: np.ndarray) -> Similarity:
-    if rule == "keep":
-        return identity()
+def _up(rule: str, viewmats: np.ndarray) -> np.ndarray:
+    """The unit vector (3,) that is up by a rule."""
     if rule in ("cameras", "plane"):
-        direction = up_of_cameras(viewmats) if rule == "cameras" else up_of_plane(viewmats)
-    else:
-        try:
-            direction = np.array([float(word) for word in rule.split(",")])
-        except ValueError:
-            direction = np.zeros(0)
-        length = float(np.linalg.norm(direction))
-        if direction.shape != (3,) or not 1e-9 < length < 1e9:
-            raise ConfigError(f"--up '{rule}': expected cameras, plane, keep, or three numbers like 0,-1,0.")
-        direction = direction / length
-    return Similarity(1.0, upright(direction), np.zeros(3))
+        return up_of_cameras(viewmats) if rule == "cameras" else up_of_plane(viewmats)
+    try:
+        direction = np.array([float(word) for word in rule.split(",")])
+    except ValueError:
+        direction = np.zeros(0)
+    length = float(np.linalg.norm(direction))
+    if direction.shape != (3,) or not 1e-9 < length < 1e9:
+        raise ConfigError(f"--up '{rule}': expected cameras, plane, keep, or three numbers like 0,-1,0.")
+    return direction / length
 
 
 def _distance(found: Sequence[Posed], points: PointTable, first: str, second: str, metres: str) -> tuple[float, float]:

@@ -38,37 +38,21 @@ SOUND_SECONDS = 1800.0
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """One video file.
+    """One video file."""
 
-    Attributes:
-        path: the file.
-        pts: time stamps of its N frames in presentation order, in units of ``time_base``.
-        time_base: of the stamps [s].
-        rate: frames per second.
-        variable: intervals between frames vary by more than rounding.
-        intervals: the shortest and the longest interval between frames [s].
-        size: width and height as shown, that is after rotation [pixels].
-        rotation: by which pictures are turned to be upright, counter-clockwise [degree], a multiple of 90.
-        timecode: the label of its first frame; None where the file has none that can be used.
-        timecode_fault: what is wrong with the label that it has.
-        sound: it has an audio track.
-        codec: name of the video codec.
-        hdr: name of a high-dynamic-range transfer function; None for the usual kind.
-    """
-
-    path: Path
-    pts: np.ndarray
-    time_base: Fraction
-    rate: Fraction
-    variable: bool
-    intervals: tuple[float, float]
-    size: tuple[int, int]
-    rotation: int
-    timecode: Timecode | None
-    timecode_fault: str | None
-    sound: bool
-    codec: str
-    hdr: str | None
+    path: Path  # the file
+    pts: np.ndarray  # time stamps of its N frames in presentation order, in units of ``time_base``
+    time_base: Fraction  # of the stamps [s]
+    rate: Fraction  # frames per second
+    variable: bool  # intervals between frames vary by more than rounding
+    intervals: tuple[float, float]  # the shortest and the longest interval between frames [s]
+    size: tuple[int, int]  # width and height as shown, that is after rotation [pixels]
+    rotation: int  # by which pictures are turned to be upright, counter-clockwise [degree], a multiple of 90
+    timecode: Timecode | None  # the label of its first frame; None where the file has none that can be used
+    timecode_fault: str | None  # what is wrong with the label that it has
+    sound: bool  # it has an audio track
+    codec: str  # name of the video codec
+    hdr: str | None  # name of a high-dynamic-range transfer function; None for the usual kind
 
     @property
     def times(self) -> np.ndarray:
@@ -265,14 +249,10 @@ def _shown_size(path: Path, frame: av.VideoFrame) -> tuple[int, int]:
     if frame.rotation % 90:
         raise DataError(f"{path}: is to be turned by {frame.rotation} degrees; only multiples of 90 are supported.")
     matrix = frame.side_data.get(SideData.DISPLAYMATRIX)
-    if matrix is not None and _mirrors(np.frombuffer(bytes(matrix), np.int32)):
+    a, b, _, c, d, *_ = (1, 0, 0, 0, 1) if matrix is None else np.frombuffer(bytes(matrix), np.int32).tolist()
+    if a * d < b * c:
         raise DataError(f"{path}: is to be mirrored by its metadata. Export it as it is to be seen.")
     return (frame.height, frame.width) if frame.rotation % 180 else (frame.width, frame.height)
-
-
-def _mirrors(matrix: np.ndarray) -> bool:
-    a, b, c, d = (int(matrix[i]) for i in (0, 1, 3, 4))
-    return a * d - b * c < 0
 
 
 def _timecode_label(container: av.container.InputContainer, stream: av.VideoStream) -> tuple[str | None, int | None]:

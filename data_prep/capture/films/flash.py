@@ -24,32 +24,20 @@ SAME = 0.75
 
 @dataclass(frozen=True)
 class Flash:
-    """A light that went on.
+    """A light that went on."""
 
-    Attributes:
-        seconds: when, on the film's clock [s].
-        resolution: what the pictures can tell of it [s].
-    """
-
-    seconds: float
-    resolution: float
+    seconds: float  # when, on the film's clock [s]
+    resolution: float  # what the pictures can tell of it [s]
 
 
 @dataclass(frozen=True)
 class FlashLag:
-    """A measured difference of starts.
+    """A measured difference of starts."""
 
-    Attributes:
-        seconds: by how much the second film began later [s].
-        spread: largest disagreement between flashes [s].
-        resolution: what they can tell [s].
-        count: how many both films saw.
-    """
-
-    seconds: float
-    spread: float
-    resolution: float
-    count: int
+    seconds: float  # by how much the second film began later [s]
+    spread: float  # largest disagreement between flashes [s]
+    resolution: float  # what they can tell [s]
+    count: int  # how many both films saw
 
 
 def brightness(gray: np.ndarray) -> float:
@@ -92,11 +80,6 @@ def flashes(levels: np.ndarray, times: np.ndarray, *, interval: float, shutter: 
 
 def flash_lag(first: list[Flash], second: list[Flash], *, interval: float) -> FlashLag:
     """By how much the second film began later than the first, from the flashes that both saw.
-
-    Args:
-        first: flashes of one film.
-        second: flashes of the other.
-        interval: the longer of their times between frames [s].
 
     Raises:
         DataError: their flashes can be matched in several ways.

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
-from scipy.signal import butter, find_peaks, sosfiltfilt
+from scipy.signal import butter, correlate, correlation_lags, find_peaks, sosfiltfilt
 from scipy.signal.windows import tukey
 
 from gausim.core import DataError
@@ -38,28 +38,16 @@ LIKE = 0.5
 
 @dataclass(frozen=True)
 class Lag:
-    """A measured difference of starts.
+    """A measured difference of starts."""
 
-    Attributes:
-        seconds: by how much the second recording's start is later than the first's [s].
-        spread: largest disagreement between parts of the film [s].
-        sharpness: of the phase transform's peak, in standard deviations of the rest.
-        likeness: correlation coefficient of the loudness.
-    """
-
-    seconds: float
-    spread: float
-    sharpness: float
-    likeness: float
+    seconds: float  # by how much the second recording's start is later than the first's [s]
+    spread: float  # largest disagreement between parts of the film [s]
+    sharpness: float  # of the phase transform's peak, in standard deviations of the rest
+    likeness: float  # correlation coefficient of the loudness
 
 
 def sound_lag(first: np.ndarray, second: np.ndarray, rate: int) -> Lag:
     """By how much the second recording began later than the first.
-
-    Args:
-        first: (n,) float32 samples of one channel.
-        second: (m,) samples of another recording of the same event.
-        rate: samples per second of both.
 
     Raises:
         DataError: one is silent, they are too short, or do not tell where they belong.
@@ -117,12 +105,11 @@ def _loudness(samples: np.ndarray, rate: int) -> np.ndarray:
 
 def _likeness(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Correlation of two signals over all lags with enough overlap, relative to their common energy."""
-    size = next_fast_len(len(a) + len(b))
-    products = irfft(rfft(a, size) * np.conj(rfft(b, size)), size)
+    products, lags = correlate(a, b, method="fft"), correlation_lags(len(a), len(b))
     least = int(LEAST_OVERLAP * ENVELOPE_RATE)
-    lags = np.arange(least - len(b), len(a) - least + 1)
+    enough = (lags >= least - len(b)) & (lags <= len(a) - least)
     norm = np.sqrt((a**2).sum() * (b**2).sum())
-    return products[lags % size] / max(norm, 1e-12), lags
+    return products[enough] / max(norm, 1e-12), lags[enough]
 
 
 def _refined(a: np.ndarray, b: np.ndarray, lag: float, rate: int) -> tuple[float, float, float]:

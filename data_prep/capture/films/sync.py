@@ -7,8 +7,9 @@ its place is the residual; above half a frame there is a better frame, or none, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -27,37 +28,23 @@ SAME_RATE = 5e-4
 
 @dataclass(frozen=True)
 class Offsets:
-    """When the cameras began.
+    """When the cameras began."""
 
-    Attributes:
-        method: how it is known.
-        seconds: by camera, what is added to its film's times to be on the common clock [s].
-        spread: by camera, how far its measurements disagree with each other [s].
-        resolution: by camera, what the method can tell apart [s].
-        notes: what the user should know.
-    """
-
-    method: str
-    seconds: Mapping[str, float]
-    spread: Mapping[str, float]
-    resolution: Mapping[str, float]
-    notes: tuple[str, ...] = field(default=())
+    method: str  # how it is known
+    seconds: Mapping[str, float]  # by camera, what is added to its film's times to be on the common clock [s]
+    spread: Mapping[str, float]  # by camera, how far its measurements disagree with each other [s]
+    resolution: Mapping[str, float]  # by camera, what the method can tell apart [s]
+    notes: tuple[str, ...] = ()  # what the user should know
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Which frames belong together.
+    """Which frames belong together."""
 
-    Attributes:
-        reference: the camera whose frames give the output its times.
-        rate: output frames per second.
-        frames: by camera, the index in its film of each of the F output frames, int64.
-        residuals: by camera, how much later than its place each of them is, float64 [output frames].
-    """
-
-    reference: str
-    rate: Fraction
-    frames: Mapping[str, np.ndarray]
+    reference: str  # the camera whose frames give the output its times
+    rate: Fraction  # output frames per second
+    frames: Mapping[str, np.ndarray]  # by camera, the index in its film of each of the F output frames, int64
+    # by camera, how much later than its place each of them is, float64 [output frames]
     residuals: Mapping[str, np.ndarray]
 
     @property
@@ -79,7 +66,8 @@ def measure(films: Mapping[str, Film], method: str, *, given: Mapping[str, float
         DataError: the method does not apply (which camera, why, and what to do), or two methods contradict each other.
     """
     if len(films) == 1:
-        return Offsets("single", dict.fromkeys(films, 0.0), dict.fromkeys(films, 0.0), dict.fromkeys(films, 0.0))
+        zero = dict.fromkeys(films, 0.0)
+        return Offsets("single", zero, zero, zero)
     if method != "auto":
         return _by(method, films, given, shutter)
     reasons = []
@@ -147,21 +135,30 @@ def _by(method: str, films: Mapping[str, Film], given: Mapping[str, float], shut
     return Offsets("offsets", {**zero, **given}, zero, zero)
 
 
+@contextmanager
+def _naming(name: str, films: Mapping[str, Film], base: str | None = None) -> Iterator[None]:
+    """Puts the camera, and the one that it is compared with, before an error."""
+    try:
+        yield
+    except DataError as error:
+        other = f" against {base} ({films[base].path.name})" if base else ""
+        raise DataError(f"{name} ({films[name].path.name}){other}: {error}") from error
+
+
 def _by_timecode(films: Mapping[str, Film]) -> Offsets:
+    codes = {}
     for name, film in films.items():
         if film.timecode is None:
             raise DataError(f"{name} ({film.path.name}): {film.timecode_fault or 'has no time code.'}")
-    (base, reference), *_ = films.items()
-    seconds, resolution = {}, {}
+        codes[name] = film.timecode
+    base, reference = next(iter(films.items()))
+    seconds = {}
     for name, film in films.items():
-        assert film.timecode is not None and reference.timecode is not None
-        try:
-            later = float(film.timecode.seconds_after(reference.timecode))
-        except DataError as error:
-            raise DataError(f"{name} ({film.path.name}) and {base} ({reference.path.name}): {error}") from error
+        with _naming(name, films, base):
+            later = float(codes[name].seconds_after(codes[base]))
         # The label is that of the first frame, wherever on the film's own clock that lies.
         seconds[name] = later - float(film.times[0]) + float(reference.times[0])
-        resolution[name] = 0.5 / float(film.timecode.rate)
+    resolution = {name: 0.5 / float(code.rate) for name, code in codes.items()}
     note = "time code counts whole frames: between cameras that are not genlocked up to half a frame stays unknown"
     return Offsets("timecode", seconds, dict.fromkeys(films, 0.0), resolution, (note,))
 
@@ -175,10 +172,8 @@ def _by_sound(films: Mapping[str, Film]) -> Offsets:
     seconds, spread, notes = {base: 0.0}, {base: 0.0}, []
     for name, film in others:
         second, begins = sound(film)
-        try:
+        with _naming(name, films, base):
             lag = sound_lag(first, second, SOUND_RATE)
-        except DataError as error:
-            raise DataError(f"{name} ({film.path.name}) against {base} ({reference.path.name}): {error}") from error
         seconds[name], spread[name] = lag.seconds + begin - begins, lag.spread
         notes.append(f"{name}: sharpness {lag.sharpness:.1f}, likeness of loudness {lag.likeness:.2f}")
     notes.append("sound travels 1 m in 2.9 ms: a microphone that is further from the source hears later")
@@ -188,19 +183,14 @@ def _by_sound(films: Mapping[str, Film]) -> Offsets:
 def _by_flash(films: Mapping[str, Film], shutter: float) -> Offsets:
     found: dict[str, list[Flash]] = {}
     for name, film in films.items():
-        interval = 1 / float(film.rate)
-        try:
+        with _naming(name, films):
+            interval = 1 / float(film.rate)
             found[name] = flashes(brightness_curve(film), film.times, interval=interval, shutter=shutter)
-        except DataError as error:
-            raise DataError(f"{name} ({film.path.name}): {error}") from error
     (base, reference), *others = films.items()
     seconds, spread, resolution = {base: 0.0}, {base: 0.0}, {base: 0.0}
     for name, film in others:
-        interval = 1 / float(min(film.rate, reference.rate))
-        try:
-            lag = flash_lag(found[base], found[name], interval=interval)
-        except DataError as error:
-            raise DataError(f"{name} ({film.path.name}) against {base} ({reference.path.name}): {error}") from error
+        with _naming(name, films, base):
+            lag = flash_lag(found[base], found[name], interval=1 / float(min(film.rate, reference.rate)))
         seconds[name], spread[name], resolution[name] = lag.seconds, lag.spread, lag.resolution
     return Offsets("flash", seconds, spread, resolution)
 
@@ -218,17 +208,16 @@ def _checked_by_sound(films: Mapping[str, Film], found: Offsets) -> Offsets:
     try:
         heard = _by_sound(films)
     except DataError as error:
-        return Offsets(found.method, found.seconds, found.spread, found.resolution, (*found.notes, f"sound: {error}"))
+        return replace(found, notes=(*found.notes, f"sound: {error}"))
+    apart = {name: (heard.seconds[name] - found.seconds[name]) * float(film.rate) for name, film in films.items()}
     for name, film in films.items():
-        apart = (heard.seconds[name] - found.seconds[name]) * float(film.rate)
-        if abs(apart) > 1.0:
+        if abs(apart[name]) > 1.0:
             raise DataError(
-                f"{name} ({film.path.name}): its time code and its sound disagree by {apart:+.2f} frames. If the "
+                f"{name} ({film.path.name}): its time code and its sound disagree by {apart[name]:+.2f} frames. If the "
                 "cameras' time codes were set together, choose --sync timecode; if they were not, choose --sync audio."
             )
-    checked = {name: round((heard.seconds[name] - found.seconds[name]) * float(films[name].rate), 2) for name in films}
-    note = f"sound agrees with the time code, later by {checked} frames"
-    return Offsets(found.method, found.seconds, found.spread, found.resolution, (*found.notes, note))
+    told = {name: round(frames, 2) for name, frames in apart.items()}
+    return replace(found, notes=(*found.notes, f"sound agrees with the time code, later by {told} frames"))
 
 
 def _check_agreement(films: Mapping[str, Film], offsets: Offsets, rate: float) -> None:

@@ -9,44 +9,51 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from jsonschema import Draft202012Validator
+from jsonschema.exceptions import best_match
+
 from data_prep.common.photos import natural
 from gausim.core import DataError
 from gausim.io.transforms import read_json
+
+# What a list file holds, as JSON schema; times are in seconds.
+_TIME = {"type": "number", "minimum": 0, "maximum": 1e6}
+_TAKE = {
+    "type": "object",
+    "required": ["cameras"],
+    "additionalProperties": False,
+    "properties": {
+        "name": {"type": ["string", "number"]},
+        "cameras": {"type": "object", "minProperties": 1, "additionalProperties": {"type": "string", "minLength": 1}},
+        "offsets": {"type": "object", "additionalProperties": {"type": ["string", "number"]}},
+        "start": _TIME,
+        "duration": _TIME,
+    },
+}
+_SEQUENCES = {"type": "array", "minItems": 1, "items": _TAKE}
+_LIST = {"type": "object", "required": ["sequences"], "properties": {"sequences": _SEQUENCES}}
 
 FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".mxf")
 
 
 @dataclass(frozen=True)
 class Take:
-    """One sequence before it is synchronised.
+    """One sequence before it is synchronised."""
 
-    Attributes:
-        name: its folder in the output, seq_000 and so on.
-        source: what the user calls it.
-        films: file by camera (cam_0 and so on).
-        labels: what the user calls each camera.
-        offsets: by camera, as given: seconds, or frames with an ``f``.
-        start: what is left out at the beginning of the common time [s].
-        duration: how much of it is kept [s]; all when None.
-    """
-
-    name: str
-    source: str
-    films: Mapping[str, Path]
-    labels: Mapping[str, str]
-    offsets: Mapping[str, str] = field(default_factory=dict)
-    start: float | None = None
-    duration: float | None = None
+    name: str  # its folder in the output, seq_000 and so on
+    source: str  # what the user calls it
+    films: Mapping[str, Path]  # file by camera (cam_0 and so on)
+    labels: Mapping[str, str]  # what the user calls each camera
+    offsets: Mapping[str, str] = field(default_factory=dict)  # by camera, as given: seconds, or frames with an ``f``
+    start: float | None = None  # what is left out at the beginning of the common time [s]
+    duration: float | None = None  # how much of it is kept [s]; all when None
 
 
 def find_takes(path: Path) -> list[Take]:
     """The sequences that a folder or list file (``.json``) names.
 
     A folder holds one folder per sequence, each with one film per camera, named alike in all; or the films of a single
-    sequence. A list file says it outright, its paths relative to itself::
-
-        {"sequences": [{"name": "poke", "cameras": {"left": "a/1.mp4", "right": "b/7.mov"},
-                        "offsets": {"right": "7.3f"}, "start": 0.5, "duration": 2.0}]}
+    sequence. A list file says it outright, its paths relative to itself (:data:`data_prep.ingest.LAYOUT`).
 
     Cameras become cam_0, cam_1 … in the natural order of their names, sequences seq_000 … in that of theirs (in a list,
     in its own).
@@ -120,30 +127,14 @@ def _by_stem(folder: Path) -> dict[str, Path]:
 
 
 def _listed(path: Path) -> list[tuple[str, dict[str, Path], dict[str, Any]]]:
-    entries = read_json(path).get("sequences")
-    if not isinstance(entries, list) or not entries:
-        raise DataError(f"{path}: field 'sequences' must be a list that is not empty.")
+    data = read_json(path)
+    fault = best_match(Draft202012Validator(_LIST).iter_errors(data))
+    if fault is not None:
+        raise DataError(f"{path}: {fault.json_path.removeprefix('$.')}: {fault.message:.200}. See --help for the form.")
     found = []
-    for i, entry in enumerate(entries):
-        where = f"{path}: sequences[{i}]"
-        unknown = set(entry) - {"name", "cameras", "offsets", "start", "duration"} if isinstance(entry, dict) else {"?"}
-        if not isinstance(entry, dict) or unknown:
-            raise DataError(f"{where}: expected an object of name, cameras, offsets, start, duration.")
-        cameras = entry.get("cameras")
-        if not isinstance(cameras, dict) or not cameras or not all(isinstance(v, str) and v for v in cameras.values()):
-            raise DataError(f"{where}: field 'cameras' must map names of cameras to films.")
-        offsets = entry.get("offsets", {})
-        if not isinstance(offsets, dict) or any(isinstance(v, bool) for v in offsets.values()):
-            raise DataError(f"{where}: field 'offsets' must map cameras to seconds, or to frames such as \"7.3f\".")
-        extra: dict[str, Any] = {"offsets": {name: str(value) for name, value in offsets.items()}}
-        for key in ("start", "duration"):
-            extra[key] = _seconds(entry[key], f"{where}: field '{key}'") if key in entry else None
-        films = {name: path.parent / value for name, value in cameras.items()}
+    for i, entry in enumerate(data["sequences"]):
+        offsets = {name: str(value) for name, value in entry.get("offsets", {}).items()}
+        extra = {"offsets": offsets, "start": entry.get("start"), "duration": entry.get("duration")}
+        films = {name: path.parent / value for name, value in entry["cameras"].items()}
         found.append((str(entry.get("name", i)), films, extra))
     return found
-
-
-def _seconds(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value) or value < 0:
-        raise DataError(f"{where}: expected seconds, at least 0, got {value!r}.")
-    return float(value)

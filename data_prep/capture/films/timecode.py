@@ -20,21 +20,13 @@ _DROPPED = {30: 2, 60: 4, 120: 8}
 
 @dataclass(frozen=True)
 class Timecode:
-    """The label of one frame.
+    """The label of one frame."""
 
-    Attributes:
-        text: as it stands in the file.
-        frame: frames since the label 00:00:00:00.
-        base: labels per nominal second, e.g. 30 at 30000/1001 frames per second.
-        drop: labels are dropped.
-        rate: frames that are shown per second, exactly.
-    """
-
-    text: str
-    frame: int
-    base: int
-    drop: bool
-    rate: Fraction
+    text: str  # as it stands in the file
+    frame: int  # frames since the label 00:00:00:00
+    base: int  # labels per nominal second, e.g. 30 at 30000/1001 frames per second
+    drop: bool  # labels are dropped
+    rate: Fraction  # frames that are shown per second, exactly
 
     @property
     def clock(self) -> tuple[bool, bool]:
@@ -66,10 +58,6 @@ class Timecode:
 def parse_timecode(text: str, rate: Fraction) -> Timecode:
     """Reads a label ``HH:MM:SS:FF`` (``;``, ``.`` or ``,`` before FF: drop frame).
 
-    Args:
-        text: the label.
-        rate: frames per second that it counts, exactly (30000/1001, not 29.97).
-
     Raises:
         DataError: it is no such label, or one that this count does not have.
     """
@@ -97,24 +85,3 @@ def frames_of_label(hours: int, minutes: int, seconds: int, frames: int, *, base
     total = 60 * hours + minutes
     count = (60 * total + seconds) * base + frames
     return count - _DROPPED[base] * (total - total // 10) if drop else count
-
-
-def label_of_frame(frame: int, *, base: int, drop: bool) -> str:
-    """The label of the frame with this number; it starts again after a day.
-
-    Raises:
-        DataError: there is no drop-frame count of this base.
-    """
-    if drop and base not in _DROPPED:
-        raise DataError(f"drop frame: expected a base of {sorted(_DROPPED)} labels per second, got {base}.")
-    frame %= frames_of_label(24, 0, 0, 0, base=base, drop=drop)
-    if drop:
-        lost = _DROPPED[base]
-        minute = 60 * base - lost
-        tens, rest = divmod(frame, 10 * 60 * base - 9 * lost)
-        # The first minute of ten is whole; each of the others begins with dropped labels.
-        frame += lost * (9 * tens + max(0, rest - lost) // minute)
-    second, part = divmod(frame, base)
-    minutes, second = divmod(second, 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours:02d}:{minutes:02d}:{second:02d}{';' if drop else ':'}{part:02d}"

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from data_prep.common.command import Options, option
+
 # Soft edges are told from empty space by this much alpha.
 TRACE = 0.05
 # Colour is kept so far around the foreground [pixels], for whoever reduces or warps the picture; beyond it is black.
@@ -15,29 +17,20 @@ BORDER = 8
 
 
 @dataclass(frozen=True)
-class Cleanup:
-    """What is done to the masks of a clip.
+class Cleanup(Options):
+    """What is done to the masks of a clip; lengths are parts of the picture's longer side."""
 
-    Attributes:
-        radius: neighbours in time on each side that a mask is compared with, fewer at a clip's ends; 0 leaves time
-            alone.
-        motion: how far an edge may move from frame to frame, as part of the longer side.
-        holes: holes up to this part of the foreground's area are filled.
-        components: so many of the largest parts are kept; 0 keeps all.
-        least: parts below this part of the picture's area go in any case.
-        edge: width over which hard edges are softened, as part of the longer side; 0 leaves them hard.
-        reach: soft edges end so far from what is mostly foreground, as part of the longer side; 0 does not limit them.
-        floor: alpha below this becomes 0, because any alpha above 0 counts as foreground.
-    """
-
-    radius: int = 2
-    motion: float = 0.02
-    holes: float = 0.02
-    components: int = 1
-    least: float = 0.0005
-    edge: float = 0.004
-    reach: float = 0.01
-    floor: float = 0.05
+    radius: int = option(
+        2, "neighbours in time on each side to agree with; 0 leaves time alone (2)", least=0, metavar="FRAMES"
+    )
+    motion: float = option(0.02, "how far edges move per frame (0.02)", least=0, most=1)
+    holes: float = option(0.02, "fill holes up to this part of the foreground (0.02)", least=0, most=1)
+    components: int = option(1, "keep the N largest parts; 0 keeps all (1)", least=0, metavar="N")
+    least: float = option(0.0005, "drop parts below this part of the picture (0.0005)", least=0, most=1)
+    edge: float = option(0.004, "width over which hard edges are softened; 0 leaves them (0.004)", least=0, most=0.1)
+    reach: float = option(0.01, "soft edges end so far from the foreground; 0: anywhere (0.01)", least=0, most=1)
+    # Any alpha above 0 counts as foreground.
+    floor: float = option(0.05, "alpha below this becomes 0 (0.05)", least=0, most=1)
 
 
 UNTOUCHED = Cleanup(radius=0, holes=0.0, components=0, least=0.0, edge=0.0, reach=0.0, floor=0.0)
@@ -72,12 +65,6 @@ def steady(mask: np.ndarray, neighbours: Sequence[tuple[int, np.ndarray]], motio
 
 def cleaned(mask: np.ndarray, rgb: np.ndarray, cleanup: Cleanup, *, soft: bool) -> np.ndarray:
     """One mask with holes filled, crumbs removed and edges softened.
-
-    Args:
-        mask: (H, W) float32 in 0..1.
-        rgb: its picture, (H, W, 3) uint8.
-        cleanup: how much of it.
-        soft: its edges are soft already.
 
     Returns:
         (H, W) uint8 alpha; above 0 is foreground.

@@ -9,10 +9,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from data_prep.capture.films.film import pictures, probe, upright
 from data_prep.capture.films.takes import FILMS
-from data_prep.common.photos import SUFFIXES, natural
+from data_prep.common.photos import SUFFIXES, natural, write_image
 from gausim.core import DataError
-from gausim.io.files import write_durably
 from gausim.io.pixels import decode
 
 # Pictures that stages draw for people, and the file that lies beside them.
@@ -21,19 +21,12 @@ SHEETS = {"sync.png": "sync.json", "cameras.png": "stage.json"}
 
 @dataclass(frozen=True)
 class Clip:
-    """Pictures of one folder, in order.
+    """Pictures of one folder, in order."""
 
-    Attributes:
-        name: the folder relative to the input, e.g. ``sequences/seq_000/cam_0``.
-        root: the input.
-        paths: its N pictures relative to ``root``.
-        moving: a film of a camera that stands still, so that neighbours in time look alike; else stills.
-    """
-
-    name: str
-    root: Path
-    paths: tuple[Path, ...]
-    moving: bool
+    name: str  # the folder relative to the input, e.g. ``sequences/seq_000/cam_0``
+    root: Path  # the input
+    paths: tuple[Path, ...]  # its N pictures relative to ``root``
+    moving: bool  # a film of a camera that stands still, so that neighbours in time look alike; else stills
 
     def __len__(self) -> int:
         """Number of pictures."""
@@ -59,11 +52,6 @@ class Clip:
 
 def find_clips(root: Path, *, kind: str = "auto", every: int = 1) -> list[Clip]:
     """All folders with pictures in ``root``, each a clip.
-
-    Args:
-        root: the folder.
-        kind: ``film``, ``stills``, or ``auto``: film where a folder lies in ``sequences``.
-        every: only each n-th picture.
 
     Raises:
         DataError: there are none, or two pictures would become one PNG.
@@ -94,8 +82,6 @@ def _drawn_by_a_stage(path: Path) -> bool:
 
 def film_frames(film: Path, folder: Path) -> None:
     """Writes a film's frames, upright, as 0000.png and so on; those that are there are kept."""
-    from data_prep.capture.films.film import pictures, probe, upright
-
     facts = probe(film)
     if len(list(folder.glob("*.png"))) == len(facts):
         return
@@ -134,12 +120,7 @@ def read_picture(path: Path) -> np.ndarray:
 def write_picture(path: Path, pixels: np.ndarray) -> None:
     """Writes (H, W), (H, W, 3) RGB or (H, W, 4) RGBA uint8 as PNG (or JPEG by its name), whole or not at all."""
     code = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}.get(pixels.shape[2] if pixels.ndim == 3 else 1)
-    ordered = pixels if code is None else cv2.cvtColor(pixels, code)
-    options = [cv2.IMWRITE_PNG_COMPRESSION, 1] if path.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 90]
-    ok, data = cv2.imencode(path.suffix, ordered, options)
-    if not ok:
-        raise DataError(f"{path}: cannot be encoded.")
-    write_durably(path, data.tobytes())
+    write_image(path, pixels if code is None else cv2.cvtColor(pixels, code), 1)
 
 
 def sampled(count: int, most: int) -> Sequence[int]:

@@ -31,14 +31,6 @@ class OnnxSegmenter:
     ) -> None:
         """Loads the network.
 
-        Args:
-            path: the ``.onnx`` file.
-            size: side of the input [pixels], where the file leaves it open.
-            mean: subtracted from RGB in 0..255; one value, or one per channel.
-            scale: what is left is divided by it.
-            output: which of its outputs is the mask.
-            activation: what makes it 0..1: ``none``, ``sigmoid``, or ``minmax`` (stretched over each picture).
-
         Raises:
             ConfigError: onnxruntime is not installed, or an option does not fit the network.
             DataError: the file is no such network.

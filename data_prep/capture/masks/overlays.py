@@ -19,13 +19,7 @@ SHEET = 12
 
 
 def overlay(rgb: np.ndarray, alpha: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Left the picture with the background dimmed and the mask's outline, right what was cut out; each of ``size``.
-
-    Args:
-        rgb: (H, W, 3) uint8.
-        alpha: (H, W) uint8.
-        size: width and height that each half is fitted into [pixels].
-    """
+    """Left the picture with the background dimmed and the mask's outline, right what was cut out; each of ``size``."""
     rgb, alpha = fitted(rgb, size), fitted(alpha, size)
     weight = alpha[..., None].astype(np.float32) / 255
     left = rgb * (0.35 + 0.65 * weight)
@@ -49,14 +43,7 @@ def fitted(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 
 def write_overlays(clip: Clip, masks: Sequence[Path], folder: Path, *, fps: float) -> None:
-    """Writes ``NAME.mp4`` of all pictures and ``NAME.jpg`` of some.
-
-    Args:
-        clip: the pictures.
-        masks: the RGBA file of each.
-        folder: where to.
-        fps: frames per second of the film.
-    """
+    """Writes ``NAME.mp4`` of all pictures and ``NAME.jpg`` of some."""
     from gausim.io.video import write_video
 
     height, width = clip.rgb(0).shape[:2]

@@ -26,15 +26,10 @@ JPEG_QUALITY = 98
 
 @dataclass(frozen=True)
 class Prompt:
-    """Where the object is on the first picture of a clip [pixels].
+    """Where the object is on the first picture of a clip [pixels]."""
 
-    Attributes:
-        box: left, top, right, bottom; None without.
-        points: x, y and 1 for object or 0 for background.
-    """
-
-    box: tuple[float, float, float, float] | None = None
-    points: tuple[tuple[float, float, int], ...] = ()
+    box: tuple[float, float, float, float] | None = None  # left, top, right, bottom; None without
+    points: tuple[tuple[float, float, int], ...] = ()  # x, y and 1 for object or 0 for background
 
 
 class VideoPredictor(Protocol):
@@ -42,32 +37,23 @@ class VideoPredictor(Protocol):
 
     def init_state(self, video_path: str, offload_video_to_cpu: bool = ...) -> Any:
         """Reads a folder of JPEG files 00000.jpg and so on."""
-        ...
 
     def add_new_points_or_box(self, inference_state: Any, frame_idx: int, obj_id: int, **prompt: Any) -> Any:
         """Takes ``points``, ``labels`` and ``box`` on a frame."""
-        ...
 
     def propagate_in_video(self, inference_state: Any) -> Iterator[tuple[int, list[int], Any]]:
         """Yields frame index, object numbers, and logits (objects, 1, H, W)."""
-        ...
 
 
 class Sam2Segmenter:
     """SAM 2's video predictor behind the protocol of :class:`data_prep.capture.masks.segmenters.Segmenter`."""
 
     def __init__(self, predictor: VideoPredictor, prompts: Mapping[str, Prompt], *, device: str = "cpu") -> None:
-        """Takes a predictor and prompts.
-
-        Args:
-            predictor: from :func:`load_predictor`.
-            prompts: by name of the clip; ``""`` counts for all that are not named.
-            device: where the predictor computes.
-        """
+        """Takes a predictor and prompts."""
         self._predictor, self._prompts, self._device = predictor, prompts, device
 
     def open(self, clip: Clip) -> MaskOf:
-        """See :class:`data_prep.capture.masks.segmenters.Segmenter`; the pictures are followed once, as they are asked for."""
+        """See :class:`~data_prep.capture.masks.segmenters.Segmenter`; pictures are followed once, in order."""
         height, width = clip.rgb(0).shape[:2]
         prompt = _fitting(self._prompts.get(clip.name, self._prompts.get("")), clip, width, height)
         masks = self._follow(clip, prompt, (height, width))
@@ -115,11 +101,6 @@ class Sam2Segmenter:
 
 def load_predictor(checkpoint: Path, config: str, *, device: str) -> VideoPredictor:
     """SAM 2's video predictor with the weights of a local checkpoint, read without pickles of code.
-
-    Args:
-        checkpoint: the ``.pt`` file.
-        config: name of its configuration within the package, e.g. ``configs/sam2.1/sam2.1_hiera_s.yaml``.
-        device: ``cpu`` or ``cuda``.
 
     Raises:
         ConfigError: the package is not installed, or has no such configuration.

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -23,6 +23,18 @@ GRABCUT_SIDE = 480
 GRABCUT_ROUNDS = 3
 
 
+@dataclass(frozen=True)
+class Backend:
+    """A way to tell foreground from background, with what its result depends on."""
+
+    name: str  # of the backend
+    make: Callable[[], Segmenter]  # makes the segmenter; called once, and only if there is something to do
+    soft: bool = False  # masks have soft edges of their own; others are softened along the picture's edges
+    settings: Mapping[str, Any] = field(default_factory=dict)  # what was chosen (plain data)
+    inputs: Mapping[str, Path] = field(default_factory=dict)  # files it reads besides the pictures
+    packages: tuple[str, ...] = ()  # libraries whose versions may matter
+
+
 class Segmenter(Protocol):
     """Tells foreground from background."""
 
@@ -32,7 +44,6 @@ class Segmenter(Protocol):
         It is called with rising indices, not necessarily all of them, and returns (H, W) float32 in 0..1, 1 being
         foreground.
         """
-        ...
 
 
 @dataclass(frozen=True)
@@ -59,16 +70,12 @@ class BackgroundSegmenter:
 
     The median holds whatever stays in its place. It removes the background of an object that leaves its place now and
     then; of one that sways about it only the swaying parts are found, and GrabCut spreads them over what looks alike.
-
-    Attributes:
-        plate: picture of the empty scene, or a folder with one per camera (named like the clip's folder); None: median.
-        threshold: difference in CIE Lab from which a pixel counts; from the noise when None.
-        grabcut: refine by GrabCut.
     """
 
+    # picture of the empty scene, or a folder with one per camera (named like the clip's folder); None: median
     plate: Path | None = None
-    threshold: float | None = None
-    grabcut: bool = True
+    threshold: float | None = None  # difference in CIE Lab from which a pixel counts; from the noise when None
+    grabcut: bool = True  # refine by GrabCut
 
     def open(self, clip: Clip) -> MaskOf:
         """See :class:`Segmenter`."""
@@ -115,17 +122,12 @@ class BackgroundSegmenter:
 
 @dataclass(frozen=True)
 class ChromaSegmenter:
-    """What has another hue than a screen.
+    """What has another hue than a screen."""
 
-    Attributes:
-        key: the screen's colour (RGB, 0..255); that of the picture's border when None.
-        tolerance: distances in the a-b plane of CIE Lab up to which a pixel is screen, and from which it is not.
-        grabcut: refine by GrabCut.
-    """
-
-    key: tuple[int, int, int] | None = None
+    key: tuple[int, int, int] | None = None  # the screen's colour (RGB, 0..255); that of the picture's border when None
+    # distances in the a-b plane of CIE Lab up to which a pixel is screen, and from which it is not
     tolerance: tuple[float, float] = (14.0, 32.0)
-    grabcut: bool = True
+    grabcut: bool = True  # refine by GrabCut
 
     def open(self, clip: Clip) -> MaskOf:
         """See :class:`Segmenter`."""
@@ -177,14 +179,7 @@ def median_picture(clip: Clip, indices: Sequence[int]) -> np.ndarray:
 
 
 def trimap(far: np.ndarray, threshold: float, *, sure: bool, ever: np.ndarray | None) -> np.ndarray:
-    """GrabCut's marks from (H, W) differences.
-
-    Args:
-        far: differences from the background.
-        threshold: from which they count.
-        sure: the background is known, so what differs much is certainly foreground and what does not is background.
-        ever: where anything differed at any time, if only that is known.
-    """
+    """GrabCut's marks from (H, W) differences."""
     side = max(far.shape)
     margin = max(3, round(0.02 * side)) | 1
     marks = np.full(far.shape, cv2.GC_BGD, np.uint8)
