@@ -6,11 +6,14 @@ import os
 import subprocess
 import sys
 import tomllib
+from argparse import ArgumentParser
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 import gausim
+from data_prep.common.command import Options, add_options, chosen, names, option
 from gausim.cli.main import main
 from gausim.cli.prepare import STAGES, stages_root
 from gausim.core import ConfigError
@@ -27,7 +30,43 @@ def test_every_stage_has_a_command_and_every_command_a_stage() -> None:
 def test_help_names_the_command(stage: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
         main(["prepare", stage, "--help"])
-    assert f"usage: gausim prepare {stage} " in capsys.readouterr().out
+    text = capsys.readouterr().out
+    assert f"usage: gausim prepare {stage} " in text and "(None)" not in text
+
+
+@dataclass(frozen=True)
+class Chosen(Options):
+    """Options of every kind."""
+
+    size: tuple[int, int] = option((4, 4), "of a picture", least=1, nargs=2)
+    names: tuple[str, ...] = option((), "several", type=names)
+    mark: tuple[tuple[str, str], ...] = option((), "repeatable", nargs=2, action="append")
+    part: float | None = option(None, "of something", least=0, most=1)
+    quick: bool = option(False, "flag")
+    hidden: int = 3
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("", Chosen()),
+        ("--size 2 3 --names a,b --part 0.5 --quick", Chosen((2, 3), ("a", "b"), (), 0.5, True)),
+        ("--mark a b --mark c d", Chosen(mark=(["a", "b"], ["c", "d"]))),
+        ("--names none", Chosen()),
+        ("--part 1.5", "--part: expected 0 to 1, got 1.5"),
+        ("--part nan", "--part: expected 0 to 1, got nan"),
+        ("--size 2 0", "--size: expected at least 1, got 0"),
+    ],
+)
+def test_options_are_fields(line: str, expected: Chosen | str) -> None:
+    parser = ArgumentParser()
+    add_options(parser, Chosen)
+    arguments = parser.parse_args(line.split())
+    if isinstance(expected, str):
+        with pytest.raises(ConfigError, match=expected):
+            chosen(Chosen, arguments)
+    else:
+        assert chosen(Chosen, arguments) == expected
 
 
 def test_the_wheel_has_the_stages_where_the_command_looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,7 +88,7 @@ def add_segment_options(parser: argparse.ArgumentParser) -> None:
     cleaning = parser.add_argument_group("cleaning (backend alpha: nothing unless asked for)")
     add_options(cleaning, Cleanup, unset=True)
     for title, kind in GROUPS.items():
-        add_options(parser.add_argument_group(title), kind, unset=True)
+        add_options(parser.add_argument_group(title), kind)
 
 
 def make_cleanup(arguments: argparse.Namespace) -> Cleanup:
