@@ -97,13 +97,8 @@ def test_the_set_is_read_and_verified(mesh: Path, tmp_path: Path) -> None:
     assert (data.name, data.fps, data.train_frames) == ("box", 24, range(0, 4))
     assert (data.train_views, data.heldout_views) == (("cam_0", "cam_1"), ("cam_2",))
     assert [s.name for s in data.sequences] == ["seq_000", "seq_001", "seq_002"] and data.sequences[0].count == 4
-    assert data.stills().images.shape == (23, 16, 16, 4) and data.sequences[1].frames(range(4)).shape == (
-        4,
-        3,
-        12,
-        20,
-        4,
-    )
+    assert data.stills().images.shape == (23, 16, 16, 4)
+    assert data.sequences[1].frames(range(4)).shape == (4, 3, 12, 20, 4)
     truth = data.ground_truth(data.sequences[2])
     assert truth is not None and truth.positions.shape == (4, 40, 3)
     assert (truth.positions[0] == truth.rest).all() and verify(tmp_path / "set") == []
@@ -118,7 +113,7 @@ def test_the_set_is_read_and_verified(mesh: Path, tmp_path: Path) -> None:
     assert make_set(mesh, tmp_path / "set", PLAN, lambda: pytest.fail("asked for Blender"))["made"] is False
 
 
-@pytest.mark.parametrize("die_at", [0, 5, 23, 30, 58])
+@pytest.mark.parametrize("die_at", [5, 30])
 def test_what_was_interrupted_goes_on_with_what_is_missing(mesh: Path, tmp_path: Path, die_at: int) -> None:
     make_set(mesh, tmp_path / "whole", PLAN, FakeBlender)
     with pytest.raises(BlenderError, match="gave up"):

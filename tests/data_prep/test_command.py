@@ -34,6 +34,11 @@ def test_help_names_the_command(stage: str, capsys: pytest.CaptureFixture[str]) 
     assert f"usage: gausim prepare {stage} " in text and "(None)" not in text
 
 
+def test_stages_load_no_torch_before_they_work() -> None:
+    code = f"import sys, {', '.join(f'data_prep.{stage}' for stage in STAGES)}; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
 @dataclass(frozen=True)
 class Chosen(Options):
     """Options of every kind."""

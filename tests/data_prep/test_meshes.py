@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from data_prep.blender.meshes import Mesh, read_mesh
-from data_prep.blender.surface import farthest_points, make_surface, paint, refine
+from data_prep.blender.surface import farthest_points, make_surface, refine
 from gausim.core import DataError
 
 CORNERS = [(x, y, z) for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (0.0, 3.0)]
@@ -183,13 +183,6 @@ def test_useless_surfaces_are_refused(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr("data_prep.blender.surface.MOST_TRIANGLES", 5000)
     with pytest.raises(DataError, match="Remesh"):
         refine(Mesh(POINTS, np.array(TETRAHEDRON)), 1e-4)
-
-
-def test_paint_is_bright_varied_and_of_its_seed() -> None:
-    points = np.random.default_rng(1).uniform(-1, 1, (500, 3))
-    first, again, other = (paint(points, np.random.default_rng(seed)) for seed in (0, 0, 1))
-    np.testing.assert_array_equal(first, again)
-    assert (first != other).any() and 0.03 <= first.min() and first.max() <= 0.95 and (first.std(0) > 0.03).all()
 
 
 def test_farthest_points_are_far_from_each_other() -> None:

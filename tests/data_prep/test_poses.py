@@ -98,6 +98,7 @@ def test_photos_become_poses(photos: Path, mapped: Path) -> None:
     assert not (mapped / "mapping").exists() and (mapped / "colmap" / "sparse" / "0" / "images.bin").is_file()
 
 
+@pytest.mark.slow
 def test_interrupted_matching_goes_on_to_the_same_result(
     photos: Path, mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

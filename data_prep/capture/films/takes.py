@@ -14,7 +14,6 @@ from jsonschema.exceptions import best_match
 
 from data_prep.common.photos import natural
 from gausim.core import DataError
-from gausim.io.transforms import read_json
 
 # What a list file holds, as JSON schema; times are in seconds.
 _TIME = {"type": "number", "minimum": 0, "maximum": 1e6}
@@ -127,6 +126,8 @@ def _by_stem(folder: Path) -> dict[str, Path]:
 
 
 def _listed(path: Path) -> list[tuple[str, dict[str, Path], dict[str, Any]]]:
+    from gausim.io.transforms import read_json  # loads torch
+
     data = read_json(path)
     fault = best_match(Draft202012Validator(_LIST).iter_errors(data))
     if fault is not None:
