@@ -13,16 +13,13 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from data_prep.blender.environment import default_environment, find_blender
+from data_prep.blender.environment import Blender, default_environment, find_blender
 from data_prep.blender.plan import Plan
 from data_prep.common.command import add_options, cores, given, headline, run_command, stage_parser
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, run_stage
-
-if TYPE_CHECKING:
-    from data_prep.blender.environment import Blender
 
 REVISION = 1
 

@@ -12,7 +12,7 @@ import shutil
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from data_prep.capture.cameras.mapping import SCRATCH, MappingOptions, map_photos
 from data_prep.capture.cameras.material import Material, Sources
@@ -25,10 +25,9 @@ from data_prep.common.photos import list_images, open_photo
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, run_stage
 from gausim.core.errors import DataError
+from gausim.io.colmap import read_colmap
+from gausim.io.colmap_files import PointTable
 from gausim.io.files import replacing
-
-if TYPE_CHECKING:
-    from gausim.io.colmap_files import PointTable
 
 # Raise when the same inputs and settings give another result than before.
 REVISION = 1
@@ -126,8 +125,6 @@ def _map(
     work: Path, material: Material, options: MappingOptions, tick: Tick
 ) -> tuple[list[Posed], PointTable, dict[str, Any]]:
     """Poses by structure from motion of the stills and the first frames of all videos."""
-    from gausim.io.colmap import read_colmap
-
     photos, cameras = list(material.stills), {photo.name: "stills" for photo in material.stills}
     for folder, names in material.sequences.items():
         for name in names:

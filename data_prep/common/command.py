@@ -62,8 +62,10 @@ def add_options(parser: argparse._ActionsContainer, kind: type[Options], *, unse
             argument["action"] = "store_true"
         elif kind_of in _TYPES:
             argument.setdefault("type", _TYPES[kind_of])
-        default = list(each.default) if argument.get("action") == "append" else each.default
-        parser.add_argument(_flag(each.name), default=None if unset else default, **argument)
+        default: Any = None if unset else each.default
+        parser.add_argument(
+            _flag(each.name), default=list(default) if isinstance(default, tuple) else default, **argument
+        )
 
 
 def given(kind: type[Options], arguments: argparse.Namespace) -> dict[str, Any]:
