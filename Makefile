@@ -61,12 +61,12 @@ format: install ## Format the code and fix what can be fixed
 data: $(DATA)/.made ## Make the synthetic data set
 
 $(DATA)/.made: | install
-	$(BIN)/python -m data_prep.synthesize --out $(DATA)
+	$(BIN)/gausim prepare synthesize --out $(DATA)
 	touch $@
 
 dataset: install ## Stages from film to data set, as a file lists them: make dataset CONFIG=object.yaml
-	@test -n "$(CONFIG)" || { echo "error: name what to run: make dataset CONFIG=object.yaml (python -m data_prep.prepare --help)" >&2; exit 1; }
-	$(BIN)/python -m data_prep.prepare "$(CONFIG)" $(ARGS)
+	@test -n "$(CONFIG)" || { echo "error: name what to run: make dataset CONFIG=object.yaml (gausim prepare dataset --help)" >&2; exit 1; }
+	$(BIN)/gausim prepare dataset "$(CONFIG)" $(ARGS)
 
 train: install ## Train: make train ARGS="experiment=demo seed=1"
 	$(BIN)/gausim train $(ARGS)

@@ -9,19 +9,20 @@ with the scene of `select` it is complete, and is checked as `gausim verify` doe
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from data_prep.common.command import add_result, headline, told
-from data_prep.common.progress import Tick, bars, silent
+from data_prep.common.command import Options, add_options, chosen, headline, names, option, run_command, stage_parser
+from data_prep.common.progress import Tick, silent
+from data_prep.common.stage import Stage, copy_missing, files_in, run_stage
 from gausim.core.errors import ConfigError, DataError
+from gausim.io.files import write_json
 
 if TYPE_CHECKING:
-    from data_prep.scenes.gathered import Gathered
+    from data_prep.ready.gathered import Gathered
 
 # Raise when the same inputs and settings give another result than before.
 REVISION = 1
@@ -34,27 +35,19 @@ SCENE = "scene.ply"
 
 
 @dataclass(frozen=True)
-class AssembleOptions:
-    """What the pictures do not say; None leaves it to a ``dataset.json`` beside them, or to the defaults.
+class AssembleOptions(Options):
+    """What the pictures do not say; None leaves it to a ``dataset.json`` beside them, or to the defaults."""
 
-    Attributes:
-        name: of the object; the result's folder by default.
-        fps: frames per second of the sequences; what their ``transforms.json`` say by default.
-        heldout: cameras never to train on; the last one by default, none where there are fewer than three.
-        train_frames: frames 0..n-1 are trained on; 16, or as many as the shortest sequence has.
-    """
-
-    name: str | None = None
-    fps: float | None = None
-    heldout: tuple[str, ...] | None = None
-    train_frames: int | None = None
-
-    def __post_init__(self) -> None:
-        """Checks the numbers."""
-        if self.fps is not None and not 0 < self.fps < 1e4:
-            raise ConfigError(f"--fps: expected frames per second, got {self.fps}.")
-        if self.train_frames is not None and self.train_frames < 2:
-            raise ConfigError(f"--train-frames: expected at least 2, got {self.train_frames}.")
+    name: str | None = option(None, "of the object (the result's folder)")
+    fps: float | None = option(
+        None, "frames per second (what transforms.json of the sequences says)", least=1e-3, most=1e4
+    )
+    heldout: tuple[str, ...] | None = option(
+        None, "cameras never to train on, or 'none' (the last of three or more)", type=names, metavar="CAM,CAM"
+    )
+    train_frames: int | None = option(
+        None, f"first frames to train on ({TRAIN_FRAMES}, or the shortest sequence)", least=2, metavar="N"
+    )
 
 
 def assemble(
@@ -68,23 +61,11 @@ def assemble(
 ) -> dict[str, Any]:
     """Runs the stage.
 
-    Args:
-        pictures: folders with posed RGBA pictures, see :func:`data_prep.scenes.gathered.gather`.
-        out: folder of the result, in the layout of docs/data.md.
-        options: what the pictures do not say.
-        scene: the rest scene (PLY, its masks beside it), or the folder of the stage that made it.
-        force: replace a result of other inputs or settings.
-        tick: told of the progress.
-
-    Returns:
-        The stage's manifest.
-
     Raises:
         DataError: there are no sequences, they do not go together, or the result would have faults.
         ConfigError: an option does not suit the pictures.
     """
-    from data_prep.common.stage import Stage, run_stage
-    from data_prep.scenes.gathered import gather
+    from data_prep.ready.gathered import gather
 
     options = options or AssembleOptions()
     found = gather(pictures)
@@ -102,16 +83,11 @@ def assemble(
 def dataset_facts(found: Gathered, options: AssembleOptions, name: str) -> dict[str, Any]:
     """The content of ``dataset.json``.
 
-    Args:
-        found: the pictures.
-        options: what they do not say.
-        name: of the object where nothing else names it.
-
     Raises:
         DataError: cameras or rates of the sequences differ, or a sequence is too short.
         ConfigError: an option does not suit the pictures.
     """
-    from data_prep.scenes.gathered import common_rate, common_views
+    from data_prep.ready.gathered import common_rate, common_views
 
     given = _checked(found.facts)
     views = common_views(found.sequences)
@@ -176,47 +152,41 @@ def _make(
     work: Path, out: Path, found: Gathered, files: Mapping[str, Path], facts: Mapping[str, Any], tick: Tick
 ) -> dict[str, Any]:
     """Copies what is missing in ``work``, checks it, and tells what is there."""
-    from data_prep.common.stage import PLAN, fingerprint
     from gausim.data.verify import verify
-    from gausim.io.files import replacing, write_json
 
     for number, (name, path) in enumerate(files.items(), 1):
-        target = work / name
-        if not target.is_file():
-            with replacing(target) as temporary:
-                shutil.copyfile(path, temporary)
+        copy_missing(path, work / name)
         tick("copying", number, len(files))
     write_json(work / "dataset.json", facts)
     faults = verify(work)
     if faults:
-        told_faults = [f"{fault.where}: {fault.what.replace(str(work), str(out))}" for fault in faults]
+        shown = [f"{fault.where}: {fault.what.replace(str(work), str(out))}" for fault in faults]
         more = f" And {len(faults) - MOST_FAULTS} more." if len(faults) > MOST_FAULTS else ""
-        raise DataError(f"{out}: the object would have faults:\n  " + "\n  ".join(told_faults[:MOST_FAULTS]) + more)
-    listed = {
-        str(p.relative_to(work)): fingerprint(p) for p in sorted(work.rglob("*")) if p.is_file() and p.name != PLAN
-    }
+        raise DataError(f"{out}: the object would have faults:\n  " + "\n  ".join(shown[:MOST_FAULTS]) + more)
     return {
         "stills": len(found.stills.frames) if found.stills is not None else 0,
         "sequences": {name: _length(posed.frames) for name, posed in found.sequences.items()},
         "facts": facts,
         "scene": SCENE in files,
-        "files": listed,
+        "files": files_in(work),
     }
 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    arguments = _parser().parse_args(argv)
+    parser = stage_parser("assemble", __doc__)
+    parser.add_argument(
+        "pictures", type=Path, nargs="+", metavar="PICTURES", help="folders with posed RGBA stills and sequences"
+    )
+    parser.add_argument("--scene", type=Path, metavar="SCENE", help="rest scene (PLY, masks beside it), or its folder")
+    add_options(parser.add_argument_group("what the pictures do not say"), AssembleOptions)
 
-    def run() -> str:
-        options = AssembleOptions(arguments.name, arguments.fps, arguments.heldout, arguments.train_frames)
-        with bars() as tick:
-            manifest = assemble(
-                arguments.pictures, arguments.out, options, scene=arguments.scene, force=arguments.force, tick=tick
-            )
-        return f"{headline(arguments.out, manifest)}\n{summary(manifest['results'], arguments.out)}"
+    def run(given: argparse.Namespace, tick: Tick) -> str:
+        options = chosen(AssembleOptions, given)
+        manifest = assemble(given.pictures, given.out, options, scene=given.scene, force=given.force, tick=tick)
+        return f"{headline(given.out, manifest)}\n{summary(manifest['results'], given.out)}"
 
-    return told(run)
+    return run_command(parser, argv, run)
 
 
 def summary(results: Mapping[str, Any], out: Path) -> str:
@@ -233,31 +203,7 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
     ]
     if results["scene"]:
         return "\n".join([*lines, f"train       gausim train data=object data.root={out} name={facts['name']}"])
-    return "\n".join([*lines, f"scene       none yet: python -m data_prep.reconstruct {out} --out DIR"])
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m data_prep.assemble", description=__doc__.replace("``", ""),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
-    parser.add_argument(
-        "pictures", type=Path, nargs="+", metavar="PICTURES", help="folders with posed RGBA stills and sequences"
-    )
-    add_result(parser)
-    parser.add_argument("--scene", type=Path, metavar="SCENE", help="rest scene (PLY, masks beside it), or its folder")
-    group = parser.add_argument_group("what the pictures do not say")
-    group.add_argument("--name", help="of the object (the result's folder)")
-    group.add_argument("--fps", type=float, help="frames per second (what transforms.json of the sequences says)")
-    group.add_argument("--heldout", type=_names, metavar="CAM,CAM",
-        help="cameras never to train on, or 'none' (the last of three or more)")  # fmt: skip
-    group.add_argument("--train-frames", type=int, metavar="N",
-        help=f"first frames to train on ({TRAIN_FRAMES}, or the shortest sequence)")  # fmt: skip
-    return parser
-
-
-def _names(text: str) -> tuple[str, ...]:
-    return () if text == "none" else tuple(name.strip() for name in text.split(",") if name.strip())
+    return "\n".join([*lines, f"scene       none yet: gausim prepare reconstruct {out} --out DIR"])
 
 
 if __name__ == "__main__":

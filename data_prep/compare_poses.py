@@ -6,16 +6,17 @@ Photos are told apart by their names without ending; for results of the stage po
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from data_prep.common.command import told
+import numpy as np
+
+from data_prep.capture.cameras.sources import factors, match_matrices, read_matrix
+from data_prep.capture.cameras.world import compare
+from data_prep.common.command import run_command, stage_parser
+from data_prep.common.photos import list_images
 from gausim.core.errors import DataError
-
-if TYPE_CHECKING:
-    import numpy as np
+from gausim.io.colmap import find_colmap, read_colmap
 
 
 def read_poses(path: Path, images: Path | None = None) -> dict[str, np.ndarray]:
@@ -30,16 +31,11 @@ def read_poses(path: Path, images: Path | None = None) -> dict[str, np.ndarray]:
     """
     if path.is_file() or (path / "transforms.json").is_file():
         return _of_transforms(path if path.is_file() else path / "transforms.json")
-    from gausim.io.colmap import find_colmap, read_colmap
-
     try:
         folder = find_colmap(path)
     except DataError:
         if images is None:
             raise
-        from data_prep.cameras.sources import factors, match_matrices, read_matrix
-        from data_prep.common.photos import list_images
-
         found = match_matrices(path, list_images(images))
         return _by_stem({photo.name: factors(read_matrix(m), str(m))[1] for photo, m in found.items()}, path)
     return _by_stem({image.name: image.viewmat for image in read_colmap(folder).images}, path)
@@ -69,16 +65,11 @@ def _by_stem(poses: dict[str, np.ndarray], path: Path) -> dict[str, np.ndarray]:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    parser = argparse.ArgumentParser(
-        prog="python -m data_prep.compare_poses",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = stage_parser("compare_poses", __doc__, result=False)
     parser.add_argument("poses", type=Path, metavar="POSES", help="what is compared")
     parser.add_argument("reference", type=Path, metavar="REFERENCE", help="with what")
     parser.add_argument("--images", type=Path, metavar="DIR", help="the photos, for projection matrices")
-    arguments = parser.parse_args(argv)
-    return told(lambda: comparison(arguments.poses, arguments.reference, arguments.images))
+    return run_command(parser, argv, lambda given, tick: comparison(given.poses, given.reference, given.images))
 
 
 def comparison(poses: Path, reference: Path, images: Path | None) -> str:
@@ -87,21 +78,17 @@ def comparison(poses: Path, reference: Path, images: Path | None) -> str:
     Raises:
         DataError: one cannot be read, or they have fewer than three photos in common.
     """
-    import numpy as np
-
-    from data_prep.cameras.world import compare
-
     mine, other = (read_poses(path, images) for path in (poses, reference))
     names = sorted(set(mine) & set(other))
     if len(names) < 3:
         raise DataError(f"{reference}: has {len(names)} photos in common with {poses}, expected 3.")
     facts = compare(np.stack([mine[n] for n in names]), np.stack([other[n] for n in names]))
-    center, turn = (f"{kind}_error_{{}}_{unit}" for kind, unit in (("center", "percent"), ("rotation", "degree")))
     return (
         f"{len(names)} photos in common ({len(mine)} and {len(other)})\n"
-        f"centres      mean {facts[center.format('mean')]:.4f} %, largest {facts[center.format('max')]:.4f} % of the "
-        "largest distance between two cameras\n"
-        f"orientation  mean {facts[turn.format('mean')]:.4f}, largest {facts[turn.format('max')]:.4f} degrees"
+        f"centres      mean {facts['center_error_mean_percent']:.4f} %, largest "
+        f"{facts['center_error_max_percent']:.4f} % of the largest distance between two cameras\n"
+        f"orientation  mean {facts['rotation_error_mean_degree']:.4f}, largest "
+        f"{facts['rotation_error_max_degree']:.4f} degrees"
     )
 
 

@@ -1,33 +1,35 @@
 """Several cameras' films of each sequence to synchronised, lossless frames.
 
-Run ``python -m data_prep.ingest FILMS --out OUT``. Cameras are put on one clock by their time code, else by their
-sound, else by a flash that all saw, else by given offsets; a camera that ends up more than half a frame from where it
-should be is refused by name. The output is sequences/seq_000/cam_0/0000.png and so on (8-bit RGB), a sheet per sequence
-to check the synchronisation by eye, and a manifest with every camera's facts.
+Cameras are put on one clock by their time code, else by their sound, else by a flash that all saw, else by given
+offsets; a camera that ends up more than half a frame from where it should be is refused by name. The output is
+sequences/seq_000/cam_0/0000.png and so on (8-bit RGB), a sheet per sequence to check the synchronisation by eye, and a
+manifest with every camera's facts.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from gausim.core import DataError
-from gausim.io.files import write_durably, write_json
+import cv2
+import numpy as np
 
-if TYPE_CHECKING:
-    import numpy as np
-
-    from data_prep.common.progress import Tick
-    from data_prep.films.film import Film
-    from data_prep.films.sync import Alignment, Offsets
-    from data_prep.films.takes import Take
+from data_prep.capture.films.film import Film, pictures, probe, upright
+from data_prep.capture.films.sheet import write_sheet
+from data_prep.capture.films.sync import Alignment, Offsets, align, facts, measure
+from data_prep.capture.films.takes import Take, find_takes, offset_seconds
+from data_prep.common.command import Options, add_options, chosen, headline, option, run_command, stage_parser
+from data_prep.common.photos import reduced, write_image
+from data_prep.common.progress import Tick, silent
+from data_prep.common.stage import Stage, run_stage
+from gausim.core.errors import ConfigError, DataError
+from gausim.io.files import write_json
 
 # Raise when the same films and settings give other frames than before.
 REVISION = 1
@@ -45,68 +47,61 @@ or a folder with the films of a single sequence; or a list file, with paths rela
 Cameras become cam_0, cam_1 ... in the natural order of their names."""
 
 
+def _offsets(text: str) -> dict[str, str]:
+    pairs = [part.partition("=") for part in text.split(",") if part.strip()]
+    if not pairs or not all(name.strip() and value.strip() for name, _, value in pairs):
+        raise argparse.ArgumentTypeError(f"expected CAMERA=SECONDS,CAMERA=FRAMESf, got {text!r}")
+    return {name.strip(): value.strip() for name, _, value in pairs}
+
+
 @dataclass(frozen=True)
-class Options:
-    """What is chosen.
+class IngestOptions(Options):
+    """How films are synchronised, and which of their frames are written."""
 
-    Attributes:
-        sync: method, or ``auto``.
-        offsets: by camera, seconds or frames with an ``f``, for all sequences that state none.
-        reference: camera whose frames give the times; chosen by the residuals when None.
-        fps: output rate as text (``25``, ``30000/1001``); the slowest camera's when None.
-        shutter: exposure as part of the frame interval, for flashes.
-        start: what is left out at the beginning of the common time [s].
-        duration: how much of it is kept [s]; all when None.
-        max_side: larger pictures are reduced to this [pixels]; None keeps them.
-    """
+    sync: str = option("auto", "method; auto takes the first that applies (%(default)s)", choices=METHODS)
+    offsets: Mapping[str, str] | None = option(
+        None, "how much later cameras began: seconds, or 7.3f in frames; for sequences that state none",
+        type=_offsets, metavar="CAM=X,CAM=X",
+    )  # fmt: skip
+    reference: str | None = option(
+        None, "camera whose frames give the times (the one with the smallest residuals)", metavar="CAM"
+    )
+    fps: str | None = option(None, "output rate, of which all cameras' rates are multiples (the slowest camera's)")
+    shutter: float = option(
+        1.0, "exposure as part of the frame interval, for flashes (%(default)s)", least=1e-3, most=1
+    )
+    start: float = option(0.0, "leave out so much of the common time [s] (%(default)s)", least=0)
+    duration: float | None = option(None, "keep so much of it [s] (all)", least=0)
+    max_side: int | None = option(None, "reduce larger pictures to this [pixels]", least=1)
 
-    sync: str = "auto"
-    offsets: Mapping[str, str] | None = None
-    reference: str | None = None
-    fps: str | None = None
-    shutter: float = 1.0
-    start: float = 0.0
-    duration: float | None = None
-    max_side: int | None = None
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        super().__post_init__()
+        try:
+            good = self.fps is None or 0 < Fraction(self.fps) <= 1000
+        except (ValueError, ZeroDivisionError):
+            good = False
+        if not good:
+            raise ConfigError(f"--fps: expected frames per second such as 25 or 30000/1001, got {self.fps!r}.")
 
 
 def ingest(
-    films: Path, out: Path, options: Options | None = None, *, force: bool = False, advance: Tick | None = None
+    films: Path, out: Path, options: IngestOptions | None = None, *, force: bool = False, tick: Tick = silent
 ) -> dict[str, Any]:
     """Writes synchronised frames of all sequences.
-
-    Args:
-        films: folder or list file, see :func:`data_prep.films.takes.find_takes`.
-        out: directory of the result.
-        options: what is chosen.
-        force: replace a result of other films or settings.
-        advance: told the sequence, frames done and frames in all, as they are written.
-
-    Returns:
-        The manifest; its ``results`` tell every camera's facts.
 
     Raises:
         DataError: a film is unusable, or the films do not go together.
     """
-    from data_prep.common.stage import Stage, run_stage
-    from data_prep.films.takes import find_takes
-
-    options = options or Options()
+    options = options or IngestOptions()
     takes = find_takes(films)
-    settings = {
-        **asdict(options),
-        "takes": [{**asdict(t), "films": {c: p.name for c, p in t.films.items()}} for t in takes],
-    }
-    stage = Stage(
-        name="ingest",
-        revision=REVISION,
-        inputs={f"{take.name}/{camera}": path for take in takes for camera, path in take.films.items()},
-        settings=settings,
-        packages=("av", "numpy", "scipy", "opencv-python-headless"),
-    )
+    told = [{**asdict(take), "films": {camera: path.name for camera, path in take.films.items()}} for take in takes]
+    inputs = {f"{take.name}/{camera}": path for take in takes for camera, path in take.films.items()}
+    packages = ("av", "numpy", "scipy", "opencv-python-headless")
+    stage = Stage("ingest", REVISION, inputs, {**asdict(options), "takes": told}, packages)
 
     def make(work: Path) -> dict[str, Any]:
-        found = {take.name: _one_take(take, work / "sequences" / take.name, options, advance) for take in takes}
+        found = {take.name: _one_take(take, work / "sequences" / take.name, options, tick) for take in takes}
         rates = {name: facts["fps"] for name, facts in found.items()}
         if len(set(rates.values())) > 1:
             raise DataError(f"{films}: sequences have different rates: {rates}. State one with --fps.")
@@ -115,29 +110,26 @@ def ingest(
     return run_stage(stage, out, make, force=force)
 
 
-def _one_take(take: Take, folder: Path, options: Options, advance: Tick | None) -> dict[str, Any]:
+def _one_take(take: Take, folder: Path, options: IngestOptions, tick: Tick) -> dict[str, Any]:
     """Synchronises and writes one sequence; its ``sync.json``, written last, says that it is complete."""
     marker = folder / "sync.json"
     if marker.is_file():
-        found = json.loads(marker.read_bytes())
-        assert isinstance(found, dict)
+        found: dict[str, Any] = json.loads(marker.read_bytes())
         return found
     films, alignment, found = synchronise(take, options)
     thumbnails = {}
-    total = len(films) * len(alignment.frames[alignment.reference])
+    count = len(alignment.frames[alignment.reference])
     for i, (camera, film) in enumerate(films.items()):
         thumbnails[camera] = _write_camera(
             film, alignment.frames[camera], folder / camera, options.max_side,
-            lambda done, i=i: advance and advance(take.source, i * total // len(films) + done, total),  # type: ignore[misc]
+            lambda done, i=i: tick(take.source, i * count + done, len(films) * count),  # type: ignore[misc]
         )  # fmt: skip
-    from data_prep.films.sheet import write_sheet
-
     write_sheet(folder / "sync.png", thumbnails, found)
     write_json(marker, found)
     return found
 
 
-def synchronise(take: Take, options: Options) -> tuple[dict[str, Film], Alignment, dict[str, Any]]:
+def synchronise(take: Take, options: IngestOptions) -> tuple[dict[str, Film], Alignment, dict[str, Any]]:
     """Reads the films' facts and finds the frames that belong together; writes nothing.
 
     Returns:
@@ -146,29 +138,22 @@ def synchronise(take: Take, options: Options) -> tuple[dict[str, Film], Alignmen
     Raises:
         DataError: a film is unusable, or the films do not go together.
     """
-    from data_prep.films.film import probe
-    from data_prep.films.sync import facts
-
     films = {camera: probe(path) for camera, path in take.films.items()}
     try:
         offsets, alignment = _placed(take, films, options)
     except DataError as error:
         raise DataError(f"sequence '{take.source}': {error}") from error
-    cameras = {
-        name: {"film": take.labels[name], **facts(film, name, offsets, alignment)} for name, film in films.items()
-    }
-    notes = [*offsets.notes, *_warnings(films)]
     found = {
-        **{"source": take.source, "fps": float(alignment.rate), "frames": len(alignment.frames[alignment.reference])},
-        **{"method": offsets.method, "reference": alignment.reference, "notes": notes, "cameras": cameras},
-    }
+        "source": take.source, "fps": float(alignment.rate), "frames": len(alignment.frames[alignment.reference]),
+        "method": offsets.method, "reference": alignment.reference, "notes": [*offsets.notes, *_warnings(films)],
+        "cameras": {
+            name: {"film": take.labels[name], **facts(film, name, offsets, alignment)} for name, film in films.items()
+        },
+    }  # fmt: skip
     return films, alignment, found
 
 
-def _placed(take: Take, films: Mapping[str, Film], options: Options) -> tuple[Offsets, Alignment]:
-    from data_prep.films.sync import align, measure
-    from data_prep.films.takes import offset_seconds
-
+def _placed(take: Take, films: Mapping[str, Film], options: IngestOptions) -> tuple[Offsets, Alignment]:
     given = {}
     for name, text in (take.offsets or options.offsets or {}).items():
         camera = _camera(name, take, "offsets")
@@ -194,24 +179,19 @@ def _camera(name: str, take: Take, what: str) -> str:
 
 
 def _warnings(films: Mapping[str, Film]) -> list[str]:
-    notes = []
-    for name, film in films.items():
-        if film.hdr:
-            notes.append(f"{name}: {film.hdr} footage; its 8-bit frames look flat. Record in standard range.")
+    notes = [
+        f"{name}: {film.hdr} footage; its 8-bit frames look flat. Record in standard range."
+        for name, film in films.items()
+        if film.hdr
+    ]
     sizes = {film.size for film in films.values()}
-    if len(sizes) > 1:
-        notes.append(f"cameras have different sizes: {sorted(sizes)}")
-    return notes
+    return notes if len(sizes) == 1 else [*notes, f"cameras have different sizes: {sorted(sizes)}"]
 
 
 def _write_camera(
     film: Film, indices: np.ndarray, folder: Path, max_side: int | None, done: Callable[[int], None]
 ) -> list[np.ndarray]:
     """Writes the frames of one camera that are not there yet; returns a small grey picture of each."""
-    import cv2
-
-    from data_prep.films.film import pictures, upright
-
     places: dict[int, list[int]] = {}
     for place, index in enumerate(indices):
         places.setdefault(int(index), []).append(place)
@@ -219,15 +199,12 @@ def _write_camera(
     for index, frame in pictures(film):
         if index not in places:
             continue
-        pixels = _reduced(cv2.cvtColor(upright(film, frame), cv2.COLOR_RGB2BGR), max_side)
+        pixels = reduced(cv2.cvtColor(upright(film, frame), cv2.COLOR_RGB2BGR), max_side)
         for place in places[index]:
             path = folder / f"{place:04d}.png"
             if not path.is_file():
-                ok, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION])
-                if not ok:
-                    raise DataError(f"{path}: cannot be encoded as PNG.")
-                write_durably(path, data.tobytes())
-            small[place] = _reduced(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), THUMBNAIL)
+                write_image(path, pixels, COMPRESSION)
+            small[place] = reduced(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY), THUMBNAIL)
         done(len(small))
         if len(small) == len(indices):
             break
@@ -236,32 +213,18 @@ def _write_camera(
     return [small[place] for place in range(len(indices))]
 
 
-def _reduced(pixels: np.ndarray, max_side: int | None) -> np.ndarray:
-    import cv2
-
-    height, width = pixels.shape[:2]
-    if not max_side or max(height, width) <= max_side:
-        return pixels
-    scale = max_side / max(height, width)
-    return cv2.resize(
-        pixels, (max(1, round(width * scale)), max(1, round(height * scale))), interpolation=cv2.INTER_AREA
-    )
-
-
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    arguments = _parser().parse_args(argv)
-    names = [name for name in Options.__dataclass_fields__]
-    options = Options(**{name: getattr(arguments, name) for name in names})
-    from data_prep.common.command import headline, told
-    from data_prep.common.progress import bars
+    parser = stage_parser("ingest", __doc__, epilog=LAYOUT)
+    parser.add_argument("films", type=Path, metavar="FILMS", help="folder of films, or a list file; see below")
+    add_options(parser.add_argument_group("synchronisation and frames"), IngestOptions)
 
-    def run() -> str:
-        with bars("synchronising") as tick:
-            manifest = ingest(arguments.films, arguments.out, options, force=arguments.force, advance=tick)
+    def run(arguments: argparse.Namespace, tick: Tick) -> str:
+        options = chosen(IngestOptions, arguments)
+        manifest = ingest(arguments.films, arguments.out, options, force=arguments.force, tick=tick)
         return f"{headline(arguments.out, manifest)}\n{summary(manifest['results'])}"
 
-    return told(run)
+    return run_command(parser, argv, run, waiting="synchronising")
 
 
 def summary(results: Mapping[str, Any]) -> str:
@@ -272,91 +235,14 @@ def summary(results: Mapping[str, Any]) -> str:
             f"{name} ({found['source']}): {found['frames']} frames at {found['fps']:.6g} per second, "
             f"by {found['method']}, reference {found['reference']}"
         )
-        for camera, facts in found["cameras"].items():
+        for camera, known in found["cameras"].items():
             lines.append(
-                f"  {camera} ({facts['film']}): starts {facts['offset_frames']:+.2f} frames later, residual "
-                f"{facts['residual_frames']['largest']:.2f}, keeps {facts['kept'][0]}..{facts['kept'][1]} of "
-                f"{facts['frames']} at {facts['fps']:.6g}"
+                f"  {camera} ({known['film']}): starts {known['offset_frames']:+.2f} frames later, residual "
+                f"{known['residual_frames']['largest']:.2f}, keeps {known['kept'][0]}..{known['kept'][1]} of "
+                f"{known['frames']} at {known['fps']:.6g}"
             )
         lines += [f"  note: {note}" for note in found["notes"]]
     return "\n".join(lines)
-
-
-def _parser() -> argparse.ArgumentParser:
-    from data_prep.common.command import add_result
-
-    parser = argparse.ArgumentParser(
-        prog="python -m data_prep.ingest", description=__doc__.split("\n")[0],
-        epilog=LAYOUT, formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
-    parser.add_argument(
-        "films", type=Path, metavar="FILMS", help="folder with a folder of films per sequence, or a list file"
-    )
-    add_result(parser)
-    sync = parser.add_argument_group("synchronisation")
-    sync.add_argument(
-        "--sync", choices=METHODS, default="auto", help="method; auto takes the first that applies (%(default)s)"
-    )
-    sync.add_argument(
-        "--offsets",
-        type=_offsets,
-        metavar="CAM=X,CAM=X",
-        help="how much later cameras began: seconds, or 7.3f in frames",
-    )
-    sync.add_argument(
-        "--reference", metavar="CAM", help="camera whose frames give the times (the one with the smallest residuals)"
-    )
-    sync.add_argument(
-        "--shutter", type=_part, default=1.0, help="exposure as part of the frame interval, for flashes (%(default)s)"
-    )
-    frames = parser.add_argument_group("frames")
-    frames.add_argument(
-        "--fps", type=_rate, help="output rate, of which all cameras' rates are multiples (the slowest camera's)"
-    )
-    frames.add_argument(
-        "--start", type=_seconds, default=0.0, help="leave out so much of the common time [s] (%(default)s)"
-    )
-    frames.add_argument("--duration", type=_seconds, help="keep so much of it [s] (all)")
-    frames.add_argument("--max-side", type=_positive, help="reduce larger pictures to this [pixels]")
-    return parser
-
-
-def _offsets(text: str) -> dict[str, str]:
-    pairs = [part.partition("=") for part in text.split(",") if part.strip()]
-    if not pairs or not all(name.strip() and value.strip() for name, _, value in pairs):
-        raise argparse.ArgumentTypeError(f"expected CAMERA=SECONDS,CAMERA=FRAMESf, got {text!r}")
-    return {name.strip(): value.strip() for name, _, value in pairs}
-
-
-def _rate(text: str) -> str:
-    try:
-        rate = Fraction(text)
-    except (ValueError, ZeroDivisionError):
-        rate = Fraction(0)
-    if not 0 < rate <= 1000:
-        raise argparse.ArgumentTypeError(f"expected frames per second such as 25 or 30000/1001, got {text!r}")
-    return str(rate)
-
-
-def _seconds(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value) or value < 0:
-        raise argparse.ArgumentTypeError("must be finite and at least 0")
-    return value
-
-
-def _part(text: str) -> float:
-    value = float(text)
-    if not 0 < value <= 1:
-        raise argparse.ArgumentTypeError("must be above 0 and at most 1")
-    return value
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError("must be at least 1")
-    return value
 
 
 if __name__ == "__main__":

@@ -14,7 +14,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from data_prep.common.command import add_result, headline, told
+from data_prep.common.command import headline, run_command, stage_parser
+from data_prep.common.progress import Tick
+from data_prep.common.stage import Stage, run_stage
 from gausim.cli.inspect import add_pin_options
 from gausim.cli.reconstruct import add_fit_options, fit_scene
 from gausim.core.errors import DataError
@@ -29,21 +31,10 @@ PACKAGES = ("torch", "numpy", "numba", "opencv-python-headless", "safetensors")
 def reconstruct(root: Path, out: Path, arguments: argparse.Namespace, *, force: bool = False) -> dict[str, Any]:
     """Runs the stage.
 
-    Args:
-        root: folder with ``transforms.json`` or ``dataset.json``.
-        out: folder of the result.
-        arguments: those of :func:`gausim.cli.reconstruct.add_fit_options` and of the pins.
-        force: replace a result of other inputs or settings.
-
-    Returns:
-        The stage's manifest; its results are the record that ``scene.json`` holds.
-
     Raises:
         DataError: images, poses, masks or points are unusable.
         SceneError: the pins select no kernel.
     """
-    from data_prep.common.stage import Stage, run_stage
-
     source = _source(root)
     settings = {key: value for key, value in vars(arguments).items() if key not in _OUTSIDE}
     settings = {key: str(value) if isinstance(value, Path) else value for key, value in settings.items()}
@@ -83,29 +74,20 @@ def _files(source: Path, arguments: argparse.Namespace) -> dict[str, Path]:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    arguments = _parser().parse_args(argv)
+    parser = stage_parser("reconstruct", __doc__)
+    parser.add_argument("root", type=Path, metavar="ROOT", help="folder with transforms.json or dataset.json")
+    add_fit_options(parser)
+    add_pin_options(parser)
 
-    def run() -> str:
-        manifest = reconstruct(arguments.root, arguments.out, arguments, force=arguments.force)
+    def run(given: argparse.Namespace, tick: Tick) -> str:
+        manifest = reconstruct(given.root, given.out, given, force=given.force)
         results = manifest["results"]
         lines = [f"{name}: {row['psnr']:.2f} dB, foreground {row['psnr_foreground']:.2f} dB, SSIM {row['ssim']:.3f}"
                  for name, row in results["measured"].items()]  # fmt: skip
         kernels = f"{results['kernels']} kernels"
-        return "\n".join([headline(arguments.out, manifest), kernels, *lines, f"look at {arguments.out / 'scene.png'}"])
+        return "\n".join([headline(given.out, manifest), kernels, *lines, f"look at {given.out / 'scene.png'}"])
 
-    return told(run)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m data_prep.reconstruct", description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
-    parser.add_argument("root", type=Path, metavar="ROOT", help="folder with transforms.json or dataset.json")
-    add_result(parser)
-    add_fit_options(parser)
-    add_pin_options(parser)
-    return parser
+    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":

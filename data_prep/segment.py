@@ -1,6 +1,6 @@
 """Foreground masks: pictures or films to RGBA with straight alpha, and overlays to check them by eye.
 
-Run ``python -m data_prep.segment PICTURES --out OUT --backend …`` on a folder of pictures, on what ``ingest`` made, or
+Run ``gausim prepare segment PICTURES --out OUT --backend …`` on a folder of pictures, on what ``ingest`` made, or
 on a film. Every picture becomes a PNG of the same name and folder whose alpha is the mask; overlays/ holds a film, a
 sheet and figures of each folder.
 """
@@ -12,49 +12,30 @@ import json
 import math
 import shutil
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from gausim.core import DataError
-from gausim.io.files import write_durably, write_json
+import numpy as np
 
-if TYPE_CHECKING:
-    import numpy as np
-
-    from data_prep.common.progress import Tick
-    from data_prep.masks.cleanup import Cleanup
-    from data_prep.masks.clips import Clip
-    from data_prep.masks.segmenters import MaskOf, Segmenter
+from data_prep.capture.films.film import probe
+from data_prep.capture.masks.cleanup import Cleanup, cleaned, matte, overlap, steady
+from data_prep.capture.masks.clips import Clip, film_frames, find_clips, is_film, read_picture, write_picture
+from data_prep.capture.masks.options import BACKENDS, GROUPS, add_segment_options, make_backend, make_cleanup
+from data_prep.capture.masks.overlays import write_overlays
+from data_prep.capture.masks.segmenters import Backend, MaskOf, Segmenter
+from data_prep.common.command import chosen, headline, run_command, stage_parser
+from data_prep.common.progress import Tick, silent
+from data_prep.common.stage import MANIFEST, Stage, copy_missing, read_manifest, run_stage
+from gausim.core.errors import ConfigError, DataError
+from gausim.io.files import write_json
 
 # Raise when the same pictures and settings give other masks than before.
 REVISION = 1
-BACKENDS = ("alpha", "background", "chroma", "onnx", "sam2")
 RAW, FRAMES, OVERLAYS = ".raw", ".frames", "overlays"
 # Below this overlap with the mask before, a frame is worth a look.
 STEADY = 0.8
-
-
-@dataclass(frozen=True)
-class Backend:
-    """A way to tell foreground from background, with what its result depends on.
-
-    Attributes:
-        name: of the backend.
-        make: makes the segmenter; called once, and only if there is something to do.
-        soft: masks have soft edges of their own; others are softened along the picture's edges.
-        settings: what was chosen (plain data).
-        inputs: files it reads besides the pictures.
-        packages: libraries whose versions may matter.
-    """
-
-    name: str
-    make: Callable[[], Segmenter]
-    soft: bool = False
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    inputs: Mapping[str, Path] = field(default_factory=dict)
-    packages: tuple[str, ...] = ()
 
 
 def segment(
@@ -66,29 +47,15 @@ def segment(
     kind: str = "auto",
     every: int = 1,
     force: bool = False,
-    advance: Tick | None = None,
+    tick: Tick = silent,
 ) -> dict[str, Any]:
     """Writes the pictures of ``source`` with their masks as alpha.
-
-    Args:
-        source: folder of pictures (any depth), or a film.
-        out: directory of the result, laid out as ``source``.
-        backend: what makes the masks.
-        cleanup: what is done to them.
-        kind: ``film`` (neighbours in time agree), ``stills``, or ``auto``: film for films and folders in ``sequences``.
-        every: only each n-th picture of a folder.
-        force: replace a result of other pictures or settings.
-        advance: told the folder, pictures done and pictures in all.
-
-    Returns:
-        The manifest; its ``results`` have figures of every folder.
 
     Raises:
         DataError: a picture is unusable, or a folder's masks are all empty.
     """
-    from data_prep.common.stage import Stage, run_stage
-    from data_prep.masks.clips import film_frames, find_clips, is_film
-
+    if every < 1:
+        raise ConfigError(f"--every: expected at least 1, got {every}.")
     film = is_film(source)
     if not film and not source.is_dir():
         raise DataError(f"{source}: expected a folder of pictures, or a film.")
@@ -103,11 +70,8 @@ def segment(
             **{f"backend/{k}": v for k, v in backend.inputs.items()},
         },
         settings={
-            "backend": backend.name,
-            **backend.settings,
-            "cleanup": asdict(cleanup),
-            "kind": kind,
-            "every": every,
+            **{"backend": backend.name, **backend.settings},
+            **{"cleanup": asdict(cleanup), "kind": kind, "every": every},
         },
         packages=("av", "numpy", "opencv-python-headless", *backend.packages),
     )
@@ -117,7 +81,7 @@ def segment(
         if film:
             film_frames(source, work / FRAMES / source.stem)
             found = find_clips(work / FRAMES, kind="stills" if kind == "stills" else "film", every=every)
-        run = _Run(work, backend, cleanup, _rate(source), advance)
+        run = _Run(work, backend, cleanup, _rate(source), tick)
         results = {clip.name: run.clip(clip) for clip in found}
         _carry(carried, work, pictures)
         for folder in (RAW, FRAMES):
@@ -130,19 +94,16 @@ def segment(
 class _Run:
     """One run over all clips; the segmenter is made when the first mask is missing."""
 
-    def __init__(self, work: Path, backend: Backend, cleanup: Cleanup, fps: float, advance: Tick | None) -> None:
+    def __init__(self, work: Path, backend: Backend, cleanup: Cleanup, fps: float, tick: Tick) -> None:
         self._work, self._backend, self._cleanup, self._fps = work, backend, cleanup, fps
-        self._advance = advance
+        self._tick = tick
         self._segmenter: Segmenter | None = None
 
     def clip(self, clip: Clip) -> dict[str, Any]:
         """Makes a clip's files; its figures, written last, say that it is complete."""
-        from data_prep.masks.overlays import write_overlays
-
         marker = self._work / OVERLAYS / f"{clip.flat}.json"
         if marker.is_file():
-            found = json.loads(marker.read_bytes())
-            assert isinstance(found, dict)
+            found: dict[str, Any] = json.loads(marker.read_bytes())
             return found
         self._raw_masks(clip)
         found = self._finish(clip)
@@ -153,10 +114,6 @@ class _Run:
 
     def _raw_masks(self, clip: Clip) -> None:
         """The backend's masks, each an 8-bit file; those of an interrupted attempt are kept."""
-        import numpy as np
-
-        from data_prep.masks.clips import write_picture
-
         mask_of: MaskOf | None = None
         for i in range(len(clip)):
             path = self._raw(clip, i)
@@ -165,15 +122,10 @@ class _Run:
                 mask_of = mask_of or self._segmenter.open(clip)
                 mask = _checked(mask_of(i), clip, i, self._backend.name)
                 write_picture(path, np.round(mask * 255).astype(np.uint8))
-            if self._advance:
-                self._advance(clip.name, i + 1, len(clip))
+            self._tick(clip.name, i + 1, len(clip))
 
     def _finish(self, clip: Clip) -> dict[str, Any]:
         """Cleans the masks, writes RGBA, and returns figures."""
-        import numpy as np
-
-        from data_prep.masks.cleanup import cleaned, matte, overlap, steady
-        from data_prep.masks.clips import read_picture, write_picture
 
         def raw(index: int) -> np.ndarray:
             return read_picture(self._raw(clip, index))[..., 0].astype(np.float32) / 255
@@ -202,7 +154,6 @@ class _Run:
 
 
 def _checked(mask: np.ndarray, clip: Clip, index: int, backend: str) -> np.ndarray:
-    import numpy as np
 
     expected = clip.rgb(index).shape[:2]
     if mask.shape != expected or not np.isfinite(mask).all():
@@ -236,12 +187,7 @@ def _figures(clip: Clip, coverage: list[float], overlaps: list[float], border: l
 
 def _rate(source: Path) -> float:
     """Frames per second of the overlay: the film's, ingest's, or 24."""
-    from data_prep.common.stage import MANIFEST, read_manifest
-    from data_prep.masks.clips import is_film
-
     if is_film(source):
-        from data_prep.films.film import probe
-
         return float(probe(source).rate)
     if (source / MANIFEST).is_file():
         rate = read_manifest(source).get("results", {}).get("fps")
@@ -264,7 +210,7 @@ def _carry(files: Mapping[str, Path], work: Path, pictures: Mapping[str, Path]) 
     done = {path.resolve() for path in pictures.values()}
     for name, path in files.items():
         if path.suffix != ".json":
-            write_durably(work / name, path.read_bytes())
+            copy_missing(path, work / name)
             continue
         data = read_json(path)
         for entry in data.get("frames", []) if isinstance(data.get("frames"), list) else []:
@@ -276,21 +222,24 @@ def _carry(files: Mapping[str, Path], work: Path, pictures: Mapping[str, Path]) 
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    arguments = _parser().parse_args(argv)
-    from data_prep.common.command import headline, told
-    from data_prep.common.progress import bars
-    from data_prep.masks.options import make_backend, make_cleanup
+    parser = stage_parser("segment", __doc__)
+    add = parser.add_argument
+    add("pictures", type=Path, metavar="PICTURES", help="folder of pictures, a result of ingest, or a film")
+    add("--backend", choices=BACKENDS, required=True, help="what makes the masks")
+    add("--every", type=int, default=1, metavar="N", help="only each N-th picture, to try out (%(default)s)")
+    add("--kind", choices=("auto", "film", "stills"), default="auto",
+        help="film: a camera that stands still; auto: films, and folders in sequences/ (%(default)s)")  # fmt: skip
+    add_segment_options(parser)
 
-    def run() -> str:
-        backend, cleanup = make_backend(arguments), make_cleanup(arguments)
-        with bars("segmenting") as tick:
-            manifest = segment(
-                arguments.pictures, arguments.out, backend, cleanup,
-                kind=arguments.kind, every=arguments.every, force=arguments.force, advance=tick,
-            )  # fmt: skip
+    def run(arguments: argparse.Namespace, tick: Tick) -> str:
+        backend = make_backend(arguments.backend, *(chosen(kind, arguments) for kind in GROUPS.values()))
+        manifest = segment(
+            arguments.pictures, arguments.out, backend, make_cleanup(arguments),
+            kind=arguments.kind, every=arguments.every, force=arguments.force, tick=tick,
+        )  # fmt: skip
         return f"{headline(arguments.out, manifest)}, by {backend.name}\n{summary(manifest['results'])}"
 
-    return told(run)
+    return run_command(parser, argv, run, waiting="segmenting")
 
 
 def summary(results: Mapping[str, Any]) -> str:
@@ -311,14 +260,6 @@ def summary(results: Mapping[str, Any]) -> str:
 def _some(what: str, names: list[str]) -> str:
     more = f" and {len(names) - 4} more" if len(names) > 4 else ""
     return f", {what}: {', '.join(names[:4])}{more}" if names else ""
-
-
-def _parser() -> argparse.ArgumentParser:
-    from data_prep.masks.options import add_options
-
-    parser = argparse.ArgumentParser(prog="python -m data_prep.segment", description=__doc__.split("\n")[0])
-    add_options(parser, BACKENDS)
-    return parser
 
 
 if __name__ == "__main__":

@@ -20,17 +20,25 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from data_prep.common.command import add_result, headline, told
+import cv2
+import numpy as np
+
+from data_prep.common.command import headline, run_command, stage_parser
+from data_prep.common.photos import write_image
+from data_prep.common.progress import Tick
+from data_prep.common.stage import Stage, run_stage
 from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from gausim.core import GaussianScene
 
 # Raise when the same inputs and settings give another result than before.
 REVISION = 1
-MASKS = ("simulated", "pinned", "foreground")
+MASKS = {
+    "simulated": "kernels that may move",
+    "pinned": "simulated kernels that are held",
+    "foreground": "kernels that are compared with segmented video",
+}
 AZIMUTHS = (0.0, 90.0, 180.0, 270.0)
 # What is marked is drawn half in this colour (RGB), what is not is drawn grey.
 TINTS = {"simulated": (0.1, 0.8, 0.2), "pinned": (0.95, 0.15, 0.1), "foreground": (0.15, 0.4, 1.0)}
@@ -49,25 +57,12 @@ def select(
 ) -> dict[str, Any]:
     """Runs the stage.
 
-    Args:
-        scene: 3DGS scene (PLY).
-        out: folder of the result.
-        selections: by mask, texts as :func:`data_prep.scenes.selections.parse_selection` reads them; other masks stay.
-        masks: its masks so far; those beside the scene when None.
-        up: axis drawn upwards, with a minus sign where it points down.
-        size: of each picture [pixels].
-        force: replace a result of other inputs or settings.
-
-    Returns:
-        The stage's manifest.
-
     Raises:
         SceneError: the scene or a selection is malformed, or a selection holds no kernel.
         DataError: a file of points is malformed.
         ConfigError: nothing is selected.
     """
-    from data_prep.common.stage import Stage, run_stage
-    from data_prep.scenes.selections import parse_selection
+    from data_prep.ready.selections import parse_selection
     from gausim.io.ply import masks_path
 
     unknown = sorted(set(selections) - set(MASKS))
@@ -105,11 +100,6 @@ def _facts(scene: GaussianScene) -> dict[str, Any]:
 
 def draw_masks(path: Path, scene: GaussianScene, *, up: str = "z", size: int = 360) -> None:
     """Writes a picture: a row per mask, a column per side; marked kernels tinted, the others grey."""
-    import cv2
-    import numpy as np
-
-    from data_prep.common.photos import write_png
-
     rows = []
     for name in MASKS:
         images = _sides(scene, name, up, size)
@@ -117,12 +107,11 @@ def draw_masks(path: Path, scene: GaussianScene, *, up: str = "z", size: int = 3
         text = f"{name}: {int(getattr(scene, name).sum())} of {scene.count}"
         cv2.putText(label, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
         rows += [label, np.concatenate(list(images), axis=1)]
-    write_png(path, np.concatenate(rows))
+    write_image(path, np.concatenate(rows))
 
 
 def _sides(scene: GaussianScene, name: str, up: str, size: int) -> np.ndarray:
     """(4, size, size, 3) uint8 BGR of the scene with one mask tinted."""
-    import numpy as np
     import torch
 
     from gausim.ops.orbit import orbit_cameras
@@ -147,37 +136,27 @@ def _sides(scene: GaussianScene, name: str, up: str, size: int) -> np.ndarray:
 
 def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
-    arguments = _parser().parse_args(argv)
-    chosen = {name: getattr(arguments, name) for name in MASKS if getattr(arguments, name)}
-
-    def run() -> str:
-        manifest = select(
-            arguments.scene, arguments.out, chosen, masks=arguments.masks, up=arguments.up, size=arguments.size,
-            force=arguments.force,
-        )  # fmt: skip
-        results = manifest["results"]
-        lines = [f"{name:<11} {results[name]['kernels']} of {results['kernels']} kernels" for name in MASKS]
-        return "\n".join([headline(arguments.out, manifest), *lines, f"look at     {arguments.out / 'masks.png'}"])
-
-    return told(run)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m data_prep.select", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = stage_parser("select", __doc__)
     parser.add_argument("scene", type=Path, metavar="SCENE", help="3DGS scene (PLY)")
-    add_result(parser)
     group = parser.add_argument_group("masks (those not given stay as they are)")
-    group.add_argument("--simulated", metavar="SELECTION", help="kernels that may move")
-    group.add_argument("--pinned", metavar="SELECTION", help="simulated kernels that are held")
-    group.add_argument("--foreground", metavar="SELECTION", help="kernels that are compared with segmented video")
+    for name, what in MASKS.items():
+        group.add_argument(f"--{name}", metavar="SELECTION", help=what)
     group.add_argument("--masks", type=Path, metavar="FILE", help="masks so far; default <stem>.masks.npz, if there")
     group = parser.add_argument_group("picture")
     group.add_argument("--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="z",
         help="axis drawn upwards (write --up=-y; default %(default)s)")  # fmt: skip
     group.add_argument("--size", type=int, default=360, help="of each view [pixels] (%(default)s)")
-    return parser
+
+    def run(given: argparse.Namespace, tick: Tick) -> str:
+        selections = {name: getattr(given, name) for name in MASKS if getattr(given, name)}
+        manifest = select(
+            given.scene, given.out, selections, masks=given.masks, up=given.up, size=given.size, force=given.force
+        )
+        results = manifest["results"]
+        lines = [f"{name:<11} {results[name]['kernels']} of {results['kernels']} kernels" for name in MASKS]
+        return "\n".join([headline(given.out, manifest), *lines, f"look at     {given.out / 'masks.png'}"])
+
+    return run_command(parser, argv, run)
 
 
 if __name__ == "__main__":

@@ -28,9 +28,8 @@ REQUIREMENTS = (f"bpy=={BPY}", "numpy<2")
 PYTHON = (3, 11)
 # What an environment of ours has, written when it is complete.
 MARKER = "gausim-blender.json"
+INTERPRETER = Path("bin") / "python"
 SCRIPT = Path(__file__).with_name("blender_scene.py")
-# Loading bpy takes seconds; minutes on a busy machine.
-PATIENCE = 600.0
 TAIL = 12
 
 
@@ -43,11 +42,9 @@ class Blender(Protocol):
 
     def versions(self) -> dict[str, str]:
         """Versions of bpy, numpy and Python, which decide what comes out."""
-        ...
 
     def run(self, job: Mapping[str, Any], told: Callable[[str], None], stop: threading.Event) -> None:
         """Does a job of ``data_prep.blender.plan``; calls ``told`` at each step, gives up when ``stop`` is set."""
-        ...
 
 
 Runner = Callable[..., subprocess.CompletedProcess[str]]
@@ -55,14 +52,10 @@ Runner = Callable[..., subprocess.CompletedProcess[str]]
 
 @dataclass(frozen=True)
 class BlenderProcess:
-    """Blender as processes of a Python that has bpy.
+    """Blender as processes of a Python that has bpy."""
 
-    Attributes:
-        python: its interpreter.
-        cores: those that no process of ours is on; each is bound to one.
-    """
-
-    python: Path
+    python: Path  # its interpreter
+    # those that no process of ours is on; each is bound to one
     cores: SimpleQueue[int] = field(default_factory=lambda: _cores(), repr=False)
 
     def versions(self) -> dict[str, str]:
@@ -168,12 +161,6 @@ def find_blender(
 ) -> BlenderProcess:
     """Blender of a Python of one's own, or of the environment in ``folder``, which is created where it is missing.
 
-    Args:
-        python: an interpreter that has bpy; None for the environment.
-        folder: of the environment.
-        say: is told what takes its time.
-        run: as :func:`subprocess.run`.
-
     Raises:
         BlenderError: the interpreter is not there, or the environment cannot be created.
         DataError: ``folder`` holds something else.
@@ -204,7 +191,7 @@ def create_environment(folder: Path, *, say: Callable[[str], None], run: Runner 
                 os.replace(making, folder)
             finally:
                 shutil.rmtree(making, ignore_errors=True)
-    return _interpreter(folder)
+    return folder / INTERPRETER
 
 
 def _is_ready(folder: Path) -> bool:
@@ -214,7 +201,7 @@ def _is_ready(folder: Path) -> bool:
         ready = json.loads((folder / MARKER).read_bytes())["requirements"] == list(REQUIREMENTS)
     except (OSError, ValueError, KeyError, TypeError):
         ready = False
-    if not ready or not _interpreter(folder).exists():
+    if not ready or not (folder / INTERPRETER).exists():
         raise DataError(
             f"--blender-env {folder}: exists and is not an environment for {', '.join(REQUIREMENTS)} made by this "
             "command. Choose another folder, or remove this one."
@@ -223,7 +210,7 @@ def _is_ready(folder: Path) -> bool:
 
 
 def _install(folder: Path, base: Path, run: Runner) -> None:
-    pip = [str(_interpreter(folder)), "-I", "-m", "pip", "install", "--disable-pip-version-check", *REQUIREMENTS]
+    pip = [str(folder / INTERPRETER), "-I", "-m", "pip", "install", "--disable-pip-version-check", *REQUIREMENTS]
     for command in ([str(base), "-m", "venv", str(folder)], pip):
         done = run(command, capture_output=True, text=True)
         if done.returncode != 0:
@@ -247,10 +234,6 @@ def _base_python(run: Runner) -> Path:
         f"bpy {BPY} needs Python {wanted}, and there is no python{wanted} on the path. Install it, or bring a Python "
         "that has bpy with --blender-python."
     )
-
-
-def _interpreter(folder: Path) -> Path:
-    return folder / "bin" / "python"
 
 
 @contextmanager

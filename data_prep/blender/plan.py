@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from data_prep.blender.surface import SIZE, UP_AXES, Surface, farthest_points
+from data_prep.common.command import Options, option
 from gausim.core import ConfigError
 
 FPS = 24
@@ -34,85 +35,54 @@ TRAIN_ELEVATIONS, HELDOUT_ELEVATION, STILL_ELEVATION = (18.0, 22.0, 16.0, 24.0),
 
 
 @dataclass(frozen=True)
-class Plan:
-    """Sizes and settings of a set; the defaults are the paper's synthetic set.
+class Plan(Options):
+    """Sizes and settings of a set; the defaults are the paper's synthetic set."""
 
-    Attributes:
-        name: of the object.
-        up: the mesh's axis that points up.
-        sequences: how many motions.
-        frames: of each, at 24 per second.
-        views: cameras of each sequence.
-        heldout: how many of them are never trained on.
-        stills: pictures of the rest state.
-        resolution: width and height of the sequences [pixels].
-        still_resolution: of the stills.
-        samples: paths per pixel.
-        points: vertices whose true motion is stored.
-        amplitude: smallest and largest displacement that a push may cause [% of the diagonal].
-        stiffness: of the soft body's springs, 0..1.
-        bend: resistance to bending.
-        damping: of the springs' vibrations.
-        speed: of time in the soft body.
-        steps: least steps per frame of Blender; more lose less energy.
-        seed: of everything random.
-    """
+    name: str = option("object", "of the object (default: the mesh file's)")
+    up: str = option("y", "axis of the mesh that points up (default: y)", choices=UP_AXES)
+    sequences: int = option(30, "how many motions (30)", least=1, most=1000)
+    frames: int = option(60, "of each, at 24 per second (60)", least=2, most=10000)
+    views: int = option(5, "cameras; the paper has 4 to 6 (5)", least=1, most=64)
+    heldout: int = option(1, "how many of them are never trained on (1)", least=0, most=63)
+    stills: int = option(200, "pictures of the rest state (200)", least=1, most=10000)
+    resolution: tuple[int, int] = option(
+        (540, 960), "of the sequences [pixels] (540 960)", least=8, most=8192, nargs=2, metavar=("W", "H")
+    )
+    still_resolution: tuple[int, int] = option(
+        (540, 960), "of the stills [pixels] (540 960)", least=8, most=8192, nargs=2, metavar=("W", "H")
+    )
+    samples: int = option(16, "light paths per pixel (16)", least=1, most=65536)
+    points: int = option(2048, "vertices whose true motion is stored (2048)", least=1, most=100_000)
+    amplitude: tuple[float, float] = option(
+        (8.0, 13.0), "largest displacement of a sequence, drawn from this range [%% of the diagonal] (default: 8 13)",
+        least=0.5, most=30, nargs=2, metavar=("LOW", "HIGH"),
+    )  # fmt: skip
+    stiffness: float = option(0.7, "of the soft body's springs, below 1 (default: 0.7)", least=0.05, most=0.999)
+    bend: float = option(5.0, "resistance to bending (default: 5)", least=0, most=10)
+    damping: float = option(0.02, "of vibrations (default: 0.02)", least=0, most=50)
+    speed: float = option(0.11, "of time in the soft body (default: 0.11)", least=0.02, most=1)
+    steps: int = option(30, "least steps per 1/192 s; more lose less energy (default: 30)", least=1, most=1000)
+    seed: int = option(0, "of everything random (default: 0)", least=0, most=2**31 - 1)
 
-    name: str = "object"
-    up: str = "y"
-    sequences: int = 30
-    frames: int = 60
-    views: int = 5
-    heldout: int = 1
-    stills: int = 200
-    resolution: tuple[int, int] = (540, 960)
-    still_resolution: tuple[int, int] = (540, 960)
-    samples: int = 16
-    points: int = 2048
-    amplitude: tuple[float, float] = (8.0, 13.0)
-    stiffness: float = 0.7
-    bend: float = 5.0
-    damping: float = 0.02
-    speed: float = 0.11
-    steps: int = 30
-    seed: int = 0
-
-    def checked(self) -> Plan:
-        """Itself.
-
-        Raises:
-            ConfigError: a field is out of its range; names the option.
-        """
+    def __post_init__(self) -> None:
+        """Checks the fields, each and together."""
+        super().__post_init__()
         if self.up not in UP_AXES:
             raise ConfigError(f"--up: expected one of {', '.join(UP_AXES)}, got '{self.up}'.")
-        for name, low, high in _RANGES:
-            value = getattr(self, name)
-            for number in value if isinstance(value, tuple) else (value,):
-                if not low <= number <= high:
-                    raise ConfigError(f"--{name.replace('_', '-')}: expected {low:g} to {high:g}, got {number:g}.")
         if self.heldout >= self.views:
             raise ConfigError(f"--heldout: expected fewer than the {self.views} --views, got {self.heldout}.")
         if self.amplitude[0] > self.amplitude[1]:
             raise ConfigError(f"--amplitude: expected the smaller one first, got {self.amplitude}.")
-        return self
 
     def quick(self) -> Plan:
         """The same in small, for tests: 2 sequences of 8 frames."""
-        small = {"sequences": 2, "frames": 8, "views": 4, "stills": 6, "samples": 4, "points": 256}
-        return replace(self, resolution=(64, 64), still_resolution=(96, 96), **small)  # type: ignore[arg-type]
+        small: dict[str, Any] = {"resolution": (64, 64), "still_resolution": (96, 96), "samples": 4, "points": 256}
+        return replace(self, sequences=2, frames=8, views=4, stills=6, **small)
 
     @property
     def view_names(self) -> list[str]:
         """Names of the cameras, those to train on first."""
         return [f"cam_{i}" for i in range(self.views)]
-
-
-_RANGES = (
-    ("sequences", 1, 1000), ("frames", 2, 10000), ("views", 1, 64), ("heldout", 0, 63), ("stills", 1, 10000),
-    ("resolution", 8, 8192), ("still_resolution", 8, 8192), ("samples", 1, 65536), ("points", 1, 100_000),
-    ("amplitude", 0.5, 30.0), ("stiffness", 0.05, 0.999), ("bend", 0.0, 10.0), ("damping", 0.0, 50.0),
-    ("speed", 0.02, 1.0), ("steps", 1, 1000), ("seed", 0, 2**31 - 1),
-)  # fmt: skip
 
 
 def dataset_facts(plan: Plan, surface: Surface) -> dict[str, Any]:

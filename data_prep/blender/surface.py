@@ -21,19 +21,12 @@ UP_AXES = ("x", "y", "z")
 
 @dataclass(frozen=True)
 class Surface:
-    """A painted surface with z up that stands on z = 0, centred on x = y = 0, its largest extent 2 units.
+    """A painted surface with z up that stands on z = 0, centred on x = y = 0, its largest extent 2 units."""
 
-    Attributes:
-        vertices: positions (V, 3) [scene units], float32.
-        faces: triangles (T, 3) of vertex indices, int32.
-        albedo_linear: linear RGB (V, 3) in 0..1, float16.
-        gt_ids: indices (P,) of the vertices whose true motion is stored, int32.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    albedo_linear: np.ndarray
-    gt_ids: np.ndarray
+    vertices: np.ndarray  # positions (V, 3) [scene units], float32
+    faces: np.ndarray  # triangles (T, 3) of vertex indices, int32
+    albedo_linear: np.ndarray  # linear RGB (V, 3) in 0..1, float16
+    gt_ids: np.ndarray  # indices (P,) of the vertices whose true motion is stored, int32
 
     @property
     def diagonal(self) -> float:
@@ -43,13 +36,6 @@ class Surface:
 
 def make_surface(mesh: Mesh, path: Path, *, up: str, points: int, seed: int) -> Surface:
     """Brings a mesh to its place, refines it where its edges are long, and paints it.
-
-    Args:
-        mesh: as it was read.
-        path: of its file, for messages.
-        up: the mesh's axis that points up, one of x, y, z.
-        points: how many vertices' true motion is to be stored; all where there are fewer.
-        seed: of the paint.
 
     Raises:
         DataError: the mesh has no area, or too many triangles.

@@ -32,7 +32,9 @@ from data_prep.blender.plan import (
     video_poses,
 )
 from data_prep.blender.surface import Surface, make_surface
-from data_prep.common.stage import PLAN, fingerprint
+from data_prep.common.photos import write_image
+from data_prep.common.progress import Tick
+from data_prep.common.stage import PLAN, files_in
 from gausim.core import DataError
 from gausim.data.images import read_rgba
 from gausim.io.files import write_durably, write_json
@@ -43,7 +45,7 @@ STILLS_PER_JOB = 20
 OVERVIEW_FRAMES, OVERVIEW_SIDE = 5, 200
 
 
-def make(mesh: Path, work: Path, plan: Plan, blender: Blender, *, workers: int = 1) -> dict[str, Any]:
+def make_images(mesh: Path, work: Path, plan: Plan, blender: Blender, *, workers: int, tick: Tick) -> dict[str, Any]:
     """Makes what is missing of a set in ``work``.
 
     Returns:
@@ -58,19 +60,20 @@ def make(mesh: Path, work: Path, plan: Plan, blender: Blender, *, workers: int =
     root = work.absolute()
     versions = blender.versions()
     _start(root, {**dataset_facts(plan, surface), "blender": versions})
-    _write_npz(root / "rest_mesh.npz", vars(surface))
+    held = io.BytesIO()
+    np.savez_compressed(held, **vars(surface))
+    write_durably(root / "rest_mesh.npz", held.getvalue())
     stills = [range(i, min(i + STILLS_PER_JOB, plan.stills)) for i in range(0, plan.stills, STILLS_PER_JOB)]
     jobs = [still_job(plan, surface, root, numbers) for numbers in stills]
     jobs += [sequence_job(plan, surface, root, number) for number in range(plan.sequences)]
-    _run(jobs, blender, workers)
+    _run(jobs, blender, workers, tick)
     _describe_stills(root / "static", plan, surface)
     sequences = [_describe_sequence(root, plan, surface, number) for number in range(plan.sequences)]
     _write_overview(root, plan)
-    _sweep(root)
-    files = {str(p.relative_to(root)): fingerprint(p) for p in sorted(root.rglob("*")) if p.is_file()}
-    files.pop(PLAN, None)
+    for half in (path for path in root.rglob(".*") if path.is_file()):
+        half.unlink()  # of a Blender that was killed
     images = plan.stills + plan.sequences * plan.frames * plan.views
-    return {"blender": versions, "sequences": sequences, "images": images, "files": files}
+    return {"blender": versions, "sequences": sequences, "images": images, "files": files_in(root)}
 
 
 def _start(root: Path, facts: Mapping[str, Any]) -> None:
@@ -88,31 +91,28 @@ def _start(root: Path, facts: Mapping[str, Any]) -> None:
     write_json(root / FACTS, facts)
 
 
-def _run(jobs: list[dict[str, Any]], blender: Blender, workers: int) -> None:
+def _run(jobs: list[dict[str, Any]], blender: Blender, workers: int, tick: Tick) -> None:
     """Does the jobs, those of interrupted work only in part, several at a time; the first error ends all."""
-    from data_prep.common.progress import bars
-
     stop = threading.Event()
     total = sum(len(job["images"]) for job in jobs)
     left = [job for job in map(_left, jobs) if job is not None]
     done = itertools.count(total - sum(len(job["images"]) for job in left) + 1)
-    with bars("rendering") as tick:
 
-        def told(step: str) -> None:
-            if step == "image":
-                tick("rendering", next(done), total)
+    def told(step: str) -> None:
+        if step == "image":
+            tick("rendering", next(done), total)
 
-        with ThreadPoolExecutor(workers) as pool:
-            pending = [pool.submit(_do, job, blender, told, stop) for job in left]
-            try:
-                finished, _ = wait(pending, return_when=FIRST_EXCEPTION)
-                failed = [future for future in pending if future in finished and future.exception() is not None]
-            finally:
-                if len([future for future in pending if future.done()]) < len(pending):
-                    stop.set()
-                    pool.shutdown(wait=False, cancel_futures=True)
-        if failed:
-            failed[0].result()
+    with ThreadPoolExecutor(workers) as pool:
+        pending = [pool.submit(_do, job, blender, told, stop) for job in left]
+        try:
+            finished, _ = wait(pending, return_when=FIRST_EXCEPTION)
+            failed = [future for future in pending if future in finished and future.exception() is not None]
+        finally:
+            if not all(future.done() for future in pending):
+                stop.set()
+                pool.shutdown(wait=False, cancel_futures=True)
+    if failed:
+        failed[0].result()
 
 
 def _left(job: dict[str, Any]) -> dict[str, Any] | None:
@@ -193,20 +193,4 @@ def _write_overview(root: Path, plan: Plan) -> None:
         pictures = [read_rgba(folder / frame_name(view, int(frame)), plan.resolution) for frame in frames]
         shown = [picture[..., 2::-1] * (picture[..., 3:] / 255) for picture in pictures]
         rows.append(np.hstack([cv2.resize(s.astype(np.uint8), size, interpolation=cv2.INTER_AREA) for s in shown]))
-    done, data = cv2.imencode(".png", np.vstack(rows))
-    if not done:
-        raise DataError(f"{root / 'overview.png'}: cannot be encoded.")
-    write_durably(root / "overview.png", data.tobytes())
-
-
-def _sweep(root: Path) -> None:
-    """Removes what a killed Blender left half."""
-    for path in root.rglob(".*"):
-        if path.is_file():
-            path.unlink()
-
-
-def _write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    held = io.BytesIO()
-    np.savez_compressed(held, **arrays)
-    write_durably(path, held.getvalue())
+    write_image(root / "overview.png", np.vstack(rows), 3)

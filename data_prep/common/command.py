@@ -1,35 +1,119 @@
-"""What the stages' command lines have in common."""
+"""What the stages' command lines have in common: options that are fields of dataclasses, progress, results, errors."""
 
 from __future__ import annotations
 
 import argparse
+import math
+import os
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from gausim.core.errors import GausSimError
+from data_prep.common.progress import Tick, bars
+from gausim.core.errors import ConfigError, GausSimError
 
-
-def add_result(parser: argparse.ArgumentParser) -> None:
-    """Adds where the result goes, and whether it may replace another."""
-    parser.add_argument("--out", type=Path, required=True, help="folder of the result")
-    parser.add_argument("--force", action="store_true", help="replace a result of other inputs or settings")
+T = TypeVar("T", bound="Options")
+_TYPES: dict[str, type] = {"int": int, "float": float, "Path": Path, "tuple[float,": float, "tuple[int,": int}
 
 
-def headline(out: Path, manifest: Mapping[str, Any]) -> str:
-    """The first line that a stage prints when it is done."""
-    return f"{out}: {'made' if manifest['made'] else 'there already'}"
+def option(default: Any, help: str, *, least: float = -math.inf, most: float = math.inf, **argument: Any) -> Any:
+    """A field of an :class:`Options` that is an option of the command line.
+
+    Args:
+        default: its value unless it is given.
+        help: what it is.
+        least: smallest number that it may be.
+        most: largest.
+        argument: of ``add_argument``, where the field's type does not say it.
+    """
+    return field(default=default, metadata={"argument": {"help": help, **argument}, "range": (least, most)})
 
 
-def told(run: Callable[[], str]) -> int:
-    """Runs a stage, prints what it returns, and turns what went wrong into a line on standard error.
+@dataclass(frozen=True)
+class Options:
+    """Options of a stage; the fields that :func:`option` made are options of its command line."""
+
+    def __post_init__(self) -> None:
+        """Checks the numbers.
+
+        Raises:
+            ConfigError: one is out of its range; names the option.
+        """
+        for each in fields(self):
+            value, (least, most) = getattr(self, each.name), each.metadata.get("range", (-math.inf, math.inf))
+            for number in value if isinstance(value, tuple) else (value,):
+                if isinstance(number, (int, float)) and not (math.isfinite(number) and least <= number <= most):
+                    expected = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
+                    raise ConfigError(f"{_flag(each.name)}: expected {expected}, got {number:g}.")
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def add_options(parser: argparse._ActionsContainer, kind: type[Options], *, unset: bool = False) -> None:
+    """Adds the options of a stage; those that are not given are None with ``unset``, else what the fields say."""
+    for each in (one for one in fields(kind) if one.metadata):
+        argument = dict(each.metadata["argument"])
+        kind_of = str(each.type).partition(" ")[0]
+        if kind_of == "bool":
+            argument["action"] = "store_true"
+        elif kind_of in _TYPES:
+            argument.setdefault("type", _TYPES[kind_of])
+        default: Any = None if unset else each.default
+        parser.add_argument(
+            _flag(each.name), default=list(default) if isinstance(default, tuple) else default, **argument
+        )
+
+
+def given(kind: type[Options], arguments: argparse.Namespace) -> dict[str, Any]:
+    """The arguments that have the names of a dataclass's fields, without those that were not given."""
+    found = {each.name: getattr(arguments, each.name, None) for each in fields(kind)}
+    return {name: tuple(v) if isinstance(v, list) else v for name, v in found.items() if v is not None}
+
+
+def chosen(kind: type[T], arguments: argparse.Namespace) -> T:
+    """The options of a stage from its arguments."""
+    return kind(**given(kind, arguments))
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Names between commas; ``none`` is none."""
+    return () if text == "none" else tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def cores() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def stage_parser(name: str, text: str, *, epilog: str | None = None, result: bool = True) -> argparse.ArgumentParser:
+    """The parser of `gausim prepare NAME`; with ``result`` it knows where the result goes and what it may replace."""
+    parser = argparse.ArgumentParser(
+        prog=f"gausim prepare {name}", description=text.replace("``", ""), epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    if result:
+        parser.add_argument("--out", type=Path, required=True, help="folder of the result")
+        parser.add_argument("--force", action="store_true", help="replace a result of other inputs or settings")
+    return parser
+
+
+def run_command(
+    parser: argparse.ArgumentParser, argv: list[str] | None, run: Callable[[argparse.Namespace, Tick], str],
+    *, waiting: str | None = None,
+) -> int:  # fmt: skip
+    """Runs a stage with bars of its progress, prints what it returns, and turns what went wrong into a line.
 
     Returns:
         The exit code: 0, 2 after an error, 130 where the user has interrupted it.
     """
+    arguments = parser.parse_args(argv)
     try:
-        text = run()
+        with bars(waiting) as tick:
+            text = run(arguments, tick)
     except (GausSimError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -38,3 +122,8 @@ def told(run: Callable[[], str]) -> int:
         return 130
     print(text)
     return 0
+
+
+def headline(out: Path, manifest: Mapping[str, Any]) -> str:
+    """The first line that a stage prints when it is done."""
+    return f"{out}: {'made' if manifest['made'] else 'there already'}"

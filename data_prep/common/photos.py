@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from gausim.core.errors import DataError
@@ -23,21 +24,13 @@ _FRAME_35MM = 35.0
 
 @dataclass(frozen=True)
 class Photo:
-    """One photo.
+    """One photo."""
 
-    Attributes:
-        name: unique among those of a run; a path with ``/``.
-        path: the file.
-        width: the right way up [pixels].
-        height: the right way up [pixels].
-        focal: by its EXIF data, None where there are none [pixels].
-    """
-
-    name: str
-    path: Path
-    width: int
-    height: int
-    focal: float | None
+    name: str  # unique among those of a run; a path with ``/``
+    path: Path  # the file
+    width: int  # the right way up [pixels]
+    height: int  # the right way up [pixels]
+    focal: float | None  # by its EXIF data, None where there are none [pixels]
 
 
 def list_images(folder: Path) -> list[Path]:
@@ -68,9 +61,8 @@ def open_photo(path: Path, name: str) -> Photo:
     """
     header = read_header(path)
     if header is None:
-        raise DataError(
-            f"{path}: {'cannot be read as an image' if path.is_file() else 'no such file'}. Export it again."
-        )
+        what = "cannot be read as an image" if path.is_file() else "no such file"
+        raise DataError(f"{path}: {what}. Export it again.")
     width, height, focal_35mm = header.width, header.height, header.exif.get(_FOCAL_35MM)
     turned = header.exif.get(_ORIENTATION) in _QUARTER
     size = (height, width) if turned else (width, height)
@@ -86,8 +78,6 @@ def read_photo(photo: Photo) -> np.ndarray:
     Raises:
         DataError: it cannot be decoded, or is of another size than its header says.
     """
-    import cv2
-
     pixels = decode(photo.path, cv2.IMREAD_COLOR)
     if pixels is None:
         raise DataError(f"{photo.path}: cannot be decoded as an image. Export it again.")
@@ -101,15 +91,24 @@ def read_photo(photo: Photo) -> np.ndarray:
     return pixels
 
 
-def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Writes (H, W), (H, W, 3) BGR or (H, W, 4) BGRA uint8 as PNG, all of it or nothing.
+def write_image(path: Path, pixels: np.ndarray, effort: int = 4) -> None:
+    """Writes (H, W), (H, W, 3) BGR or (H, W, 4) BGRA uint8 as PNG or JPEG, all of it or nothing.
 
     Raises:
-        DataError: it cannot be written.
+        DataError: it cannot be encoded.
     """
-    import cv2
-
-    good, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 4])
+    settings = [cv2.IMWRITE_PNG_COMPRESSION, effort] if path.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, 90]
+    good, data = cv2.imencode(path.suffix, pixels, settings)
     if not good:
-        raise DataError(f"{path}: cannot be encoded as PNG (shape {pixels.shape}, {pixels.dtype}).")
+        raise DataError(f"{path}: cannot be encoded (shape {pixels.shape}, {pixels.dtype}).")
     write_durably(path, data.tobytes())
+
+
+def reduced(pixels: np.ndarray, side: int | None) -> np.ndarray:
+    """A picture whose longer side is at most ``side`` [pixels]; None leaves it alone."""
+    height, width = pixels.shape[:2]
+    if not side or max(height, width) <= side:
+        return pixels
+    scale = side / max(height, width)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 # What a bar shows: step, how much of it is done, how much there is.
 Tick = Callable[[str, int, int], None]
@@ -12,30 +13,32 @@ Tick = Callable[[str, int, int], None]
 
 @contextmanager
 def bars(waiting: str | None = None) -> Iterator[Tick]:
-    """A function that is told (step, done, of how many); each step has a bar until it is done. Threads may call it.
-
-    Args:
-        waiting: what is shown until the first step begins.
-    """
+    """A function that is told (step, done, of how many); each step has a bar until it is done. Threads may call it."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     console = Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        known: dict = {}
-        lock = threading.Lock()
-        first = None if waiting is None else progress.add_task(waiting, total=None)
+    progress = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    known: dict[str, Any] = {}
+    lock = threading.Lock()
+    first = None if waiting is None else progress.add_task(waiting, total=None)
+    if waiting is not None:
+        progress.start()
 
-        def tick(step: str, done: int, total: int) -> None:
+    def tick(step: str, done: int, total: int) -> None:
+        with lock:
+            progress.start()  # not before: what reports no steps may have bars of its own
             if first is not None:
                 progress.update(first, visible=False)
-            with lock:
-                if step not in known:
-                    known[step] = progress.add_task(step, total=total)
-            progress.update(known[step], completed=done, total=total, visible=done < total)
+            if step not in known:
+                known[step] = progress.add_task(step, total=total)
+        progress.update(known[step], completed=done, total=total, visible=done < total)
 
+    try:
         yield tick
+    finally:
+        progress.stop()
 
 
 def silent(step: str, done: int, total: int) -> None:

@@ -4,6 +4,9 @@ A stage reads files and writes one directory. It works in a hidden directory bes
 when everything is there, so a directory without ``stage.json`` is never a result. Work that was interrupted goes on
 where it was, as long as inputs and settings are the same; each item of it is a file that is written at once
 (:func:`gausim.io.files.replacing`).
+
+The function of a stage takes what it reads, ``out`` (the directory of the result), its options, ``force`` (replace a
+result of other inputs or settings) and ``tick`` (told of the progress), and returns the manifest.
 """
 
 from __future__ import annotations
@@ -13,14 +16,14 @@ import os
 import platform
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import gausim
 from gausim.core.errors import DataError
-from gausim.io.files import remove_leftovers, sha256, write_durably, write_json
+from gausim.io.files import remove_leftovers, replacing, sha256, write_durably, write_json
 from gausim.io.plain_json import parse_json
 
 MANIFEST = "stage.json"
@@ -29,21 +32,13 @@ PLAN = "plan.json"
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage with everything that its result depends on.
+    """One stage with everything that its result depends on."""
 
-    Attributes:
-        name: of the stage, as in ``python -m data_prep.NAME``.
-        revision: raised when the same inputs and settings give another result than before.
-        inputs: files it reads, by the names that the manifest gives them.
-        settings: everything that was chosen; plain data (as JSON knows it).
-        packages: libraries whose versions may matter; recorded, not compared.
-    """
-
-    name: str
-    revision: int
-    inputs: Mapping[str, Path]
-    settings: Mapping[str, Any]
-    packages: Sequence[str] = field(default=())
+    name: str  # of the stage, as in `gausim prepare NAME`
+    revision: int  # raised when the same inputs and settings give another result than before
+    inputs: Mapping[str, Path]  # files it reads, by the names that the manifest gives them
+    settings: Mapping[str, Any]  # everything that was chosen; plain data (as JSON knows it)
+    packages: Sequence[str] = ()  # libraries whose versions may matter; recorded, not compared
 
     def key(self) -> dict[str, Any]:
         """What decides whether a result is of this stage: name, revision, settings and the inputs' hashes.
@@ -74,21 +69,25 @@ def run_stage(
     Raises:
         DataError: ``out`` holds something else; nothing was touched.
     """
-    key = stage.key()
+    key, old = stage.key(), out.with_name(f".{out.name}.old")
     known = _known(out, key, force=force)
     if known is not None:
-        shutil.rmtree(_old(out), ignore_errors=True)  # of a replacement that was killed at its very end
+        shutil.rmtree(old, ignore_errors=True)  # of a replacement that was killed at its very end
         return {**known, "made": False}
     work = out.with_name(f".{out.name}.{stage.name}.work")
-    manifest = _finished(work, key)
-    if manifest is None:
+    # Work that is whole, but was killed before it took its name, has a manifest already.
+    manifest = read_manifest(work) if (work / MANIFEST).is_file() else {}
+    if _different(manifest, key):
         _open_work(work, key)
         results = json.loads(json.dumps(make(work), allow_nan=False))
-        manifest = {**key, "versions": versions(stage.packages), "results": results}
+        manifest = {**key, "versions": _versions(stage.packages), "results": results}
         write_durably(work / MANIFEST, json.dumps(manifest, indent=1, sort_keys=True).encode() + b"\n")
-    # From here on the work is whole; an attempt that is killed below only has to take the name.
     (work / PLAN).unlink(missing_ok=True)
-    _replace(out, work)
+    shutil.rmtree(old, ignore_errors=True)
+    if out.exists():
+        os.replace(out, old)
+    os.replace(work, out)
+    shutil.rmtree(old, ignore_errors=True)
     return {**manifest, "made": True}
 
 
@@ -100,15 +99,14 @@ def read_manifest(folder: Path, stage: str | None = None) -> dict[str, Any]:
     """
     path = folder / MANIFEST
     if not path.is_file():
-        raise DataError(f"{path}: not found. Is this a finished stage? Run `python -m data_prep.{stage or 'STAGE'}`.")
+        raise DataError(f"{path}: not found. Is this a finished stage? Run `gausim prepare {stage or 'STAGE'}`.")
     try:
-        manifest = parse_json(path.read_bytes())
+        manifest: dict[str, Any] = parse_json(path.read_bytes())
         found = manifest["stage"]
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}: not the manifest of a stage ({error}). Make the stage again with --force.") from error
     if stage is not None and found != stage:
         raise DataError(f"{path}: stage is '{found}', expected '{stage}'.")
-    assert isinstance(manifest, dict)
     return manifest
 
 
@@ -123,7 +121,23 @@ def fingerprint(path: Path) -> dict[str, Any]:
     return {"bytes": path.stat().st_size, "sha256": sha256(path)}
 
 
-def versions(packages: Sequence[str]) -> dict[str, str]:
+def files_in(work: Path) -> dict[str, Any]:
+    """Fingerprints of all files of a stage's work, by name."""
+    files = sorted(p for p in work.rglob("*") if p.is_file() and p.name != PLAN)
+    return {str(path.relative_to(work)): fingerprint(path) for path in files}
+
+
+def copy_missing(source: Path, target: Path) -> None:
+    """Copies a file, or the files of a folder, where the target is not there yet."""
+    if source.is_dir():
+        for path in sorted(p for p in source.rglob("*") if p.is_file()):
+            copy_missing(path, target / path.relative_to(source))
+    elif source.is_file() and not target.is_file():
+        with replacing(target) as temporary:
+            shutil.copyfile(source, temporary)
+
+
+def _versions(packages: Sequence[str]) -> dict[str, str]:
     """Versions of gausim, Python and the packages; ``absent`` for one that is not installed."""
     found = {"gausim": gausim.__version__, "python": platform.python_version()}
     for name in packages:
@@ -132,6 +146,10 @@ def versions(packages: Sequence[str]) -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "absent"
     return found
+
+
+def _different(manifest: Mapping[str, Any], key: Mapping[str, Any]) -> list[str]:
+    return [name for name in key if manifest.get(name) != key[name]]
 
 
 def _known(out: Path, key: Mapping[str, Any], *, force: bool) -> dict[str, Any] | None:
@@ -143,27 +161,13 @@ def _known(out: Path, key: Mapping[str, Any], *, force: bool) -> dict[str, Any] 
             f"{out}: exists and is not the result of a stage ({MANIFEST} is missing). Choose another --out."
         )
     manifest = read_manifest(out)
-    different = [name for name in key if manifest.get(name) != key[name]]
-    if not different:
-        return manifest
-    if force:
-        return None
-    raise DataError(
-        f"{out / MANIFEST}: a result of other {', '.join(different)} is there. Choose another --out, or replace "
-        "it with --force."
-    )
-
-
-def _finished(work: Path, key: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The manifest of work that is whole and of this key, but was killed before it took its name."""
-    if not (work / MANIFEST).is_file():
-        return None
-    manifest = read_manifest(work)
-    return manifest if all(manifest.get(name) == key[name] for name in key) else None
-
-
-def _old(out: Path) -> Path:
-    return out.with_name(f".{out.name}.old")
+    different = _different(manifest, key)
+    if different and not force:
+        raise DataError(
+            f"{out / MANIFEST}: a result of other {', '.join(different)} is there. Choose another --out, or replace "
+            "it with --force."
+        )
+    return None if different else manifest
 
 
 def _open_work(work: Path, key: Mapping[str, Any]) -> None:
@@ -179,12 +183,3 @@ def _open_work(work: Path, key: Mapping[str, Any]) -> None:
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
         write_json(plan, key)
-
-
-def _replace(out: Path, work: Path) -> None:
-    old = _old(out)
-    shutil.rmtree(old, ignore_errors=True)
-    if out.exists():
-        os.replace(out, old)
-    os.replace(work, out)
-    shutil.rmtree(old, ignore_errors=True)

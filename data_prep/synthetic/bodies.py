@@ -23,19 +23,12 @@ _PATHS = ((4, 2, 1), (4, 1, 2), (2, 4, 1), (2, 1, 4), (1, 4, 2), (1, 2, 4))
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A rest shape.
+    """A rest shape."""
 
-    Attributes:
-        nodes: (N, 3) rest positions [scene units], z up.
-        cells: (C, 8) node numbers of each cell's corners.
-        grid: (C, 3) integer position of each cell in the lattice.
-        held: (N,) nodes that never move.
-    """
-
-    nodes: Array
-    cells: Ints
-    grid: Ints
-    held: NDArray[np.bool_]
+    nodes: Array  # (N, 3) rest positions [scene units], z up
+    cells: Ints  # (C, 8) node numbers of each cell's corners
+    grid: Ints  # (C, 3) integer position of each cell in the lattice
+    held: NDArray[np.bool_]  # (N,) nodes that never move
 
     @property
     def tetrahedra(self) -> Ints:

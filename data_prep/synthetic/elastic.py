@@ -2,30 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import mujoco
 import numpy as np
 
 from data_prep.synthetic.bodies import Array, Body
+from data_prep.synthetic.plan import Material
 from gausim.core import DivergenceError
-
-
-@dataclass(frozen=True)
-class Material:
-    """What a body is made of.
-
-    Attributes:
-        young_modulus: stiffness [mass / (scene unit s^2)].
-        poisson_ratio: resistance to change of volume.
-        drag: mass-proportional damping; amplitudes fall as exp(-drag t / 2) [1/s].
-        mass: of the whole body.
-    """
-
-    young_modulus: float
-    poisson_ratio: float
-    drag: float
-    mass: float = 1.0
 
 
 class ElasticBody:

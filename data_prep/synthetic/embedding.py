@@ -23,17 +23,11 @@ CANDIDATES = 8  # points per kernel among which an even covering is chosen
 
 @dataclass(frozen=True, eq=False)
 class Embedding:
-    """K points fixed in the cells of a body.
+    """K points fixed in the cells of a body."""
 
-    Attributes:
-        body: the body.
-        cell: (K,) cell of each point.
-        local: (K, 3) trilinear coordinates in [0, 1] within it.
-    """
-
-    body: Body
-    cell: Ints
-    local: Array
+    body: Body  # the body
+    cell: Ints  # (K,) cell of each point
+    local: Array  # (K, 3) trilinear coordinates in [0, 1] within it
 
     @cached_property
     def _weights(self) -> Array:
@@ -56,7 +50,7 @@ class Embedding:
         """(..., K, 3) positions of the points when the nodes are at (..., N, 3)."""
         return np.einsum("kc,...kcx->...kx", self._weights, nodes[..., self.body.cells[self.cell], :])
 
-    def gradients(self, nodes: Array) -> Array:
+    def deformation_gradients(self, nodes: Array) -> Array:
         """(..., K, 3, 3) deformation gradients at the points."""
         return np.einsum("...kcx,kca->...kxa", nodes[..., self.body.cells[self.cell], :], self._slopes)
 
@@ -92,15 +86,7 @@ def cover_surface(body: Body, count: int, rng: np.random.Generator) -> tuple[Emb
 
 
 def embedded_scene(points: Embedding, frames: Array, spacing: float, colors: Array, *, name: str) -> GaussianScene:
-    """The rest scene: flat Gaussians along the surface, slightly glossy (SH degree 1), the held ones pinned.
-
-    Args:
-        points: K points of a body.
-        frames: (K, 3, 3) tangents and normal of each.
-        spacing: distance between neighbours [scene units].
-        colors: (K, 3) RGB in [0, 1].
-        name: of the scene.
-    """
+    """The rest scene: flat Gaussians along the surface, slightly glossy (SH degree 1), the held ones pinned."""
     count, normal = len(points.cell), frames[..., 2]
     scales = spacing * np.array([TANGENT_SCALE, TANGENT_SCALE, NORMAL_SCALE])
     sh = np.zeros((count, 4, 3))

@@ -13,30 +13,22 @@ from gausim.core import DivergenceError
 # Frames within which a push reaches its full amplitude: half a period of the slowest object.
 FIRST_SWING = 12
 TRIAL_SPEED = 1.0  # [diagonals / s], of about the size that the amplitudes ask for
-# Amplitudes of a push that stays nearly linear [diagonals]; beyond LINEAR one trial does not hit the amplitude.
-SMALL_SWING = (0.05, 0.08)
+# Amplitude beyond which one trial does not hit it [diagonals].
 LINEAR = 0.1
 TRIALS, TOLERANCE = 6, 0.05
 
 
 @dataclass(frozen=True)
 class Push:
-    """One push.
+    """One push."""
 
-    Attributes:
-        kind: ``poke`` (Gaussian falloff around a point) or ``drag`` (grows with height).
-        point: where [scene units].
-        direction: where to, unit length.
-        amplitude: largest displacement that it causes, as a fraction of the body's diagonal.
-    """
-
-    kind: str
-    point: tuple[float, float, float]
-    direction: tuple[float, float, float]
-    amplitude: float
+    kind: str  # ``poke`` (Gaussian falloff around a point) or ``drag`` (grows with height)
+    point: tuple[float, float, float]  # where [scene units]
+    direction: tuple[float, float, float]  # where to, unit length
+    amplitude: float  # largest displacement that it causes, as a fraction of the body's diagonal
 
 
-def random_push(body: Body, kind: str, rng: np.random.Generator, swing: tuple[float, float] = SMALL_SWING) -> Push:
+def random_push(body: Body, kind: str, rng: np.random.Generator, swing: tuple[float, float]) -> Push:
     """A push of the upper half of a body, mostly sideways, its amplitude within ``swing`` [diagonals]."""
     height = np.ptp(body.nodes[:, 2])
     upper = np.flatnonzero(body.nodes[:, 2] > body.nodes[:, 2].min() + 0.5 * height)

@@ -3,122 +3,24 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from data_prep.synthetic.bodies import BODIES, Array, Body
-from data_prep.synthetic.elastic import ElasticBody, Material
+from data_prep.synthetic.elastic import ElasticBody
 from data_prep.synthetic.embedding import Embedding, cover_surface, embedded_scene
 from data_prep.synthetic.paint import PAINTERS
-from data_prep.synthetic.pushes import SMALL_SWING, pushed_motion, random_push
-from data_prep.synthetic.rig import VIDEO_ANGLES, photograph, still_cameras, video_cameras
-from gausim.core import Cameras, ConfigError, GaussianScene
+from data_prep.synthetic.plan import RECIPES, TRAIN_FRAMES, Plan
+from data_prep.synthetic.pushes import pushed_motion, random_push
+from data_prep.synthetic.rig import photograph, still_cameras, video_cameras
+from gausim.core import Cameras, GaussianScene
 from gausim.data.images import write_rgba
 from gausim.io.files import write_json
 from gausim.io.ply import save_scene
 from gausim.io.transforms import write_transforms
-
-TRAIN_FRAMES = 16  # frames 0..15 are seen, as the paper trains
-MIN_KERNELS = 50
-LARGEST_SWING = 0.5  # [diagonals]; further the finite elements turn inside out
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """What an object is.
-
-    Attributes:
-        body: a shape of :data:`BODIES`.
-        material: what it is made of.
-        time_step: that its stiffness allows [s].
-        swing: least and largest amplitude of its pushes [diagonals].
-    """
-
-    body: str
-    material: Material
-    time_step: float
-    swing: tuple[float, float] = SMALL_SWING
-
-
-# Periods of the slowest mode are about 14 frames (soft) and 9 frames (firm) at 24 frames per second.
-SOFT_PUDDING = Recipe("pudding", Material(young_modulus=170.0, poisson_ratio=0.35, drag=0.5), 2e-3)
-SOFT_FLOWER = Recipe("flower", Material(young_modulus=8e4, poisson_ratio=0.35, drag=0.5), 2e-4)
-# Pushes that bend a body far beyond where its motion is linear.
-LARGE_SWING = (0.18, 0.28)
-RECIPES = {
-    "pudding_soft": SOFT_PUDDING,
-    "pudding_firm": Recipe("pudding", Material(young_modulus=400.0, poisson_ratio=0.35, drag=0.5), 2e-3),
-    "flower_soft": SOFT_FLOWER,
-    "flower_firm": Recipe("flower", Material(young_modulus=1.7e5, poisson_ratio=0.35, drag=0.5), 1.5e-4),
-    "pudding_swing": replace(SOFT_PUDDING, swing=LARGE_SWING),
-    "flower_swing": replace(SOFT_FLOWER, swing=LARGE_SWING),
-}
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Size of a data set.
-
-    Attributes:
-        objects: names of :data:`RECIPES`.
-        sequences: per object; pokes and drags take turns.
-        frames: per sequence.
-        fps: frames per second.
-        train_views: cameras to train on (a held-out one is added).
-        stills: images of the rest state per object.
-        resolution: of the videos [pixels].
-        still_resolution: of the stills [pixels].
-        kernels: Gaussians per object.
-        swing: least and largest amplitude of all pushes [diagonals]; None: each object's own.
-        seed: of everything random.
-    """
-
-    objects: tuple[str, ...] = ("pudding_soft", "pudding_firm", "flower_soft", "flower_swing", "pudding_swing")
-    sequences: int = 8
-    frames: int = 50
-    fps: int = 24
-    train_views: int = 4
-    stills: int = 24
-    resolution: int = 96
-    still_resolution: int = 192
-    kernels: int = 800
-    swing: tuple[float, float] | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Checks the numbers."""
-        unknown = [name for name in self.objects if name not in RECIPES]
-        if unknown or not self.objects:
-            raise ConfigError(f"objects: no recipe for {unknown}; choose some of {', '.join(RECIPES)}.")
-        if self.frames < TRAIN_FRAMES:
-            raise ConfigError(f"frames: expected at least the {TRAIN_FRAMES} that are trained on, got {self.frames}.")
-        if not 1 <= self.train_views < len(VIDEO_ANGLES):
-            raise ConfigError(f"train_views: expected 1..{len(VIDEO_ANGLES) - 1}, got {self.train_views}.")
-        if self.kernels < MIN_KERNELS:
-            raise ConfigError(f"kernels: expected at least {MIN_KERNELS} to cover a body, got {self.kernels}.")
-
-        if self.swing is not None and not 0 < self.swing[0] <= self.swing[1] <= LARGEST_SWING:
-            raise ConfigError(f"swing: expected 0 < LOW <= HIGH <= {LARGEST_SWING} diagonals, got {self.swing}.")
-
-    @property
-    def views(self) -> tuple[str, ...]:
-        """Names of all cameras, the held-out one last."""
-        return tuple(f"cam_{i}" for i in range(self.train_views + 1))
-
-
-QUICK = replace(
-    Plan(),
-    objects=("pudding_soft", "flower_soft"),
-    sequences=2,
-    frames=20,
-    stills=10,
-    resolution=48,
-    still_resolution=64,
-    kernels=150,
-)
 
 
 class SyntheticObject:
@@ -148,7 +50,9 @@ class SyntheticObject:
         return ElasticBody(self.body, recipe.material, fps=self.plan.fps, time_step=recipe.time_step)
 
     def write_rest(self, root: Path) -> None:
-        """Writes ``dataset.json``, ``scene.ply`` with masks, ``rest_points.npz`` and the stills."""
+        """Writes ``scene.ply`` with masks, ``rest_points.npz``, the stills and, last, ``dataset.json``."""
+        if (root / "dataset.json").is_file():
+            return
         plan = self.plan
         root.mkdir(parents=True, exist_ok=True)
         save_scene(self.scene, root / "scene.ply")
@@ -165,8 +69,10 @@ class SyntheticObject:
         write_json(root / "dataset.json", self._facts())
 
     def write_sequence(self, root: Path, number: int) -> None:
-        """Simulates, photographs and writes sequence ``number``."""
+        """Simulates, photographs and writes sequence ``number``; ``meta.json`` comes last."""
         plan, folder = self.plan, root / "sequences" / f"seq_{number:03d}"
+        if (folder / "meta.json").is_file():
+            return
         push = random_push(self.body, ("poke", "drag")[number % 2], self._rng("push", number), self._swing)
         motion = pushed_motion(self.body, self.elastic, push, plan.frames)
         displacement = motion - motion[0]
@@ -188,7 +94,7 @@ class SyntheticObject:
     def _photograph(self, displacement: Array, cameras: Cameras) -> np.ndarray:
         """(F, V, H, W, 4) images of the scene under node displacements (F, N, 3)."""
         positions = self.scene.means.numpy() + self.points.positions(displacement)
-        gradients = self.points.gradients(self.body.nodes + displacement)
+        gradients = self.points.deformation_gradients(self.body.nodes + displacement)
         return photograph(self.scene, positions, gradients, cameras).numpy()
 
     def _facts(self) -> dict[str, object]:

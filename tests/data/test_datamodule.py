@@ -160,7 +160,7 @@ def test_collate_refuses_mixed_lengths(blob: Path) -> None:
 def test_roots_that_are_not_there(two_objects: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"data.root: no directory .* data.root=PATH"):
         _ = ReadyDataModule(None).objects
-    with pytest.raises(DataError, match="data_prep.synthesize"):
+    with pytest.raises(DataError, match="gausim prepare synthesize"):
         _ = ReadyDataModule(tmp_path / "none").objects
     with pytest.raises(ConfigError, match=r"data.names: \['plum'\] asked for, the roots hold"):
         _ = ReadyDataModule(two_objects, names=["plum"]).objects

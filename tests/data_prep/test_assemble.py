@@ -19,15 +19,14 @@ import yaml
 from helpers import toy_object
 
 from data_prep.assemble import AssembleOptions, assemble, main
-from data_prep.common.stage import read_manifest
-from data_prep.prepare import main as prepare_main
+from data_prep.dataset import main as prepare_main
 from gausim.core import Cameras, ConfigError, DataError
 from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.images import read_rgba, write_rgba
 from gausim.data.objects import ObjectData
 from gausim.data.verify import verify
-from gausim.io.ply import load_scene, save_scene
+from gausim.io.ply import save_scene
 from gausim.io.transforms import write_transforms
 
 GREEN = np.array([0, 177, 64], np.uint8)
@@ -295,33 +294,3 @@ def test_one_command_from_films_to_a_data_set(capture: Capture, capsys: pytest.C
     assert sample is not None
     capsys.readouterr()
     assert prepare_main([config]) == 0 and capsys.readouterr().out.count("there already") == 6
-
-
-def test_one_command_from_photos_to_a_scene(capture: Capture, capsys: pytest.CaptureFixture[str]) -> None:
-    config = _config(capture.folder, {
-        "poses": {"transforms": "photos/calibration.json"},
-        "segment": {"pictures": "{poses}", **CHROMA},
-        "reconstruct": {"root": "{segment}"},
-        "select": SELECT,
-    })  # fmt: skip
-    assert prepare_main([config]) == 0, capsys.readouterr().err
-    marked = load_scene(capture.folder / "work" / "select" / "scene.ply")
-    assert torch.equal(marked.pinned, capture.toy.scene.pinned)
-    assert read_manifest(capture.folder / "work" / "select")["results"]["pinned"]["kernels"] == 9
-
-
-def test_films_may_be_cut_out_in_another_way_than_stills(capture: Capture, capsys: pytest.CaptureFixture[str]) -> None:
-    capture.write_films()
-    config = _config(capture.folder, {
-        "ingest": {"films": "takes", "sync": "offsets", "offsets": "cam_0=0,cam_1=2f,cam_2=0"},
-        "poses": {"transforms": "photos/calibration.json", "sequences": "{ingest}"},
-        "segment": {"pictures": "{poses}", **CHROMA},
-        "segment-films": {"pictures": "{poses}/sequences", "kind": "film", **CHROMA, "radius": 1},
-        "assemble": {"pictures": ["{segment}", "{segment-films}"]},
-    })  # fmt: skip
-    assert prepare_main([config]) == 0, capsys.readouterr().err
-    work = capture.folder / "work"
-    assert verify(work / "assemble") == []
-    for name, source in (("static/images/still_0.png", "segment/images/still_0.png"),
-                         ("sequences/seq_001/cam_0/0004.png", "segment-films/seq_001/cam_0/0004.png")):  # fmt: skip
-        assert (work / "assemble" / name).read_bytes() == (work / source).read_bytes()

@@ -14,7 +14,7 @@ from helpers import colmap_files
 from helpers.toy_object import toy_scene
 
 from data_prep.import_ready import ReadyOptions, import_ready, main
-from data_prep.scenes.ready import read_pins
+from data_prep.ready.authors import read_pins
 from gausim.core import ConfigError, DataError
 from gausim.data.objects import ObjectData
 from gausim.data.records import read_stills

@@ -13,14 +13,11 @@ import pytest
 import torch
 from helpers import toy_object
 
-from data_prep import pack as command
 from data_prep.pack import pack
-from gausim.core import DataError
 from gausim.data.dataset import SampleKey, SequenceIndex, TrainingDataset
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.data.verify import verify
-from gausim.io import packed_writer
 from gausim.io.packed import HEADER, PIXELS, read_packed
 from gausim.io.packed_writer import bounding_crop
 
@@ -73,39 +70,6 @@ def test_a_view_without_foreground_takes_no_bytes() -> None:
     alpha[1, 0, 6], alpha[2, 3, 4] = 1, 255
     crop = bounding_crop(alpha, 1, 0)
     assert (crop.left, crop.top, crop.width, crop.height) == (3, 0, 4, 5)
-
-
-def test_packing_again_changes_nothing_and_other_margins_need_force(toy: Path, packed: Path) -> None:
-    assert pack(toy, packed, margin=0)["made"] is False
-    with pytest.raises(DataError, match="--force"):
-        pack(toy, packed, margin=3)
-    with pytest.raises(DataError, match="is the object itself"):
-        pack(toy, toy)
-
-
-def test_two_packings_are_the_same_bytes(toy: Path, packed: Path, tmp_path: Path) -> None:
-    assert command.main([str(toy), "--out", str(tmp_path / "store"), "--margin", "0"]) == 0
-    for path in packed.rglob("*"):
-        if path.is_file():
-            assert (tmp_path / "store" / path.relative_to(packed)).read_bytes() == path.read_bytes(), path
-
-
-def test_interrupted_packing_goes_on(toy: Path, packed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[str] = []
-
-    def cut(alpha: np.ndarray, margin: int, offset: int) -> object:
-        calls.append("crop")
-        if len(calls) == 5:  # within the second sequence of three views
-            raise KeyboardInterrupt
-        return bounding_crop(alpha, margin, offset)
-
-    monkeypatch.setattr(packed_writer, "bounding_crop", cut)
-    with pytest.raises(KeyboardInterrupt):
-        pack(toy, tmp_path / "store", margin=0)
-    assert not (tmp_path / "store").exists()
-    pack(toy, tmp_path / "store", margin=0)
-    assert len(calls) == 5 + 3  # the first sequence was kept
-    assert verify(tmp_path / "store") == []
 
 
 # ---------------------------------------------------------------------------------------------------- faults

@@ -11,10 +11,10 @@ import pytest
 from helpers import colmap_files
 
 from data_prep import poses as command
-from data_prep.cameras.lenses import rays_of, straighten
-from data_prep.cameras.mapping import MappingOptions
-from data_prep.cameras.material import Sources
-from data_prep.cameras.world import compare
+from data_prep.capture.cameras.lenses import rays_of, straighten
+from data_prep.capture.cameras.mapping import MappingOptions
+from data_prep.capture.cameras.material import Sources
+from data_prep.capture.cameras.world import compare
 from data_prep.common.stage import read_manifest
 from data_prep.compare_poses import main as compare_main
 from data_prep.compare_poses import read_poses
@@ -98,16 +98,11 @@ def test_photos_become_poses(photos: Path, mapped: Path) -> None:
     assert not (mapped / "mapping").exists() and (mapped / "colmap" / "sparse" / "0" / "images.bin").is_file()
 
 
-def test_the_same_again_is_left_alone(photos: Path, mapped: Path) -> None:
-    assert find_poses(mapped, Sources(images=photos), mapping=OPTIONS)["made"] is False
-    with pytest.raises(DataError, match="other settings"):
-        find_poses(mapped, Sources(images=photos), mapping=MappingOptions())
-
-
+@pytest.mark.slow
 def test_interrupted_matching_goes_on_to_the_same_result(
     photos: Path, mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("data_prep.cameras.mapping.PAIRS_AT_ONCE", 4)
+    monkeypatch.setattr("data_prep.capture.cameras.mapping.PAIRS_AT_ONCE", 4)
     seen: list[tuple[str, int]] = []
 
     def stop(step: str, done: int, total: int) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from data_prep import prepare, reconstruct
+from data_prep import dataset, reconstruct
 from gausim.core import Cameras
 from gausim.data.images import write_rgba
 from gausim.io.ply import load_scene
@@ -93,7 +93,7 @@ def test_prepare_runs_it_and_hands_its_scene_on(ball: Path, capsys: pytest.Captu
         "work: work\nstages:\n  reconstruct: {root: ball, iterations: 40, kernels: 60, coarse: 0}\n"
         '  select: {scene: "{reconstruct}/scene.ply", pinned: "below z=-0.2", size: 60}\n'
     )
-    assert prepare.main([str(config)]) == 0, capsys.readouterr().err
+    assert dataset.main([str(config)]) == 0, capsys.readouterr().err
     assert load_scene(ball.parent / "work" / "select" / "scene.ply").pinned.any()
 
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from data_prep.common.stage import read_manifest
-from data_prep.scenes.selections import parse_selection, read_points
+from data_prep.ready.selections import parse_selection, read_points
 from data_prep.select import main, select
 from gausim.core import ConfigError, DataError, GaussianScene, SceneError
 from gausim.io.ply import load_scene, save_scene

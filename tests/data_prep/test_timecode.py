@@ -5,8 +5,9 @@ from __future__ import annotations
 from fractions import Fraction
 
 import pytest
+from helpers.timecodes import label_of_frame
 
-from data_prep.films.timecode import label_of_frame, parse_timecode
+from data_prep.capture.films.timecode import parse_timecode
 from gausim.core import DataError
 
 NTSC = Fraction(30000, 1001)

@@ -40,7 +40,7 @@ SAID = {
     "inverted poses": ("calibration", "fault", "world-to-camera", "invert every transform_matrix"),
     "millimetres": ("calibration", "fault", "another unit", "by 0.001"),
     "inverted masks": ("masks", "fault", "are inverted", "255 - alpha"),
-    "nothing cut out": ("masks", "fault", "Nothing is cut out", "data_prep.segment"),
+    "nothing cut out": ("masks", "fault", "Nothing is cut out", "gausim prepare segment"),
     "rate over 4": ("motion", "warning", "6 frames per second is no usual rate", "'fps'"),
     "one camera moved": ("calibration", "fault", "cam_1 is not where the pose says", "pose of cam_1"),
     "all cameras moved": ("calibration", "fault", "4 of 4 cameras disagree", "Calibrate all cameras"),

@@ -15,17 +15,17 @@ import numpy as np
 import torch
 from helpers import colmap_files, toy_object
 
-from data_prep.cameras.sources import read_lens_transforms, read_projections
+from data_prep.capture.cameras.sources import read_lens_transforms, read_projections
+from data_prep.capture.films.film import pictures, probe, upright
+from data_prep.capture.films.takes import find_takes
+from data_prep.capture.masks.clips import read_picture
 from data_prep.common.photos import open_photo, read_photo
 from data_prep.common.stage import read_manifest
-from data_prep.films.film import pictures, probe, upright
-from data_prep.films.takes import find_takes
+from data_prep.dataset import plan
 from data_prep.import_ready import ReadyOptions, import_ready
-from data_prep.masks.clips import read_picture
 from data_prep.pack import pack
-from data_prep.prepare import plan
-from data_prep.scenes.gathered import gather
-from data_prep.scenes.ready import read_pins
+from data_prep.ready.authors import read_pins
+from data_prep.ready.gathered import gather
 from gausim.core.errors import GausSimError
 from gausim.data.images import read_rgba
 from gausim.data.objects import ObjectData

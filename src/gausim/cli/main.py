@@ -29,7 +29,9 @@ class Command(NamedTuple):
 
 
 COMMANDS: dict[str, Command] = {
-    "prepare": Command("gausim.cli.prepare", "Fetch what is not part of gausim: the LPIPS weights."),
+    "prepare": Command(
+        "gausim.cli.prepare", "Make a data set of films and photos, stage by stage; fetch the LPIPS weights."
+    ),
     "inspect": Command("gausim.cli.inspect", "Print a scene's kernels and hierarchy and draw its clusters."),
     "reconstruct": Command("gausim.cli.reconstruct", "Fit the Gaussians of the rest scene to posed stills."),
     "verify": Command("gausim.cli.verify", "Check a data set and name every fault."),

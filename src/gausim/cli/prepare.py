@@ -1,11 +1,31 @@
-"""`gausim prepare WHAT`: fetches what gausim needs and does not ship."""
+"""`gausim prepare WHAT`: makes data sets of films, photos or nothing, and fetches what gausim does not ship."""
 
 from __future__ import annotations
 
 import argparse
+import importlib
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 
-HELP = "Fetch what is not part of gausim: the LPIPS weights."
+import gausim
+
+HELP = "Make a data set of films and photos, stage by stage; fetch the LPIPS weights."
+# Modules of data_prep, with one line of help each.
+STAGES = {
+    "ingest": "films of several cameras to synchronised frames",
+    "poses": "camera poses of photos and fixed cameras, found by COLMAP or taken over",
+    "segment": "foreground masks: the object cut out of pictures or films",
+    "reconstruct": "the Gaussians of the rest scene, fitted to posed stills",
+    "select": "marks the kernels that are simulated, pinned and compared",
+    "assemble": "stills, sequences and scene of one object to a data set",
+    "pack": "packs a data set's sequences for streaming",
+    "import_ready": "brings a set in the layout of READY's authors to ours",
+    "dataset": "runs the stages that a YAML file lists, one after the other",
+    "compare_poses": "how far poses are from others of the same photos",
+    "synthesize": "the embedded synthetic set: puddings and flowers that MuJoCo moves",
+    "blender_bunny": "the paper's synthetic set: any mesh as a soft body of Blender",
+}
 
 
 def main(argv: Sequence[str]) -> int:
@@ -18,17 +38,47 @@ def main(argv: Sequence[str]) -> int:
         The exit status.
 
     Raises:
+        ConfigError: the stages are not part of this installation.
         DataError: something cannot be fetched or read, or is not what was published.
     """
+    if argv and argv[0] in STAGES:
+        root = str(stages_root())
+        if root not in sys.path:
+            sys.path.insert(0, root)
+        status: int = importlib.import_module(f"data_prep.{argv[0]}").main(list(argv[1:]))
+        return status
     arguments = _parser().parse_args(argv)
-    status: int = arguments.run(arguments)
+    status = arguments.run(arguments)
     return status
+
+
+def stages_root() -> Path:
+    """The folder that holds the package ``data_prep``: the wheel's own copy, or the checkout.
+
+    Raises:
+        ConfigError: neither is there.
+    """
+    package = Path(gausim.__file__).resolve().parent
+    candidates = (package / "stages", package.parents[1])
+    for candidate in candidates:
+        if (candidate / "data_prep" / "__init__.py").is_file():
+            return candidate
+    from gausim.core.errors import ConfigError
+
+    raise ConfigError(
+        f"expected the stages in {candidates[0] / 'data_prep'} or {candidates[1] / 'data_prep'}, found neither. "
+        "Reinstall gausim, or run from a complete checkout."
+    )
 
 
 def _parser() -> argparse.ArgumentParser:
     from gausim.cli import prepare_lpips as _prepare_lpips
 
-    parser = argparse.ArgumentParser(prog="gausim prepare", description=HELP)
+    parser = argparse.ArgumentParser(
+        prog="gausim prepare", description=HELP, epilog="`gausim prepare WHAT --help` explains each."
+    )
     parts = parser.add_subparsers(metavar="WHAT", required=True)
+    for name, line in STAGES.items():
+        parts.add_parser(name, help=line, add_help=False)
     _prepare_lpips.add_to(parts)
     return parser

@@ -104,7 +104,7 @@ def _film_hint(path: Path) -> str:
         return ""
     return (
         ": it is a film or a photo in a film's container (MP4, MOV, HEIC). Frames are PNG files with alpha; "
-        "`python -m data_prep.ingest` makes them of films, `python -m data_prep.segment` cuts the object out"
+        "`gausim prepare ingest` makes them of films, `gausim prepare segment` cuts the object out"
     )
 
 

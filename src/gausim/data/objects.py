@@ -163,7 +163,7 @@ def find_objects(root: Path | str) -> list[Path]:
             raise DataError(f"{root}: no data set here; it is a part of the one in {above}. Give that directory.")
         why = "no dataset.json in it or in a folder of it" if root.is_dir() else "there is no such directory"
         raise DataError(
-            f"{root}: no data set here ({why}). Make the embedded one with `python -m data_prep.synthesize`, or point "
+            f"{root}: no data set here ({why}). Make the embedded one with `gausim prepare synthesize`, or point "
             "the data config at yours (data.root=DIR)."
         )
     return found

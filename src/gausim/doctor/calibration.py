@@ -72,7 +72,7 @@ def _moved(evidence: Evidence, fits: Sequence[Sequence[Fit]]) -> Iterator[Findin
         else:
             what = f"{len(worth)} of {len(evidence.views)} cameras disagree with the rest scene: {told}."
             remedy = (
-                "Calibrate all cameras together with the stills that the scene was made of (`python -m data_prep.poses "
+                "Calibrate all cameras together with the stills that the scene was made of (`gausim prepare poses "
                 "--images STILLS --sequences FRAMES`), or make the scene again if it is of another object or world."
             )
         sure = "certain" if spoils and min(min(f.aligned for f in r) for r in fits) > _SHAPE else "likely"
@@ -125,6 +125,6 @@ def _convention(evidence: Evidence, raw: dict[str, float]) -> Finding:
         f"{start} No convention that is known to be mixed up would make them fit (best: {best.name}, overlap "
         f"{best.overlap:.2f}).",
         "Check that scene and sequences are of one object and one world, and that angles in degrees were turned into "
-        "radians; calibrate the cameras again (`python -m data_prep.poses`).",
+        "radians; calibrate the cameras again (`gausim prepare poses`).",
         measured,
     )  # fmt: skip

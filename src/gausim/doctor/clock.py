@@ -190,7 +190,7 @@ def _told(evidence: Evidence, lags: dict[int, int], guessed: set[int], sequences
             "warning" if v in guessed else "fault", "possible" if v in guessed else "likely",
             f"{view} is out of step: it shows the motion {frames} {'later' if lag > 0 else 'earlier'} than {against}, "
             f"{place}.",
-            f"Number the frames again: {cut}, and cut all cameras to one length. With films: `python -m "
-            "data_prep.ingest` with sound, a flash or `--offsets`.",
+            f"Number the frames again: {cut}, and cut all cameras to one length. With films: `gausim "
+            "prepare ingest` with sound, a flash or `--offsets`.",
             {"view": view, "late_by_frames": lag, "sequences": sequences},
         )  # fmt: skip

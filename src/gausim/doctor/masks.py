@@ -80,7 +80,7 @@ def _not_cut_out(evidence: Evidence, views: list[str], index: list[int]) -> Find
         "fault", "certain",
         f"Nothing is cut out in {listed(views)}: alpha is 255 all over the picture, so the background, which is "
         f"{looks}, would be taken for the object.",
-        f"Make masks: `python -m data_prep.segment PICTURES --out OUT --backend {backend}`.",
+        f"Make masks: `gausim prepare segment PICTURES --out OUT --backend {backend}`.",
         {"views": views, "border_deviation": spread},
     )  # fmt: skip
 

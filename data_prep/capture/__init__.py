@@ -1,0 +1,1 @@
+"""Several cameras' films and photos: one clock, poses, masks."""

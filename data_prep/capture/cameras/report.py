@@ -1,0 +1,117 @@
+"""What poses are worth: reprojection errors, tracks, why photos failed, and a picture of cameras and points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_prep.capture.cameras.lenses import project
+from data_prep.capture.cameras.sources import Posed
+from data_prep.capture.cameras.world import centers
+from data_prep.common.photos import Photo, read_photo
+from gausim.io.colmap_files import PointTable
+
+# Fewer features than this are a photo without texture, fewer inliers one that no other photo shares a view with.
+_FEW_FEATURES, _FEW_MATCHES = 300, 60
+
+
+def _observations(shot: Posed, points: PointTable) -> tuple[np.ndarray, np.ndarray]:
+    """Which of a photo's (m,) keypoints show a point of the table, and the rows of these points."""
+    order = np.argsort(points.ids, kind="stable")
+    place = np.searchsorted(points.ids, shot.point_ids, sorter=order).clip(max=max(len(order) - 1, 0))
+    rows = order[place] if len(order) else np.zeros(0, int)
+    known = points.ids[rows] == shot.point_ids if len(order) else np.zeros(len(shot.point_ids), bool)
+    return known, rows[known] if len(order) else rows
+
+
+def reprojection(posed: Sequence[Posed], points: PointTable) -> dict[str, Any]:
+    """Distances between where photos show points and where their cameras see them [pixels], over all observations."""
+    per_image: dict[str, float | None] = {}
+    every = []
+    for shot in posed:
+        known, rows = _observations(shot, points)
+        if not known.any():
+            continue
+        error = np.linalg.norm(project(shot.camera, shot.viewmat, points.xyz[rows]) - shot.xy[known], axis=1)
+        # Behind the camera there is no pixel; that is worse than any error that could be written.
+        error = error[np.isfinite(error)]
+        every.append(error)
+        per_image[shot.photo.name] = float(error.mean()) if len(error) else None
+    if not every:
+        return {"observations": 0, "mean": None, "median": None, "per_image": {}}
+    errors = np.concatenate(every)
+    means = {"mean": float(errors.mean()), "median": float(np.median(errors))}
+    return {"observations": len(errors), **means, "per_image": per_image}
+
+
+def failures(
+    photos: Sequence[Photo], posed: Sequence[Posed], features: dict[str, int], matches: dict[str, int]
+) -> list[dict[str, Any]]:
+    """The photos that got no pose, with their features and inlier matches, and what usually helps."""
+    good = {shot.photo.name for shot in posed}
+    failed = []
+    for photo in photos:
+        if photo.name in good:
+            continue
+        count, inliers = features[photo.name], matches[photo.name]
+        if count < _FEW_FEATURES:
+            remedy = "few features: blurred, dark, without texture; take it again, or put printed cloth into the scene"
+        elif inliers < _FEW_MATCHES:
+            remedy = "no other photo shows enough of the same: photos in between, --thorough, or --matching exhaustive"
+        else:
+            remedy = "matches fit no camera: the scene moved, mirrors or repeats itself, or the lens model is wrong"
+        failed.append({"name": photo.name, "features": count, "matches": inliers, "remedy": remedy})
+    return failed
+
+
+def point_colors(posed: Sequence[Posed], points: PointTable) -> np.ndarray:
+    """(P, 3) uint8 RGB: the mean of the pixels that show each point."""
+    total, count = np.zeros((len(points.ids), 3)), np.zeros(len(points.ids))
+    for shot in posed:
+        known, rows = _observations(shot, points)
+        if not known.any():
+            continue
+        pixels = read_photo(shot.photo)
+        x = shot.xy[known, 0].astype(int).clip(0, shot.photo.width - 1)
+        y = shot.xy[known, 1].astype(int).clip(0, shot.photo.height - 1)
+        np.add.at(total, rows, pixels[y, x, 2::-1])
+        np.add.at(count, rows, 1)
+    return np.round(total / np.maximum(count, 1)[:, None]).astype(np.uint8)
+
+
+def draw_cameras(path: Path, posed: Sequence[Posed], points: np.ndarray, colors: np.ndarray, title: str) -> None:
+    """Writes a picture of points (P, 3) with colours (P, 3) uint8 and of the cameras, from above and from two sides."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    viewmats = np.stack([shot.viewmat for shot in posed])
+    eyes = centers(viewmats)
+    around = np.concatenate((eyes, points)) if len(points) else eyes
+    # Stray points far away would shrink everything else to a dot.
+    low, high = (
+        np.minimum(np.percentile(around, 2, 0), eyes.min(0)),
+        np.maximum(np.percentile(around, 98, 0), eyes.max(0)),
+    )
+    reach = 0.06 * float(np.linalg.norm(high - low)) + 1e-9
+    figure = Figure(figsize=(16.5, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title)
+    for panel, (across, up) in zip(figure.subplots(1, 3), ((0, 1), (0, 2), (1, 2)), strict=True):
+        panel.scatter(points[:, across], points[:, up], s=2, c=colors / 255.0, linewidths=0)
+        ahead = viewmats[:, 2, :3] * reach
+        panel.quiver(
+            eyes[:, across], eyes[:, up], ahead[:, across], ahead[:, up],
+            angles="xy", scale_units="xy", scale=1, color="tab:red", width=0.004,
+        )  # fmt: skip
+        panel.scatter(eyes[:, across], eyes[:, up], s=14, color="tab:red")
+        margin = 2 * reach
+        panel.set_xlim(low[across] - margin, high[across] + margin)
+        panel.set_ylim(low[up] - margin, high[up] + margin)
+        panel.set_aspect("equal")
+        panel.set_xlabel("xyz"[across])
+        panel.set_ylabel("xyz"[up])
+        panel.set_title("from above" if (across, up) == (0, 1) else f"from the side, looking along {'yx'[across]}")
+    figure.savefig(path, format="png", dpi=90)

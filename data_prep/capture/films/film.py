@@ -1,0 +1,291 @@
+"""Films as ingest sees them: when each frame was shown, what the file says about itself, its pictures and its sound.
+
+Times are those of the container [s], so that pictures and sound of one file share a clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from av.error import FFmpegError
+from av.sidedata.sidedata import Type as SideData
+
+from data_prep.capture.films.timecode import Timecode, parse_timecode
+from gausim.core import DataError
+
+# Rates that cameras have; a measured rate that fits one of them is that one.
+STANDARD_RATES = (
+    *(Fraction(n) for n in (24, 25, 30, 48, 50, 60, 90, 100, 120, 240)),
+    *(Fraction(1000 * n, 1001) for n in (24, 30, 48, 60, 120, 240)),
+)
+# Clocks of cameras agree to some 1e-5; a container may count in whole milliseconds on top.
+RATE_TOLERANCE = 5e-5
+# Frame intervals further than this from the mean are no rounding: the rate varies.
+JITTER = 0.1
+# Mean and usual gap between frames differ by more than this where frames are missing.
+MISSING = 0.005
+# Transfer functions of high dynamic range (ITU-T H.273): PQ and HLG. Eight bits of them look flat and grey.
+HDR = {16: "PQ", 18: "HLG"}
+SOUND_RATE = 16000
+# Sound beyond this is not listened to: half an hour is far longer than any clip needs to be placed.
+SOUND_SECONDS = 1800.0
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """One video file."""
+
+    path: Path  # the file
+    pts: np.ndarray  # time stamps of its N frames in presentation order, in units of ``time_base``
+    time_base: Fraction  # of the stamps [s]
+    rate: Fraction  # frames per second
+    variable: bool  # intervals between frames vary by more than rounding
+    intervals: tuple[float, float]  # the shortest and the longest interval between frames [s]
+    size: tuple[int, int]  # width and height as shown, that is after rotation [pixels]
+    rotation: int  # by which pictures are turned to be upright, counter-clockwise [degree], a multiple of 90
+    timecode: Timecode | None  # the label of its first frame; None where the file has none that can be used
+    timecode_fault: str | None  # what is wrong with the label that it has
+    sound: bool  # it has an audio track
+    codec: str  # name of the video codec
+    hdr: str | None  # name of a high-dynamic-range transfer function; None for the usual kind
+
+    @property
+    def times(self) -> np.ndarray:
+        """When each of the N frames is shown, float64 [s]."""
+        return np.asarray(self.pts * float(self.time_base), np.float64)
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self.pts)
+
+
+def probe(path: Path) -> Film:
+    """Reads a film's facts: all packets, one picture.
+
+    Raises:
+        DataError: the file is missing, empty, no film, cut off or damaged, interlaced, turned by an odd angle, has
+            fewer than two frames or frames without time stamps.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: no such film.")
+    if path.stat().st_size == 0:
+        raise DataError(f"{path}: is empty (0 bytes). Copy it again from the camera.")
+    try:
+        with av.open(str(path)) as container:
+            stream = _video_stream(path, container)
+            pts, end = _stamps(path, container, stream)
+            _check_whole(path, container, end)
+            time_base, declared = stream.time_base, stream.average_rate
+            codec, sound = stream.codec_context.name, bool(container.streams.audio)
+            label, count = _timecode_label(container, stream)
+        with av.open(str(path)) as container:
+            first = next(container.decode(_video_stream(path, container)), None)
+    except (FFmpegError, OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as a film ({error}). Copy it again from the camera.") from error
+    if first is None:
+        raise DataError(f"{path}: no frame can be decoded. Copy it again from the camera.")
+    gaps = np.diff(pts) * float(time_base)
+    rate = _rate(gaps, declared, float(time_base))
+    uneven = np.abs(gaps - 1 / float(rate)).max() > JITTER / float(rate) + float(time_base)
+    timecode, fault = _timecode(label, count, rate)
+    return Film(
+        path=path, pts=pts, time_base=time_base, rate=rate, variable=bool(uneven),
+        intervals=(float(gaps.min()), float(gaps.max())), size=_shown_size(path, first),
+        rotation=int(first.rotation) % 360,
+        timecode=timecode, timecode_fault=fault, sound=sound, codec=codec, hdr=HDR.get(int(first.color_trc)),
+    )  # fmt: skip
+
+
+def pictures(film: Film) -> Iterator[tuple[int, av.VideoFrame]]:
+    """Decodes all frames in presentation order, each with its index.
+
+    Raises:
+        DataError: a frame is damaged.
+    """
+    index = {int(stamp): i for i, stamp in enumerate(film.pts)}
+    done = 0
+    try:
+        with av.open(str(film.path)) as container:
+            for frame in container.decode(_video_stream(film.path, container)):
+                if frame.pts in index and not frame.is_corrupt:
+                    done += 1
+                    yield index[frame.pts], frame
+    except (FFmpegError, OSError, ValueError) as error:
+        raise DataError(
+            f"{film.path}: frame {done}: cannot be decoded ({error}). Copy the film again from the camera."
+        ) from error
+    if done != len(film):
+        raise DataError(
+            f"{film.path}: {len(film)} frames are in it, {done} can be decoded. Copy it again from the camera."
+        )
+
+
+def upright(film: Film, frame: av.VideoFrame) -> np.ndarray:
+    """The picture as (H, W, 3) uint8 RGB, turned as the file asks for."""
+    turned = np.rot90(frame.to_ndarray(format="rgb24"), film.rotation // 90)
+    return np.ascontiguousarray(turned)
+
+
+def sound(film: Film) -> tuple[np.ndarray, float]:
+    """The first audio track as one channel of ``SOUND_RATE`` samples per second.
+
+    Returns:
+        Samples (float32, about −1..1) and when the first is heard [s], on the clock of the pictures.
+
+    Raises:
+        DataError: there is none, it is damaged, or its time stamps leap.
+    """
+    from scipy.signal import resample_poly
+
+    blocks: list[tuple[int, np.ndarray]] = []
+    rate = 0
+    try:
+        with av.open(str(film.path)) as container:
+            if not container.streams.audio:
+                raise DataError(f"{film.path}: has no sound.")
+            resampler = av.AudioResampler(format="fltp", layout="mono")
+            for frame in container.decode(audio=0):
+                if frame.pts is None:
+                    raise DataError(f"{film.path}: its sound has no time stamps. Choose another --sync.")
+                rate = frame.sample_rate
+                start = round(frame.pts * frame.time_base * rate)
+                blocks += [(start, part.to_ndarray()[0]) for part in resampler.resample(frame)]
+                if start - blocks[0][0] > SOUND_SECONDS * rate:
+                    break
+    except (FFmpegError, OSError, ValueError) as error:
+        raise DataError(f"{film.path}: its sound cannot be decoded ({error}). Choose another --sync.") from error
+    if not blocks:
+        raise DataError(f"{film.path}: its sound is empty. Choose another --sync.")
+    samples, first = _laid_out(film.path, blocks, rate)
+    ratio = Fraction(SOUND_RATE, rate)
+    return resample_poly(samples, ratio.numerator, ratio.denominator).astype(np.float32), first / rate
+
+
+def _laid_out(path: Path, blocks: list[tuple[int, np.ndarray]], rate: int) -> tuple[np.ndarray, int]:
+    """Blocks of samples at their places; holes are silent."""
+    first = blocks[0][0]
+    end = max(start + len(block) for start, block in blocks)
+    if min(start for start, _ in blocks) < first or end - first > (SOUND_SECONDS + 10) * rate:
+        raise DataError(f"{path}: the time stamps of its sound leap. Choose another --sync.")
+    samples = np.zeros(end - first, np.float32)
+    for start, block in blocks:
+        samples[start - first : start - first + len(block)] = block
+    if not np.isfinite(samples).all():
+        raise DataError(f"{path}: its sound holds values that are no numbers. Choose another --sync.")
+    return samples, first
+
+
+def _video_stream(path: Path, container: av.container.InputContainer) -> av.VideoStream:
+    for stream in container.streams.video:
+        if stream.disposition & stream.disposition.attached_pic:  # a cover is no film
+            continue
+        if stream.codec_context is None:
+            raise DataError(
+                f"{path}: its video has a codec that is unknown here. Convert it to H.264, or copy it again."
+            )
+        return stream
+    raise DataError(f"{path}: holds no video stream.")
+
+
+def _stamps(path: Path, container: av.container.InputContainer, stream: av.VideoStream) -> tuple[np.ndarray, float]:
+    """Time stamps of the frames that are shown, and where the last packet of any stream ends [s]."""
+    stamps, end = [], 0.0
+    streams = [stream, *container.streams.audio[:1]]
+    for packet in container.demux(streams):
+        if packet.size == 0:
+            continue
+        if packet.is_corrupt:
+            raise DataError(f"{path}: is damaged or cut off after {end:.3f} s. Copy it again from the camera.")
+        if packet.pts is None:
+            if packet.stream_index == stream.index:
+                raise DataError(f"{path}: its frames have no time stamps. Put them into an MP4, MOV or MKV file.")
+            continue
+        end = max(end, float((packet.pts + (packet.duration or 0)) * packet.time_base))
+        if packet.stream_index == stream.index and not packet.is_discard:
+            stamps.append(packet.pts)
+    if len(stamps) < 2:
+        raise DataError(f"{path}: holds {len(stamps)} frames, expected at least 2.")
+    pts = np.sort(np.array(stamps, np.int64))
+    if (np.diff(pts) <= 0).any():
+        raise DataError(f"{path}: several of its frames have one time stamp. Export it again.")
+    return pts, end
+
+
+def _check_whole(path: Path, container: av.container.InputContainer, end: float) -> None:
+    declared = (container.duration or 0) / av.time_base
+    if declared - end > 0.1:  # containers round; a film that was cut off lacks more
+        raise DataError(
+            f"{path}: is cut off: it says that it lasts {declared:.3f} s, its data end at {end:.3f} s. Copy it again "
+            "from the camera, or cut it to what is there with a video editor."
+        )
+
+
+def _rate(gaps: np.ndarray, declared: Fraction | None, time_base: float) -> Fraction:
+    """Frames per second: the declared or a standard rate where it explains the time stamps, else the measured one.
+
+    Where frames are missing the usual gap tells the rate, not the mean.
+    """
+    span, count = float(gaps.sum()), len(gaps)
+    for rate in (declared, *STANDARD_RATES):
+        if rate and abs(count / float(rate) - span) <= 1.01 * time_base + RATE_TOLERANCE * span:
+            return Fraction(rate)
+    usual = 1 / float(np.median(gaps))
+    nearest = min(STANDARD_RATES, key=lambda rate: abs(float(rate) / usual - 1))
+    if abs(usual * span / count - 1) > MISSING and abs(1 / usual - 1 / float(nearest)) <= 1.01 * time_base:
+        return nearest
+    return Fraction(count / span).limit_denominator(100000)
+
+
+def _shown_size(path: Path, frame: av.VideoFrame) -> tuple[int, int]:
+    if frame.interlaced_frame:
+        raise DataError(
+            f"{path}: is interlaced. Deinterlace it (for example `ffmpeg -vf bwdif`) and ingest the result."
+        )
+    if frame.rotation % 90:
+        raise DataError(f"{path}: is to be turned by {frame.rotation} degrees; only multiples of 90 are supported.")
+    matrix = frame.side_data.get(SideData.DISPLAYMATRIX)
+    a, b, _, c, d, *_ = (1, 0, 0, 0, 1) if matrix is None else np.frombuffer(bytes(matrix), np.int32).tolist()
+    if a * d < b * c:
+        raise DataError(f"{path}: is to be mirrored by its metadata. Export it as it is to be seen.")
+    return (frame.height, frame.width) if frame.rotation % 180 else (frame.width, frame.height)
+
+
+def _timecode_label(container: av.container.InputContainer, stream: av.VideoStream) -> tuple[str | None, int | None]:
+    """The label that the file carries, and its frame number where a time code track has it."""
+    for track in container.streams.data:
+        label = track.metadata.get("timecode")
+        if label:
+            container.seek(0)
+            packet = next((p for p in container.demux(track) if p.size >= 4), None)
+            return label, None if packet is None else int.from_bytes(bytes(packet)[:4], "big")
+    for metadata in (stream.metadata, container.metadata):
+        for key, label in metadata.items():
+            if key.lower() == "timecode":
+                return label, None
+    return None, None
+
+
+def _timecode(label: str | None, count: int | None, rate: Fraction) -> tuple[Timecode | None, str | None]:
+    """The label at the rate that its own track counts (at 50 per second some cameras label by 25), or its fault."""
+    if label is None:
+        return None, None
+    try:
+        if count is not None:
+            for divisor in (1, 2, 4):
+                if _counts_to(label, rate / divisor, count):
+                    return parse_timecode(label, rate / divisor), None
+        return parse_timecode(label, rate), None
+    except DataError as error:
+        return None, str(error)
+
+
+def _counts_to(label: str, rate: Fraction, count: int) -> bool:
+    try:
+        return parse_timecode(label, rate).frame == count
+    except DataError:
+        return False

@@ -1,0 +1,334 @@
+"""Several cameras' films on one clock, and the frames of each that belong together.
+
+``world time = time in the film + offset``. Offsets come from time code, sound, a flash, or the user; the output's
+frames are those of a reference camera, and every other camera gives its nearest frame. What remains between a frame and
+its place is the residual; above half a frame there is a better frame, or none, and the films are refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from data_prep.capture.films.film import SOUND_RATE, Film, pictures, sound
+from data_prep.capture.films.flash import Flash, brightness, flash_lag, flashes
+from data_prep.capture.films.sound import sound_lag
+from gausim.core import DataError
+
+METHODS = ("timecode", "audio", "flash", "offsets")
+LIMIT = 0.5
+# Rates are multiples of each other up to what quartz clocks differ by. 30 and 29.97 differ twice as much.
+SAME_RATE = 5e-4
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """When the cameras began."""
+
+    method: str  # how it is known
+    seconds: Mapping[str, float]  # by camera, what is added to its film's times to be on the common clock [s]
+    spread: Mapping[str, float]  # by camera, how far its measurements disagree with each other [s]
+    resolution: Mapping[str, float]  # by camera, what the method can tell apart [s]
+    notes: tuple[str, ...] = ()  # what the user should know
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Which frames belong together."""
+
+    reference: str  # the camera whose frames give the output its times
+    rate: Fraction  # output frames per second
+    frames: Mapping[str, np.ndarray]  # by camera, the index in its film of each of the F output frames, int64
+    # by camera, how much later than its place each of them is, float64 [output frames]
+    residuals: Mapping[str, np.ndarray]
+
+    @property
+    def worst(self) -> float:
+        """Largest residual of any camera [output frames]."""
+        return max(float(np.abs(r).max()) for r in self.residuals.values())
+
+
+def measure(films: Mapping[str, Film], method: str, *, given: Mapping[str, float], shutter: float = 1.0) -> Offsets:
+    """Offsets by a method, or by the first that applies.
+
+    Args:
+        films: by camera.
+        method: one of ``METHODS``, or ``auto``: time code, else sound, else a flash, else what is given.
+        given: by camera, offsets that the user states [s]; cameras that are not named have 0.
+        shutter: exposure as part of the frame interval, for flashes.
+
+    Raises:
+        DataError: the method does not apply (which camera, why, and what to do), or two methods contradict each other.
+    """
+    if len(films) == 1:
+        zero = dict.fromkeys(films, 0.0)
+        return Offsets("single", zero, zero, zero)
+    if method != "auto":
+        return _by(method, films, given, shutter)
+    reasons = []
+    for name in METHODS:
+        try:
+            found = _by(name, films, given, shutter)
+        except DataError as error:
+            reasons.append(f"{name}: {error}")
+            continue
+        return _checked_by_sound(films, found) if name == "timecode" else found
+    raise DataError("nothing tells how these films belong together.\n  " + "\n  ".join(reasons))
+
+
+def align(
+    films: Mapping[str, Film],
+    offsets: Offsets,
+    *,
+    rate: Fraction | None = None,
+    reference: str | None = None,
+    start: float = 0.0,
+    duration: float | None = None,
+) -> Alignment:
+    """Nearest frames of all cameras on the times of one.
+
+    Args:
+        films: by camera.
+        offsets: when they began.
+        rate: output frames per second; that of the slowest camera when None.
+        reference: whose frames give the times; of the slowest cameras the one with the smallest residuals when None.
+        start: what is left out at the beginning of the time that all saw [s].
+        duration: how much of it is kept [s]; all when None.
+
+    Raises:
+        DataError: rates are no multiples of the output's, the films have no time in common, a residual is above half a
+            frame, or a camera's measurements disagree by more than that.
+    """
+    rate = rate or min(film.rate for film in films.values())
+    steps = {name: _step(name, film, rate) for name, film in films.items()}
+    _check_agreement(films, offsets, float(rate))
+    candidates = [reference] if reference else [name for name in films if steps[name] == min(steps.values())]
+    window = _common(films, offsets, rate, start)
+    most = None if duration is None else max(1, round(duration * float(rate)))
+    found = [_aligned(films, offsets, rate, name, window, steps, most) for name in candidates]
+    best = min(found, key=lambda a: round(a.worst, 6))
+    for name, residual in best.residuals.items():
+        worst = int(np.abs(residual).argmax())
+        if abs(residual[worst]) > LIMIT + _rounding(films[name], rate):
+            _refuse(films[name], name, worst, float(residual[worst]), best)
+    return best
+
+
+def _by(method: str, films: Mapping[str, Film], given: Mapping[str, float], shutter: float) -> Offsets:
+    if method == "timecode":
+        return _by_timecode(films)
+    if method == "audio":
+        return _by_sound(films)
+    if method == "flash":
+        return _by_flash(films, shutter)
+    if not given:
+        raise DataError("no offsets are given. Name them: --offsets cam_1=0.146,cam_2=-3f (seconds, or frames with f).")
+    zero = dict.fromkeys(films, 0.0)
+    return Offsets("offsets", {**zero, **given}, zero, zero)
+
+
+@contextmanager
+def _naming(name: str, films: Mapping[str, Film], base: str | None = None) -> Iterator[None]:
+    """Puts the camera, and the one that it is compared with, before an error."""
+    try:
+        yield
+    except DataError as error:
+        other = f" against {base} ({films[base].path.name})" if base else ""
+        raise DataError(f"{name} ({films[name].path.name}){other}: {error}") from error
+
+
+def _by_timecode(films: Mapping[str, Film]) -> Offsets:
+    codes = {}
+    for name, film in films.items():
+        if film.timecode is None:
+            raise DataError(f"{name} ({film.path.name}): {film.timecode_fault or 'has no time code.'}")
+        codes[name] = film.timecode
+    base, reference = next(iter(films.items()))
+    seconds = {}
+    for name, film in films.items():
+        with _naming(name, films, base):
+            later = float(codes[name].seconds_after(codes[base]))
+        # The label is that of the first frame, wherever on the film's own clock that lies.
+        seconds[name] = later - float(film.times[0]) + float(reference.times[0])
+    resolution = {name: 0.5 / float(code.rate) for name, code in codes.items()}
+    note = "time code counts whole frames: between cameras that are not genlocked up to half a frame stays unknown"
+    return Offsets("timecode", seconds, dict.fromkeys(films, 0.0), resolution, (note,))
+
+
+def _by_sound(films: Mapping[str, Film]) -> Offsets:
+    for name, film in films.items():
+        if not film.sound:
+            raise DataError(f"{name} ({film.path.name}): has no sound.")
+    (base, reference), *others = films.items()
+    first, begin = sound(reference)
+    seconds, spread, notes = {base: 0.0}, {base: 0.0}, []
+    for name, film in others:
+        second, begins = sound(film)
+        with _naming(name, films, base):
+            lag = sound_lag(first, second, SOUND_RATE)
+        seconds[name], spread[name] = lag.seconds + begin - begins, lag.spread
+        notes.append(f"{name}: sharpness {lag.sharpness:.1f}, likeness of loudness {lag.likeness:.2f}")
+    notes.append("sound travels 1 m in 2.9 ms: a microphone that is further from the source hears later")
+    return Offsets("audio", seconds, spread, dict.fromkeys(films, 1 / SOUND_RATE), tuple(notes))
+
+
+def _by_flash(films: Mapping[str, Film], shutter: float) -> Offsets:
+    found: dict[str, list[Flash]] = {}
+    for name, film in films.items():
+        with _naming(name, films):
+            interval = 1 / float(film.rate)
+            found[name] = flashes(brightness_curve(film), film.times, interval=interval, shutter=shutter)
+    (base, reference), *others = films.items()
+    seconds, spread, resolution = {base: 0.0}, {base: 0.0}, {base: 0.0}
+    for name, film in others:
+        with _naming(name, films, base):
+            lag = flash_lag(found[base], found[name], interval=1 / float(min(film.rate, reference.rate)))
+        seconds[name], spread[name], resolution[name] = lag.seconds, lag.spread, lag.resolution
+    return Offsets("flash", seconds, spread, resolution)
+
+
+def brightness_curve(film: Film) -> np.ndarray:
+    """Mean brightness of each of the N frames in linear light, 0..1."""
+    levels = np.full(len(film), np.nan)
+    for i, frame in pictures(film):
+        levels[i] = brightness(frame.to_ndarray(format="gray"))
+    return levels
+
+
+def _checked_by_sound(films: Mapping[str, Film], found: Offsets) -> Offsets:
+    """Time code that the sound contradicts was not jam-synced: neither is believed."""
+    try:
+        heard = _by_sound(films)
+    except DataError as error:
+        return replace(found, notes=(*found.notes, f"sound: {error}"))
+    apart = {name: (heard.seconds[name] - found.seconds[name]) * float(film.rate) for name, film in films.items()}
+    for name, film in films.items():
+        if abs(apart[name]) > 1.0:
+            raise DataError(
+                f"{name} ({film.path.name}): its time code and its sound disagree by {apart[name]:+.2f} frames. If the "
+                "cameras' time codes were set together, choose --sync timecode; if they were not, choose --sync audio."
+            )
+    told = {name: round(frames, 2) for name, frames in apart.items()}
+    return replace(found, notes=(*found.notes, f"sound agrees with the time code, later by {told} frames"))
+
+
+def _check_agreement(films: Mapping[str, Film], offsets: Offsets, rate: float) -> None:
+    for name, film in films.items():
+        spread = offsets.spread[name] * rate
+        if spread > LIMIT:
+            raise DataError(
+                f"{name} ({film.path.name}): its offsets by {offsets.method} at different times disagree by "
+                f"{spread:.2f} frames, allowed {LIMIT:g}: its clock runs apart, or frames are missing. Cut the film "
+                "shorter around what you need, or choose another --sync."
+            )
+
+
+def _step(name: str, film: Film, rate: Fraction) -> int:
+    ratio = float(film.rate / rate)
+    step = round(ratio)
+    if step < 1 or abs(ratio / step - 1) > SAME_RATE:
+        raise DataError(
+            f"{name} ({film.path.name}): {float(film.rate):.6g} frames per second are no whole multiple of the "
+            f"output's {float(rate):.6g}. Film all cameras at one rate, or at multiples of one, or "
+            "convert this film first."
+        )
+    return step
+
+
+def _common(films: Mapping[str, Film], offsets: Offsets, rate: Fraction, start: float) -> tuple[float, float]:
+    """Begin and end of the time that all cameras saw, within half an output frame [s]."""
+    half = LIMIT / float(rate)
+    begins = {name: float(film.times[0]) + offsets.seconds[name] for name, film in films.items()}
+    ends = {name: float(film.times[-1]) + offsets.seconds[name] for name, film in films.items()}
+    last, first = max(begins, key=begins.__getitem__), min(ends, key=ends.__getitem__)
+    begin, end = begins[last] + start, ends[first]
+    if begin > end + half:
+        what = f"after leaving out {start:g} s" if begins[last] <= ends[first] else f"by {offsets.method}"
+        raise DataError(
+            f"{last} ({films[last].path.name}) begins {begins[last] - ends[first]:+.3f} s after {first} "
+            f"({films[first].path.name}) ended, {what}: the films have no time in common. Check the films and offsets."
+        )
+    return begin - half, end + half
+
+
+def _aligned(
+    films: Mapping[str, Film],
+    offsets: Offsets,
+    rate: Fraction,
+    reference: str,
+    window: tuple[float, float],
+    steps: Mapping[str, int],
+    most: int | None,
+) -> Alignment:
+    world = {name: film.times + offsets.seconds[name] for name, film in films.items()}
+    own, slack = world[reference], 1e-6 / float(rate)
+    inside = own[(own >= window[0] - slack) & (own <= window[1] + slack)]
+    if not len(inside):
+        raise DataError(
+            f"{reference}: has no frame between {window[0]:.3f} s and {window[1]:.3f} s. Choose a longer part."
+        )
+    count = int(np.floor((inside[-1] - inside[0]) * float(rate) + 1e-3)) + 1
+    count = min(count, most or count)
+    grid = inside[0] + np.arange(count) / float(rate)
+    frames, residuals = {}, {}
+    for name, times in world.items():
+        frames[name] = _nearest(times, grid, steps[name], (LIMIT + _rounding(films[name], rate)) / float(rate))
+        residuals[name] = (times[frames[name]] - grid) * float(rate)
+    return Alignment(reference, rate, frames, residuals)
+
+
+def _nearest(times: np.ndarray, grid: np.ndarray, step: int, within: float) -> np.ndarray:
+    """Indices of the frames nearest to the grid; evenly spaced ones where these do as well."""
+    right = np.clip(np.searchsorted(times, grid), 1, len(times) - 1)
+    nearest = np.where(grid - times[right - 1] <= times[right] - grid, right - 1, right)
+    # Half a frame off, rounded time stamps would make the nearest frame alternate between two neighbours.
+    even = nearest[0] + step * np.arange(len(grid))
+    if even[-1] < len(times) and np.abs(times[even] - grid).max() <= within:
+        return np.asarray(even)
+    return np.asarray(nearest)
+
+
+def _rounding(film: Film, rate: Fraction) -> float:
+    """What the container's rounding of time stamps may add to a residual [output frames]."""
+    return 1e-6 + 0.5 * float(film.time_base * rate)
+
+
+def _refuse(film: Film, name: str, k: int, residual: float, alignment: Alignment) -> None:
+    shortest, longest = (1000 * interval for interval in film.intervals)
+    why = (
+        f"Its frames come {shortest:.1f} to {longest:.1f} ms apart: the rate varies or frames are missing. Record at a "
+        "constant rate, or cut the film before the gap (--start, --duration)."
+        if film.variable
+        else "Check its offset and rate, or leave the camera out."
+    )
+    raise DataError(
+        f"{name} ({film.path.name}): output frame {k}: its nearest frame ({alignment.frames[name][k]}) is "
+        f"{residual:+.2f} frames from its place on the times of {alignment.reference}, allowed {LIMIT:g}. {why}"
+    )
+
+
+def facts(film: Film, name: str, offsets: Offsets, alignment: Alignment) -> dict[str, Any]:
+    """What the manifest says of one camera, as plain data."""
+    residual, frames = alignment.residuals[name], alignment.frames[name]
+    return {
+        "fps": float(film.rate),
+        "variable_rate": film.variable,
+        "frames": len(film),
+        "size": list(film.size),
+        "rotation": film.rotation,
+        "codec": film.codec,
+        "timecode": film.timecode.text if film.timecode else None,
+        "offset_seconds": offsets.seconds[name] - offsets.seconds[alignment.reference],
+        "offset_frames": (offsets.seconds[name] - offsets.seconds[alignment.reference]) * float(film.rate),
+        "resolution_frames": offsets.resolution[name] * float(film.rate),
+        "disagreement_frames": offsets.spread[name] * float(film.rate),
+        "residual_frames": {"mean": float(residual.mean()), "largest": float(np.abs(residual).max())},
+        "kept": [int(frames[0]), int(frames[-1])],
+        "left_out": [int(frames[0]), int(len(film) - 1 - frames[-1])],
+        "repeated": int((np.diff(frames) == 0).sum()),
+    }

@@ -1,0 +1,64 @@
+"""Pictures to check masks by eye: overlays as a film, and a sheet of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from data_prep.capture.masks.clips import Clip, read_picture, sampled, write_picture
+from gausim.io.files import replacing
+
+OUTLINE = (255, 40, 120)
+# What is cut out stands on a colour that objects rarely have.
+GROUND = (90, 0, 140)
+SIDE = 480
+SHEET = 12
+
+
+def overlay(rgb: np.ndarray, alpha: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Left the picture with the background dimmed and the mask's outline, right what was cut out; each of ``size``."""
+    rgb, alpha = fitted(rgb, size), fitted(alpha, size)
+    weight = alpha[..., None].astype(np.float32) / 255
+    left = rgb * (0.35 + 0.65 * weight)
+    inside = (alpha > 127).astype(np.uint8)
+    outline = cv2.dilate(inside, np.ones((3, 3), np.uint8)) != inside
+    left[outline] = OUTLINE
+    right = rgb * weight + np.array(GROUND, np.float32) * (1 - weight)
+    return np.ascontiguousarray(np.concatenate([left, right], axis=1).astype(np.uint8))
+
+
+def fitted(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Scaled into a box of (width, height), centred on black."""
+    height, width = pixels.shape[:2]
+    scale = min(size[0] / width, size[1] / height)
+    inner = max(1, round(width * scale)), max(1, round(height * scale))
+    small = cv2.resize(pixels, inner, interpolation=cv2.INTER_AREA)
+    found = np.zeros((size[1], size[0], *pixels.shape[2:]), np.uint8)
+    top, left = (size[1] - inner[1]) // 2, (size[0] - inner[0]) // 2
+    found[top : top + inner[1], left : left + inner[0]] = small
+    return found
+
+
+def write_overlays(clip: Clip, masks: Sequence[Path], folder: Path, *, fps: float) -> None:
+    """Writes ``NAME.mp4`` of all pictures and ``NAME.jpg`` of some."""
+    from gausim.io.video import write_video
+
+    height, width = clip.rgb(0).shape[:2]
+    scale = min(1.0, SIDE / max(height, width))
+    size = max(2, round(width * scale)), max(2, round(height * scale))
+
+    def frames(indices: Sequence[int]) -> Iterator[np.ndarray]:
+        for i in indices:
+            yield overlay(clip.rgb(i), read_picture(masks[i])[..., 3], size)
+
+    with replacing(folder / f"{clip.flat}.mp4", typed=True) as temporary:
+        write_video(temporary, frames(range(len(clip))), fps)
+    chosen = list(frames(sampled(len(clip), SHEET)))
+    columns = 3 if len(chosen) > 4 else 2
+    blank = np.zeros_like(chosen[0])
+    chosen += [blank] * (-len(chosen) % columns)
+    rows = [np.concatenate(chosen[i : i + columns], axis=1) for i in range(0, len(chosen), columns)]
+    write_picture(folder / f"{clip.flat}.jpg", np.concatenate(rows))

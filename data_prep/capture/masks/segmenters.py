@@ -1,0 +1,218 @@
+"""Foreground masks: the protocol that every backend obeys, and the backends that need OpenCV alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from data_prep.capture.masks.clips import Clip, read_picture, sampled
+from gausim.core import DataError
+
+MaskOf = Callable[[int], np.ndarray]
+
+# Frames that the median of a clip is made of.
+MEDIAN_FRAMES = 41
+# A difference in CIE Lab counts from here on, and from so many times the noise; 2.3 is just noticeable.
+LEAST_DIFFERENCE, OVER_NOISE = 7.0, 5.0
+GRABCUT_SIDE = 480
+GRABCUT_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A way to tell foreground from background, with what its result depends on."""
+
+    name: str  # of the backend
+    make: Callable[[], Segmenter]  # makes the segmenter; called once, and only if there is something to do
+    soft: bool = False  # masks have soft edges of their own; others are softened along the picture's edges
+    settings: Mapping[str, Any] = field(default_factory=dict)  # what was chosen (plain data)
+    inputs: Mapping[str, Path] = field(default_factory=dict)  # files it reads besides the pictures
+    packages: tuple[str, ...] = ()  # libraries whose versions may matter
+
+
+class Segmenter(Protocol):
+    """Tells foreground from background."""
+
+    def open(self, clip: Clip) -> MaskOf:
+        """Looks at a clip and returns what gives a picture's mask.
+
+        It is called with rising indices, not necessarily all of them, and returns (H, W) float32 in 0..1, 1 being
+        foreground.
+        """
+
+
+@dataclass(frozen=True)
+class AlphaSegmenter:
+    """The alpha channel that the pictures have already."""
+
+    def open(self, clip: Clip) -> MaskOf:
+        """See :class:`Segmenter`; a picture without any transparency is refused."""
+
+        def mask(index: int) -> np.ndarray:
+            alpha = clip.rgba(index)[..., 3]
+            if alpha.min() == 255:
+                raise DataError(
+                    f"{clip.file(index)}: has no transparent pixel, so its alpha is no mask. Choose another --backend."
+                )
+            return alpha.astype(np.float32) / 255
+
+        return mask
+
+
+@dataclass(frozen=True)
+class BackgroundSegmenter:
+    """What differs from the empty scene, or, where there is no picture of it, from the median over time.
+
+    The median holds whatever stays in its place. It removes the background of an object that leaves its place now and
+    then; of one that sways about it only the swaying parts are found, and GrabCut spreads them over what looks alike.
+    """
+
+    # picture of the empty scene, or a folder with one per camera (named like the clip's folder); None: median
+    plate: Path | None = None
+    threshold: float | None = None  # difference in CIE Lab from which a pixel counts; from the noise when None
+    grabcut: bool = True  # refine by GrabCut
+
+    def open(self, clip: Clip) -> MaskOf:
+        """See :class:`Segmenter`."""
+        if self.plate is None and (not clip.moving or len(clip) < 3):
+            raise DataError(
+                f"{clip.root / clip.name}: a median over time needs a film of at least 3 frames of a camera that "
+                "stands still. Give a picture of the empty scene with --plate, or choose another --backend."
+            )
+        chosen = sampled(len(clip), MEDIAN_FRAMES)
+        background = lab(self._plate(clip)) if self.plate else lab(median_picture(clip, chosen))
+        differences = [difference(lab(clip.rgb(i)), background, clip, i) for i in chosen]
+        noise = 1.4826 * float(np.median([np.median(d) for d in differences]))
+        threshold = self.threshold or max(LEAST_DIFFERENCE, OVER_NOISE * noise)
+        # Where anything ever moved: with a median, the object is somewhere in there and nowhere else.
+        ever = np.max(differences, axis=0) > threshold
+
+        def mask(index: int) -> np.ndarray:
+            rgb = clip.rgb(index)
+            far = difference(lab(rgb), background, clip, index)
+            if not self.grabcut:
+                return np.clip((far - 0.5 * threshold) / threshold, 0, 1).astype(np.float32)
+            return grabcut(rgb, trimap(far, threshold, sure=self.plate is not None, ever=None if self.plate else ever))
+
+        return mask
+
+    def _plate(self, clip: Clip) -> np.ndarray:
+        assert self.plate is not None
+        path = self.plate
+        if path.is_dir():
+            names = (clip.name, Path(clip.name).name)
+            found = [path / f"{n}{end}" for n in names for end in (".png", ".jpg") if (path / f"{n}{end}").is_file()]
+            if not found:
+                raise DataError(f"{path}: no picture of the empty scene for '{clip.name}', expected {names[1]}.png.")
+            path = found[0]
+        plate = read_picture(path)[..., :3]
+        if plate.shape != clip.rgb(0).shape:
+            shape = clip.rgb(0).shape
+            raise DataError(
+                f"{path}: is {plate.shape[1]}x{plate.shape[0]}, the pictures of '{clip.name}' are "
+                f"{shape[1]}x{shape[0]}."
+            )
+        return np.ascontiguousarray(plate)
+
+
+@dataclass(frozen=True)
+class ChromaSegmenter:
+    """What has another hue than a screen."""
+
+    key: tuple[int, int, int] | None = None  # the screen's colour (RGB, 0..255); that of the picture's border when None
+    # distances in the a-b plane of CIE Lab up to which a pixel is screen, and from which it is not
+    tolerance: tuple[float, float] = (14.0, 32.0)
+    grabcut: bool = True  # refine by GrabCut
+
+    def open(self, clip: Clip) -> MaskOf:
+        """See :class:`Segmenter`."""
+        first = lab(clip.rgb(0))
+        border = np.concatenate([first[0], first[-1], first[:, 0], first[:, -1]])
+        key = np.median(border, axis=0) if self.key is None else lab(np.full((1, 1, 3), self.key, np.uint8))[0, 0]
+        if np.hypot(key[1], key[2]) < 15:
+            raise DataError(
+                f"{clip.file(0)}: the screen's colour is nearly grey, so hue tells nothing. State it with --key, or "
+                "choose another --backend."
+            )
+        low, high = self.tolerance
+
+        def mask(index: int) -> np.ndarray:
+            rgb = clip.rgb(index)
+            distance = np.linalg.norm(lab(rgb)[..., 1:] - key[1:], axis=-1)
+            soft = np.clip((distance - low) / (high - low), 0, 1).astype(np.float32)
+            if not self.grabcut:
+                return soft
+            marks = np.where(soft > 0.5, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+            marks[soft == 0], marks[soft == 1] = cv2.GC_BGD, cv2.GC_FGD
+            return grabcut(rgb, marks)
+
+        return mask
+
+
+def lab(rgb: np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 RGB to CIE Lab, float32, slightly blurred against noise."""
+    return cv2.GaussianBlur(cv2.cvtColor(rgb.astype(np.float32) / 255, cv2.COLOR_RGB2LAB), (0, 0), 1.0)
+
+
+def difference(picture: np.ndarray, background: np.ndarray, clip: Clip, index: int) -> np.ndarray:
+    """Distance of (H, W, 3) Lab pictures by pixel, after the change that all pixels share (exposure) is taken away."""
+    if picture.shape != background.shape:
+        raise DataError(
+            f"{clip.file(index)}: is {picture.shape[1]}x{picture.shape[0]}, the background is "
+            f"{background.shape[1]}x{background.shape[0]}. Pictures of a clip have one size."
+        )
+    delta = picture - background
+    return np.asarray(np.linalg.norm(delta - np.median(delta, axis=(0, 1)), axis=-1))
+
+
+def median_picture(clip: Clip, indices: Sequence[int]) -> np.ndarray:
+    """Median of some pictures of a clip, (H, W, 3) uint8."""
+    pictures = [clip.rgb(i) for i in indices]
+    if len({p.shape for p in pictures}) > 1:
+        raise DataError(f"{clip.root / clip.name}: pictures have different sizes; those of a film have one.")
+    return np.median(pictures, axis=0).astype(np.uint8)
+
+
+def trimap(far: np.ndarray, threshold: float, *, sure: bool, ever: np.ndarray | None) -> np.ndarray:
+    """GrabCut's marks from (H, W) differences."""
+    side = max(far.shape)
+    margin = max(3, round(0.02 * side)) | 1
+    marks = np.full(far.shape, cv2.GC_BGD, np.uint8)
+    moved = cv2.morphologyEx((far > threshold).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    region = (
+        moved if ever is None else cv2.morphologyEx(ever.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    )
+    near = cv2.dilate(region, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1)))
+    marks[near > 0] = cv2.GC_PR_BGD
+    marks[region > 0] = cv2.GC_PR_FGD
+    if sure:
+        core = cv2.erode((far > 2 * threshold).astype(np.uint8), np.ones((3, 3), np.uint8))
+        marks[core > 0] = cv2.GC_FGD
+    return marks
+
+
+def grabcut(rgb: np.ndarray, marks: np.ndarray) -> np.ndarray:
+    """GrabCut (Rother et al. 2004) from marks per pixel, at a reduced size; returns an (H, W) float32 mask.
+
+    Without any possible foreground the mask is empty; without any background it is full.
+    """
+    height, width = marks.shape
+    scale = min(1.0, GRABCUT_SIDE / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    labels = cv2.resize(marks, size, interpolation=cv2.INTER_NEAREST)
+    foreground = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD))
+    if foreground.sum() < 16:
+        return np.zeros(marks.shape, np.float32)
+    if (~foreground).sum() < 16:
+        return np.ones(marks.shape, np.float32)
+    cv2.setRNGSeed(0)  # its colour models start from random clusters
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.grabCut(small, labels, None, *models, GRABCUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
+    mask = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.float32)
+    return np.clip(cv2.resize(mask, (width, height), interpolation=cv2.INTER_LINEAR), 0, 1)

@@ -1,0 +1,217 @@
+"""The layout of READY's authors: which files there are, which sequences count, whose cameras they have."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_prep.capture.cameras.sources import Posed, fitted
+from data_prep.common.photos import list_images, natural, open_photo
+from gausim.core.errors import DataError
+from gausim.io.colmap import ColmapImage, ColmapModel, colmap_files, find_colmap, read_colmap
+from gausim.io.plain_json import parse_json
+from gausim.io.transforms import read_json
+
+_VIDEO = re.compile(r"(seq_[0-9]+)_(cam_[0-9]+)")
+# Lists of meta.json; sequences of the last two are not used.
+_LISTS = ("train", "test", "invalid", "force_invalid")
+SCENE, MOVING, OBJECT, PINS = "point_cloud.ply", "moving_part_points.ply", "clean_object_points.ply", "pin_mask.json"
+
+
+class Meta:
+    """``meta.json``: lists of sequences by name, and pairs that share their cameras.
+
+    Raises:
+        DataError: it is missing or malformed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Reads the file."""
+        data = read_json(path)
+        self.lists = {key: tuple(_sequence(path, key, v) for v in _list(path, key, data.get(key))) for key in _LISTS}
+        both = set(self.lists["train"]) & set(self.lists["test"])
+        if both:
+            raise DataError(f"{path}: fields 'train' and 'test' share {sorted(both)}.")
+        self.twins: dict[str, str] = {}
+        for key in (k for k in data if "twin" in k.lower()):
+            value = data[key]
+            for pair in list(value.items()) if isinstance(value, dict) else _list(path, key, value):
+                if not isinstance(pair, list | tuple) or len(pair) != 2:
+                    raise DataError(f"{path}: field '{key}' must hold pairs of sequences, got {pair!r:.60}.")
+                a, b = (_sequence(path, key, v) for v in pair)
+                self.twins[a], self.twins[b] = b, a
+
+
+def _list(path: Path, key: str, value: Any) -> list[Any]:
+    if value is not None and not isinstance(value, list):
+        raise DataError(f"{path}: field '{key}' must be a list, got a {type(value).__name__}.")
+    return value or []
+
+
+def _sequence(path: Path, key: str, value: Any) -> str:
+    """Name of a sequence that is given by its number, as text or number, or by its name."""
+    text = str(value)
+    if isinstance(value, bool) or not isinstance(value, int | str) or not re.fullmatch(r"(seq_)?[0-9]{1,9}", text):
+        raise DataError(f"{path}: field '{key}': expected sequences like 'seq_00001' or 1, got {value!r:.60}.")
+    return text if text.startswith("seq_") else f"seq_{int(text):05d}"
+
+
+@dataclass(frozen=True, eq=False)
+class ReadyFiles:
+    """One object in the authors' layout."""
+
+    root: Path  # its folder
+    model: ColmapModel  # the COLMAP model
+    meta: Meta  # ``meta.json``
+    stills: tuple[Posed, ...]  # the images that are no video cameras
+    frames: dict[str, dict[str, Path]]  # per sequence that is used, in their order, per view the folder of its frames
+    views: tuple[str, ...]  # cameras that all sequences have
+    extra_views: dict[str, list[str]]  # per sequence, cameras that not all others have
+    left_out: dict[str, str]  # sequences that are not used, and why
+    masks: dict[str, Path | None]  # folders of masks, of ``images`` and of ``video_images``, where there are some
+
+    def part(self, name: str) -> Path | None:
+        """A file of the scene, such as :data:`SCENE`, where there is one."""
+        return self.root / name if (self.root / name).is_file() else None
+
+    def mask(self, path: Path) -> Path | None:
+        """The mask of a still or a frame: the same path with the ending of any image, or with ``.png`` appended.
+
+        Raises:
+            DataError: the others have masks, this has none.
+        """
+        kind, *parts = path.relative_to(self.root).parts
+        folder, name = self.masks[kind], Path(*parts)
+        if folder is None:
+            return None
+        for candidate in (folder / name.with_suffix(".png"), folder / name, folder / f"{name}.png"):
+            if candidate.is_file():
+                return candidate
+        raise DataError(f"{folder / name.with_suffix('.png')}: no mask of {name}. Restore it, or leave out the folder.")
+
+    def inputs(self) -> dict[str, Path]:
+        """Everything that is read, by name."""
+        model = {f"sparse/{role}": path for role, path in colmap_files(self.model.path).items()}
+        parts = {name: self.part(name) for name in (SCENE, MOVING, OBJECT, PINS)}
+        files = {**model, "meta.json": self.root / "meta.json", **parts}
+        for path in self._images():
+            name = str(path.relative_to(self.root))
+            files |= {name: path, f"mask of {name}": self.mask(path)}
+        return {name: path for name, path in files.items() if path is not None}
+
+    def _images(self) -> Iterator[Path]:
+        yield from (shot.photo.path for shot in self.stills)
+        for cameras in self.frames.values():
+            for folder in cameras.values():
+                yield from list_images(folder)
+
+
+def find_files(root: Path, image_masks: Path | None = None, video_masks: Path | None = None) -> ReadyFiles:
+    """Looks through a folder in the authors' layout; decodes no image.
+
+    Raises:
+        DataError: the model or ``meta.json`` is missing or malformed, an image is missing, or no sequence is usable.
+    """
+    model, meta = read_colmap(find_colmap(root)), Meta(root / "meta.json")
+    videos: dict[str, dict[str, Path]] = {}
+    place = root / "video_images"
+    for found in sorted(place.iterdir(), key=lambda p: natural(p.name)) if place.is_dir() else ():
+        match = _VIDEO.fullmatch(found.name)
+        if match and found.is_dir():
+            videos.setdefault(match[1], {})[match[2]] = found
+    used, left_out = _usable(videos, {Path(image.name).stem for image in model.images}, meta)
+    if not used:
+        raise DataError(f"{place}: no usable sequence here ({left_out or 'no folders seq_XXXXX_cam_XXXXX'}).")
+    common = set.intersection(*(set(cameras) for cameras in used.values()))
+    if not common:
+        raise DataError(f"{place}: the sequences have no camera in common: { {n: list(c) for n, c in used.items()} }.")
+    views = tuple(sorted(common, key=natural))
+    stills = (image for image in model.images if not _VIDEO.fullmatch(Path(image.name).stem))
+    return ReadyFiles(
+        root, model, meta,
+        tuple(_posed(root / "images" / image.name, image.name, model, image) for image in stills),
+        {name: {view: cameras[view] for view in views} for name, cameras in used.items()},
+        views, {name: sorted(set(cameras) - common) for name, cameras in used.items()}, left_out,
+        {"images": _folder(image_masks, root / "masks"), "video_images": _folder(video_masks, root / "video_masks")},
+    )  # fmt: skip
+
+
+def _folder(given: Path | None, usual: Path) -> Path | None:
+    if given is not None and not given.is_dir():
+        raise DataError(f"{given}: no such folder. Expected masks, named like the images.")
+    return given or (usual if usual.is_dir() else None)
+
+
+def _usable(
+    videos: dict[str, dict[str, Path]], posed: set[str], meta: Meta
+) -> tuple[dict[str, dict[str, Path]], dict[str, str]]:
+    """Sequences with frames and poses that meta.json does not call invalid, and why the others are none."""
+    used, left_out = {}, {}
+    invalid = {*meta.lists["invalid"], *meta.lists["force_invalid"]}
+    for name, cameras in videos.items():
+        twin = meta.twins.get(name, name)
+        good = {c: p for c, p in cameras.items() if posed & {f"{name}_{c}", f"{twin}_{c}"}}
+        if name in invalid:
+            left_out[name] = "meta.json calls it invalid"
+        elif not good:
+            left_out[name] = "none of its cameras is in the COLMAP model"
+        else:
+            used[name] = good
+    for name in (*meta.lists["train"], *meta.lists["test"]):
+        if name not in videos:
+            left_out[name] = "meta.json lists it, but video_images has no frames of it"
+    return used, left_out
+
+
+def _posed(path: Path, name: str, model: ColmapModel, image: ColmapImage) -> Posed:
+    photo = open_photo(path, name)
+    return Posed(photo, fitted(model.cameras[image.camera], photo), image.viewmat, image.xy, image.point_ids)
+
+
+def sequence_poses(files: ReadyFiles, name: str) -> dict[str, Posed]:
+    """The cameras of a sequence, its own or its twin's, for the size of its frames.
+
+    Raises:
+        DataError: a folder of frames is empty or has another shape than its camera.
+    """
+    images = {Path(image.name).stem: image for image in files.model.images}
+    twin = files.meta.twins.get(name, name)
+    return {
+        view: _posed(
+            list_images(folder)[0], f"{name}/{view}", files.model,
+            images.get(f"{name}_{view}") or images[f"{twin}_{view}"],
+        )
+        for view, folder in files.frames[name].items()
+    }  # fmt: skip
+
+
+def read_pins(path: Path, count: int) -> np.ndarray:
+    """(count,) bool of ``pin_mask.json``: a list of kernel numbers, or of one truth value per kernel.
+
+    The list may stand alone or as the only list of an object.
+
+    Raises:
+        DataError: it is anything else, or a number is no kernel's.
+    """
+    try:
+        data = parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as JSON ({error}).") from error
+    if isinstance(data, dict):
+        lists = [value for value in data.values() if isinstance(value, list)]
+        data = lists[0] if len(lists) == 1 else None
+    if not isinstance(data, list) or not data:
+        raise DataError(f"{path}: expected a list of kernel numbers.")
+    if all(isinstance(v, bool) for v in data) and len(data) == count:
+        return np.array(data)
+    wrong = [v for v in data if isinstance(v, bool) or not isinstance(v, int) or not 0 <= v < count]
+    if wrong:
+        raise DataError(f"{path}: '{wrong[0]!r:.40}' is no kernel; expected whole numbers from 0 to {count - 1}.")
+    pins = np.zeros(count, bool)
+    pins[data] = True
+    return pins

@@ -1,1 +1,0 @@
-"""Scenes of kernels: selections as texts, and the layout of READY."""

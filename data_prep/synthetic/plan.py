@@ -1,0 +1,92 @@
+"""What the embedded set consists of: its objects, what they are made of, and how much is made of each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from data_prep.common.command import Options, names, option
+from gausim.core.errors import ConfigError
+
+TRAIN_FRAMES = 16  # frames 0..15 are seen, as the paper trains
+MOST_TRAIN_VIEWS = 4
+# Amplitudes of a push that stays nearly linear, and of one that bends a body far beyond [diagonals].
+SMALL_SWING, LARGE_SWING = (0.05, 0.08), (0.18, 0.28)
+LARGEST_SWING = 0.5  # [diagonals]; further the finite elements turn inside out
+
+
+@dataclass(frozen=True)
+class Material:
+    """What a body is made of."""
+
+    young_modulus: float  # stiffness [mass / (scene unit s^2)]
+    poisson_ratio: float  # resistance to change of volume
+    drag: float  # mass-proportional damping; amplitudes fall as exp(-drag t / 2) [1/s]
+    mass: float = 1.0  # of the whole body
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What an object is."""
+
+    body: str  # a shape of :data:`data_prep.synthetic.bodies.BODIES`
+    material: Material  # what it is made of
+    time_step: float  # that its stiffness allows [s]
+    swing: tuple[float, float] = SMALL_SWING  # least and largest amplitude of its pushes [diagonals]
+
+
+# Periods of the slowest mode are about 14 frames (soft) and 9 frames (firm) at 24 frames per second.
+SOFT_PUDDING = Recipe("pudding", Material(young_modulus=170.0, poisson_ratio=0.35, drag=0.5), 2e-3)
+SOFT_FLOWER = Recipe("flower", Material(young_modulus=8e4, poisson_ratio=0.35, drag=0.5), 2e-4)
+RECIPES = {
+    "pudding_soft": SOFT_PUDDING,
+    "pudding_firm": Recipe("pudding", Material(young_modulus=400.0, poisson_ratio=0.35, drag=0.5), 2e-3),
+    "flower_soft": SOFT_FLOWER,
+    "flower_firm": Recipe("flower", Material(young_modulus=1.7e5, poisson_ratio=0.35, drag=0.5), 1.5e-4),
+    "pudding_swing": replace(SOFT_PUDDING, swing=LARGE_SWING),
+    "flower_swing": replace(SOFT_FLOWER, swing=LARGE_SWING),
+}
+
+
+@dataclass(frozen=True)
+class Plan(Options):
+    """Size of a set; of each object pokes and drags take turns."""
+
+    objects: tuple[str, ...] = option(
+        ("pudding_soft", "pudding_firm", "flower_soft", "flower_swing", "pudding_swing"), "only these objects",
+        type=names, metavar="NAME,NAME",
+    )  # fmt: skip
+    sequences: int = option(8, "sequences per object", least=1)
+    frames: int = option(50, "frames per sequence, at least 16", least=TRAIN_FRAMES)
+    fps: int = 24
+    train_views: int = 4  # a held-out one is added
+    stills: int = 24
+    resolution: int = option(96, "of the videos [pixels]", least=1)
+    still_resolution: int = 192
+    kernels: int = option(800, "Gaussians per object, at least 50", least=50)
+    swing: tuple[float, float] | None = option(
+        None, "amplitude of all pushes [fractions of the object's diagonal]; each object's own unless given",
+        least=1e-9, most=LARGEST_SWING, nargs=2, metavar=("LOW", "HIGH"),
+    )  # fmt: skip
+    seed: int = option(0, "of everything random (0)")
+
+    def __post_init__(self) -> None:
+        """Checks the numbers."""
+        super().__post_init__()
+        unknown = [name for name in self.objects if name not in RECIPES]
+        if unknown or not self.objects:
+            raise ConfigError(f"objects: no recipe for {unknown}; choose some of {', '.join(RECIPES)}.")
+        if not 1 <= self.train_views <= MOST_TRAIN_VIEWS:
+            raise ConfigError(f"train_views: expected 1..{MOST_TRAIN_VIEWS}, got {self.train_views}.")
+        if self.swing is not None and self.swing[0] > self.swing[1]:
+            raise ConfigError(f"--swing: expected LOW <= HIGH, got {self.swing}.")
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of all cameras, the held-out one last."""
+        return tuple(f"cam_{i}" for i in range(self.train_views + 1))
+
+
+QUICK = replace(
+    Plan(), objects=("pudding_soft", "flower_soft"), sequences=2, frames=20, stills=10, resolution=48,
+    still_resolution=64, kernels=150,
+)  # fmt: skip
