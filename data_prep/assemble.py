@@ -70,7 +70,7 @@ def assemble(
 
     Args:
         pictures: folders with posed RGBA pictures, see :func:`data_prep.scenes.gathered.gather`.
-        out: folder of the result, in the layout of docs/data.md.
+        out: folder of the result, in the layout of docs/reference/files.md.
         options: what the pictures do not say.
         scene: the rest scene (PLY, its masks beside it), or the folder of the stage that made it.
         force: replace a result of other inputs or settings.

@@ -32,7 +32,7 @@ def make_set(
 
     Args:
         mesh: OBJ or PLY file.
-        out: directory of the set, in the layout of docs/data.md.
+        out: directory of the set, in the layout of docs/reference/files.md.
         plan: its sizes and settings.
         connect: gives Blender; called only when there is something to make.
         workers: processes of Blender at a time, of one thread each; the bytes do not depend on it.

@@ -68,7 +68,7 @@ def import_ready(
 
     Args:
         root: folder of one object in the authors' layout.
-        out: folder of the result, in the layout of docs/data.md.
+        out: folder of the result, in the layout of docs/reference/files.md.
         options: what the folders do not say.
         image_masks: masks of stills, with the names of the images; ``root/masks`` where it is there.
         video_masks: masks of frames, laid out like ``video_images``; ``root/video_masks`` where it is there.
