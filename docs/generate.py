@@ -6,6 +6,7 @@ import contextlib
 import importlib
 import io
 import os
+import pkgutil
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -21,19 +22,16 @@ from gausim.compose.places import Place, read_places
 from gausim.compose.root import RootConfig, conf_dir
 from gausim.compose.schema import documented
 
-ROOT = Path(__file__).resolve().parents[1]
 # Files of these groups set keys of any other group: one table each, of what they set.
 RECIPES = {"experiment": "Experiments", "ablation": "Ablations", "budget": "Budgets", "sweep": "Sweeps"}
 GROUPS = ("data", "model", "supervision", "loss", "optimizer", "render", "trainer", "logger", "callbacks", "paths")
-STAGES = ("prepare", "ingest", "poses", "compare_poses", "segment", "reconstruct", "select", "assemble", "pack",
-          "import_ready", "synthesize", "blender_bunny")  # fmt: skip
+ROOT = Path(__file__).resolve().parents[1]
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Adds the generated pages to those of docs/."""
-    pages = {"reference/configuration.md": configuration(), "reference/commands.md": commands()}
-    for path, text in pages.items():
-        files.append(File.generated(config, path, content=text))
+    for name, text in (("configuration", configuration()), ("commands", commands())):
+        files.append(File.generated(config, f"reference/{name}.md", content=text))
     return files
 
 
@@ -45,8 +43,7 @@ def configuration() -> str:
         "# Configuration",
         "`gausim train KEY=VALUE …` sets keys, `GROUP=FILE` chooses a file of a group. An experiment may replace any "
         "group, an ablation comes after it, and single keys of the command line come last. This page is made from "
-        "`conf/`; `gausim train --cfg job` prints the whole configuration with all overrides applied, "
-        "`gausim config validate` checks one, and `gausim config schema` prints it for editors.",
+        "`conf/`; `gausim train --cfg job` prints the whole configuration, `gausim config validate` checks one.",
         "## Root keys",
         *_table(("key", "meaning"), root),
     ]
@@ -63,40 +60,50 @@ def configuration() -> str:
 
 def _file(path: Path, place: Place) -> Iterator[str]:
     """Title, head comment and table of one file's keys."""
-    node = yaml.safe_load(path.read_text()) or {}
-    chosen = "" if path.parent.name == "base" else f"{path.parent.name}="
-    yield f"### `{chosen}{path.stem}`"
+    node, comments = yaml.safe_load(path.read_text()) or {}, _comments(path)
+    yield f"### `{path.parent.name}={path.stem}`"
     yield _head(path)
-    inherited = [e for e in node.pop("defaults", []) if e != "_self_"]
-    if inherited:
-        yield "It begins with " + ", ".join(f"`{_entry(e)}`" for e in inherited) + "."
-    rows = [(f"`{key}`", f"`{value}`", _cell(_meaning(place, key))) for key, value in _flat(node)]
-    if rows:
-        yield from _table(("key", "value", "meaning"), rows)
+    inherited = [f"`{_entry(e)}`" for e in node.pop("defaults", []) if e != "_self_"]
+    yield f"It begins with {', '.join(inherited)}." if inherited else ""
+    rows = [(f"`{key}`", f"`{value}`", _cell(comments.get(key) or _meaning(place, key))) for key, value in _flat(node)]
+    yield from _table(("key", "value", "meaning"), rows)
+
+
+def _comments(path: Path) -> dict[str, str]:
+    """The comments behind the keys of a file, by the keys' whole names."""
+    lines, found = path.read_text().splitlines(), {}
+
+    def read(node: yaml.Node | None, prefix: str) -> None:
+        for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
+            one_line = value.end_mark.line == key.start_mark.line
+            behind = lines[key.start_mark.line][(value if one_line else key).end_mark.column :]
+            comment = re.search(r"(?:^|[\s:])#\s*(.*)", behind)
+            if comment:
+                found[prefix + key.value] = comment[1]
+            read(value, f"{prefix}{key.value}.")
+
+    read(yaml.compose("\n".join(lines)), "")
+    return found
 
 
 def _recipe(path: Path) -> tuple[str, str, str]:
     node = yaml.safe_load(path.read_text()) or {}
     chosen = [_entry(e) for e in node.pop("defaults", []) if e != "_self_"]
     node.pop(path.parent.name, None)
-    sets = [f"{key}={value}" for key, value in _flat(node)]
-    return f"`{path.stem}`", _cell(_head(path)), "<br>".join(f"`{_cell(s)}`" for s in chosen + sets)
+    sets = "<br>".join(f"`{item}`" for item in [*chosen, *(f"{key}={value}" for key, value in _flat(node))])
+    return f"`{path.stem}`", _cell(_head(path)), sets
 
 
-def _entry(entry: Any) -> str:
+def _entry(entry: str | dict[str, str]) -> str:
     """An entry of a defaults list as one would write it on the command line."""
-    if isinstance(entry, str):
-        return entry.lstrip("/")
-    ((group, name),) = entry.items()
-    return f"{group.removeprefix('override ').lstrip('/')}={name}"
+    ((group, name),) = entry.items() if isinstance(entry, dict) else [(entry, "")]
+    return group.removeprefix("override ").lstrip("/") + (f"={name}" if name else "")
 
 
 def _head(path: Path) -> str:
-    """The comment at the top of a file, or behind its `_target_`."""
-    lines = path.read_text().splitlines()
-    block = [re.sub(r"^# ?", "", line) for line in lines if line.startswith("#") and "@package" not in line]
-    found = re.search(r"^_target_:.*?#\s*(.*)", path.read_text(), re.MULTILINE)
-    return " ".join(line.strip() for line in block) or (found.group(1) if found else "")
+    """The comment at the top of a file."""
+    lines = [line[1:].strip() for line in path.read_text().splitlines() if line.startswith("#")]
+    return " ".join(line for line in lines if "@package" not in line)
 
 
 def _flat(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
@@ -104,33 +111,20 @@ def _flat(node: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
         if isinstance(value, dict) and value:
             yield from _flat(value, f"{prefix}{key}.")
         elif key not in ("_partial_", "_recursive_", "_convert_"):
-            yield f"{prefix}{key}", _value(value)
-
-
-def _value(value: Any) -> str:
-    text = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False).removesuffix("...\n").strip()
-    return text.replace("|", "\\|")
+            text = yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False)
+            yield f"{prefix}{key}", _cell(text.removesuffix("...\n").strip())
 
 
 def _meaning(place: Place, key: str) -> str:
     """What conf/ says of a key anywhere, else what the docstring of what is built says."""
-    said, parts = "", key.split(".")
-    for i, part in enumerate(parts):
-        inner = place.children.get(part)
-        if inner is None:
-            return ""
-        last = i == len(parts) - 1
-        said = inner.comment or (next(filter(None, (_argument(t, part) for t in place.targets)), "") if last else "")
-        place = inner
+    *above, last = key.split(".")
+    for part in above:
+        place = place.children.get(part, Place())
+    said = place.children[last].comment if last in place.children else ""
+    for target in (t for t in place.targets if t.startswith("gausim.")):
+        found = pkgutil.resolve_name(target)
+        said = said or {**documented(found), **documented(found.__init__)}.get(last, "")
     return said
-
-
-def _argument(target: str, name: str) -> str:
-    module, _, attribute = target.rpartition(".")
-    if not target.startswith("gausim."):
-        return ""
-    found = getattr(importlib.import_module(module), attribute)
-    return {**documented(found), **documented(found.__init__)}.get(name, "")
 
 
 def _cell(text: str) -> str:
@@ -138,7 +132,7 @@ def _cell(text: str) -> str:
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    lines = [head, ["---"] * len(head), *rows]
+    lines = [head, ["---"] * len(head), *rows] if rows else []
     return ["\n".join(f"| {' | '.join(row)} |" for row in lines)]
 
 
@@ -148,13 +142,12 @@ def commands() -> str:
     sys.path.insert(0, str(ROOT))
     parts = [
         "# Commands",
-        "What `gausim COMMAND --help` prints, and behind it the stages of `data_prep`, which are run from a checkout. "
-        "The exit status is 0 where a command worked, 2 on wrong usage or unusable input, 130 when interrupted. "
-        "`GAUSIM_DEBUG=1` shows the traceback of an error.",
+        "What `gausim COMMAND --help` prints, then the stages of `data_prep`, which are run from a checkout. The exit "
+        "status is 0 where a command worked, 2 on wrong usage or unusable input, 130 when interrupted.",
     ]
     for name, command in COMMANDS.items():
         parts += _help(f"gausim {name}", importlib.import_module(command.module).main)
-    for name in STAGES:
+    for name in sorted(path.stem for path in (ROOT / "data_prep").glob("[a-z]*.py")):
         parts += _help(f"python -m data_prep.{name}", importlib.import_module(f"data_prep.{name}").main)
     return "\n\n".join(parts)
 
@@ -163,6 +156,4 @@ def _help(title: str, main: Callable[[list[str]], object]) -> list[str]:
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
         main(["--help"])
-    text = said.getvalue().rstrip()
-    text = re.sub(r"^usage: \S+\.py", f"usage: {title}", text)
-    return [f"## `{title}`", f"```text\n{text}\n```"]
+    return [f"## `{title}`", f"```text\n{said.getvalue().rstrip()}\n```"]
