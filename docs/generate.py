@@ -63,8 +63,8 @@ def _file(path: Path, place: Place) -> Iterator[str]:
     node, comments = yaml.safe_load(path.read_text()) or {}, _comments(path)
     yield f"### `{path.parent.name}={path.stem}`"
     yield _head(path)
-    inherited = [f"`{_entry(e)}`" for e in node.pop("defaults", []) if e != "_self_"]
-    yield f"It begins with {', '.join(inherited)}." if inherited else ""
+    inherited = ", ".join(_begins_with(node))
+    yield f"It begins with {inherited}." if inherited else ""
     rows = [(f"`{key}`", f"`{value}`", _cell(comments.get(key) or _meaning(place, key))) for key, value in _flat(node)]
     yield from _table(("key", "value", "meaning"), rows)
 
@@ -75,11 +75,9 @@ def _comments(path: Path) -> dict[str, str]:
 
     def read(node: yaml.Node | None, prefix: str) -> None:
         for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
-            one_line = value.end_mark.line == key.start_mark.line
-            behind = lines[key.start_mark.line][(value if one_line else key).end_mark.column :]
-            comment = re.search(r"(?:^|[\s:])#\s*(.*)", behind)
-            if comment:
-                found[prefix + key.value] = comment[1]
+            last = value if value.end_mark.line == key.start_mark.line else key
+            comment = re.search(r"(?:^|[\s:])#\s*(.*)", lines[key.start_mark.line][last.end_mark.column :])
+            found[prefix + key.value] = comment[1] if comment else ""
             read(value, f"{prefix}{key.value}.")
 
     read(yaml.compose("\n".join(lines)), "")
@@ -88,16 +86,16 @@ def _comments(path: Path) -> dict[str, str]:
 
 def _recipe(path: Path) -> tuple[str, str, str]:
     node = yaml.safe_load(path.read_text()) or {}
-    chosen = [_entry(e) for e in node.pop("defaults", []) if e != "_self_"]
     node.pop(path.parent.name, None)
-    sets = "<br>".join(f"`{item}`" for item in [*chosen, *(f"{key}={value}" for key, value in _flat(node))])
-    return f"`{path.stem}`", _cell(_head(path)), sets
+    sets = [*_begins_with(node), *(f"`{key}={value}`" for key, value in _flat(node))]
+    return f"`{path.stem}`", _cell(_head(path)), "<br>".join(sets)
 
 
-def _entry(entry: str | dict[str, str]) -> str:
-    """An entry of a defaults list as one would write it on the command line."""
-    ((group, name),) = entry.items() if isinstance(entry, dict) else [(entry, "")]
-    return group.removeprefix("override ").lstrip("/") + (f"={name}" if name else "")
+def _begins_with(node: dict[str, Any]) -> list[str]:
+    """Takes the defaults list out of a file: its entries as one would write them on the command line."""
+    entries = [e if isinstance(e, dict) else {e: ""} for e in node.pop("defaults", []) if e != "_self_"]
+    pairs = [pair for entry in entries for pair in entry.items()]
+    return [f"`{group.removeprefix('override ').lstrip('/')}{'=' * bool(name)}{name}`" for group, name in pairs]
 
 
 def _head(path: Path) -> str:
