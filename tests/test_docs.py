@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
+import pkgutil
 import re
 import shlex
 from functools import cache
@@ -48,6 +49,13 @@ def test_commands_and_options_of_the_pages_exist() -> None:
             options = {word.split("=")[0] for word in words if word.startswith("--")} - {"--help"}
             missing = {option for option in options if not re.search(rf"(?<![\w-]){option}(?![\w-])", _help(name))}
             assert not missing, (page, name, missing)
+
+
+def test_modules_and_functions_named_in_the_pages_exist() -> None:
+    named = {name for page in PAGES for name in re.findall(r"`(gausim(?:\.\w+)+)(?:\(|`)", page.read_text())}
+    assert len(named) > 5
+    for name in named:
+        assert pkgutil.resolve_name(name) is not None
 
 
 def test_pages_named_in_code_and_configurations_exist() -> None:
