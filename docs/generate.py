@@ -54,7 +54,9 @@ def configuration() -> str:
     for group, title in RECIPES.items():
         rows = [_recipe(path) for path in sorted((conf_dir() / group).glob("*.yaml"))]
         parts += [f"## {title}", *_table((f"`{group}=`", "what it does", "what it sets"), rows)]
-    parts += ["## What the simulators have in common", *_file(conf_dir() / "base" / "simulator.yaml", places)]
+    parts.append("## What files begin with")
+    for path in sorted((conf_dir() / "base").glob("*.yaml")):
+        parts += _file(path, places)
     return "\n\n".join(parts)
 
 
