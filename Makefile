@@ -18,7 +18,7 @@ DIRS ?= $(if $(filter-out file,$(origin RUN)),$(RUN),outputs)
 ARGS ?=
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 
-.PHONY: help install test test-slow test-types fuzz test-notebooks lint format data demo dataset train evaluate simulate report benchmark clean
+.PHONY: help install test test-slow test-types fuzz test-notebooks docs lint format data demo dataset train evaluate simulate report benchmark clean
 
 help: ## Show this text
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -48,11 +48,16 @@ test-notebooks: install ## Execute the notebooks on the embedded synthetic data
 fuzz: install ## Feed 20,000 damaged files to the readers: make fuzz ARGS="--count 1000 --seed 7"
 	PYTHONPATH=.:tests $(ONE_THREAD) $(BIN)/python tests/fuzz/run.py $(ARGS)
 
-lint: install ## Check style, formatting, types and import directions
+docs: install ## Build the documentation into site/ (serve it: .venv/bin/mkdocs serve)
+	$(BIN)/python -c "import material" 2>/dev/null || $(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+lint: install ## Check style, formatting, types, import directions and declared dependencies
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/deptry .
 
 format: install ## Format the code and fix what can be fixed
 	$(BIN)/ruff check --fix .
@@ -89,5 +94,5 @@ demo: data ## From nothing to a simulator that foresees: install, make data, tra
 	$(BIN)/gausim report outputs/demo/seed_0
 
 clean: ## Remove caches and builds (not .venv, data or outputs)
-	rm -rf build dist .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf build dist site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
 	find src tests data_prep -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -32,14 +32,14 @@ def run(loaded, monkeypatch):
 
 
 def test_the_example_of_the_documentation(run, tmp_path: Path, monkeypatch) -> None:
-    text = (ROOT / "docs" / "interaction.md").read_text()
+    text = (ROOT / "docs" / "reference" / "python.md").read_text()
     code = re.search(r"```python\n(import gausim\n.*?)```", text, re.DOTALL)
     assert code is not None
     lines = [line for line in code[1].splitlines() if line.strip()]
     assert len(lines) <= 10
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    exec(compile("\n".join(lines), "interaction.md", "exec"), names)
+    exec(compile("\n".join(lines), "python.md", "exec"), names)
     sim, image = names["sim"], names["image"]
     assert isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.shape == (32, 32, 3) and image.any()
     assert (tmp_path / "push.json").is_file()

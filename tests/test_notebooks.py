@@ -38,7 +38,7 @@ def test_any_environment_has_the_kernel(path: Path) -> None:
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_the_words_name_files_that_exist(path: Path) -> None:
-    named = re.findall(r"`((?:docs|notebooks|conf)/[\w./]+|README\.md)`", text(path))
+    named = re.findall(r"`((?:docs|notebooks|conf)/[\w./-]+|README\.md)`", text(path))
     assert named, f"{path.name} points nowhere"
     for name in named:
         assert (ROOT / name).exists(), f"{path.name} names {name}, which is not there"

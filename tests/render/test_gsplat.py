@@ -133,7 +133,7 @@ def test_reasons_are_told_in_order(inputs: Callable, stand_in: ModuleType, monke
 
     def refused(reason: str) -> None:
         assert reason in str(backend.unavailable())
-        with pytest.raises(ConfigError, match=r"render=gsplat: .*(See docs/gpu.md)") as caught:
+        with pytest.raises(ConfigError, match=r"render=gsplat: .*(See docs/how-to/clusters-and-gpus.md)") as caught:
             given.draw(GsplatRenderer())
         assert reason in str(caught.value)
 

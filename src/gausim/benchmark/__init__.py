@@ -1,4 +1,4 @@
-"""Measurements of speed and memory, as ratios within one run (docs/performance.md)."""
+"""Measurements of speed and memory, as ratios within one run (docs/results.md)."""
 
 from gausim.benchmark.harness import Options, Row, medians, peak_resident, peak_saved_bytes
 from gausim.benchmark.peaks import Peaks, peaks

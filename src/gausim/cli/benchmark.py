@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="gausim benchmark",
         description=f"{HELP}\n\ncases:\n{cases}\n  all       all of them",
-        epilog="docs/performance.md explains how to read the table. Close everything else first: single times drift "
+        epilog="docs/results.md has tables of one machine. Close everything else first: single times drift "
         "with the machine's load, ratios within one run hold.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -11,9 +11,9 @@ if TYPE_CHECKING:
 
 HELP = "Fetch a published run or data set, or pack one for others."
 EPILOG = """\
-A registry is a TOML file that names archives with address, size, SHA-256, licence and card (docs/fetch.md). Nothing is
-unpacked before size and SHA-256 are right, and nothing in an archive is executed. An interrupted download goes on when
-the same command is given again.
+A registry is a TOML file that names archives with address, size, SHA-256, licence and card (docs/reference/files.md).
+Nothing is unpacked before size and SHA-256 are right, and nothing in an archive is executed. An interrupted download
+goes on when the same command is given again.
 
   gausim fetch --list --registry https://example.org/gausim/registry.toml
   gausim fetch bunny --registry registry.toml

@@ -123,7 +123,8 @@ class GsplatRenderer:
             reason = unavailable()
             if reason is not None:
                 raise ConfigError(
-                    f"render=gsplat: {reason}. See docs/gpu.md, or let render=auto choose what this machine can do."
+                    f"render=gsplat: {reason}. See docs/how-to/clusters-and-gpus.md, or let render=auto choose what "
+                    "this machine can do."
                 )
             from gsplat import rasterization
 

@@ -97,7 +97,7 @@ class Crew:
         elif self.layout.num_nodes > 1:
             raise ConfigError(
                 f"trainer.num_nodes: {self.layout.num_nodes} machines need a scheduler that starts the ranks (SLURM "
-                "with one task per rank, or torchrun), found none. See docs/distributed.md."
+                "with one task per rank, or torchrun), found none. See docs/how-to/clusters-and-gpus.md."
             )
         else:
             return
