@@ -38,7 +38,7 @@ def open_frames(root: Path, views: Sequence[str], fps: float) -> PackedSource | 
     if films and not (root / "transforms.json").is_file():
         raise DataError(
             f"{root}: expected transforms.json and a folder of PNG frames per camera, found films ({films[0]} …). Make "
-            "frames of them with `gausim prepare ingest`, then `poses` and `segment` (docs/own_capture.md)."
+            "frames of them with `gausim prepare ingest`, then `poses` and `segment` (docs/how-to/capture.md)."
         )
     return ImageSource(root, views, fps)
 
