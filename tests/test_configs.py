@@ -152,6 +152,7 @@ def test_a_sweep_gives_every_seed_its_directory(tmp_path: Path, monkeypatch: pyt
     "swept",
     [
         ["model.simulator.network.layers=2,3"],
+        ["ablation=no_mass,[no_mass,no_momentum],[no_momentum,no_mass]"],
         ["loss=default,paper", "seed=3,4"],
         ["trainer.max_minutes=1,2", "ablation=none,no_mass", "model=gausim,gausim_paper"],
         ["data.root=a/b,a/../b,a_b"],
@@ -166,12 +167,20 @@ def test_jobs_of_a_sweep_never_share_a_directory(
     seen: list[Path] = []
     arguments = ["-m", *swept, "paths.output_root=o", *(() if swept[-1].startswith("name") else ("name=rose",))]
     run_hydra("train", lambda config: seen.append(_config.run_dir()), arguments)
-    assert len(seen) == math.prod(len(override.split(",")) for override in swept)
+    assert len(seen) == math.prod(len(re.split(r",(?![^[]*\])", override)) for override in swept)
     assert len(set(seen)) == len(seen)
     for path in seen:
         inside = path.resolve().relative_to(tmp_path / "o")
         assert inside.name.startswith("seed_")
         assert not re.search(r"(name|seed|ablation|model|output_root)=", str(inside))  # said by the path already
+
+
+def test_a_list_of_ablations_is_named_by_all_its_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    seen: list[tuple[str, str]] = []
+    swept = ["-m", "ablation=none,[no_mass,no_momentum]", "model=gausim"]
+    run_hydra("train", lambda config: seen.append((config.ablation.name, _config.run_dir().parts[-3])), swept)
+    assert seen == [(name, name) for name in ("none", "no_mass+no_momentum")]
 
 
 def test_a_folder_name_is_one_short_component_and_tells_texts_apart() -> None:

@@ -91,3 +91,17 @@ def test_efficiency_stands_side_by_side_with_and_without_hierarchy(sweep: Path) 
     lines = {line.label: [e.text for e in line.entries] for line in sheets(sweep)["efficiency"].lines}
     assert lines["gausim"][2:5] == ["0.0120 ± 0.0010", "2.00", "+ 3.9 MB"]
     assert lines["gausim w/o hierarchy"][2:5] == ["0.0400 ± 0.0010", "2.00", "+ 12.0 MB"]
+
+
+def test_a_list_of_ablations_is_named_by_all_its_parts(tmp_path: Path) -> None:
+    for name, off in (
+        ("none", {}),
+        ("no_mass+relu", OFF["no_mass"]),
+        ("no_mass+no_momentum", OFF["no_mass"] | OFF["no_momentum"]),
+    ):
+        settings = config(1, **off)
+        settings["ablation"] = {"name": name}
+        evaluate(write_run(tmp_path / name / "gausim" / "seed_1", settings), make_curves())
+    assert sheets(tmp_path)["ablation_toy_bunny_gausim"].columns == (
+        ("gausim", ("full", "w/o mass, w/o momentum", "w/o mass, relu")),
+    )

@@ -19,7 +19,10 @@ _GROUPS = (
 )  # fmt: skip
 # Paths of the machine that trained, and what changes neither the run nor its figures.
 _PATHS = ("data.root", "data.scene", "data.masks", "paths")
-_UNTOLD = (*_PATHS, "data.seed", "logger", "callbacks", "name", "task_name", "evaluate", "trainer.progress")
+_UNTOLD = (
+    *_PATHS, "data.seed", "logger", "callbacks", "name", "task_name", "evaluate", "trainer.progress", "ablation",
+    "experiment",
+)  # fmt: skip
 _ABSENT = "(absent)"
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import MISSING, OmegaConf
 
@@ -104,12 +105,22 @@ def job_threads(most: int) -> int:
     return min(most, max(1, cores // (jobs if jobs > 0 else max(1, cores + 1 + jobs))))
 
 
+def chosen(group: str) -> str:
+    """Returns what was chosen of a group: `no_mass`, of a list all of it, as `no_mass+no_momentum`, or `none`."""
+    if not HydraConfig.initialized():
+        return "none"  # composed without a job
+    job = HydraConfig.get()
+    choice = job.runtime.choices.get(group)
+    if choice is None:  # Hydra does not record lists
+        overrides = OverridesParser.create().parse_overrides(list(job.overrides.task))
+        values = [override.value() for override in overrides if override.key_or_group == group]
+        choice = "+".join(str(part) for value in values[-1:] if isinstance(value, list) for part in value)
+    return str(choice or "none")
+
+
 def job_group(name: str) -> str:
     """Returns what dashboards list a run under: NAME/ABLATION/MODEL, of which seeds and settings are variants."""
-    if not HydraConfig.initialized():
-        return name  # composed without a job; nobody has chosen anything
-    choices = HydraConfig.get().runtime.choices
-    return "/".join([name, *(str(choices.get(group) or "none") for group in ("ablation", "model"))])
+    return "/".join([name, chosen("ablation"), chosen("model")]) if HydraConfig.initialized() else name
 
 
 def job_name(seed: int) -> str:
@@ -121,7 +132,7 @@ def job_name(seed: int) -> str:
 
 
 ConfigStore.instance().store(name="base_schema", node=RootConfig, provider="gausim")
-for resolver in (folder_name, job_threads, job_group, job_name):
+for resolver in (chosen, folder_name, job_threads, job_group, job_name):
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
 
 

@@ -40,6 +40,8 @@ FREE_KEYS = (
     "logger",
     "callbacks",
     "sweep",
+    "ablation",
+    "experiment",
     "task_name",
     "doctor",
     "evaluate",
