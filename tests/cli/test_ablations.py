@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 from helpers.simulators import LEVELS, change_head, silence
-from helpers.toy_object import write_toy_object
 
 from gausim.compose.build import build
 from gausim.compose.config import compose
@@ -25,11 +24,6 @@ TINY = (
     "data.curriculum.t_max=3", "data.batch_size=2", "seed=1", "loss.explosion=1000",
     "optimizer.decay.network=0",  # what only fades has not learned
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_toy_object(tmp_path_factory.mktemp("data") / "toy").root
 
 
 def fresh(toy: Path, ablation: str, model: str) -> tuple[GausSimModule, list[SequenceSample]]:

@@ -34,6 +34,8 @@ from gausim.cli.main import COMMANDS, main
         ("train mod", {"model=", "model."}),
         ("train model=spring_mass model.", {"model.method.", "model.plan."}),
         ("train model=gausim model.simulator.template.spac", {"model.simulator.template.spacing="}),
+        ("train loss.image.win", {"loss.image.window="}),  # which no configuration lists
+        ("train model=spring_mass model.simulator.network.comp", set()),
         ("train model.simulator.template.spac", set()),  # the default model has none
         ("train -m ablation=none,no_hier", {"ablation=none,no_hierarchy"}),
         ("train trainer.progress=", {"trainer.progress=true", "trainer.progress=false"}),

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.toy_object import write_toy_object
 
 from gausim.cli import evaluate, report, train
 from gausim.cli.simulate import command as simulate
@@ -48,11 +47,6 @@ NAMES = {
 def needs_warp(model: str) -> None:
     if model.startswith("phys"):
         pytest.importorskip("warp", reason="the material point method needs warp-lang (extra 'baselines')")
-
-
-@pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_toy_object(tmp_path_factory.mktemp("data") / "toy", frames=9).root
 
 
 @pytest.fixture

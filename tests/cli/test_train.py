@@ -25,11 +25,6 @@ TINY = (
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_toy_object(tmp_path_factory.mktemp("data") / "toy").root
-
-
 @pytest.fixture
 def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.chdir(tmp_path)
@@ -109,7 +104,7 @@ def test_a_finished_run_is_refused_and_can_be_overwritten(arguments: list[str]) 
     command.main([*arguments, "trainer.max_epochs=1"])
     with pytest.raises(RunError, match=r"finished.*name=NAME.*overwrite=true"):
         command.main([*arguments, "trainer.max_epochs=1"])
-    assert command.main([*arguments, "trainer.max_epochs=1", "trainer.overwrite=true"]) == 0
+    assert command.main([*arguments, "trainer.max_epochs=1", "overwrite=true"]) == 0
 
 
 def test_resuming_at_an_epochs_end_equals_an_uninterrupted_run(

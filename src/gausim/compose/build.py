@@ -104,13 +104,13 @@ def _build_fit(config: DictConfig) -> tuple[FittedModule, ReadyDataModule]:
         scene_of_sequence=[scene_id for scene_id, _ in datamodule.index.entries],
         seen=seen,
     )()
-    renderer, image_loss = instantiate(config.render), instantiate(config.loss).image
-    sources = Sources(scenes, datamodule.index.ground_truth, lambda scene_id: None, renderer, image_loss)
+    renderer, objective = instantiate(config.render), instantiate(config.loss)
+    sources = Sources(scenes, datamodule.index.ground_truth, lambda scene_id: None, renderer, objective.image)
     module = FittedModule(
         method=method,
         plan=plan,
         renderer=renderer,
-        explosion=float(config.loss.explosion),
+        explosion=objective.explosion,
         supervision=_supervision(config, sources),
         seed=int(config.seed),
     )

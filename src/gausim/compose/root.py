@@ -59,6 +59,7 @@ class RootConfig:
             takes all of the simulator from that run and keeps it, so that only initial states are learned.
         doctor: whether what `gausim doctor` would find wrong with the data is told before training (not in sweeps).
         evaluate: whether the run is evaluated once it is trained (`gausim evaluate`), for reports.
+        overwrite: remove the run that the directory holds already.
         name: of the run; its directory is `${paths.output_root}/${name}/seed_${seed}`.
         task_name: what is being done, for logs and dashboards.
     """
@@ -81,12 +82,14 @@ class RootConfig:
     freeze: str | None = None
     doctor: bool = True
     evaluate: bool = False
+    overwrite: bool = False
     name: str = MISSING
     task_name: str = "train"
 
 
 def folder_name(text: str) -> str:
     """Returns a text as the name of one directory: the same if it can be, else legible, short and with a hash."""
+    text = re.sub(r"(^|,)\+\+", r"\1", text)
     plain = re.sub(r"[^\w.,=+~:-]+", "_", text)
     if plain == text and len(text) <= LONGEST_FOLDER_NAME:
         return text

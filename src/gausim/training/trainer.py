@@ -33,7 +33,6 @@ def make_trainer(
     clock: str = "wall",
     log_every_n_steps: int = 20,
     progress: bool = True,
-    overwrite: bool = False,
     convergence: Convergence | None = None,
     run_dir: Path | str | None = None,
     callbacks: Sequence[Callback] = (),
@@ -54,7 +53,6 @@ def make_trainer(
         clock: what the budget counts, ``wall`` or ``cpu`` time.
         log_every_n_steps: optimiser steps between rows of the loggers.
         progress: whether a progress bar is shown.
-        overwrite: what the run directory is prepared with; nothing to the trainer.
         convergence: ends the run when it has learned; None leaves it all of its epochs.
         run_dir: where checkpoints, panels and tables go.
         callbacks: further ones.
