@@ -6,7 +6,6 @@ import functools
 import inspect
 import math
 import re
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -163,20 +162,10 @@ def test_the_same_choice_runs_in_the_same_directory(tmp_path: Path, monkeypatch:
     assert Path.cwd() == tmp_path
 
 
-def test_a_sweep_gives_every_seed_its_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    seen: list[tuple[int, Path]] = []
-    run_hydra("train", lambda c: seen.append((c.seed, _config.run_dir())), ["-m", "seed=3,4", "name=rose"])
-    assert [seed for seed, _ in seen] == [3, 4]
-    assert [path.name for _, path in seen] == ["seed_3", "seed_4"]
-    assert sys.argv[1:] != ["-m", "seed=3,4", "name=rose"]
-
-
 @pytest.mark.parametrize(
     "swept",
     [
         ["model.simulator.network.layers=2,3"],
-        ["ablation=no_mass,[no_mass,no_momentum],[no_momentum,no_mass]"],
         ["loss=default,paper", "seed=3,4"],
         ["trainer.max_minutes=1,2", "ablation=none,no_mass", "model=gausim,gausim_paper"],
         ["data.root=a/b,a/../b,a_b"],
@@ -191,7 +180,7 @@ def test_jobs_of_a_sweep_never_share_a_directory(
     seen: list[Path] = []
     arguments = ["-m", *swept, "paths.output_root=o", *(() if swept[-1].startswith("name") else ("name=rose",))]
     run_hydra("train", lambda config: seen.append(_config.run_dir()), arguments)
-    assert len(seen) == math.prod(len(re.split(r",(?![^[]*\])", override)) for override in swept)
+    assert len(seen) == math.prod(len(override.split(",")) for override in swept)
     assert len(set(seen)) == len(seen)
     for path in seen:
         inside = path.resolve().relative_to(tmp_path / "o")
@@ -202,9 +191,9 @@ def test_jobs_of_a_sweep_never_share_a_directory(
 def test_a_list_of_ablations_is_named_by_all_its_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     seen: list[tuple[str, str]] = []
-    swept = ["-m", "ablation=none,[no_mass,no_momentum]", "model=gausim"]
+    swept = ["-m", "ablation=none,[no_mass,no_momentum],[no_momentum,no_mass]", "model=gausim"]
     run_hydra("train", lambda config: seen.append((config.ablation.name, _config.run_dir().parts[-3])), swept)
-    assert seen == [(name, name) for name in ("none", "no_mass+no_momentum")]
+    assert seen == [(name, name) for name in ("none", "no_mass+no_momentum", "no_momentum+no_mass")]
 
 
 def test_a_folder_name_is_one_short_component_and_tells_texts_apart() -> None:
