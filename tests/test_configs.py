@@ -6,7 +6,6 @@ import functools
 import inspect
 import math
 import re
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,23 +13,23 @@ from typing import Any
 import hydra
 import pytest
 import torch
+from jsonschema import Draft7Validator
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from gausim.compose import config as _config
 from gausim.compose import root as _conf
 from gausim.compose.config import check_targets, compose, instantiate, run_hydra
+from gausim.compose.places import more_settings, read_places
 from gausim.compose.root import conf_dir
+from gausim.compose.schema import training_schema
 from gausim.core.errors import ConfigError, SceneError
 from gausim.training.ranks.launch import Crew
 from gausim.training.ranks.layout import Layout, LocalRanks, RanksStrategy
 from gausim.training.trainer import make_trainer
 
-# Values for what a file leaves to the user (`???`), by "group/option".
-MANDATORY: dict[str, list[str]] = {}
 FILES = sorted(
     path.relative_to(conf_dir()).with_suffix("") for path in conf_dir().rglob("*.yaml") if path.parent.name != "base"
 )
-ROOTS = [path.as_posix() for path in FILES if len(path.parts) == 1]
 OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1]
 # They set keys of other groups or of Hydra, and so build nothing of their own under their name.
 NOT_BUILT = ("hydra", "paths")
@@ -41,7 +40,7 @@ SPECIAL = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
 
 def compose_option(option: str) -> DictConfig:
     group, _, name = option.rpartition("/")
-    return compose("train", [f"{group}={name}", *MANDATORY.get(option, [])])
+    return compose("train", [f"{group}={name}"])
 
 
 def targets(node: Any) -> Iterator[DictConfig]:
@@ -76,38 +75,37 @@ def needs_other_hardware(config: DictConfig) -> bool:
     return accelerator not in ("cpu", "auto") and not torch.cuda.is_available()
 
 
-@pytest.mark.parametrize("name", ROOTS)
-def test_root_composes(name: str) -> None:
-    config = compose(name, MANDATORY.get(name, []))
-    check_targets(config)
-    assert config
+@pytest.fixture(scope="module")
+def schema() -> Draft7Validator:
+    return Draft7Validator(training_schema())
 
 
 @pytest.mark.parametrize("option", OPTIONS)
-def test_option_composes_and_fits_the_signatures(option: str) -> None:
-    config = compose_option(option)
+def test_option_composes_fits_the_signatures_and_builds(
+    option: str, schema: Draft7Validator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    config, group = compose_option(option), option.split("/")[0]
     check_targets(config)
     for node in targets(config):
         signature, arguments = signature_of(node)
         signature.bind_partial(*node.get("_args_", []), **arguments)  # TypeError: a key that the target does not take
-
-
-@pytest.mark.parametrize("option", [option for option in OPTIONS if option.split("/")[0] not in NOT_BUILT])
-def test_option_builds(option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("WANDB_MODE", "disabled")
-    config = compose_option(option)
+    assert list(schema.iter_errors(OmegaConf.to_container(config, resolve=True))) == []
+    if group == "experiment":  # it wins over the root file
+        written = OmegaConf.load(conf_dir() / f"{option}.yaml")
+        assert all(config[key] == written[key] for key in {"name", "seed"} & set(written))
+    if group in NOT_BUILT:
+        return
     if needs_other_hardware(config):
         pytest.skip(f"{option} asks for trainer.accelerator={config.trainer.accelerator}, which this machine lacks")
-    group = option.split("/")[0]
-    if group == "trainer" and config.trainer.devices > 1:
+    if group == "trainer" and config.trainer.get("devices", 1) > 1:
         crew = Crew(Layout(config.trainer.devices, accelerator="cpu"))
         crew.environment = LocalRanks(0, config.trainer.devices, port=1)  # as if the others had started
         made = make_trainer(instantiate(config.trainer, accelerator="cpu"), crew=crew)
         assert made.world_size == config.trainer.devices and isinstance(made.strategy, RanksStrategy)
         return
-    built = {group: config[group]} if group in config and group not in GLOBAL else config
-    for node in (built[key] for key in built):
+    for node in config.values() if group in GLOBAL or group not in config else [config[group]]:
         build(node)
 
 
@@ -123,8 +121,33 @@ def build(node: Any) -> None:
         build(child)
 
 
+def test_settings_that_no_configuration_lists_are_the_constructors_defaults() -> None:
+    root = read_places()
+    for key, value in more_settings().items():
+        *parents, name = key.split(".")
+        place = functools.reduce(lambda node, part: node.children[part], parents, root)
+        takers = [inspect.signature(hydra.utils.get_object(target)).parameters for target in place.targets]
+        defaults = [parameters[name].default for parameters in takers if name in parameters]
+        assert defaults and all((list(d) if isinstance(d, tuple) else d) == value for d in defaults), key
+
+
+def test_settings_that_no_configuration_lists_are_set_like_others(capsys: pytest.CaptureFixture[str]) -> None:
+    assert len(leaves(compose("train"))) <= 80
+    config = compose("train", ["trainer.progress=false", "loss.image.window=7", "trainer.overwrite=true"])
+    assert config.trainer.progress is False and config.loss.image.window == 7 and config.overwrite is True
+    assert "trainer.overwrite is called overwrite now" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match=r"model\.simulator\.network\.compile: unknown key"):
+        compose("train", ["model=spring_mass", "model.simulator.network.compile=true"])
+
+
+def leaves(node: Any) -> list[Any]:
+    """Settings below a node; what is built there aside."""
+    if isinstance(node, DictConfig):
+        return [leaf for key in node if key not in SPECIAL for leaf in leaves(node._get_node(key))]
+    return [node]
+
+
 def test_every_kind_of_file_is_covered() -> None:
-    assert "train" in ROOTS
     assert {"data", "model", "loss", "optimizer", "render", "trainer", "paths", "hydra"} <= {
         option.split("/")[0] for option in OPTIONS
     }
@@ -138,15 +161,6 @@ def test_the_same_choice_runs_in_the_same_directory(tmp_path: Path, monkeypatch:
         assert run_hydra("train", lambda config: seen.append(_config.run_dir()), overrides) == 0
     assert seen == [tmp_path / "o" / "rose" / f"seed_{seed}" for seed in (3, 3, 4)]
     assert Path.cwd() == tmp_path
-
-
-def test_a_sweep_gives_every_seed_its_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    seen: list[tuple[int, Path]] = []
-    run_hydra("train", lambda c: seen.append((c.seed, _config.run_dir())), ["-m", "seed=3,4", "name=rose"])
-    assert [seed for seed, _ in seen] == [3, 4]
-    assert [path.name for _, path in seen] == ["seed_3", "seed_4"]
-    assert sys.argv[1:] != ["-m", "seed=3,4", "name=rose"]
 
 
 @pytest.mark.parametrize(
@@ -175,20 +189,20 @@ def test_jobs_of_a_sweep_never_share_a_directory(
         assert not re.search(r"(name|seed|ablation|model|output_root)=", str(inside))  # said by the path already
 
 
+def test_a_list_of_ablations_is_named_by_all_its_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    seen: list[tuple[str, str]] = []
+    swept = ["-m", "ablation=none,[no_mass,no_momentum],[no_momentum,no_mass]", "model=gausim"]
+    run_hydra("train", lambda config: seen.append((config.ablation.name, _config.run_dir().parts[-3])), swept)
+    assert seen == [(name, name) for name in ("none", "no_mass+no_momentum", "no_momentum+no_mass")]
+
+
 def test_a_folder_name_is_one_short_component_and_tells_texts_apart() -> None:
     assert _conf.folder_name("") == "" and _conf.folder_name("a.b=1,+c=x") == "a.b=1,+c=x"
     texts = ["a/b", "a_b", "a//b", "a b", "../b", "k=" + 200 * "x", "k=" + 201 * "x"]
     names = [_conf.folder_name(text) for text in texts]
     assert len(set(names)) == len(names)
     assert all("/" not in name and len(name) <= 120 for name in names)
-
-
-def test_an_experiment_wins_over_the_root_file() -> None:
-    experiments = [option for option in OPTIONS if option.startswith("experiment/")]
-    for option in experiments:
-        written = OmegaConf.load(conf_dir() / f"{option}.yaml")
-        for key in {"name", "seed"} & set(written):
-            assert compose_option(option)[key] == written[key]
 
 
 @pytest.mark.parametrize(

@@ -34,8 +34,10 @@ from gausim.cli.main import COMMANDS, main
         ("train mod", {"model=", "model."}),
         ("train model=spring_mass model.", {"model.method.", "model.plan."}),
         ("train model=gausim model.simulator.template.spac", {"model.simulator.template.spacing="}),
+        ("train loss.image.win", {"loss.image.window="}),  # which no configuration lists
+        ("train model=spring_mass model.simulator.network.comp", set()),
         ("train model.simulator.template.spac", set()),  # the default model has none
-        ("train -m ablation=none,no_mass_no_h", {"ablation=none,no_mass_no_hierarchy"}),
+        ("train -m ablation=none,no_hier", {"ablation=none,no_hierarchy"}),
         ("train trainer.progress=", {"trainer.progress=true", "trainer.progress=false"}),
         ("train hydra/swee", {"hydra/sweeper="}),
         ("train sed=1 model=gausim_p", {"model=gausim_paper"}),

@@ -24,7 +24,6 @@ from gausim.core import ConfigError
 FILES = sorted(
     path.relative_to(conf_dir()) for path in conf_dir().rglob("*/*.yaml") if "hydra" not in path.parts[-3:]
 )  # fmt: skip
-MODELS = sorted(path.stem for path in (conf_dir() / "model").glob("*.yaml"))
 
 
 @pytest.fixture(scope="module")
@@ -60,11 +59,6 @@ def test_every_file_of_conf_fits_the_schema(name: Path, schema) -> None:
 
 def without_defaults(config: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in config.items() if key != "defaults"}
-
-
-@pytest.mark.parametrize("model", MODELS)
-def test_composed_configurations_fit_the_schema(model: str, schema) -> None:
-    assert violations(schema, plain(f"model={model}")) == []
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,7 @@ def needs_warp(model: str) -> None:
 
 @pytest.fixture(scope="module")
 def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Shorter than that of the session: every method is evaluated."""
     return write_toy_object(tmp_path_factory.mktemp("data") / "toy", frames=9).root
 
 
@@ -73,6 +74,8 @@ def test_the_same_commands_serve_every_method(model: str, arguments: list[str]) 
     assert entry["footnotes"][row]["notes"] and entry["efficiency"][row]["seconds_per_frame"]["mean"] >= 0
     table = (run / "evaluation" / "table.md").read_text()
     assert all(note in table for note in entry["footnotes"][row]["notes"])
+    if model not in ("spring_mass", "deformation_field"):  # what draws and reports does not ask for the method
+        return
     assert simulate.main([str(run), "--frames", "12"]) == 0
     assert (run / "simulation" / "toy" / "seq_000" / "cam_0.mp4").is_file()
     assert report.main([str(run), "--out", "page"]) == 0

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from helpers.simulators import LEVELS
-from helpers.toy_object import write_toy_object
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gausim.cli import train as command
@@ -27,11 +26,6 @@ TINY = (
     "trainer.progress=false", "trainer.threads=1", "trainer.log_every_n_steps=1", "render=reference", "name=toy",
     "callbacks.panels.every_epochs=1",
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_toy_object(tmp_path_factory.mktemp("data") / "toy").root
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 from helpers.simulators import LEVELS
 from helpers.toy_object import write_toy_object
 
@@ -25,15 +26,25 @@ TINY = (
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_toy_object(tmp_path_factory.mktemp("data") / "toy").root
-
-
 @pytest.fixture
 def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.chdir(tmp_path)
     return [f"data.root={toy}", *TINY]
+
+
+@pytest.fixture(scope="module")
+def finished(toy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of one epoch, which tests copy."""
+    root = tmp_path_factory.mktemp("finished")
+    assert command.main([f"data.root={toy}", *TINY, "trainer.max_epochs=1", f"paths.output_root={root}"]) == 0
+    return root
+
+
+@pytest.fixture
+def again(arguments: list[str], finished: Path, tmp_path: Path) -> list[str]:
+    """The arguments of a run that is finished here already."""
+    shutil.copytree(finished, tmp_path / "outputs")
+    return [*arguments, "trainer.max_epochs=1"]
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -105,11 +116,10 @@ def test_motion_and_data_are_looked_at_and_training_does_not_notice(
     assert float(rows[-1]["error_level_1"]) == pytest.approx(row["level_errors"][0], rel=1e-3)
 
 
-def test_a_finished_run_is_refused_and_can_be_overwritten(arguments: list[str]) -> None:
-    command.main([*arguments, "trainer.max_epochs=1"])
+def test_a_finished_run_is_refused_and_can_be_overwritten(again: list[str]) -> None:
     with pytest.raises(RunError, match=r"finished.*name=NAME.*overwrite=true"):
-        command.main([*arguments, "trainer.max_epochs=1"])
-    assert command.main([*arguments, "trainer.max_epochs=1", "trainer.overwrite=true"]) == 0
+        command.main(again)
+    assert command.main([*again, "overwrite=true"]) == 0
 
 
 def test_resuming_at_an_epochs_end_equals_an_uninterrupted_run(
@@ -135,13 +145,24 @@ def test_resuming_at_an_epochs_end_equals_an_uninterrupted_run(
         torch.testing.assert_close(cut[name], value, rtol=0, atol=0)
 
 
-def test_a_changed_config_is_refused_by_the_name_of_its_keys(
-    arguments: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    command.main([*arguments, "trainer.max_epochs=1"])
+def test_a_changed_config_is_refused_by_the_name_of_its_keys(again: list[str]) -> None:
     Path("outputs/toy/seed_0/FINISHED").unlink()
-    with pytest.raises(RunError, match=r"changed: loss\.static_weight\."):
-        command.main([*arguments, "trainer.max_epochs=1", "loss.static_weight=2"])
+    with pytest.raises(RunError, match=r"changed: loss\.image\.window, loss\.static_weight\."):
+        command.main([*again, "loss.static_weight=2", "loss.image.window=7"])
+
+
+def test_a_run_of_a_version_with_other_settings_goes_on(again: list[str]) -> None:
+    """Its configuration said what is left to defaults now, and had other names."""
+    run = Path("outputs/toy/seed_0")
+    old = yaml.safe_load((run / "config.yaml").read_text())
+    assert old["loss"]["explosion"] == 3.0 and old["trainer"]["clock"] == "wall"  # though no configuration lists them
+    del old["loss"]["explosion"], old["overwrite"]
+    old |= {"supervision": {}, "experiment": {"name": "toy"}, "ablation": {"name": "none"}}
+    old["trainer"]["overwrite"] = False
+    (run / "config.yaml").write_text(yaml.safe_dump(old))
+    (run / "FINISHED").unlink()
+    assert command.main(again) == 0
+    assert load_run(run).config["trainer"].get("overwrite") is None
 
 
 def test_an_unknown_key_is_refused(arguments: list[str]) -> None:
@@ -150,8 +171,8 @@ def test_an_unknown_key_is_refused(arguments: list[str]) -> None:
     assert not Path("outputs").exists()
 
 
-def test_a_checkpoint_of_another_scene_is_refused(arguments: list[str], tmp_path: Path) -> None:
-    command.main([*arguments, "trainer.max_epochs=1"])
+@pytest.mark.usefixtures("again")
+def test_a_checkpoint_of_another_scene_is_refused(tmp_path: Path) -> None:
     other = write_toy_object(tmp_path / "other")
     from dataclasses import replace
 

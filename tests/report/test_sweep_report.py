@@ -80,3 +80,17 @@ def test_failures_are_told_and_every_number_links_to_its_runs(sweep: Path, tmp_p
     assert row["seeds"] == "2" and len(row["runs"].split(";")) == 2 and "seed_2" not in row["runs"]
     assert all(row[key] for key in ("config", "commit", "scene_sha256", "manifest_sha256"))
     assert {r["status"] for r in rows if r["row"] == "gausim w/o hierarchy"} == {"failed"}
+
+
+def test_a_list_of_ablations_is_named_by_all_its_parts(tmp_path: Path) -> None:
+    for name, off in (
+        ("none", {}),
+        ("no_mass+relu", OFF["no_mass"]),
+        ("no_mass+no_momentum", OFF["no_mass"] | OFF["no_momentum"]),
+    ):
+        settings = config(1, **off)
+        settings["ablation"] = {"name": name}
+        evaluate(write_run(tmp_path / name / "gausim" / "seed_1", settings), make_curves())
+    assert sheets(tmp_path)["ablation_toy_bunny_gausim"].columns == (
+        ("gausim", ("full", "w/o mass, w/o momentum", "w/o mass, relu")),
+    )

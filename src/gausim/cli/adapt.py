@@ -22,7 +22,7 @@ EPOCHS, REPEATS = 60, 4
 ALL_EPOCHS = {"max_minutes": None, "convergence": None}
 # What `--supervision` stands for (the defaults of these are those of conf/supervision).
 SUPERVISIONS = {
-    "images": None,
+    "images": "gausim.training.supervision.images.training_views",
     "points": "gausim.training.supervision.points.PointSupervision",
     "tracks": "gausim.training.supervision.motion_tracks.TrackSupervision",
 }
@@ -112,11 +112,11 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
         "init_from": str(run.resolve()),
         "freeze": "model",
         "evaluate": True,
-        "trainer": {**config["trainer"], "max_epochs": arguments.epochs, **ALL_EPOCHS, "overwrite": False},
+        "trainer": {**config["trainer"], "max_epochs": arguments.epochs, **ALL_EPOCHS},
+        "overwrite": False,
     }
     if arguments.supervision is not None:
-        target = SUPERVISIONS[arguments.supervision]
-        adapted["supervision"] = {"_target_": target, "_partial_": True} if target else {}
+        adapted["supervision"] = {"_target_": SUPERVISIONS[arguments.supervision], "_partial_": True}
     node = OmegaConf.create(adapted)
     OmegaConf.set_struct(node, True)
     try:
@@ -127,6 +127,7 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
 
 
 def _checked(overrides: Sequence[str]) -> list[str]:
+    from gausim.compose.places import spelled
     from gausim.core.errors import ConfigError
 
     wrong = [text for text in overrides if "=" not in text.lstrip("=")]
@@ -134,7 +135,7 @@ def _checked(overrides: Sequence[str]) -> list[str]:
         raise ConfigError(
             f"--set {wrong[0]}: expected KEY=VALUE, e.g. trainer.threads=1. `gausim adapt --help` explains."
         )
-    return list(overrides)
+    return [override.lstrip("+") for override in spelled(overrides)]
 
 
 def _roots(config: dict[str, Any], run: Path, stores: Sequence[str] | None) -> list[dict[str, Any]]:

@@ -8,6 +8,8 @@ import json
 import sys
 from typing import TYPE_CHECKING, Any
 
+from gausim.cli.arguments import positive
+
 if TYPE_CHECKING:
     from gausim.benchmark.harness import Options, Row
     from gausim.core import GaussianScene
@@ -82,17 +84,10 @@ def _parser() -> argparse.ArgumentParser:
         help=f"training configuration of the case train; default {' '.join(DEFAULT_OVERRIDES)}")  # fmt: skip
     add("--json", action="store_true", help='print one JSON object: {"machine": ..., "rows": [...]}')
     add("--quick", action="store_true", help="tiny sizes: to see that it works, not to quote")
-    add("--threads", type=_positive, default=1, help="threads of torch and the renderer; default %(default)s")
-    add("--rounds", type=_positive, default=7, help="timed calls of each candidate; default %(default)s")
+    add("--threads", type=positive, default=1, help="threads of torch and the renderer; default %(default)s")
+    add("--rounds", type=positive, default=7, help="timed calls of each candidate; default %(default)s")
     add("--device", default="cpu", help="cpu, cuda or cuda:N; default %(default)s")
     return parser
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected at least 1, got {value}")
-    return value
 
 
 def _device(name: str) -> Any:

@@ -19,7 +19,10 @@ _GROUPS = (
 )  # fmt: skip
 # Paths of the machine that trained, and what changes neither the run nor its figures.
 _PATHS = ("data.root", "data.scene", "data.masks", "paths")
-_UNTOLD = (*_PATHS, "data.seed", "logger", "callbacks", "name", "task_name", "evaluate", "trainer.progress")
+_UNTOLD = (
+    *_PATHS, "data.seed", "logger", "callbacks", "name", "task_name", "evaluate", "trainer.progress", "ablation",
+    "experiment",
+)  # fmt: skip
 _ABSENT = "(absent)"
 
 
@@ -176,6 +179,7 @@ def _differences(run: RunRecord) -> tuple[str, list[tuple[str, str, str]]]:
     from gausim.compose.config import compose
     from gausim.core.errors import ConfigError
     from gausim.report.gather.runs import flatten
+    from gausim.runs.defaults import with_defaults
 
     chosen = [f"{group}={run.choices[group]}" for group in _GROUPS if run.choices.get(group) not in (None, "None")]
     words = f"`gausim train {' '.join(chosen)}`" if chosen else "`gausim train`"
@@ -183,7 +187,9 @@ def _differences(run: RunRecord) -> tuple[str, list[tuple[str, str, str]]]:
         default = compose("train", chosen)
     except ConfigError:  # a preset of a version that is gone
         default, words = compose("train"), "`gausim train` (its own presets are not of this version)"
-    own, base = dict(flatten(run.config)), dict(flatten(OmegaConf.to_container(default, resolve=True)))
+    base_config = OmegaConf.to_container(default, resolve=True)
+    own, base = (dict(flatten(with_defaults(config))) for config in (run.config, base_config))
     keys = [key for key in own if own[key] != base.get(key)] + [key for key in base if key not in own]
     rows = [(k, own.get(k, _ABSENT), base.get(k, _ABSENT)) for k in keys if not _is_one_of(k, _UNTOLD)]
+    rows = [row for row in rows if {*row[1:]} != {"None", _ABSENT}]  # null says as much as nothing
     return f"{words} of gausim {gausim.__version__}", rows

@@ -96,21 +96,35 @@ def _overrides(before: Sequence[str], word: str) -> list[str]:
     from hydra.plugins.completion_plugin import DefaultCompletionPlugin
     from omegaconf.errors import OmegaConfBaseException
 
+    from gausim.compose.places import spelled
     from gausim.compose.root import HYDRA_VERSION_BASE, conf_dir
 
     key, _, value = word.partition("=")
     listed, comma, last = value.rpartition(",")
     asked = f"{key}={last}" if comma else word
+    begun = key.rpartition(".")[0]
     chosen = [said for said in before if "=" in said and "," not in said]
     with hydra.initialize_config_dir(str(conf_dir()), version_base=HYDRA_VERSION_BASE):
         plugin = DefaultCompletionPlugin(GlobalHydra.instance().config_loader())
         try:
-            found = plugin._query("train", " ".join([*chosen, asked]) if asked else f"{' '.join(chosen)} ")
+            found = plugin._query("train", " ".join([*spelled(chosen), asked]) if asked else f"{' '.join(chosen)} ")
+            if begun and plugin._query("train", " ".join([*spelled(chosen), f"{begun}."])):
+                found = sorted({*found, *_more(key, asked)})
         except (HydraException, OmegaConfBaseException):  # a word before this one is wrong, or a value stands nowhere
             return []
     if comma:
         return [f"{key}={listed},{choice.removeprefix(f'{key}=')}" for choice in found]
     return [also for choice in found for also in _either(choice) if _is_for_people(also, word)]
+
+
+def _more(key: str, asked: str) -> list[str]:
+    """Settings that Hydra does not list: those that begin so, or the value of the one that is asked for."""
+    from gausim.compose.places import more_settings
+
+    more = more_settings()
+    if "=" in asked:
+        return [f"{key}={str(more[key]).lower()}"] if isinstance(more.get(key), bool) else []
+    return [f"{name}=" for name in more if name.startswith(key) and "." not in name[len(key) :]]
 
 
 def _either(choice: str) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gausim.cli.arguments import positive
 from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -154,24 +155,17 @@ def _parser() -> argparse.ArgumentParser:
     add("--object", metavar="NAME", help="of a run; default its first")
     add("--sequence", metavar="NAME", help="of a run; default its first")
     add_data_option(parser)
-    add("--frames", type=_positive, metavar="N", help="frames to predict; default as many as were recorded")
-    add("--every", type=_positive, default=1, metavar="N", help="take every so many frames")
+    add("--frames", type=positive, metavar="N", help="frames to predict; default as many as were recorded")
+    add("--every", type=positive, default=1, metavar="N", help="take every so many frames")
     add("--fps", type=float, help="of a folder of PLY files that does not say it")
     add("--up", default="z", choices=("y", "z"), help="vertical axis (default: z)")
     pictures = parser.add_argument_group("mp4 and gif")
     pictures.add_argument("--view", metavar="NAME", help="camera of the run's data set")
     pictures.add_argument("--azimuth", type=float, default=30.0, metavar="DEGREE", help="of a camera about the "
                           "vertical, where no --view is named (default: 30)")  # fmt: skip
-    pictures.add_argument("--size", type=_positive, default=480, metavar="PIXELS", help="height and width (480)")
+    pictures.add_argument("--size", type=positive, default=480, metavar="PIXELS", help="height and width (480)")
     pictures.add_argument("--background", default="black", metavar="COLOR", help="black, white or R,G,B in 0..1")
     return parser
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected a positive number, got {text}")
-    return value
 
 
 # -------------------------------------------------------------------------------------------------------- sources
@@ -329,7 +323,7 @@ _WRITERS: dict[str, Callable[[Motion, Path, argparse.Namespace], int]] = {
 def _pictures(motion: Motion, arguments: argparse.Namespace) -> Iterator[np.ndarray]:
     import torch
 
-    from gausim.cli.background import parse_background
+    from gausim.cli.arguments import parse_background
     from gausim.compose.config import compose, instantiate
     from gausim.render.draw import draw, to_bytes
 

@@ -39,7 +39,7 @@ Learns an object's dynamics from multi-view videos. Every setting is a key of co
 
 A run goes to OUTPUT_ROOT/NAME/seed_SEED (paths.output_root, name, seed). Started again, it resumes from its last
 checkpoint; cut short by trainer.max_minutes or max_epochs before it had learned, the same command grants it as much
-again; once finished it is refused, unless trainer.overwrite=true. A sweep (-m) that is started again leaves out
+again; once finished it is refused, unless overwrite=true. A sweep (-m) that is started again leaves out
 what is finished, resumes what is not, and tries again what failed if sweep.retry_failed=true."""
 
 # Largest motion from frame to frame that small pushes were seen to begin with [diagonals]; others begin with less.
@@ -103,7 +103,7 @@ def train(cfg: DictConfig) -> float | None:
 
 def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
     """Trains into a run directory that this process holds, and evaluates if the configuration says so."""
-    if cfg.evaluate and not cfg.trainer.overwrite and run.awaits_evaluation(_plain(cfg)):
+    if cfg.evaluate and not cfg.overwrite and run.awaits_evaluation(_plain(cfg)):
         objective = run.facts()["last_epoch"].get("excess_static")
     else:
         objective = _train(cfg, run)
@@ -113,9 +113,12 @@ def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
 
 
 def _plain(cfg: DictConfig) -> dict[str, Any]:
+    """The whole configuration, defaults of constructors included."""
     from omegaconf import OmegaConf
 
-    return cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
+    from gausim.runs.defaults import with_defaults
+
+    return cast("dict[str, Any]", with_defaults(OmegaConf.to_container(cfg, resolve=True)))
 
 
 def _evaluate(run: RunDirectory) -> None:
@@ -151,7 +154,7 @@ def _train(cfg: DictConfig, run: RunDirectory) -> float | None:
         if not crew.is_first:  # a scheduler has started it beside the first
             return follow(crew)
         config = _plain(cfg)
-        task = crew.announce(lambda: (config, str(run.path), run.prepare(config, overwrite=cfg.trainer.overwrite)))
+        task = crew.announce(lambda: (config, str(run.path), run.prepare(config, overwrite=cfg.overwrite)))
         parts = _parts(cfg, resumed=task[2] is not None)
         crew.start(task)
         return _fit(cfg, run, task[2], parts, crew)

@@ -104,13 +104,12 @@ def _build_fit(config: DictConfig) -> tuple[GausSimModule, ReadyDataModule]:
         scene_of_sequence=[scene_id for scene_id, _ in datamodule.index.entries],
         seen=seen,
     )()
-    renderer, image_loss = instantiate(config.render), instantiate(config.loss).image
-    sources = Sources(scenes, datamodule.index.ground_truth, lambda scene_id: None, renderer, image_loss)
-    explosion = float(config.loss.explosion)
+    renderer, objective = instantiate(config.render), instantiate(config.loss)
+    sources = Sources(scenes, datamodule.index.ground_truth, lambda scene_id: None, renderer, objective.image)
     module = GausSimModule(
-        method=StagedFit(fitted, plan, datamodule.curriculum, explosion),
+        method=StagedFit(fitted, plan, datamodule.curriculum, objective.explosion),
         renderer=renderer,
-        objective=Objective(explosion=explosion),
+        objective=Objective(explosion=objective.explosion),
         supervision=_supervision(config, sources),
         seed=int(config.seed),
     )

@@ -20,6 +20,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from gausim.compose.places import more_settings, spelled
 from gausim.compose.root import HYDRA_VERSION_BASE, conf_dir
 from gausim.compose.targets import check_hydra, check_targets
 from gausim.core.errors import ConfigError, GausSimError
@@ -59,7 +60,7 @@ def compose_leniently(config_name: str, overrides: Sequence[str]) -> tuple[DictC
     """
     try:
         return _compose(config_name, overrides), []
-    except (HydraException, OmegaConfBaseException):
+    except (ConfigError, HydraException, OmegaConfBaseException):
         pass  # now one by one, groups first: they decide which keys there are
     taken: list[str] = []
     faults: list[str] = []
@@ -67,6 +68,8 @@ def compose_leniently(config_name: str, overrides: Sequence[str]) -> tuple[DictC
         try:
             _compose(config_name, [*taken, override])
             taken.append(override)
+        except ConfigError as error:
+            faults.append(str(error))
         except (HydraException, OmegaConfBaseException) as error:
             faults.append(_fault(config_name, taken, override, error))
     return compose(config_name, taken), faults
@@ -85,13 +88,24 @@ def _fault(config_name: str, taken: Sequence[str], override: str, error: Excepti
         why = f"{error.__cause__ or error}".partition("Config search path")[0]
         return f"{override}: {' '.join(why.split())}"
     key = override.lstrip("+~").split("=")[0]
-    matches = difflib.get_close_matches(key, list(_keys(_compose(config_name, taken))), n=1, cutoff=0.6)
+    matches = difflib.get_close_matches(key, [*_keys(_compose(config_name, taken)), *more_settings()], n=1, cutoff=0.6)
     return f"{key}: unknown key." + (f" Did you mean '{matches[0]}'?" if matches else "")
 
 
 def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    known = spelled(overrides)
     with hydra.initialize_config_dir(str(conf_dir()), version_base=HYDRA_VERSION_BASE):
-        return hydra.compose(config_name, overrides=list(overrides))
+        config = hydra.compose(config_name, overrides=known)
+    _check_more(config, known)
+    return config
+
+
+def _check_more(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Refuses settings of what is not there, as that of a network where the model has none."""
+    for key in (override.partition("=")[0] for override in overrides if override.startswith("++")):
+        parent = OmegaConf.select(config, key[2:].rpartition(".")[0])
+        if key[2:] in more_settings() and not (isinstance(parent, DictConfig) and "_target_" in parent):
+            raise ConfigError(f"{key[2:]}: unknown key. This configuration builds nothing that it would be set of.")
 
 
 class Job:
@@ -126,7 +140,7 @@ def run_hydra(config_name: str, task: Callable[[DictConfig], float | None], argv
     )
     saved_argv, saved_flag = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     # Hydra reads sys.argv; with its full errors on it raises them, which are then told in our way, instead of exiting.
-    sys.argv = [saved_argv[0], *argv]
+    sys.argv = [saved_argv[0], *spelled(argv)]
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
         with _readable_errors(config_name), _guarded():
@@ -158,6 +172,7 @@ def _guarded() -> Iterator[None]:
     def checked(self: ConfigLoaderImpl, *args: Any, **kwargs: Any) -> DictConfig:
         config = load(self, *args, **kwargs)
         check_hydra(config.hydra)
+        _check_more(config, list(config.hydra.overrides.task))
         return config
 
     ConfigLoaderImpl.load_configuration = checked  # type: ignore[method-assign]
@@ -181,6 +196,8 @@ def _readable_errors(config_name: str) -> Iterator[None]:
             message = f"{message}\n{cause}"
         if "hydra/launcher/" in message:
             message += "\njoblib, submitit_local and submitit_slurm come with `pip install 'gausim[sweep]'`."
+        if "does not support sweep type" in message:
+            message += "\nA search takes intervals: hydra/sweeper=optuna."
         raise ConfigError(f"{config_name}.yaml: {message}{_close_keys(config_name, message)}") from error
 
 
@@ -190,7 +207,7 @@ def _close_keys(config_name: str, message: str) -> str:
         return ""
     key = str(found.group(1) or found.group(2)).split("@")[0]
     try:
-        known = list(_keys(_compose(config_name, ())))
+        known = [*_keys(_compose(config_name, ())), *more_settings()]
     except (HydraException, OmegaConfBaseException):
         return ""  # the configuration is broken without the override as well; the message at hand says how
     matches = difflib.get_close_matches(key, known, n=3, cutoff=0.6)

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from gausim.compose.root import conf_dir
 
 ROOT_FILE, GLOBAL_PACKAGE = "train", "# @package _global_"
+# Settings that have another name since the last version.
+RENAMED = {"trainer.overwrite": "overwrite"}
 # The defaults list composes; the node `hydra` is Hydra's own.
 _NOT_OURS = ("defaults", "hydra")
 BASE = "base"  # what files of groups inherit from; no group to choose from
+MORE = f"{BASE}/more.yaml"  # settings that no configuration lists: their values are the constructors' defaults
 
 
 @dataclass
@@ -73,6 +78,32 @@ def read_places() -> Place:
         if isinstance(node, yaml.MappingNode):
             _read(node, place, text.splitlines())
     return root
+
+
+def more_settings() -> dict[str, Any]:
+    """Settings that no composed configuration lists, by their dotted keys, with the defaults of their constructors."""
+    return dict(_leaves(yaml.safe_load((conf_dir() / MORE).read_text()), ""))
+
+
+def spelled(overrides: Sequence[str]) -> list[str]:
+    """Overrides as Hydra takes them: settings that no configuration lists are added, those of old names renamed."""
+    more, found = more_settings(), []
+    for override in overrides:
+        key, equals, value = override.partition("=")
+        if key.lstrip("+") in RENAMED:
+            new = RENAMED[key.lstrip("+")]
+            print(f"{key} is called {new} now; the old name goes with the next version.", file=sys.stderr)
+            key = new
+        found.append(f"++{key}{equals}{value}" if key in more else f"{key}{equals}{value}")
+    return found
+
+
+def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
+    if not isinstance(node, dict):
+        yield key, node
+        return
+    for name, child in node.items():
+        yield from _leaves(child, f"{key}.{name}" if key else name)
 
 
 def _files() -> Iterator[Path]:

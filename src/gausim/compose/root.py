@@ -14,6 +14,7 @@ from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import MISSING, OmegaConf
 
@@ -58,6 +59,7 @@ class RootConfig:
             takes all of the simulator from that run and keeps it, so that only initial states are learned.
         doctor: whether what `gausim doctor` would find wrong with the data is told before training (not in sweeps).
         evaluate: whether the run is evaluated once it is trained (`gausim evaluate`), for reports.
+        overwrite: remove the run that the directory holds already.
         name: of the run; its directory is `${paths.output_root}/${name}/seed_${seed}`.
         task_name: what is being done, for logs and dashboards.
     """
@@ -80,12 +82,14 @@ class RootConfig:
     freeze: str | None = None
     doctor: bool = True
     evaluate: bool = False
+    overwrite: bool = False
     name: str = MISSING
     task_name: str = "train"
 
 
 def folder_name(text: str) -> str:
     """Returns a text as the name of one directory: the same if it can be, else legible, short and with a hash."""
+    text = re.sub(r"(^|,)\+\+", r"\1", text)
     plain = re.sub(r"[^\w.,=+~:-]+", "_", text)
     if plain == text and len(text) <= LONGEST_FOLDER_NAME:
         return text
@@ -104,12 +108,22 @@ def job_threads(most: int) -> int:
     return min(most, max(1, cores // (jobs if jobs > 0 else max(1, cores + 1 + jobs))))
 
 
+def chosen(group: str) -> str:
+    """Returns what was chosen of a group: `no_mass`, of a list all of it, as `no_mass+no_momentum`, or `none`."""
+    if not HydraConfig.initialized():
+        return "none"  # composed without a job
+    job = HydraConfig.get()
+    choice = job.runtime.choices.get(group)
+    if choice is None:  # Hydra does not record lists
+        overrides = OverridesParser.create().parse_overrides(list(job.overrides.task))
+        values = [override.value() for override in overrides if override.key_or_group == group]
+        choice = "+".join(str(part) for value in values[-1:] if isinstance(value, list) for part in value)
+    return str(choice or "none")
+
+
 def job_group(name: str) -> str:
     """Returns what dashboards list a run under: NAME/ABLATION/MODEL, of which seeds and settings are variants."""
-    if not HydraConfig.initialized():
-        return name  # composed without a job; nobody has chosen anything
-    choices = HydraConfig.get().runtime.choices
-    return "/".join([name, *(str(choices.get(group) or "none") for group in ("ablation", "model"))])
+    return "/".join([name, chosen("ablation"), chosen("model")]) if HydraConfig.initialized() else name
 
 
 def job_name(seed: int) -> str:
@@ -121,7 +135,7 @@ def job_name(seed: int) -> str:
 
 
 ConfigStore.instance().store(name="base_schema", node=RootConfig, provider="gausim")
-for resolver in (folder_name, job_threads, job_group, job_name):
+for resolver in (chosen, folder_name, job_threads, job_group, job_name):
     OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
 
 

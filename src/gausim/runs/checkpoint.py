@@ -110,7 +110,7 @@ def check_resumable(path: Path) -> None:
     if DIGEST not in checkpoint or checkpoint["gausim"].get("format") != RESUME_FORMAT:
         raise RunError(
             f"{path}: written by another version of gausim, which did not save what a resumed run needs here. Finish "
-            "it with that version, or train anew (trainer.overwrite=true). It can still be evaluated."
+            "it with that version, or train anew (overwrite=true). It can still be evaluated."
         )
 
 

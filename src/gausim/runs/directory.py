@@ -20,6 +20,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from gausim.core import GausSimError, RunError
 from gausim.io.files import remove_leftovers, write_durably
 from gausim.runs.checkpoint import BEFORE_THE_END, PREVIOUS_CHECKPOINT, check_resumable
+from gausim.runs.defaults import with_defaults
 from gausim.runs.files import sole_writer, unwritable
 from gausim.runs.names import (
     CONFIG,
@@ -40,9 +41,10 @@ FETCHED = "FETCHED"  # in a directory that `gausim fetch` made: from where
 DAMAGED_CHECKPOINT = "last.damaged.ckpt"
 # What may differ when a run is resumed: where it is kept, how it is shown and what computes it, not what is learned.
 FREE_KEYS = (
-    "paths", "logger", "callbacks", "sweep", "task_name", "doctor", "evaluate", "trainer.threads", "render.threads",
+    "paths", "logger", "callbacks", "sweep", "ablation", "experiment", "task_name", "doctor", "evaluate",
+    "trainer.threads", "render.threads",
     "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.timeout_minutes",
-    "trainer.log_every_n_steps", "trainer.progress", "trainer.overwrite",
+    "trainer.log_every_n_steps", "trainer.progress", "overwrite",
 )  # fmt: skip
 # What `overwrite` removes; anything else in the directory is not ours.
 OWN_FILES = (
@@ -101,8 +103,7 @@ class RunDirectory:
             loaded["last_epoch"] = dict(loaded["last_epoch"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise RunError(
-                f"{path}: expected facts of a finished run ({type(error).__name__}). Train anew with "
-                "trainer.overwrite=true."
+                f"{path}: expected facts of a finished run ({type(error).__name__}). Train anew with overwrite=true."
             ) from error
         return loaded
 
@@ -173,7 +174,7 @@ class RunDirectory:
         if self.is_finished:
             raise RunError(
                 f"{self.path}: this run is finished. Give the new one another name (name=NAME) or seed, or remove the "
-                "old one with trainer.overwrite=true."
+                "old one with overwrite=true."
             )
         if self.has_checkpoint:
             self.check_unchanged(config)
@@ -214,7 +215,7 @@ class RunDirectory:
         if changed:
             raise RunError(
                 f"{self.path}: the run here was started with another configuration; changed: {', '.join(changed)}. "
-                "Restore these keys to resume it, give the new run another name, or set trainer.overwrite=true."
+                "Restore these keys to resume it, give the new run another name, or set overwrite=true."
             )
 
     def record(self, event: str) -> None:
@@ -265,7 +266,7 @@ class RunDirectory:
             return path
         if problems:
             raise RunError(
-                f"{self.path}: no checkpoint here is whole. {' '.join(problems)} Train anew (trainer.overwrite=true), "
+                f"{self.path}: no checkpoint here is whole. {' '.join(problems)} Train anew (overwrite=true), "
                 "or under another name."
             )
         return None
@@ -306,10 +307,9 @@ def changed_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
 
 
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Dotted keys whose values differ between two nested mappings."""
-    first, second = dict(_flatten(old)), dict(_flatten(new))
-    keys = sorted(set(first) | set(second))
-    return [k for k in keys if k not in first or k not in second or first[k] != second[k]]
+    """Dotted keys whose values differ between two configurations; a key that one leaves out has its default there."""
+    first, second = dict(_flatten(with_defaults(old))), dict(_flatten(with_defaults(new)))
+    return [key for key in sorted({*first, *second}) if first.get(key) != second.get(key)]
 
 
 def _flatten(value: Any, prefix: str = "") -> list[tuple[str, Any]]:

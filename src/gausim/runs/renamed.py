@@ -36,6 +36,8 @@ GONE = {
     **dict.fromkeys(("PointSupervision", "TrackSupervision", "tracks_or_images"), ("velocity_weight",)),
 }
 
+IMAGES = "gausim.training.supervision.images.training_views"
+TRAINER = "gausim.training.trainer.TrainerSettings"
 SIMULATOR = "gausim.models.step.simulator.GausSim"
 # Where the arguments of the simulator went, and the names they have there.
 PARTS: dict[str, tuple[str, dict[str, str]]] = {
@@ -101,6 +103,10 @@ def with_present_names(config: Any) -> Any:
             return None
         kept = {k: v for k, v in config.items() if k not in GONE.get(name, ())}
         found = {k: _present(v) if k == "_target_" else with_present_names(v) for k, v in kept.items()}
+        if found.get("_target_") == TRAINER:
+            found.pop("overwrite", None)  # a setting of the run now
+        if found.get("supervision") == {}:
+            found["supervision"] = {"_target_": IMAGES, "_partial_": True}
         if found.get("_target_") == ELASTIC:
             return _settled(found)
         if found.get("_target_") in GROUPS and "discretisation" not in found:

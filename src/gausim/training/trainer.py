@@ -33,7 +33,6 @@ class TrainerSettings(Layout):
         clock: what the budget counts, ``wall`` or ``cpu`` time.
         log_every_n_steps: optimiser steps between rows of the loggers.
         progress: whether a progress bar is shown.
-        overwrite: whether an earlier run in the directory is removed.
         convergence: ends the run when it has learned; None leaves it all of its epochs.
     """
 
@@ -44,7 +43,6 @@ class TrainerSettings(Layout):
     clock: str = "wall"
     log_every_n_steps: int = 20
     progress: bool = True
-    overwrite: bool = False
     convergence: Convergence | None = None
 
 

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gausim.cli.arguments import positive
+
 if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
@@ -34,7 +36,7 @@ def main(argv: list[str]) -> int:
         DataError: an object, sequence or view that is not there.
         DivergenceError: the prediction left the finite numbers.
     """
-    from gausim.cli.background import parse_background
+    from gausim.cli.arguments import parse_background
     from gausim.interaction.words import has_forces
 
     arguments = _parser().parse_args(argv)
@@ -75,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
     add("--object", nargs="+", metavar="NAME", help="only these objects")
     add("--sequence", nargs="+", metavar="NAME", help="sequences, or `all`; default the first of each object")
-    add("--frames", type=_positive, metavar="N", help="frames to predict; default as many as were recorded")
+    add("--frames", type=positive, metavar="N", help="frames to predict; default as many as were recorded")
     add("--view", nargs="+", metavar="NAME", help="cameras; default the first trained and the first held-out one")
     add_data_option(parser)
     add("--out", metavar="DIR", help="folder to write; default RUN/simulation")
@@ -86,13 +88,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--verbose", action="store_true", help="list the files that are written")
     add_force_options(parser)
     return parser
-
-
-def _positive(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected a positive number, got {text}")
-    return value
 
 
 def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namespace, folder: Path) -> str:
@@ -160,7 +155,7 @@ def _write_view(
     arguments: argparse.Namespace,
     folder: Path,
 ) -> None:
-    from gausim.cli.background import parse_background
+    from gausim.cli.arguments import parse_background
     from gausim.compose.predict import head, scene_of
     from gausim.io.video import write_gif, write_video
     from gausim.render.draw import film

@@ -125,7 +125,7 @@ def _write_view(
     arguments: argparse.Namespace,
     folder: Path,
 ) -> None:
-    from gausim.cli.background import parse_background
+    from gausim.cli.arguments import parse_background
     from gausim.compose.predict import scene_of
     from gausim.io.video import write_gif, write_video
     from gausim.render.draw import film

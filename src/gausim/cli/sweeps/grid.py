@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,9 +14,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn
+from hydra.errors import HydraException
 from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
+from gausim.compose.places import spelled
 from gausim.core.errors import BusyError, ConfigError, GausSimError, RunError
 from gausim.runs.directory import RunDirectory, one_line
 
@@ -80,7 +83,7 @@ def do_job(cfg: DictConfig, run: RunDirectory, train: Callable[[DictConfig, RunD
 
 def _left_out(cfg: DictConfig, run: RunDirectory) -> JobResult | None:
     """The result of a run that is not to be trained (again)."""
-    if cfg.trainer.overwrite:
+    if cfg.overwrite:
         return None
     if run.is_finished:
         config = cast("dict[str, Any]", OmegaConf.to_container(cfg, resolve=True))
@@ -101,7 +104,7 @@ def _finished(run: RunDirectory, state: str) -> JobResult:
 
 
 class Sweep:
-    """What every sweeper needs: overrides taken apart, jobs started and collected, the summary.
+    """What a search needs of Hydra: overrides taken apart, jobs started and collected.
 
     Attributes:
         config: the composed configuration of the sweep, Hydra's own included.
@@ -124,7 +127,7 @@ class Sweep:
     def overrides(self, params: Mapping[str, Any] | None, arguments: Sequence[str]) -> list[Override]:
         """The parsed overrides of a sweep, each key once: those of the command line win over the configuration's."""
         parser = OverridesParser.create(config_loader=self._context.config_loader)
-        parsed = parser.parse_overrides([*(f"{k}={v}" for k, v in (params or {}).items()), *arguments])
+        parsed = parser.parse_overrides([*spelled([f"{k}={v}" for k, v in (params or {}).items()]), *arguments])
         return list({override.get_key_element(): override for override in parsed}.values())
 
     def launch(self, jobs: Sequence[Sequence[str]]) -> list[JobResult]:
@@ -136,37 +139,44 @@ class Sweep:
         """
         for overrides in jobs:  # all at first: a misspelt value must not show after hours
             self._context.config_loader.load_sweep_config(self.config, list(overrides))
-        try:
+        with _launching(self.folder):
             returned = self._launcher.launch(jobs, initial_job_idx=len(self.results))
-        except Exception as error:
-            raise RunError(
-                f"{self.folder}: the launcher stopped ({one_line(error)}). Jobs that it started may still be running. "
-                "The same command goes on with what is not finished."
-            ) from error
         results = [_result(one) for one in returned]
         self.results += results
         return results
 
-    def conclude(self) -> None:
-        """Prints the summary.
 
-        Raises:
-            RunError: a job failed, now or before.
-        """
-        counts = Counter(result.state for result in self.results)
-        told = ", ".join(f"{counts[s]} {s}" for s in (TRAINED, PRUNED, FINISHED_BEFORE, BUSY) if counts[s])
-        failed = {r.directory: r for r in self.results if r.state in (FAILED, FAILED_BEFORE)}
-        told = ", ".join(part for part in (told, f"{len(failed)} failed" if failed else "") if part)
-        print(
-            f"\nsweep of {len(self.results)} jobs: {told or 'nothing left to do'}\nnext: gausim report {self.folder}",
-            flush=True,
+@contextmanager
+def _launching(folder: Path) -> Iterator[None]:
+    """The block in which jobs run: what is no fault of the configuration is the launcher's."""
+    try:
+        yield
+    except (GausSimError, HydraException, OmegaConfBaseException):
+        raise
+    except Exception as error:
+        raise RunError(
+            f"{folder}: the launcher stopped ({one_line(error)}). Jobs that it started may still be running. "
+            "The same command goes on with what is not finished."
+        ) from error
+
+
+def conclude(folder: Path, results: Sequence[JobResult]) -> None:
+    """Prints the summary of a sweep.
+
+    Raises:
+        RunError: a job failed, now or before.
+    """
+    counts = Counter(result.state for result in results)
+    told = ", ".join(f"{counts[s]} {s}" for s in (TRAINED, PRUNED, FINISHED_BEFORE, BUSY) if counts[s])
+    failed = {r.directory: r for r in results if r.state in (FAILED, FAILED_BEFORE)}
+    told = ", ".join(part for part in (told, f"{len(failed)} failed" if failed else "") if part)
+    print(f"\nsweep of {len(results)} jobs: {told or 'nothing left to do'}\nnext: gausim report {folder}", flush=True)
+    if failed:
+        lines = [f"\n  {r.directory}: {r.detail}" for r in failed.values()]
+        raise RunError(
+            f"{len(failed)} of {len(results)} jobs failed:{''.join(lines)}\n"
+            "The same command with sweep.retry_failed=true tries these again, from their last checkpoints."
         )
-        if failed:
-            lines = [f"\n  {r.directory}: {r.detail}" for r in failed.values()]
-            raise RunError(
-                f"{len(failed)} of {len(self.results)} jobs failed:{''.join(lines)}\n"
-                "The same command with sweep.retry_failed=true tries these again, from their last checkpoints."
-            )
 
 
 def _result(returned: JobReturn) -> JobResult:
@@ -177,34 +187,22 @@ def _result(returned: JobReturn) -> JobResult:
     return JobResult.of(value, TRAINED, RunDirectory(returned.hydra_cfg.hydra.runtime.output_dir))
 
 
-def run_grid(sweep: Sweep, arguments: Sequence[str], params: Mapping[str, Any] | None, batch: int | None) -> None:
-    """Trains every combination of the values.
+def run_grid(sweep: Callable[[list[str]], Any], arguments: list[str], folder: Path) -> None:
+    """Has Hydra train every combination of the values, and tells what became of the jobs.
 
     Args:
-        sweep: launcher and directory.
+        sweep: Hydra's own, which returns its batches of jobs.
         arguments: overrides of the command line.
-        params: overrides of the configuration, key to text.
-        batch: most jobs that are handed to the launcher at a time; None hands over all.
+        folder: where the sweep lies.
 
     Raises:
-        ConfigError: an override gives no value, or an interval.
+        ConfigError: an override gives no value.
         RunError: a job failed.
     """
-    jobs = [list(job) for job in itertools.product(*(_values(o) for o in sweep.overrides(params, arguments)))]
-    sweep.begin()
-    size = batch if batch and batch > 0 else max(1, len(jobs))
-    for start in range(0, len(jobs), size):
-        sweep.launch(jobs[start : start + size])
-    sweep.conclude()
-
-
-def _values(override: Override) -> list[str]:
-    key = override.get_key_element()
-    if not override.is_sweep_override():
-        return [f"{key}={override.get_value_element_as_str()}"]
-    if not override.is_discrete_sweep():
-        raise ConfigError(f"{override.input_line}: a grid needs single values. Intervals: hydra/sweeper=optuna.")
-    values = [f"{key}={value}" for value in override.sweep_string_iterator()]
-    if not values:
-        raise ConfigError(f"{override.input_line}: expected at least one value, got none, so there is nothing to run.")
-    return values
+    with _launching(folder):
+        results = [_result(one) for batch in sweep(arguments) for one in batch]
+    if not results:
+        raise ConfigError(
+            f"{' '.join(arguments)}: expected at least one value of every key, so there is nothing to run."
+        )
+    conclude(folder, results)

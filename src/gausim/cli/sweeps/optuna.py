@@ -16,7 +16,7 @@ from hydra.core.override_parser.types import Override
 from hydra.utils import get_object
 from omegaconf import DictConfig
 
-from gausim.cli.sweeps.grid import BUSY, FAILED_BEFORE, OBJECTIVE, PRUNED, JobResult, Sweep
+from gausim.cli.sweeps.grid import BUSY, FAILED_BEFORE, OBJECTIVE, PRUNED, JobResult, Sweep, conclude
 from gausim.compose.config import check_targets, instantiate
 from gausim.core.errors import ConfigError
 from gausim.io.files import write_durably
@@ -114,7 +114,7 @@ class Search:
                 if not self._do(study, batch, fixed):
                     break
             self._report(study)
-        self._sweep.conclude()
+        conclude(self._sweep.folder, self._sweep.results)
 
     def _open(self, space: Mapping[str, BaseDistribution], fixed: Sequence[str]) -> optuna.Study:
         """The study, new or as it was left; another one under the same name is refused."""

@@ -21,9 +21,9 @@ def judges(cfg: DictConfig) -> list[Callback]:
     sweeper = HydraConfig.get().sweeper
     if sweeper.get("pruner") is None or sweeper.get("trial") is None:
         return []
-    if str(cfg.trainer.devices) != "1":
+    if (devices := cfg.trainer.get("devices", 1)) != 1:
         raise ConfigError(
-            f"hydra.sweeper.pruner: expected trainer.devices=1, got {cfg.trainer.devices}. Train without a pruner "
+            f"hydra.sweeper.pruner: expected trainer.devices=1, got {devices}. Train without a pruner "
             "(hydra.sweeper.pruner=null)."
         )
     from gausim.cli.sweeps.optuna import pruning_judge

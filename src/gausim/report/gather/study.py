@@ -223,6 +223,9 @@ def _data(run: RunRecord) -> tuple[Any, Any]:
     return (data.get("names"), data.get("root", "?")) if isinstance(data, dict) else (None, "?")
 
 
+_SWITCHES = ("no_mass", "no_momentum", "no_hierarchy")  # ablations that are told from the settings themselves
+
+
 def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
     """(label, family, variation) from what the configuration computes, not from what it is called."""
     model = run.config.get("model")
@@ -241,8 +244,10 @@ def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
         varied.append("w/o hierarchy")
     ablation = run.config.get("ablation")
     name = ablation.get("name") if isinstance(ablation, dict) else None
-    if varied in ([], ["jointly"]) and name not in (None, "none", "full", "joint"):
-        varied.append(str(name))
+    parts = [part for part in str(name or "none").split("+") if part not in ("none", "full", "joint")]
+    if varied not in ([], ["jointly"]):  # what is switched off has been named; of a list, the others have not
+        parts = [part for part in parts if part not in _SWITCHES] if "+" in str(name) else []
+    varied += parts
     variation = ", ".join(varied) or FULL
     return (family if not varied else f"{family} {variation}"), family, variation
 

@@ -119,3 +119,7 @@ class ImageSupervision:
         image, target = channels(drawn.rgb, drawn.alpha, self.loss), channels(frames, alpha, self.loss)
         losses = self.loss(image.expand_as(target), target).tolist()
         return StaticFigures(losses, (frames[1:] - frames[:-1]).square().sum((1, 2, 3, 4)).tolist())
+
+
+def training_views(sources: Sources) -> None:
+    """Stands for the images of the training views, which every module compares with by itself."""

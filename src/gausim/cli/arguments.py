@@ -1,11 +1,20 @@
-"""The background colour of a command line."""
+"""Values of command lines that several commands read."""
 
 from __future__ import annotations
 
+import argparse
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+
+def positive(text: str) -> int:
+    """Reads a whole number above 0."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"expected a positive number, got {text}")
+    return value
 
 
 def parse_background(text: str) -> Tensor | None:

@@ -1,0 +1,50 @@
+"""Configurations completed by the defaults of the constructors they name: a later default changes no run."""
+
+from __future__ import annotations
+
+import inspect
+import pkgutil
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+OURS = "gausim."
+
+
+def with_defaults(config: Any) -> Any:
+    """A configuration in which every node that builds something of gausim states its arguments' plain defaults.
+
+    Null is left out: to a constructor it says as much as nothing.
+
+    Args:
+        config: plain containers, interpolations resolved.
+    """
+    if isinstance(config, Mapping):
+        found = {key: with_defaults(value) for key, value in config.items()}
+        return {**found, **{k: v for k, v in _defaults(found.get("_target_")) if k not in found}}
+    return [with_defaults(value) for value in config] if isinstance(config, list | tuple) else config
+
+
+def _defaults(target: Any) -> Iterator[tuple[str, Any]]:
+    if not isinstance(target, str) or not target.startswith(OURS):
+        return
+    try:
+        parameters = inspect.signature(pkgutil.resolve_name(target)).parameters
+    except (ImportError, AttributeError, TypeError, ValueError):
+        return  # what builds it says what is wrong with it
+    for name, parameter in parameters.items():
+        if parameter.default not in (None, inspect.Parameter.empty) and _is_plain(parameter.default):
+            yield name, _plain(parameter.default)
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return all(_is_plain(child) for child in value.values())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return bool(value) and all(_is_plain(child) for child in value)
+    return isinstance(value, bool | int | float | str)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(child) for key, child in value.items()}
+    return [_plain(child) for child in value] if isinstance(value, list | tuple) else value
