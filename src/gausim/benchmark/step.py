@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gausim.benchmark.harness import Options, Row, medians, saved_bytes, torch_threads
 from gausim.core import GaussianScene, SimState
-from gausim.kernels.compiled import torch_only
+from gausim.kernels.operations import plain_forms
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.rollout.cuda_graph import GraphedStep
@@ -257,7 +257,7 @@ def _available_memory(device: torch.device) -> int:
 
 
 def _by_torch(call: Callable[[], object]) -> object:
-    with torch_only():
+    with plain_forms():
         return call()
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -15,7 +16,7 @@ from gausim.benchmark.harness import Options, Row, medians, peak_resident, torch
 from gausim.core import Rendered, Renderer
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
-from gausim.kernels.compiled import torch_only
+from gausim.kernels.operations import OPERATIONS, plain_forms
 from gausim.render.reference import ReferenceRenderer
 from gausim.training.module import GausSimModule
 from gausim.training.rollout import States, windows
@@ -268,37 +269,29 @@ def compare_all(case: _Case, stretches: list[tuple[int, States]]) -> None:
 def _ratios(name: str, case: _Case, options: Options, recorder: _Recorder, static: float, render: float) -> list[Row]:
     """How much longer the same step takes with plain parts."""
 
-    def plain() -> None:
-        with torch_only():
+    def step(names: Sequence[str]) -> None:
+        with plain_forms(names):
             case.step(static=False)
 
     reference, drawn = ReferenceRenderer(), recorder.calls[0][0][0].shape[0]
-    times = medians(
-        {
-            "own": lambda: case.step(static=False),
-            "plain": plain,
-            "reference": lambda: recorder.replay(reference, calls=1),
-        },
+    forms: dict[str, Callable[[], object]] = {n: partial(step, [n]) for n in OPERATIONS}
+    times = medians({"own": partial(step, []), "plain": partial(step, list(OPERATIONS)), **forms}, options)
+    drawing = medians(
+        {"reference": lambda: recorder.replay(reference, calls=1)},
         options,
         rounds=min(REFERENCE_ROUNDS, options.rounds),
     )
     whole = times["own"] + static
-    scaled = times["reference"] * case.states / drawn
+    plain = times["plain"] + static
+    scaled = plain - render + drawing["reference"] * case.states / drawn
+    text = f"that and the plain torch renderer (timed on {drawn} of {case.states} states, scaled)"
     return [
-        Row(
-            name,
-            "speed-up",
-            (times["plain"] + static) / whole,
-            "x",
-            "the same step with every compiled operation but the renderer as plain torch",
+        *(
+            Row(name, f"speed-up by {n}", (times[n] + static) / whole, "x", "its fast form against the plain")
+            for n in forms
         ),
-        Row(
-            name,
-            "speed-up",
-            (times["plain"] + static - render + scaled) / whole,
-            "x",
-            f"that and the plain torch renderer (timed on {drawn} of {case.states} states, scaled)",
-        ),
+        Row(name, "speed-up", plain / whole, "x", "the same step with every operation but the renderer as plain torch"),
+        Row(name, "speed-up", scaled / whole, "x", text),
     ]
 
 

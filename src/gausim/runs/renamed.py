@@ -38,7 +38,7 @@ PARTS: dict[str, tuple[str, dict[str, str]]] = {
         "gausim.models.settings.HierarchySettings",
         {
             "clustering": "clustering", "max_neighbours": "max_neighbours", "edges": "edges",
-            "edge_bucket": "edge_bucket", "share_levels": "share_network", "body_frame": "body_frame",
+            "share_levels": "share_network", "body_frame": "body_frame",
         },
     ),
     "features": (
@@ -81,6 +81,11 @@ GROUPS: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
     },
     "gausim.baselines.material_point.physgaussian.PhysGaussian": {"material": _MATERIAL, "discretisation": _GRID},
 }
+# Settings that no longer exist and had no effect on results.
+GONE = {
+    "gausim.losses.image.ImageLoss": ("crop",),
+    "gausim.models.settings.HierarchySettings": ("edge_bucket",),
+}
 WEIGHTS = ("network.", "node_normaliser.", "edge_normaliser.")
 
 
@@ -96,6 +101,8 @@ def with_present_names(config: Any) -> Any:
             return _settled(found)
         if found.get("_target_") in GROUPS and "discretisation" not in found:
             return _grouped(found)
+        for name in GONE.get(str(found.get("_target_")), ()):
+            found.pop(name, None)
         return _in_parts(found) if found.get("_target_") == SIMULATOR and "hierarchy" not in found else found
     return [with_present_names(v) for v in config] if isinstance(config, list) else config
 
@@ -130,7 +137,8 @@ def _grouped(old: Mapping[str, Any]) -> dict[str, Any]:
 
 def _in_parts(old: Mapping[str, Any]) -> dict[str, Any]:
     """The simulator's arguments by part; what an old configuration leaves out has the default that it had."""
-    gone = {"radii", "predicted_levels", "graph_radii", *(name for _, names in PARTS.values() for name in names)}
+    moved = {name for _, names in PARTS.values() for name in names}
+    gone = {"edge_bucket", "radii", "predicted_levels", "graph_radii", *moved}
     new = {name: value for name, value in old.items() if name not in gone}
     for part, (target, names) in PARTS.items():
         new[part] = {"_target_": target, **{names[k]: old[k] for k in names if k in old}}
