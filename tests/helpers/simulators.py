@@ -20,7 +20,7 @@ from gausim.models.step.simulator import GausSim
 from gausim.nn.meshgraphnet import MeshGraphNet
 
 PARTS: dict[str, tuple[str, ...]] = {
-    "hierarchy": ("clustering", "max_neighbours", "edges", "edge_bucket", "share_network", "body_frame"),
+    "hierarchy": ("clustering", "max_neighbours", "edges", "share_network", "body_frame"),
     "features": ("angle", "rest_inputs", "coarse_inputs", "velocities", "attributes", "gravity", "normaliser_floor"),
     "network": ("hidden", "layers", "norm", "activation", "precision", "checkpoint", "compile"),
     "head": ("output_scale", "zero_output", "lever", "anchor"),

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from gausim.core import SimState
-from gausim.models.step.features import FeatureOptions, UnitState, edge_features, node_features
+from gausim.models.step.features import FeatureOptions, UnitState, edge_features, network_inputs
+from gausim.models.step.recursion import Solved, Units
 
 DT = 0.25
 
@@ -21,27 +22,42 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
     return math.acos(float(a @ b) / float(np.linalg.norm(a) * np.linalg.norm(b)))
 
 
-@pytest.mark.parametrize("coarse", [False, True])
-@pytest.mark.parametrize("rest_inputs", [False, True])
-def test_node_features_by_hand(rest_inputs: bool, coarse: bool) -> None:
-    unit, parent = _unit_state(0), _unit_state(1)
-    gravity = torch.tensor([[0.0, 0.0, -9.81]], dtype=torch.float64).expand(4, 3)
+@pytest.mark.parametrize(
+    ("options", "coarse"),
+    [
+        (FeatureOptions(), False),
+        (FeatureOptions(), True),
+        (FeatureOptions(rest_inputs=True), False),
+        (FeatureOptions(rest_inputs=True, velocities=False), False),
+    ],
+)
+def test_node_features_by_hand(options: FeatureOptions, coarse: bool) -> None:
+    size, gravity, index = 2.0, np.array([0, 0, -9.81]), torch.tensor([1, 0, 1, 1])
+    unit, parent, template = _unit_state(0), _unit_state(1, 2), _unit_state(2)
+    gradient = torch.eye(3) + 0.3 * torch.randn(2, 3, 3, dtype=torch.float64)
     density, attributes = torch.linspace(-1, 1, 4).double(), torch.rand(4, 2).double()
-    options = FeatureOptions(rest_inputs=rest_inputs)
-    dt = torch.full((4, 1), DT, dtype=torch.float64)
-    out = node_features(unit, parent, dt, gravity, density, attributes, options, coarse=coarse)
-    for i in range(4):
-        u = {n: getattr(unit, n)[i].numpy() for n in ("rest", "now", "before", "after")}
-        p = {n: getattr(parent, n)[i].numpy() for n in ("rest", "now", "before", "after")}
-        current = "after" if coarse else "now"
-        expected = [
-            np.array([0, 0, -9.81]) - (p["after"] - 2 * p["now"] + p["before"]) / DT**2,
-            ((u[current] - p[current]) - (u["before"] - p["before"])) / DT,
-        ]
-        if rest_inputs:
-            expected += [u["now"] - u["rest"], (u["after"] - u["now"]) / DT]
-        expected += [density[i : i + 1].numpy(), attributes[i].numpy()]
-        np.testing.assert_allclose(out[i].numpy(), np.concatenate(expected), rtol=1e-12)
+    units = Units(unit.rest, unit.now, unit.before, density.exp(), density, attributes)
+    above = Solved(
+        parent.rest, parent.now, parent.before, parent.after, template.rest[:2], gradient, gradient, index
+    )  # fmt: skip
+    constants = torch.full((4, 1), size).double(), torch.full((4, 1), DT).double(), torch.from_numpy(gravity)
+    edges = torch.zeros(2, 0, dtype=torch.int64)
+    out, _ = network_inputs(units, template.now, above, edges, *constants, options, coarse=coarse)
+    for i, p in enumerate(index.tolist()):
+        target, rest, now, before = (x[i].numpy() for x in (template.now, unit.rest, unit.now, unit.before))
+        p_rest, p_now, p_before, p_after = (
+            x[p].numpy() for x in (parent.rest, parent.now, parent.before, parent.after)
+        )  # fmt: skip
+        after = p_after + gradient[p].numpy() @ (target - template.rest[p].numpy())
+        inertial = gravity - (p_after - 2 * p_now + p_before) / DT**2
+        local = after - p_after if coarse else now - p_now
+        expected = [inertial, (local - (before - p_before)) / DT]
+        if not options.velocities:
+            expected = [rest - p_rest, now - rest, after - target]
+        elif options.rest_inputs:
+            expected += [now - rest, (after - now) / DT]
+        columns = [np.concatenate(expected) / size, density[i : i + 1].numpy(), attributes[i].numpy()]
+        np.testing.assert_allclose(out[i].numpy(), np.concatenate(columns), rtol=1e-9)
     assert out.shape[1] == options.node_normalised + 1 + 2
 
 

@@ -6,29 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from gausim.nn.linear import SMALLEST, Linear, has_onednn, product
+from gausim.nn.linear import SMALLEST, Linear, has_onednn
 
 
 def _randn(*shape: int) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(sum(shape)))
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
-@pytest.mark.parametrize("rows", [0, 1, 37])
-def test_product(dtype: torch.dtype, rows: int) -> None:
-    inputs, weight, bias, added = (v.to(dtype) for v in (_randn(rows, 6), _randn(5, 6), _randn(5), _randn(rows, 5)))
-    tolerance = 0.1 if dtype == torch.bfloat16 else 1e-5
-    wanted = inputs.double() @ weight.double().t()
-    assert torch.allclose(product(inputs, weight).double(), wanted, atol=tolerance)
-    assert torch.allclose(product(inputs, weight, bias).double(), wanted + bias, atol=tolerance)
-    assert torch.allclose(product(inputs, weight, bias, added).double(), wanted + bias + added, atol=tolerance)
-
-
-def test_product_takes_views() -> None:
-    wide = _randn(7, 12)
-    for inputs in (wide[:, 3:9], _randn(6, 7).t(), wide[::2, :6], _randn(1, 6).expand(7, 6)):
-        for weight in (_randn(6, 5).t(), _randn(5, 9)[:, 2:8]):
-            assert torch.allclose(product(inputs, weight), inputs @ weight.t(), atol=1e-5)
 
 
 @pytest.mark.parametrize("bias", [True, False])

@@ -12,7 +12,6 @@ from gausim.core.errors import SceneError
 from gausim.core.scene import GaussianScene
 from gausim.ops.selection import (
     Box,
-    ColorBall,
     HalfSpace,
     NearPoints,
     apply_masks,
@@ -55,10 +54,6 @@ def test_near_points(scene: GaussianScene) -> None:
     points = torch.tensor([[1.0, 0.0, 0.0], [0.0, 2.0, 0.45]])
     assert selected(NearPoints(points, 0.1)(scene)) == [2]
     assert selected(NearPoints(points, 0.21)(scene)) == [1, 2]
-
-
-def test_color_ball(scene: GaussianScene) -> None:
-    assert selected(ColorBall((0.5, 0.78, 0.5), 0.05)(scene)) == [2]
 
 
 def test_combinations(scene: GaussianScene) -> None:

@@ -4,19 +4,14 @@ from __future__ import annotations
 
 import itertools
 import pickle
-import platform
-import re
 from collections.abc import Callable
 from dataclasses import replace
 
-import numba
 import pytest
 import torch
 
 from gausim.core import ConfigError, DivergenceError
 from gausim.render.cpu import CpuRenderer
-from gausim.render.cpu.raster import backward_block, forward_block
-from gausim.render.cpu.simd import vector
 from gausim.render.reference import ReferenceRenderer
 
 CASES = {
@@ -138,27 +133,3 @@ def test_renderer_can_be_pickled_after_use(inputs: Callable) -> None:
     renderer = CpuRenderer(threads=2)
     first = given.draw(renderer)
     assert torch.equal(given.draw(pickle.loads(pickle.dumps(renderer))).rgb, first.rgb)
-
-
-PACKED = {
-    "x86_64": r"v?(mulps|fmadd\d+ps)\s[^\n]*%[xyz]mm",
-    "AMD64": r"v?(mulps|fmadd\d+ps)\s[^\n]*%[xyz]mm",
-    "arm64": r"fml?[aul]+\S*\s[^\n]*\.4s|fm(la|ul)\.4s",
-    "aarch64": r"fml?[aul]+\S*\s[^\n]*\.4s|fm(la|ul)\.4s",
-}
-
-
-@pytest.mark.skipif(platform.machine() not in PACKED, reason="vector instructions of this processor are not known here")
-@pytest.mark.parametrize("kernel", [forward_block, backward_block])
-def test_hot_loops_are_vectorised(kernel: numba.core.registry.CPUDispatcher) -> None:
-    rows, numbers = numba.int32[::1], numba.float32[::1]
-    args = (numbers, rows, numba.int64, numba.int64)
-    if kernel is forward_block:
-        args += (numba.int64, vector, vector, numba.float32, numbers, numba.int64, numba.none)
-    else:
-        args += (vector, vector, numba.float32, numbers, numbers, numbers, numba.none)
-    # A fresh compilation: numba does not show the code of functions that it loads from its cache.
-    fresh = numba.njit(nogil=True, fastmath=True, error_model="numpy")(kernel.py_func)
-    fresh.compile(args)
-    (code,) = fresh.inspect_asm().values()
-    assert len(re.findall(PACKED[platform.machine()], code)) >= 12  # the exponential alone is eight per vector

@@ -15,7 +15,7 @@ from gausim.ops.quaternion import quaternion_to_matrix
 from gausim.ops.spherical_harmonics import evaluate_sh
 from gausim.render import SceneAppearance, draw, draw_trajectory, film
 from gausim.render.cpu import CpuRenderer
-from gausim.render.draw import view_colors
+from gausim.render.draw import deformed_appearance
 from gausim.render.reference import ReferenceRenderer
 
 COUNT, UNITS = 12, 3
@@ -63,7 +63,8 @@ def test_colours_are_looked_up_along_the_unrotated_direction(
     still = scene(COUNT, degree)
     positions = torch.randn(2, COUNT, 3, dtype=torch.float64)
     _, rotations = deformation(2)
-    colors = view_colors(SceneAppearance.of(still), positions, rotations, units, cameras.centers)
+    look = SceneAppearance.of(still)
+    _, colors = deformed_appearance(positions, rotations, rotations, units, look.covars, look.sh, cameras.centers)
     for b, v, k in ((0, 0, 0), (1, 0, 7), (1, 1, 5)):
         away = torch.nn.functional.normalize(positions[b, k] - cameras.centers[v], dim=-1)
         expected = evaluate_sh(still.sh[k], rotations[b, units[k]].T @ away)

@@ -29,7 +29,7 @@ OLD = {
         "simulator": {
             "_target_": "gausim.models.simulator.GausSim", "_partial_": True, "radii": [0.2, 0.5],
             "predicted_levels": [2, 1], "graph_radii": [2.0, 0.4], "hidden": 8, "lever_head": 0.1,
-            "passive_frames": 4, "conserve_mass": False,
+            "passive_frames": 4, "conserve_mass": False, "edge_bucket": 16,
         }
     },
     "loss": {"_target_": "gausim.losses.objective.Objective", "input_noise": 0.0, "static_weight": 2.0},
@@ -54,6 +54,8 @@ def test_a_configuration_of_before_is_read_by_present_names(tmp_path) -> None:
         {"diameter": 0.5, "edge_length": 2.0}, {"diameter": 0.2, "edge_length": 0.4},
     ]  # fmt: skip
     assert simulator["head"]["lever"] == 0.1 and simulator["rollout"]["energy_guard_frames"] == 4
+    loss = {"_target_": "gausim.losses.image.ImageLoss", "window": 7}
+    assert with_present_names(loss | {"crop": True}) == loss
     model = instantiate(simulator, scenes=[toy_scene()], fps=[24.0])()
     assert model.predicted_levels == (2, 1)
     assert with_present_names(found) == found

@@ -168,7 +168,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
 
 @pytest.mark.parametrize("backprop_steps", [1, 0])
 def test_one_read_per_optimiser_step(backprop_steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    from gausim.kernels.compiled import torch_only
+    from gausim.kernels.operations import plain_forms
 
     _, module = pair(Objective(backprop_steps=backprop_steps), 0.01)
     module.images.renderer = blobs
@@ -177,7 +177,7 @@ def test_one_read_per_optimiser_step(backprop_steps: int, monkeypatch: pytest.Mo
     module.optimise(batch, optimizer, torch.Generator().manual_seed(0))  # cameras and baselines are read once
     draws = torch.Generator().manual_seed(1)
     monkeypatch.setattr(module, "terms", lambda: ())  # whether to is drawn on the host, and never leaves it
-    with torch_only(), watched(monkeypatch) as found:
+    with plain_forms(), watched(monkeypatch) as found:
         module.optimise(batch, optimizer, draws)
     assert found == ["tolist"]
 

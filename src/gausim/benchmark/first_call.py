@@ -17,7 +17,7 @@ import torch
 from gausim.benchmark.harness import peak_resident
 from gausim.benchmark.splats import deformed, splats
 from gausim.render.cpu import CpuRenderer
-from gausim.render.cpu.appearance import deformed_appearance
+from gausim.render.draw import deformed_appearance
 
 
 def measure(count: int, size: int) -> dict[str, float]:

@@ -17,12 +17,10 @@ from gausim.benchmark.harness import Options, Row, medians, torch_threads
 from gausim.benchmark.peaks import fma_peak, peaks
 from gausim.benchmark.render_stages import Stages
 from gausim.benchmark.splats import Deformed, Splats, deformed, splats
-from gausim.ops.covariance import transport_covariance
 from gausim.render import gsplat
 from gausim.render.cpu import CpuRenderer
-from gausim.render.cpu.appearance import deformed_appearance
 from gausim.render.cpu.raster import BACKWARD_FLOPS, FORWARD_FLOPS
-from gausim.render.draw import view_colors
+from gausim.render.draw import deformed_appearance
 from gausim.render.reference import ReferenceRenderer
 
 # Kernels and edge of the square image [pixels].
@@ -115,36 +113,30 @@ def _appearance(count: int, options: Options) -> list[Row]:
     name = f"colours and covariances, {count} kernels, {VIEWS} views, degree {SH_DEGREE}"
     rows = []
     for metric, call in (("forward", _forward), ("forward + backward", _gradients)):
-        times = _in_a_row({"cpu": partial(call, state, _compiled), "torch": partial(call, state, _by_torch)}, options)
+        times = _in_a_row(
+            {
+                "cpu": partial(call, state, deformed_appearance.fast),
+                "torch": partial(call, state, deformed_appearance.plain),
+            },
+            options,
+        )
         rows.append(Row(name, metric, 1e3 * times["cpu"], "ms"))
         text = "the torch form, one thread, same run"
         rows.append(Row(name, f"plain torch / {metric}", times["torch"] / times["cpu"], "x", text))
     return rows
 
 
-_Form = Callable[[Deformed], tuple[Tensor, Tensor]]
-
-
-def _compiled(state: Deformed) -> tuple[Tensor, Tensor]:
-    look = state.look
-    return deformed_appearance(*state[:4], look.covars, look.sh, state.centers)
-
-
-def _by_torch(state: Deformed) -> tuple[Tensor, Tensor]:
-    covars = transport_covariance(
-        state.look.covars.expand(1, -1, -1, -1), state.deformation_gradients.index_select(1, state.unit_of_kernel)
-    )
-    return covars, view_colors(state.look, state.positions, state.rotations, state.unit_of_kernel, state.centers)
+_Form = Callable[..., tuple[Tensor, Tensor]]
 
 
 @torch.no_grad()
 def _forward(state: Deformed, form: _Form) -> object:
-    return form(state)
+    return form(*state[:4], state.look.covars, state.look.sh, state.centers)
 
 
 def _gradients(state: Deformed, form: _Form) -> tuple[Tensor, ...]:
     leaves = [value.detach().requires_grad_() for value in state[:3]]
-    outputs = form(state._replace(positions=leaves[0], deformation_gradients=leaves[1], rotations=leaves[2]))
+    outputs = form(*leaves, state.unit_of_kernel, state.look.covars, state.look.sh, state.centers)
     return torch.autograd.grad(outputs, leaves, [torch.ones_like(output) for output in outputs])
 
 

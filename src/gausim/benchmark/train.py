@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,7 +13,7 @@ from torch.optim import Optimizer
 from gausim.benchmark.harness import Options, Row, medians, peak_resident, peak_saved_bytes, spent_in, torch_threads
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
-from gausim.kernels.compiled import torch_only
+from gausim.kernels.operations import OPERATIONS, plain_forms
 from gausim.training.module import GausSimModule
 from gausim.training.supervision.comparison import Comparison
 
@@ -58,11 +60,6 @@ class _Case:
         finally:
             self.module.objective = own
 
-    def by_torch(self) -> None:
-        """The same with every compiled operation but the renderer as plain torch."""
-        with torch_only():
-            self.step()
-
 
 def run(
     options: Options,
@@ -101,14 +98,25 @@ def _speed(name: str, case: _Case, options: Options) -> list[Row]:
     parts["static loss (by its fraction of the batches)"] = static
     parts["rest"] = whole - sum(parts.values())
     rounds = min(REFERENCE_ROUNDS, options.rounds)
-    plain = medians({"own": case.step, "plain": case.by_torch}, options, rounds=rounds)
-    reference = "the same step with every compiled operation but the renderer as plain torch"
+    forms: dict[str, Callable[[], object]] = {form: partial(_plain, case, [form]) for form in OPERATIONS}
+    plain = medians(
+        {"own": case.step, "plain": partial(_plain, case, list(OPERATIONS)), **forms}, options, rounds=rounds
+    )
+    reference = "the same step with every operation but the renderer as plain torch"
+    one, own = "its fast form against the plain", plain["own"] + static
     return [
         Row(name, "throughput", case.steps * len(case.samples) / whole, "sequence-steps/s"),
         Row(name, "optimiser step", 1e3 * whole, "ms"),
         *(Row(name, part, seconds / whole, "1", "of the optimiser step") for part, seconds in parts.items()),
-        Row(name, "speed-up", (plain["plain"] + static) / (plain["own"] + static), "x", reference),
+        *(Row(name, f"speed-up by {form}", (plain[form] + static) / own, "x", one) for form in forms),
+        Row(name, "speed-up", (plain["plain"] + static) / own, "x", reference),
     ]
+
+
+def _plain(case: _Case, names: Sequence[str]) -> None:
+    """A step with these operations in their plain form."""
+    with plain_forms(names):
+        case.step()
 
 
 def _parts(case: _Case, options: Options) -> dict[str, float]:

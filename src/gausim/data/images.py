@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
@@ -15,8 +14,7 @@ from torch import Tensor
 
 from gausim.core import DataError
 from gausim.io.pixels import decode, read_header
-from gausim.kernels.compiled import fits
-from gausim.kernels.jit import KERNEL
+from gausim.kernels.operations import operation
 
 # Decoding releases the interpreter lock; more threads than this only queue for the disk.
 DECODER_THREADS = 4
@@ -34,31 +32,17 @@ def composite(
     Returns:
         RGB in [0, 1] and alpha in [0, 1] (the foreground mask is alpha > 0).
     """
-    if background is None and frames.device.type == "cpu" and fits():
-        rgb, alpha = torch.empty(*frames.shape[:-1], 3), torch.empty(frames.shape[:-1])
-        over_black(frames.contiguous().numpy().reshape(-1), rgb.numpy().reshape(-1), alpha.numpy().reshape(-1))
-        return rgb, alpha
-    values = frames.float() / 255
-    alpha = values[..., 3]
-    rgb = values[..., :3] * alpha[..., None]
+    rgb, alpha = over_black(frames)
     if background is not None:
         rgb = rgb + (1 - alpha[..., None]) * background.to(rgb)
     return rgb, alpha
 
 
-@numba.njit(**KERNEL)
-def over_black(frames, rgb, alpha):  # type: ignore[no-untyped-def]
-    """Writes RGB and alpha of straight-alpha 8-bit RGBA over black; all three lie flat in memory.
-
-    The same operations as in torch, so the same bits, but in one pass.
-    """
-    full = np.float32(255)
-    for i in range(alpha.shape[0]):
-        a = np.float32(frames[4 * i + 3]) / full
-        alpha[i] = a
-        rgb[3 * i] = np.float32(frames[4 * i]) / full * a
-        rgb[3 * i + 1] = np.float32(frames[4 * i + 1]) / full * a
-        rgb[3 * i + 2] = np.float32(frames[4 * i + 2]) / full * a
+@operation("gausim.kernels.over_black:over_black", constant=True)
+def over_black(frames: UInt8[Tensor, "*B H W 4"]) -> tuple[Float[Tensor, "*B H W 3"], Float[Tensor, "*B H W"]]:
+    """RGB and alpha in [0, 1] of straight-alpha RGBA over black; the two forms give the same bits."""
+    values = frames.float() / 255
+    return values[..., :3] * values[..., 3:], values[..., 3]
 
 
 def read_rgba(path: Path, size: tuple[int, int], *, opaque: bool = False) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Compiled forms of :mod:`gausim.ops.deformation`."""
+"""Fast forms of the operations of :mod:`gausim.ops.deformation`."""
 
 # The kernels carry no annotations: numba has to compile them as they are.
 # mypy: allow-untyped-defs, allow-untyped-calls
@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gausim.kernels.compiled import array
+from gausim.kernels.constants import MAX_LOG_STRETCH, POLAR_ITERATIONS
 from gausim.kernels.jit import HELPER, KERNEL, ORDERED
+from gausim.kernels.operations import array
 
 ONE, TWO, HALF, THIRD = np.float32(1), np.float32(2), np.float32(0.5), np.float32(1 / 3)
 SMALLEST_NORM = np.float32(1e-12)  # torch.nn.functional.normalize
 
-POLAR_ITERATIONS = 8
+LIMIT = np.float32(MAX_LOG_STRETCH)
 
 
 @numba.njit(fastmath=ORDERED, **HELPER)
@@ -116,27 +117,31 @@ def _gradients_adjoint(output, limit, conserve, grad_gradient, grad_rotation, gr
         _rotation_adjoint(qv, nv, gv, grad, i, 4)
 
 
-class GradientFromOutput(torch.autograd.Function):
-    """:func:`gausim.ops.deformation.gradient_from_output` of (N, 11) numbers."""
-
+class _GradientFromOutput(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, output: Tensor, limit: float, conserve_mass: bool) -> tuple[Tensor, Tensor]:
-        """F and its rotation."""
+    def forward(ctx: Any, output: Tensor, conserve_mass: bool) -> tuple[Tensor, Tensor]:
         gradient = np.empty((len(output), 3, 3), np.float32)
         rotation = np.empty((len(output), 3, 3), np.float32)
-        _gradients(array(output), np.float32(limit), conserve_mass, gradient, rotation)
+        _gradients(array(output), LIMIT, conserve_mass, gradient, rotation)
         ctx.save_for_backward(output)
-        ctx.settings = np.float32(limit), conserve_mass
+        ctx.conserve_mass = conserve_mass
         return torch.from_numpy(gradient), torch.from_numpy(rotation)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_gradient: Tensor, grad_rotation: Tensor) -> Any:
-        """Gradient of the numbers."""
         (output,) = ctx.saved_tensors
         grad = np.empty(output.shape, np.float32)
-        _gradients_adjoint(array(output), *ctx.settings, array(grad_gradient), array(grad_rotation), grad)
-        return torch.from_numpy(grad), None, None
+        _gradients_adjoint(
+            array(output), LIMIT, ctx.conserve_mass, array(grad_gradient), array(grad_rotation), grad
+        )  # fmt: skip
+        return torch.from_numpy(grad), None
+
+
+def gradient_from_output(output: Tensor, *, conserve_mass: bool) -> tuple[Tensor, Tensor]:
+    """:func:`gausim.ops.deformation.gradient_from_output`."""
+    found: tuple[Tensor, Tensor] = _GradientFromOutput.apply(output, conserve_mass)
+    return found
 
 
 @numba.njit(fastmath=ORDERED, **KERNEL)
@@ -159,6 +164,13 @@ def polar_rotations(matrices, iterations, rotations):
         r[0, 0], r[0, 1], r[0, 2] = a, b, c
         r[1, 0], r[1, 1], r[1, 2] = d, e, f
         r[2, 0], r[2, 1], r[2, 2] = g, h, k
+
+
+def polar_rotation(gradient: Tensor) -> Tensor:
+    """:func:`gausim.ops.deformation.polar_rotation`."""
+    found = np.empty((gradient.numel() // 9, 3, 3), np.float32)
+    polar_rotations(array(gradient).reshape(-1, 3, 3), POLAR_ITERATIONS, found)
+    return torch.from_numpy(found).view(gradient.shape)
 
 
 @numba.njit(fastmath=ORDERED, **KERNEL)
@@ -198,12 +210,9 @@ def _bound_adjoint(bounded, factors, unit, g, grad):
                 grad[i, r, c] = f * (g[i, r, c] - along * cofactor)
 
 
-class BoundedDeformation(torch.autograd.Function):
-    """:func:`gausim.ops.deformation.bounded_deformation` of (N, 3, 3) gradients."""
-
+class _BoundedDeformation(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, gradient: Tensor, least: float, unit: bool) -> Tensor:
-        """The bounded gradients."""
         bounded, factors = np.empty(gradient.shape, np.float32), np.empty(len(gradient), np.float32)
         _bound(array(gradient), np.float32(least), unit, bounded, factors)
         result = torch.from_numpy(bounded)
@@ -214,8 +223,13 @@ class BoundedDeformation(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad: Tensor) -> Any:
-        """Gradient of the first."""
         bounded, factors = (array(t) for t in ctx.saved_tensors)
         found = np.empty(bounded.shape, np.float32)
         _bound_adjoint(bounded, factors, ctx.unit, array(grad), found)
         return torch.from_numpy(found), None, None
+
+
+def bounded_deformation(gradient: Tensor, least: float, *, unit: bool) -> Tensor:
+    """:func:`gausim.ops.deformation.bounded_deformation`."""
+    found: Tensor = _BoundedDeformation.apply(gradient, least, unit)
+    return found

@@ -1,11 +1,11 @@
-"""Squared error and SSIM of one image with the gradient, in one pass over its rows: what is compiled.
+"""Fast form of :func:`gausim.losses.image.image_loss`: one pass over the rows of each image.
 
 An image is a flat run of H W 3 floats. For each row inside the box that is not black, five maps (x, y, x^2, x y, y^2)
 are blurred along H, then along W, and give the derivatives of SSIM with respect to the blurred x, x^2 and x y. These
 pass through the adjoint of the blur: along W at once, along H when the rows below are there too. So only as many rows
 as the window is high are kept, and they stay in the first cache. Channels lie interleaved: a step along W is three
 floats. Inner loops run over one row without branches, on indices that cannot be negative, so that LLVM turns them into
-vector instructions (a test looks for them); the tuple of taps has its length in its type, so loops over it unroll.
+vector instructions; the tuple of taps has its length in its type, so loops over it unroll.
 """
 
 # Annotations would be checked by beartype in the tests, around functions that numba has to compile.
@@ -14,12 +14,15 @@ from __future__ import annotations
 
 import numba
 import numpy as np
+import torch
 from numba.cpython.unsafe.tuple import tuple_setitem
+from torch import Tensor
 
+from gausim.kernels.constants import SSIM_C1, SSIM_C2
 from gausim.kernels.jit import HELPER, KERNEL
+from gausim.kernels.operations import array
+from gausim.kernels.pool import shared_pool
 
-# (k L)^2 of Wang et al. 2004 with k = 0.01, 0.03 and L = 1.
-SSIM_C1, SSIM_C2 = 1e-4, 9e-4
 C1, C2 = np.float32(SSIM_C1), np.float32(SSIM_C2)
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 # All of fastmath but the promise that there is no NaN: a prediction that is not finite must give such a loss.
@@ -187,7 +190,7 @@ def adjoint_weights(row, top, bottom, taps, slots, size, inset):
 
 
 @numba.njit(**KERNEL)
-def compare(x, y, shape, taps, slots, by_error, by_ssim, crop, gradient):
+def compare(x, y, shape, taps, slots, by_error, by_ssim, gradient):
     """Sums of squared errors and of 1 - SSIM over pixels and channels of one image; writes the gradient.
 
     Args:
@@ -198,13 +201,11 @@ def compare(x, y, shape, taps, slots, by_error, by_ssim, crop, gradient):
         slots: a tuple of as many uint64 (its type tells numba the window).
         by_error: what the squared errors are multiplied by in the gradient, times two.
         by_ssim: what SSIM is multiplied by in the gradient.
-        crop: leave out the black border.
         gradient: written, as long as ``x``.
     """
     height, width = shape
     window, half = len(taps), len(taps) // 2
-    box = coloured_box(x, y, height, width, window) if crop else (0, height, 0, width)
-    top, bottom, left, right = box
+    top, bottom, left, right = coloured_box(x, y, height, width, window)
     gradient[: (top * width + left) * 3] = ZERO
     count, inset = 3 * (right - left), 3 * half
     maps = np.empty((5, count + 2 * inset), np.float32)
@@ -235,3 +236,22 @@ def compare(x, y, shape, taps, slots, by_error, by_ssim, crop, gradient):
             )
     gradient[done:] = ZERO
     return squared, dissimilar
+
+
+def image_loss(
+    prediction: Tensor, target: Tensor, taps: tuple[float, ...], *, balance: float, scale: float
+) -> tuple[Tensor, Tensor]:
+    """:func:`gausim.losses.image.image_loss`, the images divided over torch's number of threads."""
+    states, views, height, width, _ = prediction.shape
+    x, y = (array(v).reshape(states * views, -1) for v in (prediction, target))
+    gradient, sums = np.empty_like(x), np.empty((states * views, 2))
+    # Tuples tell numba the window by their type.
+    window, slots = tuple(np.float32(tap) for tap in taps), (np.uint64(0),) * len(taps)
+    by_error, by_ssim = np.float32(2 * scale * balance), np.float32(-0.5 * scale * (1 - balance))
+
+    def one(i: int) -> None:
+        sums[i] = compare(x[i], y[i], (height, width), window, slots, by_error, by_ssim, gradient[i])
+
+    shared_pool(torch.get_num_threads()).run(one, range(states * views))
+    values = scale * (sums @ np.array([balance, 0.5 * (1 - balance)])).reshape(states, views).sum(1)
+    return torch.from_numpy(values.astype(np.float32)), torch.from_numpy(gradient.reshape(prediction.shape))

@@ -1,4 +1,4 @@
-"""A balanced k-d tree with bounding boxes, compiled: what the neighbour search and the clustering stand on."""
+"""A balanced k-d tree with bounding boxes, compiled: what the clustering stands on."""
 
 # Annotations would be checked by beartype in the tests, around functions that numba has to compile.
 # mypy: allow-untyped-defs, allow-untyped-calls

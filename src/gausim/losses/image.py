@@ -6,17 +6,14 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.core import ConfigError
-from gausim.kernels.announce import announced
-from gausim.kernels.compiled import array, fits
-from gausim.kernels.image_loss import SSIM_C1, SSIM_C2, compare
-from gausim.kernels.pool import shared_pool
+from gausim.kernels.constants import SSIM_C1, SSIM_C2
+from gausim.kernels.operations import operation
 
 # Pixels of the authors' 960 x 540 frames: sums over their pixels, restated for any image size as mean times this.
 REFERENCE_PIXELS = 518_400
@@ -31,9 +28,7 @@ class ImageLoss(nn.Module):
     """lambda times the squared error plus (1 - lambda) times (1 - SSIM) / 2.
 
     Both are summed over channels, averaged over pixels and views and multiplied by ``pixels``, so that weights of
-    other terms mean the same at every image size. float32 on the CPU goes through compiled kernels
-    (:mod:`gausim.kernels.image_loss`); everything else, and the tests' oracle, is plain torch and never waits for a
-    device.
+    other terms mean the same at every image size.
 
     Attributes:
         compares_alpha: whether images have the opacity as their fourth channel.
@@ -41,17 +36,13 @@ class ImageLoss(nn.Module):
 
     compares_alpha: bool = False
 
-    def __init__(
-        self, *, balance: float = 0.9, window: int = 5, pixels: float = REFERENCE_PIXELS, crop: bool = True
-    ) -> None:
+    def __init__(self, *, balance: float = 0.9, window: int = 5, pixels: float = REFERENCE_PIXELS) -> None:
         """Keeps the settings.
 
         Args:
             balance: lambda, the share of the squared error in [0, 1].
             window: odd size of the SSIM window [pixels].
             pixels: the mean over pixels is multiplied by this.
-            crop: the compiled kernels leave out the border that is black in both images. It contributes exactly zero,
-                so only the speed changes.
 
         Raises:
             ConfigError: a setting out of range.
@@ -62,7 +53,7 @@ class ImageLoss(nn.Module):
                 f"loss.image: expected balance in [0, 1], an odd window >= 3 and pixels > 0, got balance {balance}, "
                 f"window {window}, pixels {pixels}."
             )
-        self.balance, self.window, self.pixels, self.crop = balance, window, float(pixels), crop
+        self.balance, self.window, self.pixels = balance, window, float(pixels)
 
     def forward(
         self, prediction: Float[Tensor, "B V H W C"], target: Float[Tensor, "B V H W C"]
@@ -89,48 +80,10 @@ class ImageLoss(nn.Module):
                 f"loss.image: images of {width}x{height} pixels are smaller than the SSIM window of {self.window}. "
                 "Draw larger images or lower loss.image.window."
             )
-        if fits(prediction, target):
-            return self._compiled(prediction, target)
-        return self._plain(prediction.detach(), target)
-
-    def _compiled(self, prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        states, views, height, width, _ = prediction.shape
-        scale = self.pixels / (views * height * width)
-        x, y = (array(v).reshape(states * views, -1) for v in (prediction, target))
-        gradient = np.empty_like(x)
-        sums = np.empty((states * views, 2))
-        taps, slots = _window(self.window)
-        by_error, by_ssim = np.float32(2 * scale * self.balance), np.float32(-0.5 * scale * (1 - self.balance))
-
-        def one(i: int) -> None:
-            sums[i] = compare(x[i], y[i], (height, width), taps, slots, by_error, by_ssim, self.crop, gradient[i])
-
-        with announced("the image loss"):
-            shared_pool(torch.get_num_threads()).run(one, range(states * views))
-        values = scale * (sums @ np.array([self.balance, 0.5 * (1 - self.balance)])).reshape(states, views).sum(1)
-        return torch.from_numpy(values.astype(np.float32)), torch.from_numpy(gradient.reshape(prediction.shape))
-
-    def _plain(self, prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-        pixels = prediction[0, ..., 0].numel()
-        states = max(1, (CPU_PIXELS if prediction.device.type == "cpu" else GPU_PIXELS) // pixels)
-        values: list[Tensor] = []
-        gradients: list[Tensor] = []
-        for start in range(0, prediction.shape[0], states):
-            part = prediction[start : start + states].clone().requires_grad_()
-            with torch.enable_grad():
-                value = self._of_states(part, target[start : start + states]) * (self.pixels / pixels)
-                gradients += torch.autograd.grad(value.sum(), part)
-            values.append(value.detach())
-        return torch.cat(values), torch.cat(gradients)
-
-    def _of_states(self, prediction: Tensor, target: Tensor) -> Tensor:
-        """Sums over views, pixels and channels of each state."""
-        total = self.balance * (prediction - target).square().sum((1, 2, 3, 4))
-        if self.balance < 1:
-            first, second = (x.movedim(-1, 2).flatten(0, 2) for x in (prediction, target))
-            loss = (1 - structural_similarity(first, second, self.window)) / 2
-            total = total + (1 - self.balance) * loss.reshape(total.shape[0], -1).sum(1)
-        return total
+        scale = self.pixels / (prediction.shape[1] * height * width)
+        return image_loss(
+            prediction, target, gaussian_taps(self.window), balance=self.balance, scale=scale
+        )  # fmt: skip
 
 
 class _WithGradient(torch.autograd.Function):
@@ -150,6 +103,47 @@ class _WithGradient(torch.autograd.Function):
         return gradient * incoming[0][:, None, None, None, None], None, None
 
 
+@operation("gausim.kernels.image_loss:image_loss")
+def image_loss(
+    prediction: Float[Tensor, "B V H W 3"],
+    target: Float[Tensor, "B V H W 3"],
+    taps: tuple[float, ...],
+    *,
+    balance: float,
+    scale: float,
+) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V H W 3"]]:
+    """Loss of each state and the gradient of their sum with respect to the prediction; neither is part of a graph.
+
+    Never waits for a device.
+
+    Args:
+        prediction: the images.
+        target: the true ones.
+        taps: of the SSIM window along one axis.
+        balance: share of the squared error; the rest is (1 - SSIM) / 2.
+        scale: what the sums over views, pixels and channels are multiplied by.
+    """
+    pixels = prediction[0, ..., 0].numel()
+    states = max(1, (CPU_PIXELS if prediction.device.type == "cpu" else GPU_PIXELS) // pixels)
+    values: list[Tensor] = []
+    gradients: list[Tensor] = []
+    for start in range(0, prediction.shape[0], states):
+        part, true = (
+            prediction[start : start + states].detach().clone().requires_grad_(),
+            target[start : start + states],
+        )
+        with torch.enable_grad():
+            value = balance * (part - true).square().sum((1, 2, 3, 4))
+            if balance < 1:
+                first, second = (x.movedim(-1, 2).flatten(0, 2) for x in (part, true))
+                loss = (1 - structural_similarity(first, second, taps)) / 2
+                value = value + (1 - balance) * loss.reshape(len(part), -1).sum(1)
+            value = scale * value
+            gradients += torch.autograd.grad(value.sum(), part)
+        values.append(value.detach())
+    return torch.cat(values), torch.cat(gradients)
+
+
 @functools.cache
 def gaussian_taps(window: int) -> tuple[float, ...]:
     """The Gaussian window of SSIM along one axis; sums to 1."""
@@ -158,20 +152,13 @@ def gaussian_taps(window: int) -> tuple[float, ...]:
     return tuple((weights / weights.sum()).tolist())
 
 
-@functools.cache
-def _window(window: int) -> tuple[tuple[np.float32, ...], tuple[np.uint64, ...]]:
-    """The taps and as many zeros: tuples tell numba the window by their type."""
-    return tuple(np.float32(tap) for tap in gaussian_taps(window)), (np.uint64(0),) * window
-
-
 def structural_similarity(
-    first: Float[Tensor, "N H W"], second: Float[Tensor, "N H W"], window: int
+    first: Float[Tensor, "N H W"], second: Float[Tensor, "N H W"], taps: Sequence[float]
 ) -> Float[Tensor, "N H W"]:
     """SSIM map with a Gaussian window and reflected borders, as kornia computes it, at half of its cost on a CPU.
 
-    Differentiable in ``first`` only: ``second`` is the ground truth.
+    Differentiable in ``first`` only: ``second`` is the ground truth. ``taps`` are those of the window along one axis.
     """
-    taps = gaussian_taps(window)
     with torch.no_grad():
         mean_second = _blur(second, taps)
         variance_second = _blur(second * second, taps) - mean_second.square()

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import ConfigError
-from gausim.losses.image import ImageLoss, structural_similarity
+from gausim.losses.image import ImageLoss, gaussian_taps, structural_similarity
 
 # Size of the SSIM window of 3DGS and the methods after it [pixels].
 SSIM_WINDOW = 11
@@ -72,7 +72,7 @@ class MixedLoss(ImageLoss):
             total = total + self.mse * difference.square().mean((1, 2, 3, 4))
         if self.dssim > 0:
             first, second = (x.movedim(-1, 2).flatten(0, 2) for x in (color, true))
-            similarity = structural_similarity(first, second, self.window).reshape(len(total), -1)
+            similarity = structural_similarity(first, second, gaussian_taps(self.window)).reshape(len(total), -1)
             total = total + self.dssim * (1 - similarity.mean(1))
         if self.alpha > 0:
             total = total + self.alpha * (prediction[..., 3] - target[..., 3]).square().mean((1, 2, 3))

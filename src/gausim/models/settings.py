@@ -19,8 +19,6 @@ class HierarchySettings:
         clustering: as in :func:`gausim.models.hierarchy.clusters.build_hierarchy`.
         max_neighbours: edges per unit.
         edges: neighbours in ``rest`` space, in the ``current`` state, or the ``union`` / ``intersection`` of both.
-        edge_bucket: fill the edges of a level up to a multiple of this with edges of a dummy node, so that their number
-            seldom changes; 0 does not. In evaluation mode on CUDA it never changes.
         share_network: one network serves every predicted level; else each has its own (normalisers are shared).
         body_frame: work in the body's own axes, so that a scene that is turned or moved moves likewise.
 
@@ -35,7 +33,6 @@ class HierarchySettings:
     clustering: str = "agglomerative"
     max_neighbours: int = 16
     edges: str = "union"
-    edge_bucket: int = 0
     share_network: bool = True
     body_frame: bool = False
 

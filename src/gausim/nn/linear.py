@@ -26,15 +26,9 @@ def product(
     inputs: Float[Tensor, "N I"],
     weight: Float[Tensor, "O I"],
     bias: Float[Tensor, " O"] | None = None,
-    added: Float[Tensor, "N O"] | None = None,
 ) -> Float[Tensor, "N O"]:
-    """``inputs @ weight.T + bias + added``; not differentiable, transposed views are taken as they are."""
-    if has_onednn(inputs) and len(inputs) and inputs.shape[1]:
-        if added is None:
-            return torch.ops.mkldnn._linear_pointwise(inputs, weight, bias, "none", [], "")
-        return torch.ops.mkldnn._linear_pointwise.binary(inputs, added, weight, bias, "add")
-    result = nn.functional.linear(inputs, weight, bias)
-    return result if added is None else result + added
+    """``inputs @ weight.T + bias`` by oneDNN; not differentiable, transposed views are taken as they are."""
+    return torch.ops.mkldnn._linear_pointwise(inputs, weight, bias, "none", [], "")
 
 
 class _Linear(torch.autograd.Function):

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as recomputed
 
 from gausim.core import ConfigError
-from gausim.nn.edge_update import EdgeWeights, edge_update
 from gausim.nn.linear import Linear
 from gausim.nn.mlp import ACTIVATIONS, mlp
 
@@ -22,8 +21,8 @@ PRECISIONS = ("fp32", "bf16")
 NORMS = ("pre", "post", "joint")
 
 
-class _Message(nn.Module):
-    """One message-passing layer: residual edge and node updates with pre-norm.
+class _SplitLayer(nn.Module):
+    """Pre-norm and SiLU: what each update reads is normalised, then added to the stream.
 
     The edge MLP's first layer acts on [edge, source, destination]; it is split into three matrices so that the two
     node products are computed once per node instead of once per edge.
@@ -37,17 +36,18 @@ class _Message(nn.Module):
         self.edge_out = Linear(hidden, hidden)
         self.node = mlp((2 * hidden, hidden, hidden))
 
-    def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor, bf16: bool) -> tuple[Tensor, Tensor]:
-        normed = self.node_norm(nodes)
-        source, destination = self.from_nodes(normed).chunk(2, -1)
-        norm, first, second = self.edge_norm, self.from_edge, self.edge_out
-        weights = EdgeWeights(norm.weight, norm.bias, first.weight, first.bias, second.weight, second.bias)
-        edges, received = edge_update(edges, source, destination, edge_index, weights, bf16=bf16)
-        return nodes + self.node(torch.cat((normed, received), -1)), edges
+    def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
+        source, destination = edge_index
+        seen = self.node_norm(nodes)
+        of_source, of_destination = self.from_nodes(seen).chunk(2, -1)
+        ends = of_source.index_select(0, source) + of_destination.index_select(0, destination)
+        edges = edges + self.edge_out(nn.functional.silu(self.from_edge(self.edge_norm(edges)) + ends))
+        received = torch.zeros_like(nodes).index_add(0, destination, edges)
+        return nodes + self.node(torch.cat((seen, received), -1)), edges
 
 
-class _PlainMessage(nn.Module):
-    """The layer of other choices than pre-norm and SiLU, in plain operations of torch.
+class _Layer(nn.Module):
+    """The same for other choices than pre-norm and SiLU.
 
     With norm "post" the updates are normalised instead of what they are computed from (Pfaff et al. 2021).
     """
@@ -59,19 +59,18 @@ class _PlainMessage(nn.Module):
         self.edge = mlp((3 * hidden, hidden, hidden), activation)
         self.node = mlp((2 * hidden, hidden, hidden), activation)
 
-    def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor, bf16: bool) -> tuple[Tensor, Tensor]:
+    def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
         source, destination = edge_index
         seen = nodes if self.post else self.node_norm(nodes)
         own = edges if self.post else self.edge_norm(edges)
-        joined = torch.cat((own, seen.index_select(0, source), seen.index_select(0, destination)), -1)
-        update = self.edge(joined)
+        update = self.edge(torch.cat((own, seen.index_select(0, source), seen.index_select(0, destination)), -1))
         edges = edges + (self.edge_norm(update) if self.post else update)
         received = torch.zeros_like(nodes).index_add(0, destination, edges)
         update = self.node(torch.cat((seen, received), -1))
         return nodes + (self.node_norm(update) if self.post else update), edges
 
 
-class _JointMessage(nn.Module):
+class _JointLayer(nn.Module):
     """The layer of the authors' code: MLPs of three linear layers, one LayerNorm over all that each of them reads.
 
     The summed messages are normalised with the node, so that the node stream does not grow from layer to layer.
@@ -83,7 +82,7 @@ class _JointMessage(nn.Module):
         self.edge = mlp((3 * hidden, hidden, hidden, hidden), activation)
         self.node = mlp((2 * hidden, hidden, hidden, hidden), activation)
 
-    def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor, bf16: bool) -> tuple[Tensor, Tensor]:
+    def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
         source, destination = edge_index
         joined = torch.cat((edges, nodes.index_select(0, destination), nodes.index_select(0, source)), -1)
         edges = edges + self.edge(self.edge_norm(joined))
@@ -95,10 +94,6 @@ class MeshGraphNet(nn.Module):
     """Encoder, ``layers`` message-passing layers, decoder hidden -> hidden/2 -> hidden/4 -> outputs.
 
     How it computes (``precision``, ``checkpoint``, ``compile``) changes no parameter: checkpoints fit every choice.
-
-    Fixed shapes: a caller that pads its graph appends one dummy node, of zero features, behind the N real ones, and
-    edges N -> N of zero features. Messages travel along edges only, so the first N rows of the output, and all
-    gradients of them, are those of the graph without padding; the dummy's own row is finite and is to be dropped.
     """
 
     def __init__(
@@ -115,7 +110,7 @@ class MeshGraphNet(nn.Module):
         checkpoint: bool = False,
         compile: bool = False,
     ) -> None:
-        """Builds the network; its gradients are of first order only.
+        """Builds the network.
 
         Args:
             node_features: number of features per node.
@@ -126,14 +121,13 @@ class MeshGraphNet(nn.Module):
             norm: LayerNorm ``pre`` (of what a residual update reads), ``post`` (of the update), or ``joint``: the
                 authors' layers, with three linear layers per MLP, one LayerNorm over all that each reads, none before
                 the decoder, and ReLU in encoders and decoder.
-            activation: ``silu`` or ``relu``; anything but pre-norm and SiLU runs without the blocked kernels.
+            activation: ``silu`` or ``relu``.
             precision: ``fp32``, or ``bf16``: the products of the message-passing layers in bfloat16, all streams, sums,
                 encoders and the decoder in float32. An autocast around the network means ``bf16`` too.
             checkpoint: keep only the streams before every few layers (2 of 16) and recompute the rest in the backward
                 pass, with the same gradients bit by bit.
             compile: compile the layers at the first call, for any number of nodes and edges; needs a C++ compiler on
-                the CPU and triton on a GPU. It pays on a GPU; on the CPU the edges have their own blocked kernels, and
-                only the nodes are compiled.
+                the CPU and triton on a GPU. It pays on a GPU.
 
         Raises:
             ConfigError: unknown precision, norm or activation.
@@ -167,44 +161,41 @@ class MeshGraphNet(nn.Module):
         with torch.autocast(device, enabled=False):
             nodes, edges = self.node_encoder(node_features), self.edge_encoder(edge_features)
         with torch.autocast(device, dtype=torch.bfloat16, enabled=bf16):
-            nodes = self._process(nodes, edges, edge_index, bf16)
+            nodes = self._process(nodes, edges, edge_index)
         with torch.autocast(device, enabled=False):
             result: Tensor = self.decoder(self.norm(nodes))
         return result
 
-    def _process(self, nodes: Tensor, edges: Tensor, edge_index: Tensor, bf16: bool) -> Tensor:
+    def _process(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> Tensor:
         modules = list(self.processor)
         # For none and for one the compiler would build a variant each: such graphs run as they are.
         compiled = self.compiled and min(len(nodes), len(edges)) > 1
         if compiled:
             _compile(modules, nodes.device)
         layers: list[Callable] = [layer if compiled else layer.forward for layer in modules]
-        edge_index = edge_index.contiguous()
         if not (self.checkpointed and torch.is_grad_enabled()):
-            return _run(layers, nodes, edges, edge_index, bf16)[0]
+            return _run(layers, nodes, edges, edge_index)[0]
         # 16 layers keep 16 / 2 streams, plus 2 x 2 arrays while a segment is recomputed: near the least sum.
         size = max(1, math.isqrt(len(layers) // 2))
         for first in range(0, len(layers), size):
             segment = layers[first : first + size]
             nodes, edges = recomputed(
-                _run, segment, nodes, edges, edge_index, bf16, use_reentrant=False, preserve_rng_state=False
+                _run, segment, nodes, edges, edge_index, use_reentrant=False, preserve_rng_state=False
             )
         return nodes
 
 
 def _layer(hidden: int, norm: str, activation: str) -> nn.Module:
     if (norm, activation) == ("pre", "silu"):
-        return _Message(hidden)
+        return _SplitLayer(hidden)
     if norm == "joint":
-        return _JointMessage(hidden, activation=activation)
-    return _PlainMessage(hidden, norm=norm, activation=activation)
+        return _JointLayer(hidden, activation=activation)
+    return _Layer(hidden, norm=norm, activation=activation)
 
 
-def _run(
-    layers: Sequence[Callable], nodes: Tensor, edges: Tensor, edge_index: Tensor, bf16: bool
-) -> tuple[Tensor, Tensor]:
+def _run(layers: Sequence[Callable], nodes: Tensor, edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
     for layer in layers:
-        nodes, edges = layer(nodes, edges, edge_index, bf16)
+        nodes, edges = layer(nodes, edges, edge_index)
     return nodes, edges
 
 

@@ -2,39 +2,34 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.kernels import deformation as compiled
-from gausim.kernels.compiled import array, fits
+from gausim.kernels.constants import MAX_LOG_STRETCH, POLAR_ITERATIONS
+from gausim.kernels.operations import operation
 from gausim.ops.quaternion import quaternion_to_matrix
 
-# Bound of the logarithmic stretch (METHOD section 2).
-MAX_LOG_STRETCH = 5.0
 
-
+@operation("gausim.kernels.deformation:gradient_from_output")
 def gradient_from_output(
-    output: Float[Tensor, "*N 11"], *, conserve_mass: bool
-) -> tuple[Float[Tensor, "*N 3 3"], Float[Tensor, "*N 3 3"]]:
+    output: Float[Tensor, "N 11"], *, conserve_mass: bool
+) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3 3"]]:
     """F = U diag(lambda) V^T and its rotation U V^T from 11 numbers; zero output gives the identity.
 
     The first eight numbers are two quaternions relative to (1, 0, 0, 0), the last three logarithms of the stretches;
     with ``conserve_mass`` their mean is subtracted, so that det F = 1 (METHOD section 2).
     """
-    if fits(output) and output.dim() == 2:
-        return compiled.GradientFromOutput.apply(output, MAX_LOG_STRETCH, conserve_mass)
     one = torch.zeros(4, dtype=output.dtype, device=output.device)
     one[:1] = 1  # made on the device: a copy from the host would end a graph capture
-    u = quaternion_to_matrix(output[..., 0:4] + one)
-    v = quaternion_to_matrix(output[..., 4:8] + one)
-    stretch = torch.clamp(output[..., 8:11], -MAX_LOG_STRETCH, MAX_LOG_STRETCH)
+    u, v = quaternion_to_matrix(output[:, :8].unflatten(1, (2, 4)) + one).unbind(1)
+    stretch = torch.clamp(output[:, 8:11], -MAX_LOG_STRETCH, MAX_LOG_STRETCH)
     if conserve_mass:
         stretch = stretch - stretch.mean(-1, keepdim=True)
     return (u * torch.exp(stretch)[..., None, :]) @ v.mT, u @ v.mT
 
 
+@operation("gausim.kernels.deformation:bounded_deformation")
 def bounded_deformation(gradient: Float[Tensor, "N 3 3"], least: float, *, unit: bool) -> Float[Tensor, "N 3 3"]:
     """The gradient where its determinant is at least ``least`` > 0, else the identity: matter is not turned inside out.
 
@@ -43,8 +38,6 @@ def bounded_deformation(gradient: Float[Tensor, "N 3 3"], least: float, *, unit:
         least: smallest determinant.
         unit: whether to scale them to determinant 1 (volume kept).
     """
-    if fits(gradient):
-        return compiled.BoundedDeformation.apply(gradient, least, unit)
     det = determinant(gradient)
     kept = ~(det < least)  # so that NaN stays NaN
     identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
@@ -70,13 +63,10 @@ def _inverse_transpose(a: Tensor) -> Tensor:
     return rows / (a[..., 0, :] * rows[..., 0, :]).sum(-1)[..., None, None]
 
 
+@operation("gausim.kernels.deformation:polar_rotation", constant=True)
 def polar_rotation(gradient: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:
     """Rotation of the polar decomposition by Newton's iteration R <- (R + R^-T) / 2 (Higham 1986); det > 0 assumed."""
-    if fits(gradient) and not gradient.requires_grad:
-        found = np.empty((gradient.numel() // 9, 3, 3), np.float32)
-        compiled.polar_rotations(array(gradient).reshape(-1, 3, 3), compiled.POLAR_ITERATIONS, found)
-        return torch.from_numpy(found).view(gradient.shape)
     rotation = gradient
-    for _ in range(compiled.POLAR_ITERATIONS):
+    for _ in range(POLAR_ITERATIONS):
         rotation = 0.5 * (rotation + _inverse_transpose(rotation))
     return rotation

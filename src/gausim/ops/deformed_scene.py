@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gausim.core import GaussianScene
@@ -51,21 +52,9 @@ def deformed_scene(
 
 
 def matrix_to_quaternion(rotation: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 4"]:
-    """Unit quaternions w x y z with w >= 0 of rotation matrices.
-
-    The eigenvector of the largest eigenvalue of Bar-Itzhack's symmetric 4 x 4 matrix (2000): no case is special.
-    """
-    r = rotation
-    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
-    rows = (
-        (xx + yy + zz, r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]),
-        (r[:, 2, 1] - r[:, 1, 2], xx - yy - zz, r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0]),
-        (r[:, 0, 2] - r[:, 2, 0], r[:, 0, 1] + r[:, 1, 0], yy - xx - zz, r[:, 1, 2] + r[:, 2, 1]),
-        (r[:, 1, 0] - r[:, 0, 1], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1], zz - xx - yy),
-    )
-    matrix = torch.stack([torch.stack(row, -1) for row in rows], -2)
-    quats = torch.linalg.eigh(matrix)[1][..., 3]
-    return torch.where(quats[:, :1] < 0, -quats, quats)
+    """Unit quaternions w x y z with w >= 0 of rotation matrices."""
+    quats = Rotation.from_matrix(rotation.cpu().numpy()).as_quat(canonical=True, scalar_first=True)
+    return torch.from_numpy(quats).to(rotation)
 
 
 def rotate_sh(sh: Float[Tensor, "n B 3"], rotation: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n B 3"]:

@@ -1,20 +1,22 @@
 """Neighbour edges within a radius: for several disjoint objects at once, on the CPU and without leaving a GPU.
 
 Everything here measures in float32: two points are neighbours if their squared distance, in float32, is below the
-squared radius, and of two points at the same distance the one with the lower index is nearer. So the compiled search
-(:func:`batched_radius_edges`) and the one of torch operations (:func:`neighbour_table`) agree to the last tie.
+squared radius, and of two points at the same distance the one with the lower index is nearer. So the search in a k-d
+tree (:func:`batched_radius_edges`) and the one of torch operations (:func:`neighbour_table`) agree to the last tie.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gausim.kernels import nearest
-from gausim.kernels.announce import announced
-
+NONE = torch.iinfo(torch.int64).max
+SLACK = 1 + 1e-5  # of distances in the tree, where those of float32 decide, which are good to 3e-7
 TABLE_ELEMENTS = 1 << 24  # distances that neighbour_table holds at a time: 128 MiB of int64 keys
 
 
@@ -67,14 +69,44 @@ def batched_radius_edges(
             f"{int((~np.isfinite(x).all(1)).sum())} of {len(x)} positions are NaN or infinite, so they have no "
             "neighbours: the state has diverged. Lower the learning rate or shorten the rollout."
         )
-    largest = int(np.diff(starts).max(initial=0))
-    k = min(max_neighbours, largest - 1)
+    edges = [torch.zeros(2, 0, dtype=torch.int64)]
+    for low, end, square in zip(starts[:-1], starts[1:], _squared(radii).tolist(), strict=True):
+        edges.append(low + _nearest(torch.from_numpy(x[low:end]), square, max_neighbours))
+    return torch.cat(edges, 1).to(points.device)
+
+
+def _nearest(x: Float[Tensor, "N 3"], square: float, most: int) -> Int[Tensor, "2 E"]:
+    """Edges into every point from the at most ``most`` nearest below a squared distance, by destination and source."""
+    count, k = len(x), min(most, len(x) - 1)
     if k < 1:
-        return torch.zeros((2, 0), dtype=torch.int64, device=points.device)
-    squares = _squared(radii).cpu().numpy()
-    with announced("the neighbour search"):
-        edges = nearest.member_edges(np.ascontiguousarray(x.T), starts, squares, k)
-    return torch.from_numpy(edges).to(points.device)
+        return torch.zeros(2, 0, dtype=torch.int64)
+    tree, limit, asked = cKDTree(x.numpy()), SLACK * math.sqrt(square), min(count, k + 9)
+    # The point itself is one of the k + 1 nearest; more are asked for until none is as far as the last that counts.
+    distance, found = tree.query(x.numpy(), asked, distance_upper_bound=limit)
+    while asked < count and (distance[:, -1] <= SLACK * np.minimum(distance[:, k], limit)).any():
+        asked = min(count, 2 * asked)
+        distance, found = tree.query(x.numpy(), asked, distance_upper_bound=limit)
+    index, own = torch.from_numpy(found), torch.arange(count)[:, None]
+    squares = _squares(x[index.clamp_max(count - 1)] - x[:, None])
+    index = _first(squares, (squares < square) & (index < count) & (index != own), index, k)
+    valid = index < count
+    return torch.stack((index[valid], own.expand_as(index)[valid]))
+
+
+def _squares(offsets: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
+    """Written out, so that every product and sum is rounded alike in every search."""
+    dx, dy, dz = offsets.unbind(-1)
+    return dx * dx + dy * dy + dz * dz
+
+
+def _first(
+    squares: Float[Tensor, "R C"], near: Bool[Tensor, "R C"], index: Int[Tensor, "... C"], k: int
+) -> Int[Tensor, "R k"]:
+    """The indices of the k nearest candidates of each row, ascending; larger than any index where there are none."""
+    # The bits of a float32 >= 0 order as the number does: one key holds the distance and, for ties, the index.
+    key = (squares.view(torch.int32).long() << 32) | index
+    found = key.masked_fill(~near, NONE).topk(k, largest=False, sorted=False).values
+    return torch.where(found == NONE, NONE, found & 0xFFFFFFFF).sort().values
 
 
 def neighbour_table(
@@ -105,17 +137,10 @@ def neighbour_table(
     nearest_index = torch.full((count, k), count, device=x.device)
     for low in range(0, count, max(TABLE_ELEMENTS // max(count, 1), 1)):
         rows = slice(low, low + max(TABLE_ELEMENTS // max(count, 1), 1))
-        # Written out, so that every product and sum is rounded as in the compiled search.
-        dx, dy, dz = (x[None, :, a] - x[rows, None, a] for a in range(3))
-        square = dx * dx + dy * dy + dz * dz
+        square = _squares(x - x[rows, None])
         near = (square < squares[rows, None]) & (member_of_point[rows, None] == member_of_point)
         near &= identity[rows, None] != identity
-        # The bits of a float32 >= 0 order as the number does: one key holds the distance and, for ties, the index.
-        key = (square.view(torch.int32).long() << 32) | identity
-        key = key.masked_fill(~near, torch.iinfo(torch.int64).max)
-        found = key.topk(width, largest=False, sorted=False).values
-        index = torch.where(found == torch.iinfo(torch.int64).max, count, found & 0xFFFFFFFF)
-        nearest_index[rows, :width] = index.sort().values
+        nearest_index[rows, :width] = _first(square, near, identity, width)
     valid = nearest_index < count
     return torch.where(valid, nearest_index, identity[:, None]), valid
 
@@ -134,19 +159,13 @@ def combine_edges(a: Int[Tensor, "2 E1"], b: Int[Tensor, "2 E2"], count: int, *,
         rule: ``union`` or ``intersection``.
 
     Raises:
-        ValueError: unknown rule, or (where the edges lie on the CPU) edges that are not sorted.
+        ValueError: unknown rule.
     """
     if rule not in ("union", "intersection"):
         raise ValueError(f"edge rule is {rule!r}; expected 'union' or 'intersection'")
-    if a.device.type != "cpu":
-        codes = [e[1] * count + e[0] for e in (a, b)]
-        code = torch.unique(torch.cat(codes)) if rule == "union" else codes[0][torch.isin(codes[0], codes[1])]
-        return torch.stack((code % count, code // count))
-    with announced("the neighbour search"):
-        merged, ascending = nearest.merge_edges(a.numpy(), b.numpy(), rule == "union")
-    if not ascending:
-        raise ValueError("edges are not in ascending order of destination, then source; sort them before combining")
-    return torch.from_numpy(merged)
+    codes = [e[1] * count + e[0] for e in (a, b)]
+    code = torch.unique(torch.cat(codes)) if rule == "union" else codes[0][torch.isin(codes[0], codes[1])]
+    return torch.stack((code % count, code // count))
 
 
 def combine_tables(

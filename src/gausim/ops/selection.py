@@ -1,4 +1,4 @@
-"""Selections of kernels by place or colour, to be combined with ``&``, ``|`` and ``~`` and stored as masks."""
+"""Selections of kernels by place, to be combined with ``&``, ``|`` and ``~`` and stored as masks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from torch import Tensor
 
 from gausim.core.errors import SceneError
 from gausim.core.scene import GaussianScene
-from gausim.ops.spherical_harmonics import C0
 
 AXES = {"x": 0, "y": 1, "z": 2}
 # Distances of this many pairs are held at once (float32: 64 MiB).
@@ -149,19 +148,6 @@ class Component(Selection):
         _, label = connected_components(links, directed=False)
         chosen = np.bincount(label).argmax() if self.seed is None else label[tree.query(np.array(self.seed))[1]]
         return torch.from_numpy(label == chosen).to(scene.means.device)
-
-
-@dataclass(frozen=True)
-class ColorBall(Selection):
-    """Kernels whose view-independent colour lies within a distance of an RGB colour in [0, 1]."""
-
-    color: tuple[float, float, float]
-    distance: float
-
-    def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
-        """True for the kernels of about that colour."""
-        color = scene.sh[:, 0] * C0 + 0.5
-        return (color - color.new_tensor(self.color)).norm(dim=-1) <= self.distance
 
 
 def parse_half_space(text: str, *, above: bool = False) -> HalfSpace:

@@ -165,7 +165,7 @@ class Reconstruction:
         )  # fmt: skip
         self._generator = torch.Generator().manual_seed(options.seed)
         self._queues: list[list[int]] = [[] for _ in sets]
-        self._similarity = ImageLoss(balance=0.0, window=SSIM_WINDOW, pixels=1 / 3, crop=False)
+        self._similarity = ImageLoss(balance=0.0, window=SSIM_WINDOW, pixels=1 / 3)
         self._rounds, self._patience = options.round_steps, _Patience(options)
         self.done, self.loss = 0, math.nan
 

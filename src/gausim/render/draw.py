@@ -10,10 +10,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import Cameras, ConfigError, GaussianScene, Rendered, Renderer, Trajectory
-from gausim.kernels.compiled import fits
+from gausim.kernels.operations import operation
 from gausim.ops.covariance import covariance_from_scales, transport_covariance
 from gausim.ops.spherical_harmonics import spherical_harmonics_basis
-from gausim.render.cpu.appearance import deformed_appearance
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +75,7 @@ def draw(
 
     Kernel k of unit c has covariance G_c S_k G_c^T and the colour of its spherical harmonics at Q_c^T d, d the unit
     vector from the camera to the kernel. Differentiable in ``positions``, ``gradients`` and ``rotations``, and in the
-    tensors of a SceneAppearance. For float32 on the CPU both are compiled, as the CPU renderer is; elsewhere torch's.
+    tensors of a SceneAppearance.
 
     Args:
         renderer: what draws.
@@ -102,14 +101,9 @@ def draw(
         positions, unit_of_kernel = positions.index_select(1, look.index), unit_of_kernel[look.index]
     states, views = positions.shape[0], cameras.viewmats.shape[0]
     centers = cameras.centers.to(positions)
-    if fits(positions, deformation_gradients, rotations, look.covars, look.sh, centers):
-        covars, colors = deformed_appearance(
-            positions, deformation_gradients, rotations, unit_of_kernel, look.covars, look.sh, centers
-        )
-    else:
-        rest = look.covars.expand(states, -1, -1, -1)
-        covars = transport_covariance(rest, deformation_gradients.index_select(1, unit_of_kernel))
-        colors = view_colors(look, positions, rotations, unit_of_kernel, centers)
+    covars, colors = deformed_appearance(
+        positions, deformation_gradients, rotations, unit_of_kernel, look.covars, look.sh, centers
+    )
     return renderer(
         positions,
         covars,
@@ -123,22 +117,34 @@ def draw(
     )
 
 
-def view_colors(
-    look: SceneAppearance,
+@operation("gausim.render.cpu.appearance:deformed_appearance")
+def deformed_appearance(
     positions: Float[Tensor, "B n 3"],
+    deformation_gradients: Float[Tensor, "B N 3 3"],
     rotations: Float[Tensor, "B N 3 3"],
     unit_of_kernel: Int[Tensor, " n"],
+    covars: Float[Tensor, "n 3 3"],
+    sh: Float[Tensor, "n basis 3"],
     centers: Float[Tensor, "V 3"],
-) -> Float[Tensor, "B V n 3"]:
-    """Colours of the kernels as each camera sees them, max(0, 0.5 + sum_b sh_b Y_b(Q^T d))."""
-    if look.sh_degree == 0:
-        basis = spherical_harmonics_basis(0, centers.new_zeros(3))
-        colors = (0.5 + basis * look.sh[:, 0]).clamp_min(0.0)
-        return colors.expand(positions.shape[0], centers.shape[0], -1, 3)
+) -> tuple[Float[Tensor, "B n 3 3"], Float[Tensor, "B V n 3"]]:
+    """Covariances G S G^T and colours max(0, 0.5 + sum_b sh_b Y_b(Q^T d)) of the kernels as each camera sees them.
+
+    Differentiable in all but the camera centres.
+
+    Args:
+        positions: kernel means of B states [scene units].
+        deformation_gradients: accumulated deformation gradients G of the N units.
+        rotations: their accumulated rotations Q.
+        unit_of_kernel: the unit of each kernel.
+        covars: rest covariances S [scene units^2].
+        sh: colour coefficients of degree 0..3.
+        centers: of V cameras [scene units].
+    """
+    deformed = transport_covariance(covars, deformation_gradients.index_select(1, unit_of_kernel))
     away = torch.nn.functional.normalize(positions[:, None] - centers[:, None], dim=-1)
     turned = away.transpose(1, 2) @ rotations.index_select(1, unit_of_kernel)  # rows d^T Q, (B, n, V, 3)
-    basis = spherical_harmonics_basis(look.sh_degree, turned)
-    return (torch.einsum("bnvs,nsc->bvnc", basis, look.sh) + 0.5).clamp_min(0.0)
+    basis = spherical_harmonics_basis(round(sh.shape[1] ** 0.5) - 1, turned)
+    return deformed, (torch.einsum("bnvs,nsc->bvnc", basis, sh) + 0.5).clamp_min(0.0)
 
 
 def draw_trajectory(

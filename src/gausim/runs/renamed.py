@@ -30,14 +30,18 @@ MOVED = {
     "gausim.models.simulator": "gausim.models.step.simulator",
     "gausim.training.trainer.make_trainer": "gausim.training.trainer.TrainerSettings",
 }
-# Settings that no longer exist, by the name of what had them; they were off unless asked for.
+# Settings that no longer exist, by the name of what had them: of no effect on what is learned, or off unless asked for.
 GONE = {
+    "ImageLoss": ("crop",),
+    "HierarchySettings": ("edge_bucket",),
+    "make_trainer": ("overwrite",),
+    "TrainerSettings": ("overwrite",),
+}
+UNSUPPORTED = {
     "Objective": ("input_noise",),
     **dict.fromkeys(("PointSupervision", "TrackSupervision", "tracks_or_images"), ("velocity_weight",)),
 }
-
 IMAGES = "gausim.training.supervision.images.training_views"
-TRAINER = "gausim.training.trainer.TrainerSettings"
 SIMULATOR = "gausim.models.step.simulator.GausSim"
 # Where the arguments of the simulator went, and the names they have there.
 PARTS: dict[str, tuple[str, dict[str, str]]] = {
@@ -45,7 +49,7 @@ PARTS: dict[str, tuple[str, dict[str, str]]] = {
         "gausim.models.settings.HierarchySettings",
         {
             "clustering": "clustering", "max_neighbours": "max_neighbours", "edges": "edges",
-            "edge_bucket": "edge_bucket", "share_levels": "share_network", "body_frame": "body_frame",
+            "share_levels": "share_network", "body_frame": "body_frame",
         },
     ),
     "features": (
@@ -88,6 +92,7 @@ GROUPS: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
     },
     "gausim.baselines.material_point.physgaussian.PhysGaussian": {"material": _MATERIAL, "discretisation": _GRID},
 }
+# Settings that no longer exist and had no effect on results.
 WEIGHTS = ("network.", "node_normaliser.", "edge_normaliser.")
 
 
@@ -101,10 +106,13 @@ def with_present_names(config: Any) -> Any:
         name = str(config.get("_target_")).rsplit(".", 1)[-1]
         if name == "ConstantSchedule":  # constant is what no schedule means
             return None
-        kept = {k: v for k, v in config.items() if k not in GONE.get(name, ())}
-        found = {k: _present(v) if k == "_target_" else with_present_names(v) for k, v in kept.items()}
-        if found.get("_target_") == TRAINER:
-            found.pop("overwrite", None)  # a setting of the run now
+        wanted = [k for k in UNSUPPORTED.get(name, ()) if config.get(k)]
+        if wanted:
+            raise ValueError(f"{wanted[0]} is {config[wanted[0]]!r}, which is no longer supported: train the run again")
+        gone = GONE.get(name, ()) + UNSUPPORTED.get(name, ())
+        found = {
+            k: _present(v) if k == "_target_" else with_present_names(v) for k, v in config.items() if k not in gone
+        }
         if found.get("supervision") == {}:
             found["supervision"] = {"_target_": IMAGES, "_partial_": True}
         if found.get("_target_") == ELASTIC:
@@ -145,7 +153,8 @@ def _grouped(old: Mapping[str, Any]) -> dict[str, Any]:
 
 def _in_parts(old: Mapping[str, Any]) -> dict[str, Any]:
     """The simulator's arguments by part; what an old configuration leaves out has the default that it had."""
-    gone = {"radii", "predicted_levels", "graph_radii", *(name for _, names in PARTS.values() for name in names)}
+    moved = {name for _, names in PARTS.values() for name in names}
+    gone = {"edge_bucket", "radii", "predicted_levels", "graph_radii", *moved}
     new = {name: value for name, value in old.items() if name not in gone}
     for part, (target, names) in PARTS.items():
         new[part] = {"_target_": target, **{names[k]: old[k] for k in names if k in old}}

@@ -12,11 +12,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import GaussianScene, SteppedFrame
-from gausim.kernels.compiled import fits
 from gausim.ops.covariance import transport_covariance
 from gausim.ops.spherical_harmonics import C0
-from gausim.render.cpu.appearance import deformed_appearance
-from gausim.render.draw import SceneAppearance, view_colors
+from gausim.render.draw import SceneAppearance, deformed_appearance
 
 VIEW, BASE, STRAIN, SPEED, MASS = (
     "As seen from the camera (SH)", "Base colour (DC)", "Strain", "Velocity", "Mass",
@@ -87,21 +85,13 @@ class Painter:
             frame.positions.cpu(), frame.deformation_gradients.cpu(), frame.rotations.cpu(), unit_of_kernel.cpu()
         )  # fmt: skip
         look = self._look.to(positions)
-        if mode == VIEW and fits(positions, deformation_gradients, rotations, look.covars, look.sh):
+        if mode == VIEW:
             covars, rgb = deformed_appearance(
-                positions[None],
-                deformation_gradients[None],
-                rotations[None],
-                unit,
-                look.covars,
-                look.sh,
+                positions[None], deformation_gradients[None], rotations[None], unit, look.covars, look.sh,
                 eye[None].to(positions),
-            )
+            )  # fmt: skip
             return covars[0], rgb[0, 0], Legend("spherical harmonics for the camera that moved last")
         covars = transport_covariance(look.covars, deformation_gradients[unit])
-        if mode == VIEW:
-            rgb = view_colors(look, positions[None], rotations[None], unit, eye[None].to(positions))[0, 0]
-            return covars, rgb, Legend("spherical harmonics for the camera that moved last")
         rgb, legend = self._value(deformation_gradients[unit], speed.cpu(), mode)
         return covars, rgb, legend
 

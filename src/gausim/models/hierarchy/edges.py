@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import pad
 
 from gausim.core import ConfigError
 from gausim.models.hierarchy.batch import LevelBatch
@@ -21,21 +20,18 @@ class EdgeSet:
     other edge touches that node.
     """
 
-    def __init__(self, rule: str, bucket: int = 0) -> None:
-        """Sets the options.
+    def __init__(self, rule: str) -> None:
+        """Chooses the rule.
 
         Args:
             rule: neighbours at ``rest``, those of the ``current`` state, or the ``union`` or ``intersection`` of both.
-            bucket: the number of edges of a level is filled up to a multiple of this; 0 leaves it as it is.
 
         Raises:
-            ConfigError: an option is out of range.
+            ConfigError: an unknown rule.
         """
         if rule not in EDGE_RULES:
             raise ConfigError(f"model.simulator.hierarchy.edges is '{rule}'; expected one of {', '.join(EDGE_RULES)}.")
-        if bucket < 0:
-            raise ConfigError(f"model.simulator.hierarchy.edge_bucket is {bucket}; expected 0 (no filling) or more.")
-        self.rule, self.bucket = rule, bucket
+        self.rule = rule
 
     def of(self, level: LevelBatch, positions: Float[Tensor, "N 3"]) -> Int[Tensor, "2 E"]:
         """Edges of a level whose units are at ``positions`` [scene units], without those of the dummy node."""
@@ -58,17 +54,3 @@ class EdgeSet:
         destination = torch.arange(count, device=source.device)[:, None].expand_as(source)
         code = torch.where(valid, destination * (count + 1) + source, count * (count + 2)).flatten().sort().values
         return torch.stack((code % (count + 1), code // (count + 1)))
-
-    def missing(self, edges: int) -> int:
-        """How many edges fill the bucket."""
-        return -edges % self.bucket if self.bucket else 0
-
-
-def fill(features: Float[Tensor, "E C"], extra: int) -> Float[Tensor, "E2 C"]:
-    """Appends rows of zeros."""
-    return pad(features, (0, 0, 0, extra))
-
-
-def fill_edges(edge_index: Int[Tensor, "2 E"], count: int, extra: int) -> Int[Tensor, "2 E2"]:
-    """Appends edges of the dummy node ``count``."""
-    return pad(edge_index, (0, extra), value=count)

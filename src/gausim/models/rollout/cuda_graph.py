@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -14,24 +13,7 @@ from gausim.core import ConfigError, SimState, SteppedFrame
 WARM_UP = 3  # steps before a capture: lazy initialisation and autotuning must be over (PyTorch's notes on CUDA graphs)
 
 
-@runtime_checkable
-class Predicted(Protocol):
-    """What a rollout keeps of a step; :class:`gausim.models.step.simulator.Step` is one."""
-
-    @property
-    def positions(self) -> Tensor:
-        """x_{t+1} of all kernels, (K, 3) [scene units]."""
-
-    @property
-    def deformation_gradients(self) -> Tensor:
-        """Accumulated deformation gradients of the units, (N, 3, 3)."""
-
-    @property
-    def rotations(self) -> Tensor:
-        """Their rotations, (N, 3, 3)."""
-
-
-StepFunction = Callable[[SimState, Tensor | None], Predicted]
+StepFunction = Callable[[SimState, Tensor | None], SteppedFrame]
 
 
 class GraphedStep:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gausim.core import SimState, SteppedFrame
-from gausim.models.rollout.cuda_graph import Predicted, StepFunction
+from gausim.models.rollout.cuda_graph import StepFunction
 from gausim.models.step.prepared import Prepared
 from gausim.models.step.simulator import GausSim
 from gausim.ops.deformation import polar_rotation
@@ -52,7 +52,7 @@ class EnergyGuard:
         self._made: SteppedFrame | None = None
         self.held, self.limited = 0, 0
 
-    def step(self, step: StepFunction, state: SimState, force: Tensor | None) -> Predicted:
+    def step(self, step: StepFunction, state: SimState, force: Tensor | None) -> SteppedFrame:
         """The next frame.
 
         Counted are those whose correction was held back (:attr:`held`) and those that the ceiling limited, their force
@@ -83,7 +83,7 @@ class EnergyGuard:
         self._made = SteppedFrame(result.positions, result.deformation_gradients, result.rotations)
         return result
 
-    def _weakened(self, state: SimState, force: Tensor, ceiling: float) -> tuple[Predicted, float]:
+    def _weakened(self, state: SimState, force: Tensor, ceiling: float) -> tuple[SteppedFrame, float]:
         """The template's step with the largest part of the force that stays below the ceiling, or none."""
         for scale in WEAKER:
             made, energy = self._corrected(state, scale * force if scale else None, 0.0)
@@ -91,7 +91,7 @@ class EnergyGuard:
                 break
         return made, energy
 
-    def _cut_short(self, made: Predicted, state: SimState, ceiling: float) -> tuple[Predicted, float]:
+    def _cut_short(self, made: SteppedFrame, state: SimState, ceiling: float) -> tuple[SteppedFrame, float]:
         """The longest part of a step below the ceiling, by bisection; none where even standing still is above it.
 
         Below means in motion and if it stopped at once: E looks at the middle of a step, which its end may overtop.
@@ -106,7 +106,7 @@ class EnergyGuard:
         part = self._part(made, state, low)
         return part, self._energy(_after(part, state))
 
-    def _part(self, made: Predicted, state: SimState, scale: float) -> SteppedFrame:
+    def _part(self, made: SteppedFrame, state: SimState, scale: float) -> SteppedFrame:
         positions = state.positions + scale * (made.positions - state.positions)
         if self._made is None:  # the first step: from identity gradients
             before = turned = torch.eye(3).to(positions).expand_as(made.deformation_gradients)
@@ -116,7 +116,9 @@ class EnergyGuard:
         rotations = polar_rotation(turned + scale * (made.rotations - turned))
         return SteppedFrame(positions, deformation_gradients, rotations)
 
-    def _held_back(self, state: SimState, force: Tensor | None, energy: float, limit: float) -> tuple[Predicted, float]:
+    def _held_back(
+        self, state: SimState, force: Tensor | None, energy: float, limit: float
+    ) -> tuple[SteppedFrame, float]:
         self.held += 1
         alone, lowest = self._corrected(state, force, 0.0)
         if lowest >= limit:
@@ -124,7 +126,7 @@ class EnergyGuard:
         part, found = self._corrected(state, force, (limit - lowest) / (energy - lowest))
         return (part, found) if found <= limit else (alone, lowest)
 
-    def _corrected(self, state: SimState, force: Tensor | None, scale: float) -> tuple[Predicted, float]:
+    def _corrected(self, state: SimState, force: Tensor | None, scale: float) -> tuple[SteppedFrame, float]:
         made = self._model.step(self._prepared.batch, state, force, self._prepared, scale)
         return made, self._energy(_after(made, state))
 
@@ -132,5 +134,5 @@ class EnergyGuard:
         return float(self._model.energy(self._prepared.batch, state, self._prepared))
 
 
-def _after(step: Predicted, state: SimState) -> SimState:
+def _after(step: SteppedFrame, state: SimState) -> SimState:
     return SimState(step.positions, state.positions)

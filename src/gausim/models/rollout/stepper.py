@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import SimState, SteppedFrame
-from gausim.models.rollout.cuda_graph import GraphedStep, Predicted, StepFunction
+from gausim.models.rollout.cuda_graph import GraphedStep, StepFunction
 from gausim.models.rollout.energy_guard import EnergyGuard
 from gausim.models.rollout.watch import Watch
 from gausim.models.step.prepared import Prepared
@@ -89,7 +89,7 @@ class SceneStepper:
         self._watch.ask(self._number, now=True)
 
     def _function(self, prepared: Prepared) -> StepFunction:
-        def step(state: SimState, force: Tensor | None) -> Predicted:
+        def step(state: SimState, force: Tensor | None) -> SteppedFrame:
             return self._model.step(prepared.batch, state, force, prepared)
 
         rest = prepared.batch.rest

@@ -10,8 +10,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gausim.core import ConfigError
-from gausim.kernels.compiled import fits
-from gausim.kernels.features import NetworkInputs
 from gausim.models.step.recursion import Solved, Units
 
 # Lengths are divided by the diagonal of the scene before they get here: 1e-6 of it is nothing.
@@ -137,54 +135,30 @@ def network_inputs(
         options: among the readings of the paper.
         coarse: whether positions are those of the coarse prediction.
     """
-    moving = unit.rest, unit.now, unit.before, target
-    parents = above.rest, above.now, above.before, above.after, above.template, above.gradient
-    if fits(*moving, *parents, unit.log_density, unit.attributes, size, dt, gravity):
-        choices = options.rest_inputs, coarse, options.angle == "cos_sin"
-        constants = above.index, edge_index, size.view(-1), dt.view(-1), gravity
-        made = NetworkInputs.apply(*moving, unit.log_density, unit.attributes, *parents, *constants, choices)
-        return made if options.velocities else _positions_only(made[0], made[1], unit, target, above, size)
-    own = UnitState(unit.rest / size, unit.now / size, unit.before / size, above.carry(target) / size)
-    parent = UnitState(*(x.index_select(0, above.index) / size for x in parents[:4]))
-    nodes = node_features(
-        own, parent, dt, gravity / size, unit.log_density, unit.attributes, options, coarse=coarse
-    )  # fmt: skip
+    coarsely = above.carry(target)
+    # Stacked and gathered together: on a CPU the number of operations is what costs.
+    own = UnitState(*(torch.stack((unit.rest, unit.now, unit.before, coarsely)) / size).unbind())
+    parents = torch.stack((above.rest, above.now, above.before, above.after)).index_select(1, above.index)
+    parent = UnitState(*(parents / size).unbind())
     edges = edge_features(own, parent, edge_index, dt, options, coarse=coarse)
-    return (nodes, edges) if options.velocities else _positions_only(nodes, edges, unit, target, above, size)
+    if options.velocities:
+        moving = _velocities(own, parent, dt, gravity / size, options, coarse=coarse)
+    else:
+        lever = (unit.rest - above.rest.index_select(0, above.index)) / size
+        moving = [lever, own.now - own.rest, (coarsely - target) / size]
+    return torch.cat([*moving, unit.log_density[:, None], unit.attributes], -1), edges
 
 
-def _positions_only(
-    nodes: Tensor, edges: Tensor, unit: Units, target: Tensor, above: Solved, size: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Inputs without any velocity: lever, displacement and what the parent did to the template [diagonals]."""
-    lever = (unit.rest - above.rest.index_select(0, above.index)) / size
-    done = (above.carry(target) - target) / size
-    nodes = torch.cat((lever, nodes[:, 6:9], done, nodes[:, 12:]), -1)
-    return nodes, torch.cat((edges[:, :4], edges[:, 7:]), -1)
-
-
-def node_features(
-    unit: UnitState,
-    parent: UnitState,
-    dt: Float[Tensor, "N 1"],
-    gravity: Float[Tensor, "N 3"],
-    log_density: Float[Tensor, " N"],
-    attributes: Float[Tensor, "N A"],
-    options: FeatureOptions,
-    *,
-    coarse: bool = False,
-) -> Float[Tensor, "N C"]:
-    """Inertial acceleration of the parent's frame plus gravity, local velocity, log density and attributes.
-
-    With ``coarse`` the velocity reads the coarse prediction and the parent's new position instead of x_t.
-    """
+def _velocities(
+    unit: UnitState, parent: UnitState, dt: Tensor, gravity: Tensor, options: FeatureOptions, *, coarse: bool
+) -> list[Tensor]:
+    """Inertial acceleration of the parent's frame plus gravity, local velocity, and ``rest_inputs``."""
     inertial = gravity - (parent.after - 2 * parent.now + parent.before) / dt**2
     local = unit.after - parent.after if coarse else unit.now - parent.now
-    velocity = (local - (unit.before - parent.before)) / dt
-    columns = [inertial, velocity]
+    columns = [inertial, (local - (unit.before - parent.before)) / dt]
     if options.rest_inputs:
         columns += [unit.now - unit.rest, (unit.after - unit.now) / dt]
-    return torch.cat([*columns, log_density[:, None], attributes], -1)
+    return columns
 
 
 def edge_features(
@@ -202,32 +176,28 @@ def edge_features(
     """
     s, d = edge_index
     current, centre = (unit.after, barycentre.after) if coarse else (unit.now, barycentre.now)
-    now = current.index_select(0, d) - current.index_select(0, s)
-    rest = unit.rest.index_select(0, d) - unit.rest.index_select(0, s)
-    before = unit.before.index_select(0, d) - unit.before.index_select(0, s)
-    length = safe_norm(now)
-    columns = [length / safe_norm(rest), now / length, (now - before) / dt.index_select(0, d)]
+    places = torch.stack((unit.rest, current, unit.before), 1)
+    source, destination = places.index_select(0, s), places.index_select(0, d)
+    offset = destination - source
+    rest, now, before = offset.unbind(1)
+    rest_length, length = safe_norm(offset[:, :2]).unbind(1)
+    columns = [length / rest_length, now / length]
+    if options.velocities:
+        columns.append((now - before) / dt.index_select(0, d))
     if options.rest_inputs:
         columns += [rest, now - rest]
-    columns.append(_angle(current, centre, unit.rest, barycentre.rest, edge_index, options.angle))
+    about = torch.stack((barycentre.rest, centre), 1).index_select(0, d)
+    columns.append(_turned(destination[:, :2] - about, source[:, :2] - about, options.angle))
     return torch.cat(columns, -1)
 
 
-def _angle(now: Tensor, centre: Tensor, rest: Tensor, rest_centre: Tensor, edge_index: Tensor, kind: str) -> Tensor:
-    s, d = edge_index
-    products = []
-    for x, c in ((now, centre), (rest, rest_centre)):
-        c = c.index_select(0, d)
-        a, b = x.index_select(0, d) - c, x.index_select(0, s) - c
-        dot = (a * b).sum(-1, keepdim=True)
-        if kind == "inner":
-            products.append((dot, dot))
-        else:
-            scale = safe_norm(a) * safe_norm(b)
-            # Floored by the square of the lengths' floor: a unit on its barycentre gives 0, never 1 / length.
-            across = torch.linalg.cross(a, b).square().sum(-1, keepdim=True).add(TINY**4).sqrt()
-            products.append((dot / scale, across / scale))
-    (c1, s1), (c0, s0) = products
+def _turned(a: Float[Tensor, "E 2 3"], b: Float[Tensor, "E 2 3"], kind: str) -> Float[Tensor, "E C"]:
+    """The angle between two directions now less that at rest; both stand at rest, then now."""
+    dot = (a * b).sum(-1, keepdim=True)
     if kind == "inner":
-        return c1 - c0
+        return dot[:, 1] - dot[:, 0]
+    scale = safe_norm(a) * safe_norm(b)
+    # Floored by the square of the lengths' floor: a unit on its barycentre gives 0, never 1 / length.
+    across = torch.linalg.cross(a, b).square().sum(-1, keepdim=True).add(TINY**4).sqrt()
+    (c0, c1), (s0, s1) = (dot / scale).unbind(1), (across / scale).unbind(1)
     return torch.cat((c1 * c0 + s1 * s0, s1 * c0 - c1 * s0), -1)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.models.hierarchy.batch import LevelBatch
-from gausim.models.hierarchy.edges import EdgeSet, fill, fill_edges
+from gausim.models.hierarchy.edges import EdgeSet
 from gausim.models.step.features import FeatureOptions, network_inputs
 from gausim.models.step.head import Head
 from gausim.models.step.recursion import Solved, Units
@@ -92,10 +92,8 @@ class GradientPredictor(nn.Module):
             unit, target, above, present, level.length, level.dt, self.gravity, self.features, coarse=coarse
         )
         nodes, edges = self.node_normaliser(nodes), self.edge_normaliser(edges)
-        extra = self.edges.missing(edge_index.shape[1])
-        if fixed or self.edges.bucket:
-            nodes, edges = fill(nodes, 1), fill(edges, extra)
-            edge_index = fill_edges(edge_index, level.count, extra)
+        if fixed:
+            nodes = nn.functional.pad(nodes, (0, 0, 0, 1))
         output: Tensor = network(nodes, edges, edge_index)[: level.count]
         return output
 

@@ -8,8 +8,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gausim.kernels import recursion as compiled
-from gausim.kernels.compiled import fits
 from gausim.models.hierarchy.batch import Inheritance
 from gausim.ops.deformation import polar_rotation
 
@@ -89,10 +87,6 @@ def advance(
         target: template positions T of the units [scene units].
         above: the solved parents.
     """
-    if fits(gradient, rotation, target, above.after, above.template, above.gradient, above.rotation):
-        return compiled.Advance.apply(
-            gradient, rotation, target, above.after, above.template, above.gradient, above.rotation, above.index
-        )  # fmt: skip
     accumulated = gradient @ above.gradient.index_select(0, above.index)
     offset = target - above.template.index_select(0, above.index)
     after = above.after.index_select(0, above.index) + apply(accumulated, offset)
@@ -111,11 +105,6 @@ def inherit(
         kernels: who inherits from whom.
     """
     gradient, rotation = finest.gradient, finest.rotation
-    if fits(gradient, rotation, finest.rest, finest.after, kernels.rest):
-        return compiled.Inherit.apply(
-            gradient, template, rotation, finest.rest, finest.after, kernels.rest, kernels.unit, kernels.rows,
-            kernels.padded,
-        )  # fmt: skip
     if template is not None:
         gradient = gradient @ template
         rotation = rotation @ polar_rotation(template.detach())

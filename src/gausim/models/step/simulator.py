@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gausim.core import GaussianScene, SimState
-from gausim.kernels.announce import announced
+from gausim.core import GaussianScene, SimState, SteppedFrame
 from gausim.models.hierarchy.batch import LevelBatch, SceneBatch
 from gausim.models.hierarchy.edges import EdgeSet
 from gausim.models.hierarchy.units import FixedUnits, fixed_units
@@ -30,21 +29,15 @@ PLAIN_HEAD, PLAIN_ROLLOUT = Head(), RolloutSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class Step:
-    """What a step gives.
+class Step(SteppedFrame):
+    """What a step gives: x_{t+1} of a batch, and accumulated gradients and rotations of its finest units.
 
     Attributes:
-        positions: x_{t+1} of all kernels of the batch [scene units].
-        deformation_gradients: accumulated, of the finest predicted units, per member plus its identity unit.
-        rotations: their accumulated rotations.
         momentum: sum over levels and parents of ||m_c x_c - sum m_i x_i||^2, masses over that of the scene and lengths
             over its diagonal; zero where it is switched off.
         predicted: the network's own gradients F, per predicted level, coarse to fine.
     """
 
-    positions: Float[Tensor, "K 3"]
-    deformation_gradients: Float[Tensor, "N 3 3"]
-    rotations: Float[Tensor, "N 3 3"]
     momentum: Float[Tensor, ""]
     predicted: tuple[Float[Tensor, "_ 3 3"], ...]
 
@@ -94,7 +87,7 @@ class GausSim(SceneModel):
         )  # fmt: skip
         self.predictor = GradientPredictor(
             networks=1 if hierarchy.share_network else len(self.predicted_levels), features=features, network=network,
-            head=head, edges=EdgeSet(hierarchy.edges, hierarchy.edge_bucket), conserve_mass=conserve_mass,
+            head=head, edges=EdgeSet(hierarchy.edges), conserve_mass=conserve_mass,
         )  # fmt: skip
 
     def prepare(self, batch: SceneBatch) -> Prepared:
@@ -140,11 +133,10 @@ class GausSim(SceneModel):
         prepared.check_serves(batch)
         if force is not None:
             state = self.pushed(prepared, state, force)
-        with announced("the simulator's step"):
-            now, before = prepared.finest(state.positions), prepared.finest(state.previous)
-            finest, template, momentum, predicted = self._descend(prepared, now, before, correction_scale, [])
-            finest, template, predicted = prepared.in_scene_axes(finest, template, predicted)
-            return Step(*inherit(finest, template, batch.kernels), momentum, tuple(predicted))
+        now, before = prepared.finest(state.positions), prepared.finest(state.previous)
+        finest, template, momentum, predicted = self._descend(prepared, now, before, correction_scale, [])
+        finest, template, predicted = prepared.in_scene_axes(finest, template, predicted)
+        return Step(*inherit(finest, template, batch.kernels), momentum, tuple(predicted))
 
     def _descend(
         self, prepared: Prepared, now: Tensor, before: Tensor, correction_scale: float, outputs: list[Tensor]

@@ -1,4 +1,4 @@
-"""Covariances and colours of deformed kernels as one torch operation."""
+"""Fast form of :func:`gausim.render.draw.deformed_appearance`."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor
 
-from gausim.kernels.announce import announced
+from gausim.kernels.operations import array
 from gausim.kernels.pool import shared_pool
 from gausim.render.cpu.shading import shade, shade_adjoint
 from gausim.render.cpu.simd import LANES
@@ -20,31 +19,20 @@ BACKWARD_TASKS = 4  # each has gradients of all units of its own
 
 
 def deformed_appearance(
-    positions: Float[Tensor, "B n 3"],
-    deformation_gradients: Float[Tensor, "B N 3 3"],
-    rotations: Float[Tensor, "B N 3 3"],
-    unit_of_kernel: Int[Tensor, " n"],
-    covars: Float[Tensor, "n 3 3"],
-    sh: Float[Tensor, "n basis 3"],
-    centers: Float[Tensor, "V 3"],
-) -> tuple[Float[Tensor, "B n 3 3"], Float[Tensor, "B V n 3"]]:
-    """Covariances G S G^T and colours max(0, 0.5 + sum_b sh_b Y_b(Q^T d)) (METHOD section 2), float32 on the CPU.
-
-    Differentiable in all but the camera centres. Works on torch.get_num_threads() threads; the result does not depend
-    on their number.
-
-    Args:
-        positions: kernel means of B states [scene units].
-        deformation_gradients: accumulated deformation gradients G of the N units.
-        rotations: their accumulated rotations Q.
-        unit_of_kernel: the unit of each kernel.
-        covars: rest covariances S [scene units^2].
-        sh: colour coefficients of degree 0..3.
-        centers: of V cameras [scene units].
-    """
+    positions: Tensor,
+    deformation_gradients: Tensor,
+    rotations: Tensor,
+    unit_of_kernel: Tensor,
+    covars: Tensor,
+    sh: Tensor,
+    centers: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """:func:`gausim.render.draw.deformed_appearance`, divided over torch's number of threads without effect on bits."""
     pool = shared_pool(torch.get_num_threads())
-    with announced("the colours of deformed kernels"):
-        return _Shade.apply(positions, deformation_gradients, rotations, covars, sh, unit_of_kernel, centers, pool)
+    found: tuple[Tensor, Tensor] = _Shade.apply(
+        positions, deformation_gradients, rotations, covars, sh, unit_of_kernel, centers, pool
+    )
+    return found
 
 
 def _lanes(rows: Tensor) -> Any:
@@ -60,10 +48,6 @@ def _rows(lanes: Any, like: Tensor) -> Tensor:
     """The sum over states of (B, blocks, numbers, LANES), in the shape of ``like`` (n, ...)."""
     total = lanes.sum(0).transpose(0, 2, 1)
     return torch.from_numpy(total.reshape(-1, total.shape[2])[: like.shape[0]]).reshape(like.shape)
-
-
-def _array(tensor: Tensor) -> Any:
-    return tensor.detach().contiguous().numpy()
 
 
 def _cuts(blocks: int, tasks: int, states: int) -> list[tuple[int, int]]:
@@ -85,8 +69,8 @@ class _Shade(torch.autograd.Function):
     ) -> Any:
         unit, centers, pool = rest
         states, count = positions.shape[:2]
-        inputs = [_array(x) for x in (positions, deformation_gradients, rotations)]
-        fixed = _array(unit), _lanes(covars), _lanes(sh), round(sh.shape[1] ** 0.5) - 1, _array(centers)
+        inputs = [array(x) for x in (positions, deformation_gradients, rotations)]
+        fixed = array(unit), _lanes(covars), _lanes(sh), round(sh.shape[1] ** 0.5) - 1, array(centers)
         out_covars = np.empty((states, count, 3, 3), np.float32)
         out_colors = np.empty((states, centers.shape[0], count, 3), np.float32)
         cuts = _cuts(fixed[1].shape[0], FORWARD_TASKS, states)
@@ -106,7 +90,7 @@ class _Shade(torch.autograd.Function):
     def backward(ctx: Any, grad_covars: Tensor, grad_colors: Tensor) -> Any:
         positions, deformation_gradients, _, covars, sh = ctx.saved_tensors
         states, fixed, needed = positions.shape[0], ctx.fixed, ctx.needs_input_grad
-        given = _array(grad_covars), _array(grad_colors)
+        given = array(grad_covars), array(grad_colors)
         cuts = _cuts(fixed[1].shape[0], BACKWARD_TASKS, states)
         moved = np.empty(positions.shape, np.float32)
         of_units = np.zeros((2, states, len(cuts), *deformation_gradients.shape[1:]), np.float32)

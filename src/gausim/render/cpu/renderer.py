@@ -11,12 +11,9 @@ from torch import Tensor
 
 from gausim.core import ConfigError, Rendered
 from gausim.kernels.announce import announced
+from gausim.kernels.operations import array
 from gausim.kernels.pool import shared_pool
-from gausim.render.cpu.batch import Array, Batch, Images
-
-
-def _array(tensor: Tensor) -> Array:
-    return tensor.detach().contiguous().numpy()
+from gausim.render.cpu.batch import Batch, Images
 
 
 class _Render(torch.autograd.Function):
@@ -28,13 +25,13 @@ class _Render(torch.autograd.Function):
     ) -> Any:
         pool, keep, depth, viewmats, Ks, size, near, alpha_max = rest
         batch = Batch(
-            means=_array(means),
-            covars=_array(covars),
-            colors=_array(colors),
-            opacities=_array(opacities),
-            viewmats=_array(viewmats),
-            Ks=_array(Ks),
-            background=_array(background),
+            means=array(means),
+            covars=array(covars),
+            colors=array(colors),
+            opacities=array(opacities),
+            viewmats=array(viewmats),
+            Ks=array(Ks),
+            background=array(background),
             width=size[0],
             height=size[1],
             near=near,
@@ -54,9 +51,9 @@ class _Render(torch.autograd.Function):
         batch, needed = ctx.batch, ctx.needs_input_grad[:5]
         shape = (*batch.viewmats.shape[:2], batch.height, batch.width)
         images = Images(
-            np.zeros((*shape, 3), np.float32) if grad_rgb is None else _array(grad_rgb),
-            np.zeros(shape, np.float32) if grad_alpha is None else _array(grad_alpha),
-            None if grad_depth is None else _array(grad_depth),
+            np.zeros((*shape, 3), np.float32) if grad_rgb is None else array(grad_rgb),
+            np.zeros(shape, np.float32) if grad_alpha is None else array(grad_alpha),
+            None if grad_depth is None else array(grad_depth),
         )
         grads = batch.backward(ctx.pool, images, background=needed[4])
         return (

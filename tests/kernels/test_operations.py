@@ -1,0 +1,181 @@
+"""Every operation's fast form against its plain one in float64, values and gradients; which of them serves a call."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from gausim.data.images import over_black
+from gausim.kernels.operations import OPERATIONS, Operation, plain_forms
+from gausim.losses.image import gaussian_taps, image_loss
+from gausim.ops.deformation import bounded_deformation, gradient_from_output, polar_rotation
+from gausim.render.draw import deformed_appearance
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def outputs() -> tuple[Tensor]:
+    found = random(40, 11)
+    found[::3, 8:] *= 8  # beyond the bound of the stretch
+    assert bool((found[:, 8:].abs() > 5).any())
+    return (found,)
+
+
+def near_identity() -> tuple[Tensor]:
+    found = torch.eye(3) + 0.4 * random(60, 3, 3)
+    assert 0 < int((torch.linalg.det(found) < 0.2).sum()) < 30
+    return (found,)
+
+
+def rotatable() -> tuple[Tensor]:
+    found = torch.eye(3) + 0.25 * random(50, 3, 3)
+    return (found[torch.linalg.det(found) > 0.1],)
+
+
+def pictures(height: int, width: int, box: tuple[slice, slice] = (slice(None), slice(None))) -> tuple[Tensor, Tensor]:
+    """Prediction and truth; outside a box both are black, and what is in it is shifted a little in the truth."""
+    images = random(2, 3, 2, height, width, 3).sigmoid()
+    inside = torch.zeros(height, width, 1, dtype=torch.float64)
+    inside[box] = 1
+    prediction, target = images * inside
+    return prediction, target if box[0] == slice(None) else target.roll((2, 2), (2, 3))
+
+
+def pixel(which: int, row: int, column: int) -> tuple[Tensor, Tensor]:
+    """All black but for one pixel of one image."""
+    images = torch.zeros(2, 1, 1, 19, 31, 3, dtype=torch.float64)
+    images[which, 0, 0, row, column, 1] = 0.7
+    return images[0], images[1]
+
+
+def deformed(degree: int) -> tuple[Tensor, ...]:
+    """Positions, gradients, rotations, covariances and colours; 37 kernels are no multiple of a block of sixteen."""
+    gradients, root = torch.eye(3) + 0.3 * random(3, 5, 3, 3), random(37, 3, 3, seed=1)
+    rotations = polar_rotation.plain(gradients)
+    return random(3, 37, 3), gradients, rotations, root @ root.mT, random(37, (degree + 1) ** 2, 3, seed=2)
+
+
+def appearance(form: Callable[..., Any], *x: Tensor) -> Any:
+    unit = torch.randint(0, 5, (37,), generator=torch.Generator().manual_seed(3))
+    return form(*x[:3], unit, *x[3:], 4 * random(2, 3, seed=4).to(x[0]))
+
+
+def loss(form: Callable[..., Any], *x: Tensor, window: int = 5, balance: float = 0.9) -> Any:
+    return form(*x, gaussian_taps(window), balance=balance, scale=7.0)
+
+
+Form, Case = Callable[..., Any], tuple[Operation[..., Any], Callable[..., Any], tuple[Tensor, ...]]
+SIZES = [(17, 23, 5), (6, 40, 5), (33, 7, 5), (5, 5, 5), (9, 8, 3), (21, 11, 11)]  # height, width, window
+BOXES = [(slice(10, 20), slice(12, 30)), (slice(0, 9), slice(25, 38)), (slice(30, 31), slice(3, 4))]
+CORNERS = [(0, 0), (0, -1), (-1, 0), (-1, -1), (2, 20), (10, 1)]
+CASES: dict[str, Case] = {
+    "gradient_from_output": (gradient_from_output, lambda f, x: f(x, conserve_mass=False), outputs()),
+    "gradient_from_output-conserving": (gradient_from_output, lambda f, x: f(x, conserve_mass=True), outputs()),
+    "bounded_deformation": (bounded_deformation, lambda f, x: f(x, 0.2, unit=False), near_identity()),
+    "bounded_deformation-unit": (bounded_deformation, lambda f, x: f(x, 0.2, unit=True), near_identity()),
+    "polar_rotation": (polar_rotation, lambda f, x: f(x), rotatable()),
+    **{f"image_loss-{h}-{w}-{n}-{b}": (image_loss, partial(loss, window=n, balance=b), pictures(h, w))
+       for h, w, n in SIZES for b in (0.9, 0.0, 1.0)},
+    **{f"image_loss-box-{i}": (image_loss, loss, pictures(33, 40, box)) for i, box in enumerate(BOXES)},
+    **{f"image_loss-pixel-{i}-{r}-{c}": (image_loss, loss, pixel(i, r, c)) for i in (0, 1) for r, c in CORNERS},
+    **{f"deformed_appearance-{d}": (deformed_appearance, appearance, deformed(d)) for d in range(4)},
+    "over_black": (over_black, lambda f, x: f((255 * x).to(torch.uint8)), (random(2, 5, 7, 4).sigmoid(),)),
+}  # fmt: skip
+
+
+def test_every_operation_has_a_case() -> None:
+    assert {made.__name__ for made, _, _ in CASES.values()} == set(OPERATIONS)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_fast_form_in_float32_is_the_plain_one_in_float64(name: str) -> None:
+    made, call, inputs = CASES[name]
+    found = []
+    for form, dtype in ((made.fast, torch.float32), (made.plain, torch.float64)):
+        leaves = [x.to(dtype).requires_grad_(not made.constant) for x in inputs]
+        results = call(form, *leaves)
+        results = list(results) if isinstance(results, tuple) else [results]
+        slopes = [r for r in results if r.requires_grad]
+        if slopes:
+            total = sum((r * random(*r.shape, seed=i).to(dtype)).sum() for i, r in enumerate(slopes))
+            results += torch.autograd.grad(total, leaves, materialize_grads=True)
+        found.append(results)
+    assert found[1][0].any() and len(found[0]) == len(found[1])
+    for number, (value, truth) in enumerate(zip(*found, strict=True)):
+        assert value.dtype is torch.float32, number
+        assert float((value - truth).detach().norm()) <= 2e-6 * float(truth.detach().norm()) + 1e-9, number
+
+
+@pytest.fixture
+def torch_threads() -> Iterator[None]:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("name", ["image_loss-17-23-5-0.9", "deformed_appearance-2"])
+def test_bits_do_not_depend_on_the_number_of_threads(torch_threads: None, name: str) -> None:
+    made, call, inputs = CASES[name]
+    found = []
+    for threads in (1, 2, 4):
+        torch.set_num_threads(threads)
+        leaves = [x.float().requires_grad_() for x in inputs]
+        results = call(made.fast, *leaves)
+        if results[0].requires_grad:
+            results = (*results, *torch.autograd.grad(sum(r.sum() for r in results), leaves))
+        found.append(results)
+    for other in found[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(found[0], other, strict=True))
+
+
+def test_float32_on_the_cpu_is_what_fast_forms_take() -> None:
+    x, calls = torch.ones(2), []
+    made: Operation[..., str] = Operation(lambda *_: "plain", "math:fabs", constant=False)
+    constant: Operation[..., str] = Operation(lambda *_: "plain", "math:fabs", constant=True)
+    for one in (made, constant):
+        vars(one)["fast"] = lambda *given: calls.append(given) or "fast"
+    assert made(x) == made(x, torch.arange(2)) == made(x.requires_grad_()) == "fast" and len(calls) == 3
+    assert made(x, x.double()) == made(x.to("meta")) == constant(x) == "plain"
+    with torch.no_grad():
+        assert constant(x) == "fast"
+
+
+def test_fast_forms_can_be_switched_off() -> None:
+    x = CASES["gradient_from_output"][2][0].float()
+    fast, plain = (
+        gradient_from_output.fast(x, conserve_mass=True)[0],
+        gradient_from_output.plain(x, conserve_mass=True)[0],
+    )
+    assert not torch.equal(fast, plain)  # other roundings
+    with plain_forms(["polar_rotation"]):
+        assert torch.equal(gradient_from_output(x, conserve_mass=True)[0], fast)
+        with plain_forms():
+            assert torch.equal(gradient_from_output(x, conserve_mass=True)[0], plain)
+    assert torch.equal(gradient_from_output(x, conserve_mass=True)[0], fast)
+
+
+@pytest.mark.slow
+def test_the_process_that_compiles_gives_the_bits_of_later_ones(tmp_path: Path) -> None:
+    code = """
+import hashlib, torch
+from gausim.losses import ImageLoss
+x, y = torch.rand(2, 1, 2, 40, 37, 3, generator=torch.Generator().manual_seed(0))
+values, gradient = ImageLoss().value_and_gradient(x, y)
+print(hashlib.sha256(values.numpy().tobytes() + gradient.numpy().tobytes()).hexdigest())
+"""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    runs = [subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+            for _ in range(2)]  # fmt: skip
+    assert list(tmp_path.rglob("*.nbc"))  # the second one had something to load
+    assert len(runs[0].stdout) > 60 and runs[0].stdout == runs[1].stdout
