@@ -18,6 +18,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from gausim.cli.main import COMMANDS
+from gausim.cli.prepare import STAGES
 from gausim.compose.places import Place, read_places
 from gausim.compose.root import RootConfig, conf_dir
 from gausim.compose.schema import documented
@@ -142,13 +143,13 @@ def commands() -> str:
     sys.path.insert(0, str(ROOT))
     parts = [
         "# Commands",
-        "What `gausim COMMAND --help` prints, then the stages of `data_prep`, which are run from a checkout. The exit "
+        "What `gausim COMMAND --help` prints, then the stages of `gausim prepare`. The exit "
         "status is 0 where a command worked, 2 on wrong usage or unusable input, 130 when interrupted.",
     ]
     for name, command in COMMANDS.items():
         parts += _help(f"gausim {name}", importlib.import_module(command.module).main)
-    for name in sorted(path.stem for path in (ROOT / "data_prep").glob("[a-z]*.py")):
-        parts += _help(f"python -m data_prep.{name}", importlib.import_module(f"data_prep.{name}").main)
+    for name in STAGES:
+        parts += _help(f"gausim prepare {name}", importlib.import_module(f"data_prep.{name}").main)
     return "\n\n".join(parts)
 
 
