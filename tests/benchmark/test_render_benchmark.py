@@ -15,6 +15,7 @@ from gausim.benchmark.splats import deformed, splats
 from gausim.cli.benchmark import CASES
 from gausim.render import gsplat
 from gausim.render.cpu import CpuRenderer
+from gausim.render.draw import deformed_appearance
 from gausim.render.reference import ReferenceRenderer
 
 QUICK = Options(torch.device("cpu"), quick=True, rounds=1)
@@ -75,9 +76,10 @@ def test_both_renderers_draw_and_differentiate_the_same_scene() -> None:
 
 def test_colours_of_both_forms_are_the_same() -> None:
     state = deformed(50, 6, 3, 2)
-    for value, expected in zip(render._compiled(state), render._by_torch(state), strict=True):
+    fast, plain = deformed_appearance.fast, deformed_appearance.plain
+    for value, expected in zip(render._forward(state, fast), render._forward(state, plain), strict=True):
         torch.testing.assert_close(value, expected)
-    found, truth = render._gradients(state, render._compiled), render._gradients(state, render._by_torch)
+    found, truth = render._gradients(state, fast), render._gradients(state, plain)
     for value, expected in zip(found, truth, strict=True):
         torch.testing.assert_close(value, expected, rtol=1e-4, atol=1e-5)
 

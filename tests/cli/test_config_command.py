@@ -93,7 +93,7 @@ def test_keys_without_a_target_are_those_of_any(schema) -> None:
     def change(**keys: Any) -> list[str]:
         return violations(schema, {"model": {"method": keys}})
 
-    assert change(anchors=3, courant=0.5) == []  # of the springs, and of PhysDreamer
+    assert change(anchors=3, particles=9) == []  # of the springs, and of PhysDreamer
     assert len(change(ankers=3)) == 1
 
 

@@ -10,6 +10,7 @@ import torch
 
 from gausim.cli.main import main
 from gausim.compose.config import compose
+from gausim.compose.places import more_settings
 from gausim.core.scene import GaussianScene
 from gausim.io.ply import load_scene, masks_path, save_scene
 
@@ -108,8 +109,9 @@ def test_the_default_hierarchy_is_that_of_the_models(
     assert main(common) == 0
     default = capsys.readouterr().out
     hierarchy = simulator.hierarchy
+    clustering = more_settings()["model.simulator.hierarchy.clustering"]
     radii = [str(level.diameter) for level in reversed(hierarchy.levels)]
-    assert main([*common, "--clustering", hierarchy.clustering, "--radii", *radii]) == 0
+    assert main([*common, "--clustering", clustering, "--radii", *radii]) == 0
     assert capsys.readouterr().out == default
     assert all(f"{float(radius):.3g} of diagonal" in default for radius in radii)
 

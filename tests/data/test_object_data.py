@@ -16,7 +16,7 @@ from gausim.core import ConfigError, DataError, SceneError
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData, find_objects
 from gausim.data.records import read_stills
-from gausim.kernels.compiled import torch_only
+from gausim.kernels.operations import plain_forms
 
 VIEWS = ("cam_0", "cam_1", "cam_2")
 FRAMES, POINTS = 20, 5  # of tests/data/conftest.py
@@ -70,7 +70,7 @@ def test_compiled_and_torch_give_the_same_bits_for_every_value() -> None:
     colour, alpha = torch.arange(256).repeat(256), torch.arange(256).repeat_interleave(256)
     frames = torch.stack((colour, 255 - colour, colour // 2, alpha), -1).to(torch.uint8).reshape(2, 128, 256, 4)
     compiled = composite(frames)
-    with torch_only():
+    with plain_forms():
         plain = composite(frames)
     assert all(torch.equal(a, b) for a, b in zip(compiled, plain, strict=True))
     assert float(compiled[0].max()) == 1.0

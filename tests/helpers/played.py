@@ -38,7 +38,13 @@ def played_run(folder: Path) -> SimpleNamespace:
             return SceneDynamics(model).rollout(SimState(toy.scene.means, states.previous(sequence)), steps)
 
     module = SimpleNamespace(
-        model=model, simulator=model, initial_states=states, predict=predict, method_name="gausim", footnotes=None
+        model=model,
+        simulator=model,
+        initial_states=states,
+        predict=predict,
+        method_name="gausim",
+        footnotes=None,
+        method=None,
     )
     directory = folder / "demo" / "seed_0"
     directory.mkdir(parents=True)

@@ -104,7 +104,8 @@ def _check_more(config: DictConfig, overrides: Sequence[str]) -> None:
     """Refuses settings of what is not there, as that of a network where the model has none."""
     for key in (override.partition("=")[0] for override in overrides if override.startswith("++")):
         parent = OmegaConf.select(config, key[2:].rpartition(".")[0])
-        if key[2:] in more_settings() and not (isinstance(parent, DictConfig) and "_target_" in parent):
+        built = parent is None or (isinstance(parent, DictConfig) and "_target_" in parent)  # None: switched off
+        if key[2:] in more_settings() and not built:
             raise ConfigError(f"{key[2:]}: unknown key. This configuration builds nothing that it would be set of.")
 
 
