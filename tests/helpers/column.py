@@ -38,7 +38,7 @@ def _model(scene: GaussianScene, *, seed: int = 0, passive: int = 6) -> GausSim:
     torch.manual_seed(seed)
     model = gausim(
         [scene], [24.0], radii=(0.2, 0.5), graph_radii=(0.8, 0.35), max_neighbours=6, hidden=16, layers=2,
-        template=partial(ElasticTemplate, modes=8, geometric=1.0), output_scale=0.01, energy_guard_frames=passive,
+        template=partial(ElasticTemplate, modes=8), output_scale=0.01, anchor=True, energy_guard_frames=passive,
     )  # fmt: skip
     with torch.no_grad():
         for parameter in (*model.log_density, *model.attributes):

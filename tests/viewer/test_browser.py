@@ -70,16 +70,17 @@ def play(viewer: Viewer, page: Any, folder: Path, interaction: Interaction) -> N
     page.press(*start)
     page.drag_to(start, end)
     page.wait(lambda: live.interaction.acting, 10, "a force")
-    time.sleep(1.0)
+    begun = live.interaction.frame_number
+    page.wait(lambda: live.interaction.frame_number > begun + 40, 30, "five periods")
     page.picture(folder / "dragged.png")
     force = next(e.event for e in reversed(interaction.session().entries) if isinstance(e.event, Force))
-    moved = interaction.frame.positions - scene.means
+    moved = interaction.trajectory().positions[-40:].mean(0) - scene.means  # it swings about where the pull holds it
     along = torch.tensor(force.direction) / torch.tensor(force.direction).norm()
     mean = (moved[hands.mask] @ along).mean() / scene.diagonal
     assert float(mean) > 1e-4, f"moved {float(mean):.2e} diagonals along the drag"
     across = (moved[hands.mask].mean(0) / scene.diagonal - mean * along).norm()
     assert float(mean) > float(across), "moved more across the drag than along it"
-    seen = on_screen(viewer, viewer.placing.to_page(interaction.frame.positions[hands.mask].mean(0)))
+    seen = on_screen(viewer, viewer.placing.to_page((scene.means + moved)[hands.mask].mean(0)))
     rest = on_screen(viewer, viewer.placing.to_page(scene.means[hands.mask].mean(0)))
     assert seen[0] > rest[0], "did not move to the right on the screen"
     page.release(*end)
