@@ -36,7 +36,7 @@ SCENE = "scene.ply"
 
 @dataclass(frozen=True)
 class AssembleOptions(Options):
-    """What the pictures do not say; None leaves it to a ``dataset.json`` beside them, or to the defaults."""
+    """Facts beyond the pictures; None takes the value of a ``dataset.json`` beside them, or the default."""
 
     name: str | None = option(None, "of the object (the result's folder)")
     fps: float | None = option(
@@ -120,7 +120,7 @@ def dataset_facts(found: Gathered, options: AssembleOptions, name: str) -> dict[
 
 
 def _checked(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """What a ``dataset.json`` beside the pictures says, where it is what it should be."""
+    """Valid entries of a ``dataset.json`` beside the pictures."""
     heldout, frames = facts.get("heldout_views", []), facts.get("train_frames", [0, 2])
     if not isinstance(heldout, list) or not all(isinstance(view, str) for view in heldout):
         raise DataError(f"dataset.json: field 'heldout_views' must be a list of camera names, got {heldout!r}.")

@@ -1,4 +1,4 @@
-"""How far poses are from others of the same photos, after the similarity that brings their cameras nearest.
+"""Distance of poses from others of the same photos, after the best similarity transform of their cameras.
 
 Both may be a transforms.json (or the result of the stage poses), a COLMAP model, or a folder of projection matrices.
 Photos are told apart by their names without ending; for results of the stage poses, by the names that they came with.
@@ -23,7 +23,7 @@ def read_poses(path: Path, images: Path | None = None) -> dict[str, np.ndarray]:
     """World-to-camera matrices (4, 4) by the photos' names without ending.
 
     Args:
-        path: what holds the poses.
+        path: file or folder of the poses.
         images: folder of the photos, which projection matrices need for their names.
 
     Raises:
@@ -73,7 +73,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def comparison(poses: Path, reference: Path, images: Path | None) -> str:
-    """How far two sets of poses are from each other, for people.
+    """Text of the distance between two sets of poses.
 
     Raises:
         DataError: one cannot be read, or they have fewer than three photos in common.

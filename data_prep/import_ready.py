@@ -33,7 +33,7 @@ NEAR = 0.01
 
 @dataclass(frozen=True)
 class ReadyOptions(Options):
-    """What the folders do not say."""
+    """Facts that the folders do not contain."""
 
     fps: float = option(50.0, "of the films; the orchids' 29.97 (%(default)s)", least=1e-3, most=1e4)
     train_frames: int = option(16, "first frames to train on (%(default)s)", least=2, metavar="N")

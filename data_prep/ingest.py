@@ -56,7 +56,7 @@ def _offsets(text: str) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class IngestOptions(Options):
-    """How films are synchronised, and which of their frames are written."""
+    """Settings of synchronisation and of the frames that are written."""
 
     sync: str = option("auto", "method; auto takes the first that applies (%(default)s)", choices=METHODS)
     offsets: Mapping[str, str] | None = option(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from gausim.data.objects import ObjectData
 
 REVISION = 1
-# What an object has besides its sequences; copied as it is.
+# Files of an object besides its sequences; copied unchanged.
 PARTS = ("dataset.json", "scene.ply", "scene.masks.npz", "scene.json", "rest_points.npz", "rest_mesh.npz", "static")
 
 

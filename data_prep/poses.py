@@ -174,7 +174,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _summary(out: Path, manifest: dict[str, Any]) -> str:
-    """What the command prints."""
+    """Text that the command prints."""
     results = manifest["results"]
     error, world = results["reprojection"], results["world"]
     lines = [

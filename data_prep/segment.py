@@ -165,7 +165,7 @@ def _checked(mask: np.ndarray, clip: Clip, index: int, backend: str) -> np.ndarr
 
 
 def _figures(clip: Clip, coverage: list[float], overlaps: list[float], border: list[float]) -> dict[str, Any]:
-    """What the manifest says of a clip; refuses one in which nothing was found at all."""
+    """Entry of a clip in the manifest; refuses a clip without any foreground."""
     if max(coverage) == 0:
         raise DataError(
             f"{clip.root / clip.name}: nothing was found in any of {len(clip)} pictures. Look at them, try another "
@@ -197,7 +197,7 @@ def _rate(source: Path) -> float:
 
 
 def _beside(source: Path) -> dict[str, Path]:
-    """What belongs to the pictures, by its name: poses, facts, points."""
+    """Files beside the pictures, by name: poses, facts, points."""
     found = [*source.rglob("transforms.json"), *(source / name for name in ("dataset.json", "points.npz"))]
     named = {path.relative_to(source).as_posix(): path for path in sorted(found) if path.is_file()}
     return {name: path for name, path in named.items() if not any(part.startswith(".") for part in Path(name).parts)}

@@ -40,7 +40,7 @@ MASKS = {
     "foreground": "kernels that are compared with segmented video",
 }
 AZIMUTHS = (0.0, 90.0, 180.0, 270.0)
-# What is marked is drawn half in this colour (RGB), what is not is drawn grey.
+# Selected kernels are drawn half in this colour (RGB), the others grey.
 TINTS = {"simulated": (0.1, 0.8, 0.2), "pinned": (0.95, 0.15, 0.1), "foreground": (0.15, 0.4, 1.0)}
 _GREY, _TINT, _PALE = 0.75, 0.6, 0.7
 

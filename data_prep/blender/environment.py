@@ -26,7 +26,7 @@ from gausim.io.files import write_durably
 BPY = "4.5.15"
 REQUIREMENTS = (f"bpy=={BPY}", "numpy<2")
 PYTHON = (3, 11)
-# What an environment of ours has, written when it is complete.
+# Marker file of an environment, written when it is complete.
 MARKER = "gausim-blender.json"
 INTERPRETER = Path("bin") / "python"
 SCRIPT = Path(__file__).with_name("blender_scene.py")
@@ -38,7 +38,7 @@ class BlenderError(GausSimError):
 
 
 class Blender(Protocol):
-    """What the stage needs of Blender."""
+    """Interface of Blender that the stage uses."""
 
     def versions(self) -> dict[str, str]:
         """Versions of bpy, numpy and Python, which decide what comes out."""
@@ -151,7 +151,7 @@ def _tail(said: Any) -> str:
 
 
 def default_environment() -> Path:
-    """Where the environment lies unless said otherwise: in the user's cache directory."""
+    """Default directory of the environment, in the user's cache directory."""
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(cache) / "gausim" / f"blender-{BPY}"
 

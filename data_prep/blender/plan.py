@@ -1,4 +1,4 @@
-"""What a set made by Blender consists of: its sizes, its pushes, its cameras, its cage; all before Blender starts.
+"""Plan of a set made by Blender: sizes, pushes, cameras and cage, all fixed before Blender starts.
 
 Everything follows from the plan and the surface. A job for ``blender_scene`` is plain data: ``rest`` (file of the
 surface), ``cage`` (lattice), ``camera``, ``samples``, ``motion`` (what moves; None for stills) and ``images``.
@@ -113,7 +113,7 @@ def cage(surface: Surface) -> dict[str, Any]:
 
 
 def action(plan: Plan, surface: Surface, number: int) -> dict[str, Any]:
-    """What happens in a sequence: a poke is local, a drag moves a wide region, a double is two pokes at once."""
+    """Pushes of a sequence: a poke is local, a drag moves a wide region, a double is two pokes at once."""
     rng = np.random.default_rng([plan.seed, 2, number])
     kind, sites = KINDS[number % len(KINDS)], _sites(surface)
     first = number % len(sites)
@@ -131,7 +131,7 @@ def action(plan: Plan, surface: Surface, number: int) -> dict[str, Any]:
 
 
 def _sites(surface: Surface) -> np.ndarray:
-    """Where pushes act: places (S, 3) on the upper part of the surface, far from each other."""
+    """Sites of pushes: points (S, 3) on the upper part of the surface, far from each other."""
     points = surface.vertices[surface.gt_ids].astype(np.float64)
     upper = points[points[:, 2] >= 0.4 * points[:, 2].max()]
     return upper[farthest_points(upper, SITES)]

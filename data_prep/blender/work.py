@@ -116,7 +116,7 @@ def _run(jobs: list[dict[str, Any]], blender: Blender, workers: int, tick: Tick)
 
 
 def _left(job: dict[str, Any]) -> dict[str, Any] | None:
-    """What is left of a job; None where all is there."""
+    """The unfinished part of a job; None where it is complete."""
     images = [image for image in job["images"] if not _is_there(Path(image["file"]))]
     moved = job["motion"] is None or _is_there(Path(job["motion"]["file"]))
     return None if moved and not images else {**job, "images": images}

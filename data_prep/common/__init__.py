@@ -1,1 +1,1 @@
-"""What the stages share: all or nothing, photos, progress, the command line."""
+"""Common parts of the stages: atomic results, photos, progress, the command line."""

@@ -1,4 +1,4 @@
-"""What the stages' command lines have in common: options that are fields of dataclasses, progress, results, errors."""
+"""Common parts of the stages' command lines: options as fields of dataclasses, progress, results, errors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def option(default: Any, help: str, *, least: float = -math.inf, most: float = m
 
     Args:
         default: its value unless it is given.
-        help: what it is.
+        help: text for the command line.
         least: smallest number that it may be.
         most: largest.
         argument: of ``add_argument``, where the field's type does not say it.
@@ -85,7 +85,7 @@ def names(text: str) -> tuple[str, ...]:
 
 
 def cores() -> int:
-    """How many this process may use."""
+    """Number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

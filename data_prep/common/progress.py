@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-# What a bar shows: step, how much of it is done, how much there is.
+# Columns of a bar: step, number done, total.
 Tick = Callable[[str, int, int], None]
 
 
@@ -28,7 +28,7 @@ def bars(waiting: str | None = None) -> Iterator[Tick]:
 
     def tick(step: str, done: int, total: int) -> None:
         with lock:
-            progress.start()  # not before: what reports no steps may have bars of its own
+            progress.start()  # not earlier: a stage without steps may draw bars itself
             if first is not None:
                 progress.update(first, visible=False)
             if step not in known:

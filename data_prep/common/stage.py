@@ -1,4 +1,4 @@
-"""What the stages from film to data set have in common: all or nothing, resumable, with a manifest of what was done.
+"""Execution of the stages from film to data set: atomic, resumable, with a manifest of inputs and settings.
 
 A stage reads files and writes one directory. It works in a hidden directory beside it, which takes the final name only
 when everything is there, so a directory without ``stage.json`` is never a result. Work that was interrupted goes on
@@ -39,9 +39,10 @@ class Stage:
     inputs: Mapping[str, Path]  # files it reads, by the names that the manifest gives them
     settings: Mapping[str, Any]  # everything that was chosen; plain data (as JSON knows it)
     packages: Sequence[str] = ()  # libraries whose versions may matter; recorded, not compared
+    former: str = MANIFEST  # record of earlier versions in the place of the manifest; `force` replaces such a result
 
     def key(self) -> dict[str, Any]:
-        """What decides whether a result is of this stage: name, revision, settings and the inputs' hashes.
+        """Identity of a result: name and revision of the stage, settings, and the inputs' hashes.
 
         Raises:
             DataError: an input is missing.
@@ -57,7 +58,7 @@ def run_stage(
     """Brings ``out`` to the state that the stage describes, unless it is there already.
 
     Args:
-        stage: what is to be done.
+        stage: with inputs and settings.
         out: directory of the result.
         make: does it in the directory that it is given, where items of an interrupted attempt may lie; returns what is
             worth telling (plain data), which the manifest keeps as ``results``.
@@ -70,7 +71,8 @@ def run_stage(
         DataError: ``out`` holds something else; nothing was touched.
     """
     key, old = stage.key(), out.with_name(f".{out.name}.old")
-    known = _known(out, key, force=force)
+    replaced = force and not (out / MANIFEST).is_file() and (out / stage.former).is_file()
+    known = None if replaced else _known(out, key, force=force)
     if known is not None:
         shutil.rmtree(old, ignore_errors=True)  # of a replacement that was killed at its very end
         return {**known, "made": False}

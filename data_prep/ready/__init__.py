@@ -1,1 +1,1 @@
-"""READY sequences: what objects are assembled of, selections of kernels as texts, the layout of the paper's authors."""
+"""READY sequences: sources of objects, textual selections of kernels, the layout of the paper's authors."""

@@ -1,4 +1,4 @@
-"""What an object is assembled from: posed stills and sequences in the results of other stages."""
+"""Sources of an object: posed stills and sequences in the results of other stages."""
 
 from __future__ import annotations
 

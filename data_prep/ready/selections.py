@@ -16,7 +16,7 @@ from gausim.io.npz import read_npz
 from gausim.io.ply import MASK_NAMES, load_points
 from gausim.ops.selection import Box, Component, HalfSpace, NearPoints, Selection, parse_half_space
 
-# What a term looks like, by its first word.
+# Syntax of a term, by its first word.
 FORMS = {
     "all": "all",
     "below": "below AXIS=VALUE",

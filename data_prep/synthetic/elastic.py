@@ -18,7 +18,7 @@ class ElasticBody:
 
         Args:
             body: its rest shape.
-            material: what it is made of.
+            material: of the body.
             fps: frames per second of the result.
             time_step: longest step of the integrator [s]; stable up to about 1e-3 at the stiffnesses used here.
         """

@@ -1,4 +1,4 @@
-"""What the embedded set consists of: its objects, what they are made of, and how much is made of each."""
+"""Plan of the embedded set: objects, their materials, numbers and sizes of sequences and pictures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LARGEST_SWING = 0.5  # [diagonals]; further the finite elements turn inside out
 
 @dataclass(frozen=True)
 class Material:
-    """What a body is made of."""
+    """Elastic material of a body."""
 
     young_modulus: float  # stiffness [mass / (scene unit s^2)]
     poisson_ratio: float  # resistance to change of volume
@@ -26,10 +26,10 @@ class Material:
 
 @dataclass(frozen=True)
 class Recipe:
-    """What an object is."""
+    """Definition of an object."""
 
     body: str  # a shape of :data:`data_prep.synthetic.bodies.BODIES`
-    material: Material  # what it is made of
+    material: Material  # of the body
     time_step: float  # that its stiffness allows [s]
     swing: tuple[float, float] = SMALL_SWING  # least and largest amplitude of its pushes [diagonals]
 

@@ -1,4 +1,4 @@
-"""How sequences start: random pokes (local) and drags (wide), as initial velocities scaled to an amplitude."""
+"""Random pushes that start the sequences: pokes (local) and drags (wide), velocities scaled to an amplitude."""
 
 from __future__ import annotations
 

@@ -35,13 +35,13 @@ PAIRS_AT_ONCE = 32
 _FOCAL_GUESS = 1.2
 # Models of fewer images than this are accidents.
 _SMALLEST_MODEL = 3
-# Threshold of weak features in a thorough search, as a share of COLMAP's.
+# Threshold of weak features in a thorough search, as a fraction of COLMAP's.
 _WEAKER = 0.5
 
 
 @dataclass(frozen=True)
 class MappingOptions(Options):
-    """How poses are found."""
+    """Settings of the search for poses."""
 
     camera_model: str = option("SIMPLE_RADIAL", "of COLMAP: SIMPLE_RADIAL, OPENCV, OPENCV_FISHEYE ... (%(default)s)")
     intrinsics: str = option(
@@ -73,7 +73,7 @@ class MappingOptions(Options):
 
 @dataclass(frozen=True)
 class Mapped:
-    """What came out beside the model itself."""
+    """Facts of a mapping beside the model itself."""
 
     folder: Path  # of the COLMAP model with most images, in the photos' names
     features: dict[str, int]  # number of features per photo

@@ -1,4 +1,4 @@
-"""What the stage of poses reads: photos, frames of sequences, and poses to take over."""
+"""Inputs of the stage of poses: photos, frames of sequences, and poses to take over."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from gausim.io.colmap_files import PointTable
 
 @dataclass(frozen=True)
 class Sources(Options):
-    """What poses are made of."""
+    """Options for the inputs of the poses."""
 
     images: Path | None = option(None, "photos of the rest state", metavar="DIR")
     sequences: Path | None = option(
         None, "result of ingest, or folders SEQ/CAM of frames; cameras stand still through a sequence, and its first "
         "frame shows the rest state", metavar="DIR",
     )  # fmt: skip
-    fps: float | None = option(None, "frames per second of the sequences (default: what ingest says)", metavar="RATE")
+    fps: float | None = option(None, "frames per second of the sequences (default: that of ingest)", metavar="RATE")
     colmap: Path | None = option(
         None, "COLMAP model to take over, binary or text, for --images of any size", metavar="DIR"
     )
@@ -59,7 +59,7 @@ class Sources(Options):
 
 @dataclass(frozen=True)
 class Material:
-    """What was found in the sources."""
+    """Photos, frames and poses found in the sources."""
 
     stills: tuple[Photo, ...]  # photos whose poses are to be found
     # poses that are taken over, with their points; None where they are to be found

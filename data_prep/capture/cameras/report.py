@@ -1,4 +1,4 @@
-"""What poses are worth: reprojection errors, tracks, why photos failed, and a picture of cameras and points."""
+"""Quality of poses: reprojection errors, tracks, reasons of failed photos, a picture of cameras and points."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FEW_FEATURES, _FEW_MATCHES = 300, 60
 
 
 def _observations(shot: Posed, points: PointTable) -> tuple[np.ndarray, np.ndarray]:
-    """Which of a photo's (m,) keypoints show a point of the table, and the rows of these points."""
+    """Indices of a photo's (m,) keypoints that show a point of the table, and the rows of these points."""
     order = np.argsort(points.ids, kind="stable")
     place = np.searchsorted(points.ids, shot.point_ids, sorter=order).clip(max=max(len(order) - 1, 0))
     rows = order[place] if len(order) else np.zeros(0, int)

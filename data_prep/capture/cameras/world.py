@@ -67,7 +67,7 @@ def fit_similarity(source: np.ndarray, target: np.ndarray) -> Similarity:
 
 
 def compare(viewmats: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """How far poses (n, 4, 4) are from reference poses of the same images, after similarity alignment of their centres.
+    """Distance of poses (n, 4, 4) from reference poses of the same images, after similarity alignment of their centres.
 
     Distances of the centres are per cent of the largest distance between two of the reference's; angles are in degrees.
     """

@@ -1,4 +1,4 @@
-"""How much later one camera began than another, by light that was switched on in view of both.
+"""Time offset between two cameras, by a light that was switched on in view of both.
 
 The mean brightness of each picture, in linear light, steps up when a lamp goes on. A picture exposed while it happened
 has part of the step, which tells when within the exposure it was. Several flashes are matched by their pattern.

@@ -1,4 +1,4 @@
-"""How much later one camera began than another, by what both microphones heard.
+"""Time offset between two cameras, by the sound that both microphones recorded.
 
 Loudness over time (its logarithm, in a band that every camera records) gives candidates; generalised
 cross-correlation with phase transform (Knapp and Carter, 1976) on windows of the sound itself places them to a small
@@ -151,7 +151,7 @@ def _phase_peak(a: np.ndarray, b: np.ndarray, reach: int, rate: int) -> tuple[fl
 
 
 def parabola_peak(values: np.ndarray, top: int) -> float:
-    """Where between its neighbours the maximum at index ``top`` lies, in −0.5..0.5 of a sample."""
+    """Position of the maximum at index ``top`` between its neighbours, in −0.5..0.5 of a sample."""
     if not 0 < top < len(values) - 1:
         return 0.0
     left, middle, right = (float(values[top + i]) for i in (-1, 0, 1))

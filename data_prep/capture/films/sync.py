@@ -39,7 +39,7 @@ class Offsets:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Which frames belong together."""
+    """Assignment of frames of several cameras to each other."""
 
     reference: str  # the camera whose frames give the output its times
     rate: Fraction  # output frames per second
@@ -97,7 +97,7 @@ def align(
         offsets: when they began.
         rate: output frames per second; that of the slowest camera when None.
         reference: whose frames give the times; of the slowest cameras the one with the smallest residuals when None.
-        start: what is left out at the beginning of the time that all saw [s].
+        start: time left out at the beginning of the common interval [s].
         duration: how much of it is kept [s]; all when None.
 
     Raises:
@@ -294,7 +294,7 @@ def _nearest(times: np.ndarray, grid: np.ndarray, step: int, within: float) -> n
 
 
 def _rounding(film: Film, rate: Fraction) -> float:
-    """What the container's rounding of time stamps may add to a residual [output frames]."""
+    """Largest residual caused by the container's rounding of time stamps [output frames]."""
     return 1e-6 + 0.5 * float(film.time_base * rate)
 
 
@@ -313,7 +313,7 @@ def _refuse(film: Film, name: str, k: int, residual: float, alignment: Alignment
 
 
 def facts(film: Film, name: str, offsets: Offsets, alignment: Alignment) -> dict[str, Any]:
-    """What the manifest says of one camera, as plain data."""
+    """Entry of one camera in the manifest, as plain data."""
     residual, frames = alignment.residuals[name], alignment.frames[name]
     return {
         "fps": float(film.rate),

@@ -1,4 +1,4 @@
-"""Which films belong to which sequence and camera: a folder of folders, one folder, or a list file."""
+"""Assignment of films to sequences and cameras: a folder of folders, one folder, or a list file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from jsonschema.exceptions import best_match
 from data_prep.common.photos import natural
 from gausim.core import DataError
 
-# What a list file holds, as JSON schema; times are in seconds.
+# JSON schema of a list file; times are in seconds.
 _TIME = {"type": "number", "minimum": 0, "maximum": 1e6}
 _TAKE = {
     "type": "object",

@@ -39,7 +39,7 @@ class Timecode:
         return self.frame / self.rate
 
     def seconds_after(self, other: Timecode) -> Fraction:
-        """How much later than ``other`` this frame was taken [s], by the shorter way around midnight.
+        """Time of this frame after ``other`` [s], by the shorter way around midnight.
 
         Raises:
             DataError: the two count differently, so that their difference means nothing.

@@ -1,1 +1,1 @@
-"""Foreground masks: what makes them, what cleans them, pictures to check them."""
+"""Foreground masks: segmenters, cleaning, and pictures to check them."""

@@ -1,4 +1,4 @@
-"""What turns raw masks into mattes: agreement over time, holes, crumbs, soft edges."""
+"""Cleaning of raw masks into mattes: agreement over time, holes, crumbs, soft edges."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ BORDER = 8
 
 @dataclass(frozen=True)
 class Cleanup(Options):
-    """What is done to the masks of a clip; lengths are parts of the picture's longer side."""
+    """Settings of the cleaning of a clip's masks; lengths are fractions of the picture's longer side."""
 
     radius: int = option(
         2, "neighbours in time on each side to agree with; 0 leaves time alone (2)", least=0, metavar="FRAMES"

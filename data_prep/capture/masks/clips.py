@@ -33,7 +33,7 @@ class Clip:
         return len(self.paths)
 
     def file(self, index: int) -> Path:
-        """Where a picture lies."""
+        """Path of a picture."""
         return self.root / self.paths[index]
 
     def rgba(self, index: int) -> np.ndarray:
@@ -76,7 +76,7 @@ def find_clips(root: Path, *, kind: str = "auto", every: int = 1) -> list[Clip]:
 
 
 def _drawn_by_a_stage(path: Path) -> bool:
-    """Whether a picture only tells of a stage's work: it lies beside the record of that work."""
+    """Whether a picture is a stage's report: it lies beside the record of that stage."""
     return path.name in SHEETS and (path.parent / SHEETS[path.name]).is_file()
 
 

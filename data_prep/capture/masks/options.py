@@ -92,7 +92,7 @@ def add_segment_options(parser: argparse.ArgumentParser) -> None:
 
 
 def make_cleanup(arguments: argparse.Namespace) -> Cleanup:
-    """What is done to the masks; the backend decides what is usual."""
+    """Options for the cleaning of masks; their defaults depend on the backend."""
     usual = UNTOUCHED if arguments.backend == "alpha" else Cleanup()
     given = {each.name: getattr(arguments, each.name) for each in fields(Cleanup)}
     return Cleanup(**{name: getattr(usual, name) if value is None else value for name, value in given.items()})

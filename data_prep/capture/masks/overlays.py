@@ -12,7 +12,7 @@ from data_prep.capture.masks.clips import Clip, read_picture, sampled, write_pic
 from gausim.io.files import replacing
 
 OUTLINE = (255, 40, 120)
-# What is cut out stands on a colour that objects rarely have.
+# The foreground is drawn on a colour that objects rarely have.
 GROUND = (90, 0, 140)
 SIDE = 480
 SHEET = 12

@@ -26,14 +26,14 @@ JPEG_QUALITY = 98
 
 @dataclass(frozen=True)
 class Prompt:
-    """Where the object is on the first picture of a clip [pixels]."""
+    """Point or box of the object in the first picture of a clip [pixels]."""
 
     box: tuple[float, float, float, float] | None = None  # left, top, right, bottom; None without
     points: tuple[tuple[float, float, int], ...] = ()  # x, y and 1 for object or 0 for background
 
 
 class VideoPredictor(Protocol):
-    """What is used of ``sam2.sam2_video_predictor.SAM2VideoPredictor``."""
+    """Interface of ``sam2.sam2_video_predictor.SAM2VideoPredictor``, as far as it is used."""
 
     def init_state(self, video_path: str, offload_video_to_cpu: bool = ...) -> Any:
         """Reads a folder of JPEG files 00000.jpg and so on."""

@@ -66,7 +66,7 @@ class AlphaSegmenter:
 
 @dataclass(frozen=True)
 class BackgroundSegmenter:
-    """What differs from the empty scene, or, where there is no picture of it, from the median over time.
+    """Pixels that differ from the empty scene, or, without a picture of it, from the median over time.
 
     The median holds whatever stays in its place. It removes the background of an object that leaves its place now and
     then; of one that sways about it only the swaying parts are found, and GrabCut spreads them over what looks alike.
@@ -122,7 +122,7 @@ class BackgroundSegmenter:
 
 @dataclass(frozen=True)
 class ChromaSegmenter:
-    """What has another hue than a screen."""
+    """Pixels whose hue differs from that of a screen."""
 
     key: tuple[int, int, int] | None = None  # the screen's colour (RGB, 0..255); that of the picture's border when None
     # distances in the a-b plane of CIE Lab up to which a pixel is screen, and from which it is not
