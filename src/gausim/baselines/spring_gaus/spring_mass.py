@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Unpack
 
 import numpy as np
 import torch
@@ -18,10 +19,10 @@ from scipy.sparse.linalg import eigsh
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from gausim.baselines.fitted import Fitted
+from gausim.baselines.fitted import Fitted, Recorded
 from gausim.baselines.spring_gaus.anchors import Anchors
 from gausim.baselines.spring_gaus.springs import Net, move
-from gausim.core import ConfigError, DivergenceError, FittedState, GaussianScene
+from gausim.core import ConfigError, DivergenceError, FittedState
 
 # What the original takes.
 ANCHORS, NEIGHBOURS, SUBSTEPS, DAMPING = 2048, 256, 100, 0.1
@@ -32,37 +33,29 @@ MOST_SUBSTEPS = 16
 class AnchoredMotion(Fitted):
     """Kernels that follow anchors, and a velocity per anchor and sequence: a base for what moves anchors.
 
-    A velocity is in diagonals of the scene per frame; anchors of pinned kernels have none.
+    A velocity is in diagonals of the scene per frame; anchors of pinned kernels have none. Kernels turn and stretch
+    with their anchors; those of the original keep their shape.
     """
 
     def __init__(
         self,
         *,
-        scenes: Sequence[GaussianScene],
-        fps: Sequence[float],
-        scene_of_sequence: Sequence[int],
-        seen: int,
         anchors: int,
-        gradients: bool = True,
+        **recorded: Unpack[Recorded],
     ) -> None:
         """Places the anchors.
 
         Args:
-            scenes: the rest scenes.
-            fps: frames per second of each.
-            scene_of_sequence: the scene of each sequence.
-            seen: predicted frames that training may see.
             anchors: at most so many per scene.
-            gradients: kernels turn and stretch with their anchors; else they keep their shape (the original).
 
         Raises:
             ConfigError: fewer than four anchors are allowed.
             SceneError: the kernels of a scene occupy fewer than four grid cells.
         """
-        super().__init__(scenes=scenes, fps=fps, scene_of_sequence=scene_of_sequence, seen=seen)
+        super().__init__(**recorded)
         if anchors < 4:
             raise ConfigError(f"model.method.anchors: expected at least 4, got {anchors}.")
-        self.most, self.gradients = anchors, gradients
+        self.most = anchors
         self._anchors = [Anchors.of(scene, anchors) for scene in self.scenes]
         self.velocity = nn.ParameterList(torch.zeros(self._anchors[i].count, 3) for i in self.scene_of_sequence)
 
@@ -82,13 +75,8 @@ class AnchoredMotion(Fitted):
         """The kernels that follow anchors at ``x``."""
         anchors = self.anchors(sequence_id)
         displacement = x - anchors.rest
-        if self.gradients:
-            deformation_gradients, rotations = anchors.deformation_gradients(displacement)
-        else:
-            deformation_gradients = rotations = torch.eye(3).to(x).expand(len(anchors.means), 3, 3)
-        return FittedState(
-            sequence_id, frame, anchors.positions(displacement), deformation_gradients, rotations, (x, v)
-        )
+        turned = anchors.deformation_gradients(displacement)
+        return FittedState(sequence_id, frame, anchors.positions(displacement), *turned, (x, v))
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
         """``velocity``, one per sequence."""
@@ -123,40 +111,29 @@ class SpringMass(AnchoredMotion):
     def __init__(
         self,
         *,
-        scenes: Sequence[GaussianScene],
-        fps: Sequence[float],
-        scene_of_sequence: Sequence[int],
-        seen: int,
         anchors: int = ANCHORS,
         neighbours: int = NEIGHBOURS,
         substeps: int = SUBSTEPS,
         damping: float = DAMPING,
         stiffness: float | None = None,
         period: float = 8.0,
-        gradients: bool = True,
+        **recorded: Unpack[Recorded],
     ) -> None:
         """Places anchors and springs.
 
         Args:
-            scenes: the rest scenes.
-            fps: frames per second of each.
-            scene_of_sequence: the scene of each sequence.
-            seen: predicted frames that training may see.
             anchors: at most so many per scene.
             neighbours: springs from an anchor to so many of its nearest.
             substeps: per frame, at least; stiff springs get more.
             damping: of the closing speed of a spring's ends, times its rest length [diagonals / s].
             stiffness: k at the start; None derives it from ``period``.
             period: of the slowest vibration at the start [frames].
-            gradients: kernels turn and stretch with their anchors; else they keep their shape (the original).
 
         Raises:
             ConfigError: a number out of range.
             SceneError: too few anchors.
         """
-        super().__init__(
-            scenes=scenes, fps=fps, scene_of_sequence=scene_of_sequence, seen=seen, anchors=anchors, gradients=gradients
-        )
+        super().__init__(anchors=anchors, **recorded)
         if min(neighbours, substeps) < 1 or damping <= 0 or period <= 0:
             raise ConfigError(
                 "model.method: expected neighbours, substeps >= 1 and damping, period > 0, got "
