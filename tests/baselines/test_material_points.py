@@ -59,15 +59,12 @@ def rolled(method: MaterialPoints, state: FittedState, frames: int) -> list[Fitt
     return states
 
 
-def turn(angle: float = 0.6) -> Tensor:
-    return quaternion_to_matrix(torch.tensor([math.cos(angle / 2), 0.2, -0.1, 0.3]))
-
-
 def test_kernels_follow_an_affine_motion_of_their_particles_exactly() -> None:
     scene = replace(toy_scene(), pinned=torch.zeros(36, dtype=torch.bool))
     driven = clustered(scene, 12)
     assert driven.count == 12 and driven.followed.shape == (36, 8)
-    wanted = turn() @ torch.diag(torch.tensor([1.2, 0.9, 1.05]))
+    turn = quaternion_to_matrix(torch.tensor([0.96, 0.2, -0.1, 0.3]))
+    wanted = turn @ torch.diag(torch.tensor([1.2, 0.9, 1.05]))
     shift = torch.tensor([0.4, -0.2, 0.1])
     positions, deformation_gradients, rotations = driven.carried(
         driven.rest @ wanted.T + shift, wanted.expand(12, 3, 3)
@@ -160,29 +157,6 @@ def test_the_gradient_with_respect_to_the_modulus_is_its_difference_quotient() -
             values.append(float(misfit(method, targets, 5, swaying(method))))
     assert float(slope) == pytest.approx((values[0] - values[1]) / 0.04, rel=0.01)
     assert float(slope) < 0  # stiffer is better
-
-
-@pytest.mark.slow
-def test_a_known_modulus_and_velocity_are_found_again() -> None:
-    frames = 10
-    truth = dreamer()
-    targets, wanted = observed(truth, frames), swaying(truth).inner[1]
-    torch.manual_seed(0)
-    method = dreamer(young_modulus=TRUE / 10)
-    groups = [{"params": own, "lr": 1e-2} for own in method.parameter_groups().values()]
-    optimizer = torch.optim.Adam(groups)
-    modulus = groups[1]
-    for iteration in range(160):
-        modulus["lr"] = 0.0 if iteration < 40 else 1e-2
-        optimizer.zero_grad()
-        seen = 2 if iteration < 40 else min(frames, 2 + (iteration - 40) // 8)
-        (1e3 * misfit(method, targets, seen) + method.penalties(0)["modulus_variation"]).backward()
-        optimizer.step()
-    with torch.no_grad():
-        found, velocity = method.modulus(0), method.begin(0).inner[1]
-    free = ~method.body(0).driven.pinned
-    assert math.exp(abs(float((found[free] / TRUE).log().mean()))) < 1.2
-    assert float((velocity - wanted).norm()) < 0.1 * float(wanted.norm())
 
 
 def test_sequences_share_the_modulus_and_nothing_else() -> None:

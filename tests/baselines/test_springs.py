@@ -60,16 +60,6 @@ def test_compiled_motion_equals_plain_torch_with_all_gradients() -> None:
         torch.testing.assert_close(ours, oracle, rtol=1e-9, atol=1e-11, msg=lambda m, n=name: f"{n}: {m}")
 
 
-def test_single_precision_stays_close() -> None:
-    net, state = net_and_state()
-    single = [state[n].float() for n in ("x", "v", "stiffness", "drag", "free")]
-    x, v = move(net, *single, 50)
-    expected = move_plain(net, *(state[n] for n in ("x", "v", "stiffness", "drag", "free")), 50)
-    assert x.dtype == v.dtype == torch.float32
-    torch.testing.assert_close(x.double(), expected[0], rtol=0, atol=2e-6)
-    torch.testing.assert_close(v.double(), expected[1], rtol=0, atol=2e-5)
-
-
 def test_force_is_the_negative_slope_of_the_energy() -> None:
     net, state = net_and_state()
     x = state["x"].clone().requires_grad_()
