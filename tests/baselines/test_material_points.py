@@ -62,7 +62,7 @@ def rolled(method: MaterialPoints, state: FittedState, frames: int) -> list[Fitt
 def test_kernels_follow_an_affine_motion_of_their_particles_exactly() -> None:
     scene = replace(toy_scene(), pinned=torch.zeros(36, dtype=torch.bool))
     driven = clustered(scene, 12)
-    assert driven.count == 12 and driven.followed.shape == (36, 8)
+    assert len(driven.rest) == 12 and driven.followed.shape == (36, 8)
     turn = quaternion_to_matrix(torch.tensor([0.96, 0.2, -0.1, 0.3]))
     wanted = turn @ torch.diag(torch.tensor([1.2, 0.9, 1.05]))
     shift = torch.tensor([0.4, -0.2, 0.1])
@@ -78,7 +78,7 @@ def test_kernels_follow_an_affine_motion_of_their_particles_exactly() -> None:
 def test_clusters_and_pins() -> None:
     scene = toy_scene()
     driven = clustered(scene, 20)
-    assert driven.count == 20 and int(driven.pinned.sum()) == 5  # a quarter of the kernels is pinned
+    assert len(driven.rest) == 20 and int(driven.pinned.sum()) == 5  # a quarter of the kernels is pinned
     assert float(driven.rest[driven.pinned, 2].max()) < 0.01 < 0.3 < float(driven.rest[~driven.pinned, 2].min())
     with pytest.raises(SceneError, match=r"toy: expected at least 8 simulated kernels"):
         clustered(replace(scene, simulated=torch.arange(36) < 5, pinned=torch.arange(36) < 1), 20)
@@ -89,7 +89,7 @@ def test_transparent_kernels_follow_the_nearest_particle() -> None:
     logits = scene.opacity_logits.clone()
     logits[[35, 20]] = -6.0
     driven = opaque(replace(scene, opacity_logits=logits), 0.02)
-    assert driven.count == 34 and driven.followed.shape == (36, 1)
+    assert len(driven.rest) == 34 and driven.followed.shape == (36, 1)
     near = torch.cdist(scene.means[[35]], driven.rest).argmin()
     assert int(driven.followed[35, 0]) == int(near)
     with pytest.raises(SceneError, match=r"opacity above 0.99999.*model\.method\.opacity"):

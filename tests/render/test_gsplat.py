@@ -116,11 +116,6 @@ def test_what_gsplat_cannot_draw_is_refused(inputs: Callable, stand_in: ModuleTy
         GsplatRenderer(near=0.0)
 
 
-def test_tensors_on_the_cpu_are_refused(inputs: Callable) -> None:
-    with pytest.raises(ConfigError, match=r"got torch.float32 on cpu. Set trainer=gpu, or use render=cpu"):
-        inputs(2, 2, 5, (8, 8)).to(torch.float32).draw(GsplatRenderer())
-
-
 def test_reasons_are_told_in_order(inputs: Callable, stand_in: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     """From the nearest obstacle to the furthest; each is an error that names the remedy."""
     assert backend.unavailable() is None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TypedDict
+from typing import TypedDict, TypeVar
 
 import torch
 from jaxtyping import Int
@@ -12,6 +12,15 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from gausim.core import FittedState, GaussianScene
+
+T = TypeVar("T")
+
+
+def moved(value: T, device: torch.device) -> T:
+    """A dataclass with its tensors on another device."""
+    tensors = {name: x.to(device) for name, x in vars(value).items() if isinstance(x, Tensor)}
+    found: T = replace(value, **tensors)  # type: ignore[type-var]
+    return found
 
 
 class Recorded(TypedDict):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -39,16 +39,6 @@ class Driven:
     weights: Float[Tensor, "K n"]
     means: Float[Tensor, "K 3"]
     held: Bool[Tensor, " K"]
-
-    @property
-    def count(self) -> int:
-        """Number of particles P."""
-        return len(self.rest)
-
-    def to(self, device: torch.device) -> Driven:
-        """The same on another device."""
-        names = ("rest", "pinned", "followed", "weights", "means", "held")
-        return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
     def carried(
         self, x: Float[Tensor, "P 3"], gradient: Float[Tensor, "P 3 3"]

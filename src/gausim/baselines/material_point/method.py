@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from gausim.baselines.fitted import Fitted, Recorded
+from gausim.baselines.fitted import Fitted, Recorded, moved
 from gausim.baselines.material_point.driven import Driven
 from gausim.baselines.mpm import Grid, Material, MPMSolver, Particles, ParticleState, TimeStep
 from gausim.baselines.mpm.runtime import warp
@@ -208,7 +208,7 @@ class MaterialPoints(Fitted):
         """A scene on the device of the parameters."""
         found = self._bodies[scene_id]
         if found.driven.rest.device != self._device:
-            found = self._bodies[scene_id] = self._body(scene_id, found.driven.to(self._device))
+            found = self._bodies[scene_id] = self._body(scene_id, moved(found.driven, self._device))
         return found
 
     def begin(self, sequence_id: int) -> FittedState:
@@ -254,7 +254,7 @@ class MaterialPoints(Fitted):
         least, mean, most = (f"{float(e):.3g}" for e in (own.amin(), own.log().mean().exp(), own.amax()))
         spread = "" if least == most else f" ({least} to {most})"
         return (
-            f"{self.scenes[scene_id].name}: {self._bodies[scene_id].driven.count} particles, Young's modulus "
+            f"{self.scenes[scene_id].name}: {len(self._bodies[scene_id].driven.rest)} particles, Young's modulus "
             f"{mean}{spread}, waves of {speed:.2g} sides per frame, {self.substeps(scene_id)} substeps per frame"
         )
 

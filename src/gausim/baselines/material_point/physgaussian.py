@@ -64,7 +64,7 @@ class PhysGaussian(MaterialPoints):
             velocity_scale=velocity_scale,
         )
         for scene_id in range(len(self.scenes)):
-            moduli = torch.full((self.body(scene_id).driven.count,), float(material.young_modulus))
+            moduli = torch.full((len(self.body(scene_id).driven.rest),), float(material.young_modulus))
             self.register_buffer(f"young_{scene_id}", moduli)
 
     def drive(self, scene: GaussianScene) -> Driven:

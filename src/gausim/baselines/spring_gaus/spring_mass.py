@@ -19,7 +19,7 @@ from scipy.sparse.linalg import eigsh
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from gausim.baselines.fitted import Fitted, Recorded
+from gausim.baselines.fitted import Fitted, Recorded, moved
 from gausim.baselines.spring_gaus.anchors import Anchors
 from gausim.baselines.spring_gaus.springs import Net, move
 from gausim.core import ConfigError, DivergenceError, FittedState
@@ -57,13 +57,13 @@ class AnchoredMotion(Fitted):
             raise ConfigError(f"model.method.anchors: expected at least 4, got {anchors}.")
         self.most = anchors
         self._anchors = [Anchors.of(scene, anchors) for scene in self.scenes]
-        self.velocity = nn.ParameterList(torch.zeros(self._anchors[i].count, 3) for i in self.scene_of_sequence)
+        self.velocity = nn.ParameterList(torch.zeros(len(self._anchors[i].rest), 3) for i in self.scene_of_sequence)
 
     def anchors(self, sequence_id: int) -> Anchors:
         """The anchors of a sequence's scene."""
         scene_id = self.scene_of_sequence[sequence_id]
         if self._anchors[scene_id].rest.device != self._device:
-            self._anchors[scene_id] = self._anchors[scene_id].to(self._device)
+            self._anchors[scene_id] = moved(self._anchors[scene_id], self._device)
         return self._anchors[scene_id]
 
     def begin(self, sequence_id: int) -> FittedState:
@@ -143,7 +143,7 @@ class SpringMass(AnchoredMotion):
         self._nets = [Net.of(a.rest, a.pinned, neighbours) for a in self._anchors]
         self.attenuation = nn.ParameterList(torch.zeros(()) for _ in self.scenes)
         self.damping = nn.ParameterList(torch.tensor(math.log10(damping)) for _ in self.scenes)
-        self.stiffness = nn.ParameterList(torch.zeros(a.count) for a in self._anchors)
+        self.stiffness = nn.ParameterList(torch.zeros(len(a.rest)) for a in self._anchors)
         for scene_id, own in enumerate(self.stiffness):
             nn.init.constant_(own, self._matching(scene_id, period) if stiffness is None else stiffness)
 
@@ -165,7 +165,7 @@ class SpringMass(AnchoredMotion):
     def springs(self, scene_id: int) -> tuple[Float[Tensor, " E"], Float[Tensor, " E"]]:
         """Stiffness kappa [1 / frames^2] and drag [1 / frames] of every spring of a scene."""
         if self._nets[scene_id].length.device != self._device:
-            self._nets[scene_id] = self._nets[scene_id].to(self._device)
+            self._nets[scene_id] = moved(self._nets[scene_id], self._device)
         net = self._nets[scene_id]
         k, fps = self.stiffness[scene_id], self.fps[scene_id]
         firm = net.attenuation(self.attenuation[scene_id]) / net.length
@@ -219,7 +219,7 @@ def slowest_vibration(net: Net, anchors: Anchors, kappa: Float[Tensor, " E"]) ->
         rows.append(np.broadcast_to(row, blocks.shape).ravel())
         columns.append(np.broadcast_to(column, blocks.shape).ravel())
         values.append((blocks if a == b else -blocks).ravel())
-    size = 3 * anchors.count
+    size = 3 * len(anchors.rest)
     whole = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)).tocsc()
     free = np.repeat(~anchors.pinned.numpy(), 3)
     stiff = whole[free][:, free]

@@ -16,8 +16,6 @@ from numba.core.typing.templates import ConcreteTemplate, infer_global, signatur
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 LANES = 16
-
-
 _F32, _I1, _I32 = ir.FloatType(), ir.IntType(1), ir.IntType(32)
 _VECTOR = ir.VectorType(_F32, LANES)
 
