@@ -16,7 +16,6 @@ from gausim.core import ConfigError, DataError, SceneError
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData, find_objects
 from gausim.data.records import read_stills
-from gausim.kernels.operations import plain_forms
 
 VIEWS = ("cam_0", "cam_1", "cam_2")
 FRAMES, POINTS = 20, 5  # of tests/data/conftest.py
@@ -64,25 +63,6 @@ def test_sequences_can_be_limited(blob: Path) -> None:
     for wrong in (4, 0, ["seq_009"], []):
         with pytest.raises(DataError, match="asked for, it has 3"):
             _ = ObjectData(blob, sequences=wrong).sequences
-
-
-def test_compiled_and_torch_give_the_same_bits_for_every_value() -> None:
-    colour, alpha = torch.arange(256).repeat(256), torch.arange(256).repeat_interleave(256)
-    frames = torch.stack((colour, 255 - colour, colour // 2, alpha), -1).to(torch.uint8).reshape(2, 128, 256, 4)
-    compiled = composite(frames)
-    with plain_forms():
-        plain = composite(frames)
-    assert all(torch.equal(a, b) for a, b in zip(compiled, plain, strict=True))
-    assert float(compiled[0].max()) == 1.0
-
-
-def test_strided_frames() -> None:
-    frames = torch.randint(0, 256, (3, 5, 7, 4), generator=torch.Generator().manual_seed(0)).to(torch.uint8)
-    strided = frames.transpose(0, 1)
-    assert not strided.is_contiguous()
-    for a, b in zip(composite(strided), composite(strided.contiguous()), strict=True):
-        assert torch.equal(a, b)
-    assert composite(frames[:0])[0].shape == (0, 5, 7, 3)
 
 
 def test_composite_over_black_and_over_a_color() -> None:

@@ -102,14 +102,6 @@ def test_kernels_stay_within_the_budget_and_the_object(fitted: GaussianScene) ->
     assert float(ratio.quantile(0.9)) < 6
 
 
-def test_same_seed_same_scene(stills: ImageSet) -> None:
-    short = ReconstructionOptions(kernels=60, iterations=25, hull_resolution=16)
-    other = ReconstructionOptions(kernels=60, iterations=25, hull_resolution=16, seed=1)
-    first, again, third = (reconstruct([stills], CpuRenderer(threads=1), o) for o in (short, short, other))
-    assert torch.equal(first.means, again.means) and torch.equal(first.sh, again.sh)
-    assert first.means.shape != third.means.shape or not torch.equal(first.means, third.means)
-
-
 def test_given_points_replace_the_hull_as_start(stills: ImageSet) -> None:
     options = ReconstructionOptions(kernels=40, iterations=1, hull_resolution=16)
     points = true_scene().means[::2]
@@ -117,16 +109,11 @@ def test_given_points_replace_the_hull_as_start(stills: ImageSet) -> None:
     assert torch.cdist(scene.means, points).amin(1).max() < 0.02
 
 
-def test_empty_hull_is_refused(stills: ImageSet) -> None:
+def test_masks_that_miss_a_part_are_outvoted(stills: ImageSet) -> None:
     images = stills.images.clone()
     images[3, ..., 3] = 0
     with pytest.raises(DataError, match="visual hull of 24 masks is empty"):
         reconstruct([ImageSet("stills", images, stills.cameras)], CpuRenderer(threads=1), TINY)
-
-
-def test_masks_that_miss_a_part_are_outvoted(stills: ImageSet) -> None:
-    images = stills.images.clone()
-    images[3, ..., 3] = 0
     allowed = replace(TINY, missing_masks=0.05, iterations=1)
     scene = reconstruct([ImageSet("stills", images, stills.cameras)], CpuRenderer(threads=1), allowed)
     whole = reconstruct([stills], CpuRenderer(threads=1), allowed)
@@ -224,10 +211,6 @@ def test_it_stops_where_more_steps_do_not_help(stills: ImageSet) -> None:
     steps: list[int] = []
     reconstruct([stills.select([0])], CpuRenderer(threads=1), options, progress=lambda run: steps.append(run.done))
     assert steps[-1] == 71 + 3 * 5  # the first look, and two that are not better
-    steps.clear()
-    patient = replace(options, patience=0)
-    reconstruct([stills.select([0])], CpuRenderer(threads=1), patient, progress=lambda run: steps.append(run.done))
-    assert steps[-1] == 100
 
 
 @pytest.mark.parametrize("change", [{"kernels": 0}, {"iterations": 0}, {"sh_degree": 4}, {"missing_masks": 1.0}])

@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gausim.core import ConfigError, Rendered
+from gausim.core import ConfigError
 from gausim.render import auto
 from gausim.render.auto import AutoRenderer, chosen
 from gausim.render.cpu import CpuRenderer
@@ -60,24 +60,6 @@ def test_on_cuda_it_is_gsplat_or_says_why_not(
     assert "\n" not in message
     assert caplog.records[0].levelno == (logging.INFO if reason is None else logging.WARNING)
     assert ("by gsplat on the GPU" if reason is None else f"slow, because {REASON}.") in message
-
-
-def test_gsplat_gets_what_auto_was_given(inputs: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = inputs(2, 2, 5, (8, 8)).to(torch.float32)
-    arguments = (*given.tensors[:4], given.viewmats, given.Ks, given.size)
-    seen = []
-
-    def draw(*args: object, **options: object) -> Rendered:
-        seen.append((args, options))
-        return CpuRenderer()(*args, **options)
-
-    renderer = AutoRenderer()
-    monkeypatch.setattr(auto, "chosen", lambda device: "gsplat")
-    monkeypatch.setattr(renderer, "gsplat", draw)
-    renderer(*arguments, background=given.background, depth=True)
-    ((args, options),) = seen
-    assert all(a is b for a, b in zip(args, arguments, strict=True))
-    assert options == {"background": given.background, "depth": True}
 
 
 @pytest.mark.gpu

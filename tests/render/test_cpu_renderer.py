@@ -19,7 +19,6 @@ CASES = {
     "two_bands": dict(states=2, views=2, count=200, size=(45, 70)),
     "dense": dict(states=2, views=2, count=1500, size=(40, 36), scale=0.05),
     "big": dict(states=2, views=2, count=60, size=(50, 41), scale=0.8),
-    "odd_size": dict(states=2, views=2, count=150, size=(37, 53)),
     "tiny": dict(states=2, views=2, count=400, size=(50, 41), scale=1e-4),
     "around_the_camera": dict(states=2, views=3, count=400, size=(48, 48), spread=2.0),
     "off_screen": dict(states=2, views=2, count=200, size=(30, 30), spread=4.0, scale=0.5),
@@ -29,8 +28,7 @@ CASES = {
 NAMES = ("means", "covars", "colors", "opacities", "background")
 
 
-@pytest.mark.parametrize("depth", [False, True])
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(("case", "depth"), [("usual", False), *((case, True) for case in CASES)])
 def test_image_and_gradients_equal_the_reference(inputs: Callable, case: str, depth: bool) -> None:
     given = replace(inputs(**CASES[case]), depth=depth)
     given.opacities[:, 1::9] = 1e-3  # below 1/255
@@ -68,14 +66,12 @@ def test_one_view_alone_is_cut_into_more_bands_and_stays_the_same(inputs: Callab
         assert float((value - expected).norm() / expected.norm()) < 1e-5
 
 
-@pytest.mark.parametrize("size", [(66, 50), (40, 130)])
-def test_threads_change_no_bit(inputs: Callable, size: tuple[int, int]) -> None:
-    given = inputs(2, 2, 400, size)
-    images, deformation_gradients = given.to(torch.float32).draw_with_gradients(CpuRenderer(threads=1))
-    for threads in (2, 5):
-        again, again_gradients = given.to(torch.float32).draw_with_gradients(CpuRenderer(threads=threads))
-        assert torch.equal(again.rgb, images.rgb) and torch.equal(again.alpha, images.alpha)
-        assert all(torch.equal(a, b) for a, b in zip(again_gradients, deformation_gradients, strict=True))
+def test_threads_change_no_bit(inputs: Callable) -> None:
+    given = inputs(2, 2, 400, (40, 130)).to(torch.float32)
+    images, gradients = given.draw_with_gradients(CpuRenderer(threads=1))
+    again, again_gradients = given.draw_with_gradients(CpuRenderer(threads=5))
+    assert torch.equal(again.rgb, images.rgb) and torch.equal(again.alpha, images.alpha)
+    assert all(torch.equal(a, b) for a, b in zip(again_gradients, gradients, strict=True))
 
 
 def test_view_that_sees_nothing(inputs: Callable) -> None:
@@ -112,10 +108,9 @@ def test_input_changed_in_place_before_backward_is_refused(inputs: Callable) -> 
 
 
 @pytest.mark.parametrize("name", ["means", "covars", "colors", "opacities"])
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_numbers_that_are_not_finite_are_refused(inputs: Callable, name: str, value: float) -> None:
+def test_numbers_that_are_not_finite_are_refused(inputs: Callable, name: str) -> None:
     given = inputs(2, 2, 30, (20, 20)).to(torch.float32)
-    getattr(given, name).reshape(-1)[40] = value
+    getattr(given, name).reshape(-1)[40] = float("inf" if name == "means" else "nan")
     with pytest.raises(DivergenceError, match="1 of the Gaussians .* of state"):
         given.draw(CpuRenderer(threads=2))
 

@@ -34,7 +34,7 @@ def deformation(states: int) -> tuple[Tensor, Tensor]:
     return rotations @ stretch, rotations
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_rotating_scene_and_cameras_together_changes_nothing(
     scene: Callable, cameras: Cameras, units: Tensor, degree: int
 ) -> None:
@@ -56,7 +56,7 @@ def test_rotating_scene_and_cameras_together_changes_nothing(
         assert float((behind.rgb - expected.rgb).abs().max()) > 1e-2
 
 
-@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("degree", [1, 3])
 def test_colours_are_looked_up_along_the_unrotated_direction(
     scene: Callable, cameras: Cameras, units: Tensor, degree: int
 ) -> None:

@@ -28,31 +28,26 @@ def rasterization(
     Ks: Tensor,
     width: int,
     height: int,
-    near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    radius_clip: float = 0.0,
-    eps2d: float = 0.3,
-    sh_degree: int | None = None,
-    packed: bool = True,
-    backgrounds: Tensor | None = None,
-    render_mode: str = "RGB",
-    rasterize_mode: str = "classic",
-    covars: Tensor | None = None,
+    near_plane: float,
+    radius_clip: float,
+    eps2d: float,
+    packed: bool,
+    backgrounds: Tensor,
+    render_mode: str,
+    covars: Tensor,
 ) -> tuple[Tensor, Tensor, dict]:
     """gsplat 1.5.3's function of that name: its arguments, its checks of shapes, its reading of the covariances."""
     batch, count, views = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
-    assert covars is not None and quats is None and scales is None
+    assert quats is None and scales is None and (radius_clip, eps2d, packed) == (0.0, 0.3, False)
     assert means.shape == (*batch, count, 3) and covars.shape == (*batch, count, 3, 3)
     assert opacities.shape == (*batch, count) and colors.shape == (*batch, views, count, 3)
     assert viewmats.shape == (*batch, views, 4, 4) and Ks.shape == (*batch, views, 3, 3)
-    assert backgrounds is not None and backgrounds.shape == (*batch, views, 3)
-    assert (sh_degree, rasterize_mode, radius_clip, eps2d, far_plane) == (None, "classic", 0.0, 0.3, 1e10)
-    i, j = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
-    upper = covars[..., i, j]
-    symmetric = torch.stack([upper[..., k] for k in (0, 1, 2, 1, 3, 4, 2, 4, 5)], -1).unflatten(-1, (3, 3))
+    assert backgrounds.shape == (*batch, views, 3)
+    upper = covars.triu()
     drawn = ReferenceRenderer(near=near_plane)(
-        means, symmetric, colors, opacities, viewmats, Ks, (width, height), depth=render_mode == "RGB+D"
-    )
+        means, upper + upper.mT.tril(-1), colors, opacities, viewmats, Ks, (width, height),
+        depth=render_mode == "RGB+D",
+    )  # fmt: skip
     image = drawn.rgb + (1 - drawn.alpha)[..., None] * backgrounds[..., None, None, :]
     if drawn.depth is not None:
         image = torch.cat((image, drawn.depth[..., None]), -1)
@@ -121,11 +116,6 @@ def test_what_gsplat_cannot_draw_is_refused(inputs: Callable, stand_in: ModuleTy
         GsplatRenderer(near=0.0)
 
 
-def test_tensors_on_the_cpu_are_refused(inputs: Callable) -> None:
-    with pytest.raises(ConfigError, match=r"got torch.float32 on cpu. Set trainer=gpu, or use render=cpu"):
-        inputs(2, 2, 5, (8, 8)).to(torch.float32).draw(GsplatRenderer())
-
-
 def test_reasons_are_told_in_order(inputs: Callable, stand_in: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
     """From the nearest obstacle to the furthest; each is an error that names the remedy."""
     assert backend.unavailable() is None
@@ -152,44 +142,29 @@ def test_reasons_are_told_in_order(inputs: Callable, stand_in: ModuleType, monke
 
 CASES = {
     "usual": dict(states=2, views=3, count=300, size=(66, 50)),
-    "dense": dict(states=2, views=2, count=1500, size=(40, 36), scale=0.05),
     "big": dict(states=2, views=2, count=60, size=(50, 41), scale=0.8),
     "tiny": dict(states=2, views=2, count=400, size=(50, 41), scale=1e-4),
     "around_the_camera": dict(states=2, views=3, count=400, size=(48, 48), spread=2.0),
-    "off_screen": dict(states=2, views=2, count=200, size=(30, 30), spread=4.0, scale=0.5),
 }
 
 
-def on_gpu(inputs: Callable, case: str) -> tuple[object, object]:
-    """The same arguments in float32 on the GPU and in float64 for the oracle."""
+@pytest.mark.gpu
+@pytest.mark.parametrize("case", CASES)
+def test_gpu_images_and_gradients_equal_the_reference(inputs: Callable, case: str) -> None:
     reason = backend.unavailable()
     if reason is not None:
         pytest.skip(reason)
     given = replace(inputs(**CASES[case]), depth=True)
     given.opacities[:, 1::9] = 1e-3  # below 1/255
-    single = given.to(torch.float32)
+    single, double = given.to(torch.float32), given.to(torch.float64)
     for name in ("means", "covars", "colors", "opacities", "viewmats", "Ks", "background"):
         setattr(single, name, getattr(single, name).cuda())
-    return single, given.to(torch.float64)
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("case", CASES)
-def test_gpu_images_and_depth_equal_the_reference(inputs: Callable, case: str) -> None:
-    single, double = on_gpu(inputs, case)
-    images, expected = single.draw(GsplatRenderer()), double.draw(ReferenceRenderer())
+    images, gradients = single.draw_with_gradients(GsplatRenderer())
+    expected, true_gradients = double.draw_with_gradients(ReferenceRenderer())
     for name, scale in (("rgb", 1.0), ("alpha", 1.0), ("depth", float(expected.depth.max()))):
-        error = (getattr(images, name).cpu().double() - getattr(expected, name)).abs() / scale
+        error = (getattr(images, name).detach().cpu().double() - getattr(expected, name).detach()).abs() / scale
         # Single pixels may fall on the other side of a threshold (1/255, 1e-4): gsplat's exponential is a fast one.
         assert float(error.quantile(0.99)) < 1e-4 and float(error.max()) < 2e-2, name
-
-
-@pytest.mark.gpu
-@pytest.mark.parametrize("case", CASES)
-def test_gpu_gradients_equal_the_reference(inputs: Callable, case: str) -> None:
-    single, double = on_gpu(inputs, case)
-    _, deformation_gradients = single.draw_with_gradients(GsplatRenderer())
-    _, expected = double.draw_with_gradients(ReferenceRenderer())
     names = ("means", "covars", "colors", "opacities", "background")
-    for name, value, truth in zip(names, deformation_gradients, expected, strict=True):
+    for name, value, truth in zip(names, gradients, true_gradients, strict=True):
         assert float((value.cpu() - truth).norm() / truth.norm()) < 5e-3, name

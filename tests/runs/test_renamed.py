@@ -105,3 +105,6 @@ def test_the_settings_of_material_points_are_in_groups() -> None:
     with pytest.raises(ValueError, match="no longer supported"):
         with_present_names(flows)
     assert "yield_stress" not in with_present_names({**flows, "material": "fixed_corotated"})
+    assert with_present_names({**new, "gradients": True}) == new
+    with pytest.raises(ValueError, match="gradients is False, which is no longer supported"):
+        with_present_names({**new, "gradients": False})

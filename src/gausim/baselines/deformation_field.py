@@ -8,14 +8,15 @@ by itself, and beyond the trained frames its motion is repeated from frame 0, as
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from gausim.baselines.fitted import Fitted
-from gausim.core import FittedState, GaussianScene
+from gausim.baselines.fitted import Fitted, Recorded
+from gausim.core import FittedState
 from gausim.nn.planes import Planes
 from gausim.ops.quaternion import quaternion_to_matrix
 
@@ -64,27 +65,20 @@ class DeformationField(Fitted):
     def __init__(
         self,
         *,
-        scenes: Sequence[GaussianScene],
-        fps: Sequence[float],
-        scene_of_sequence: Sequence[int],
-        seen: int,
         resolution: int = 32,
         features: int = 32,
         hidden: int = 64,
+        **recorded: Unpack[Recorded],
     ) -> None:
         """Makes the fields.
 
         Args:
-            scenes: the rest scenes.
-            fps: frames per second of each.
-            scene_of_sequence: the scene of each sequence.
-            seen: predicted frames that training may see; the planes have a row for each of them and for frame 0.
-            resolution: of the planes along each axis of space.
+            resolution: of the planes along each axis of space; along time they have a row for every seen frame.
             features: channels of the planes.
             hidden: width of the layers behind them.
         """
-        super().__init__(scenes=scenes, fps=fps, scene_of_sequence=scene_of_sequence, seen=seen)
-        sizes, counts = [resolution] * 3 + [seen + 1], [self.scenes[i].count for i in self.scene_of_sequence]
+        super().__init__(**recorded)
+        sizes, counts = [resolution] * 3 + [self.seen + 1], [self.scenes[i].count for i in self.scene_of_sequence]
         self.fields = nn.ModuleList(Field(sizes, features, hidden) for _ in counts)
         self.means = nn.ParameterList(torch.zeros(count, 3) for count in counts)
         self.scales = nn.ParameterList(torch.zeros(count, 3) for count in counts)

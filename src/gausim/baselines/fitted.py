@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TypedDict, TypeVar
 
 import torch
 from jaxtyping import Int
@@ -11,17 +13,40 @@ from torch.nn import Parameter
 
 from gausim.core import FittedState, GaussianScene
 
+T = TypeVar("T")
 
-class Fitted(nn.Module):
-    """A method with a gradient and a rotation for every kernel, and nothing to learn: a base for others.
+
+def moved(value: T, device: torch.device) -> T:
+    """A dataclass with its tensors on another device."""
+    tensors = {name: x.to(device) for name, x in vars(value).items() if isinstance(x, Tensor)}
+    found: T = replace(value, **tensors)  # type: ignore[type-var]
+    return found
+
+
+class Recorded(TypedDict):
+    """What a method is fitted to: the options of :class:`Fitted`, which every other method passes on.
 
     Attributes:
-        name: its row in tables.
         scenes: the rest scenes.
         fps: frames per second of each.
         scene_of_sequence: the scene of each sequence.
         seen: predicted frames that training may see.
-        extrapolates: whether frames beyond those are foreseen.
+    """
+
+    scenes: Sequence[GaussianScene]
+    fps: Sequence[float]
+    scene_of_sequence: Sequence[int]
+    seen: int
+
+
+class Fitted(nn.Module):
+    """A method with a gradient and a rotation for every kernel, and nothing to learn: a base for others.
+
+    It is made with what it is fitted to (:class:`Recorded`), which it keeps as attributes.
+
+    Attributes:
+        name: its row in tables.
+        extrapolates: whether frames beyond the seen ones are foreseen.
     """
 
     name = "static"
@@ -30,7 +55,6 @@ class Fitted(nn.Module):
     def __init__(
         self, *, scenes: Sequence[GaussianScene], fps: Sequence[float], scene_of_sequence: Sequence[int], seen: int
     ) -> None:
-        """Keeps what it is fitted to."""
         super().__init__()
         self.scenes, self.fps = tuple(scenes), tuple(fps)
         self.scene_of_sequence, self.seen = tuple(scene_of_sequence), seen
@@ -51,14 +75,7 @@ class Fitted(nn.Module):
 
     def advance(self, state: FittedState) -> FittedState:
         """The same again."""
-        return FittedState(
-            state.sequence_id,
-            state.frame + 1,
-            state.positions,
-            state.deformation_gradients,
-            state.rotations,
-            state.inner,
-        )
+        return replace(state, frame=state.frame + 1)
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
         """None."""

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from gausim.core import DataError
 from gausim.io.pixels import decode, read_header
-from gausim.kernels.operations import operation
 
 # Decoding releases the interpreter lock; more threads than this only queue for the disk.
 DECODER_THREADS = 4
@@ -38,9 +37,8 @@ def composite(
     return rgb, alpha
 
 
-@operation("gausim.kernels.over_black:over_black", constant=True)
 def over_black(frames: UInt8[Tensor, "*B H W 4"]) -> tuple[Float[Tensor, "*B H W 3"], Float[Tensor, "*B H W"]]:
-    """RGB and alpha in [0, 1] of straight-alpha RGBA over black; the two forms give the same bits."""
+    """RGB and alpha in [0, 1] of straight-alpha RGBA over black."""
     values = frames.float() / 255
     return values[..., :3] * values[..., 3:], values[..., 3]
 

@@ -1,8 +1,4 @@
 """Numbers that both forms of an operation share."""
 
-from __future__ import annotations
-
-MAX_LOG_STRETCH = 5.0  # bound of the logarithmic stretch (METHOD section 2)
-POLAR_ITERATIONS = 8
 # (k L)^2 of Wang et al. 2004 with k = 0.01, 0.03 and L = 1.
 SSIM_C1, SSIM_C2 = 1e-4, 9e-4

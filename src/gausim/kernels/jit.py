@@ -14,5 +14,3 @@ HELPER: dict[str, Any] = {
 }  # fmt: skip
 # All of fastmath but nnan and ninf: what overflows must not turn into an undefined index later.
 FINITE_MATH_OFF = {"contract", "reassoc", "arcp", "nsz", "afn"}
-# The same for sums that stay in the order in which they are written.
-ORDERED = {"contract", "arcp", "nsz"}

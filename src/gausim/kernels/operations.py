@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import is_dataclass
 from importlib import import_module
 from typing import Any, Generic, ParamSpec, TypeVar
 
@@ -31,12 +30,11 @@ class Operation(Generic[P, R]):
     Attributes:
         plain: computes the result on every device and in every type, by torch.
         enabled: whether the fast form may serve.
-        constant: the fast form has no gradients and serves only where none are asked for.
     """
 
-    def __init__(self, plain: Callable[P, R], fast: str, *, constant: bool) -> None:
+    def __init__(self, plain: Callable[P, R], fast: str) -> None:
         functools.update_wrapper(self, plain)
-        self.plain, self.enabled, self.constant, self._fast = plain, True, constant, fast
+        self.plain, self.enabled, self._fast = plain, True, fast
 
     @functools.cached_property
     def fast(self) -> Callable[P, R]:
@@ -56,23 +54,15 @@ class Operation(Generic[P, R]):
         """Whether the fast form serves such a call: all on the CPU, every real number a float32, in eager mode."""
         if not self.enabled or torch.compiler.is_compiling():
             return False
-        tensors = list(_tensors((*args, *options.values())))
-        if self.constant and torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
-            return False
+        tensors = [value for value in (*args, *options.values()) if isinstance(value, Tensor)]
         return all(t.device.type == "cpu" and (t.dtype is torch.float32 or not t.is_floating_point()) for t in tensors)
 
 
-def operation(fast: str, *, constant: bool = False) -> Callable[[Callable[P, R]], Operation[P, R]]:
-    """Makes an operation of the plain function below.
-
-    Args:
-        fast: ``module:function``, its fast form; imported late.
-        constant: the fast form has no gradients and serves only where none are asked for.
-    """
+def operation(fast: str) -> Callable[[Callable[P, R]], Operation[P, R]]:
+    """Makes an operation of the plain function below; ``fast`` = ``module:function`` is imported late."""
 
     def register(plain: Callable[P, R]) -> Operation[P, R]:
-        made = Operation(plain, fast, constant=constant)
-        OPERATIONS[plain.__name__] = made
+        OPERATIONS[plain.__name__] = made = Operation(plain, fast)
         return made
 
     return register
@@ -95,11 +85,3 @@ def plain_forms(names: Iterable[str] | None = None) -> Iterator[None]:
 def array(tensor: Tensor) -> np.ndarray:
     """The tensor's numbers as a contiguous array, without a copy where it is contiguous already."""
     return tensor.detach().contiguous().numpy()
-
-
-def _tensors(values: Iterable[Any]) -> Iterator[Tensor]:
-    for value in values:
-        if isinstance(value, Tensor):
-            yield value
-        elif is_dataclass(value):
-            yield from _tensors(vars(value).values())

@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.kernels.constants import MAX_LOG_STRETCH, POLAR_ITERATIONS
-from gausim.kernels.operations import operation
 from gausim.ops.quaternion import quaternion_to_matrix
 
+MAX_LOG_STRETCH = 5.0  # bound of the logarithmic stretch (METHOD section 2)
+POLAR_ITERATIONS = 8
 
-@operation("gausim.kernels.deformation:gradient_from_output")
+
 def gradient_from_output(
     output: Float[Tensor, "N 11"], *, conserve_mass: bool
 ) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3 3"]]:
@@ -29,7 +29,6 @@ def gradient_from_output(
     return (u * torch.exp(stretch)[..., None, :]) @ v.mT, u @ v.mT
 
 
-@operation("gausim.kernels.deformation:bounded_deformation")
 def bounded_deformation(gradient: Float[Tensor, "N 3 3"], least: float, *, unit: bool) -> Float[Tensor, "N 3 3"]:
     """The gradient where its determinant is at least ``least`` > 0, else the identity: matter is not turned inside out.
 
@@ -50,23 +49,11 @@ def determinant(a: Float[Tensor, "*N 3 3"]) -> Float[Tensor, " *N"]:
     return (a[..., 0, :] * torch.linalg.cross(a[..., 1, :], a[..., 2, :])).sum(-1)
 
 
-def _inverse_transpose(a: Tensor) -> Tensor:
-    """A^-T by cofactors."""
-    rows = torch.stack(
-        (
-            torch.linalg.cross(a[..., 1, :], a[..., 2, :]),
-            torch.linalg.cross(a[..., 2, :], a[..., 0, :]),
-            torch.linalg.cross(a[..., 0, :], a[..., 1, :]),
-        ),
-        -2,
-    )
-    return rows / (a[..., 0, :] * rows[..., 0, :]).sum(-1)[..., None, None]
-
-
-@operation("gausim.kernels.deformation:polar_rotation", constant=True)
 def polar_rotation(gradient: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:
     """Rotation of the polar decomposition by Newton's iteration R <- (R + R^-T) / 2 (Higham 1986); det > 0 assumed."""
     rotation = gradient
     for _ in range(POLAR_ITERATIONS):
-        rotation = 0.5 * (rotation + _inverse_transpose(rotation))
+        cofactors = torch.linalg.cross(rotation.roll(-1, -2), rotation.roll(-2, -2))
+        scale = (rotation[..., 0, :] * cofactors[..., 0, :]).sum(-1)  # the determinant
+        rotation = 0.5 * (rotation + cofactors / scale[..., None, None])
     return rotation

@@ -113,15 +113,12 @@ def reconstruct(
 
     Args:
         sets: training images; the hull is carved from the first set.
-        renderer: what draws the Gaussians.
-        options: see there.
+        renderer: draws the Gaussians.
+        options: how.
         cloud: points to start from; an open scene needs them.
-        name: name of the scene.
+        name: of the scene, whose kernels are all simulated and foreground, none pinned.
         progress: called after every step.
         begun: :meth:`Reconstruction.state` of an interrupted one with the same arguments, to go on from.
-
-    Returns:
-        The scene: all kernels simulated and foreground, none pinned.
 
     Raises:
         ConfigError: an open scene without points.
@@ -181,7 +178,8 @@ class Reconstruction:
             DivergenceError: the loss is not finite, or pruning left nothing.
         """
         images, i = self._draw()
-        background = self._background()
+        random = torch.rand(3, generator=self._generator)
+        background = random if self._options.random_background else torch.zeros(3)
         truth, mask = composite(images.images[i], background)
         drawable = self.splats.drawable(images.cameras.centers[i])
         rgb, alpha = self._render(images, i, background, drawable)
@@ -219,7 +217,7 @@ class Reconstruction:
             **queues,
             "done": torch.tensor(self.done),
             "generator": self._generator.get_state(),
-            "patience": self._patience.state(),
+            "patience": torch.tensor(self._patience.state, dtype=torch.float64),
         }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
@@ -228,7 +226,7 @@ class Reconstruction:
         self._queues = [state[f"queue_{k}"].tolist() for k in range(len(self._queues))]
         self.done = int(state["done"])
         self._generator.set_state(state["generator"])
-        self._patience.restore(state["patience"])
+        self._patience.state = state["patience"].tolist()
 
     def _draw(self) -> tuple[ImageSet, int]:
         """An image: the set by its share, within a set every image once before any comes again."""
@@ -238,10 +236,6 @@ class Reconstruction:
         if not self._queues[k]:
             self._queues[k] = torch.randperm(len(self._sets[k].images), generator=self._generator).tolist()
         return self._sets[k], self._queues[k].pop()
-
-    def _background(self) -> Float[Tensor, " 3"]:
-        random = torch.rand(3, generator=self._generator)
-        return random if self._options.random_background else torch.zeros(3)
 
     def _render(
         self, images: ImageSet, i: int, background: Tensor, drawable: Drawable
@@ -309,33 +303,30 @@ class Reconstruction:
 
 
 class _Patience:
-    """Tells when the mean loss over a stretch of steps has stopped falling."""
+    """Tells when the mean loss over a stretch of steps has stopped falling.
+
+    Attributes:
+        state: sum and number of the losses of this stretch, the best mean so far, stretches since that were not better.
+    """
 
     def __init__(self, options: ReconstructionOptions) -> None:
         self._allowed, self._length = options.patience, max(1, options.iterations // LOOKS)
         self._first = options.round_steps[-1] + 1
-        self._sum, self._count, self._best, self._worse = 0.0, 0, math.inf, 0
+        self.state = [0.0, 0.0, math.inf, 0.0]
 
     @property
     def over(self) -> bool:
-        return self._allowed > 0 and self._worse >= self._allowed
+        return self._allowed > 0 and self.state[3] >= self._allowed
 
     def note(self, step: int, loss: float) -> None:
         if step < self._first:
             return
-        self._sum, self._count = self._sum + loss, self._count + 1
-        if self._count < self._length:
-            return
-        mean = self._sum / self._count
-        self._worse = 0 if mean < (1 - BETTER) * self._best else self._worse + 1
-        self._best, self._sum, self._count = min(self._best, mean), 0.0, 0
-
-    def state(self) -> Tensor:
-        return torch.tensor([self._sum, self._count, self._best, self._worse], dtype=torch.float64)
-
-    def restore(self, state: Tensor) -> None:
-        self._sum, self._best = float(state[0]), float(state[2])
-        self._count, self._worse = int(state[1]), int(state[3])
+        total, count, best, worse = self.state[0] + loss, self.state[1] + 1, *self.state[2:]
+        if count >= self._length:
+            mean = total / count
+            worse = 0.0 if mean < (1 - BETTER) * best else worse + 1
+            total, count, best = 0.0, 0.0, min(best, mean)
+        self.state = [total, count, best, worse]
 
 
 def _start(images: ImageSet, options: ReconstructionOptions, cloud: PointCloud | None, name: str) -> Start:
@@ -343,14 +334,9 @@ def _start(images: ImageSet, options: ReconstructionOptions, cloud: PointCloud |
         if cloud is None:
             raise ConfigError(f"{name}: an open scene starts from points. Give those that `poses` found (points.npz).")
         return start_open(images, cloud, name=name)
-    return start_object(
-        images,
-        round(START_SHARE * options.kernels),
-        resolution=options.hull_resolution,
-        missing=options.missing_masks,
-        cloud=cloud,
-        name=name,
-    )
+    count = round(START_SHARE * options.kernels)
+    resolution, missing = options.hull_resolution, options.missing_masks
+    return start_object(images, count, resolution=resolution, missing=missing, cloud=cloud, name=name)
 
 
 def _crop(mask: Bool[Tensor, "H W"]) -> tuple[slice, slice]:

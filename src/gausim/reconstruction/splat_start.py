@@ -109,15 +109,9 @@ class Start:
 
 
 def start_object(
-    images: ImageSet,
-    count: int,
-    *,
-    resolution: int,
-    missing: float,
-    cloud: PointCloud | None,
-    name: str,
+    images: ImageSet, count: int, *, resolution: int, missing: float, cloud: PointCloud | None, name: str
 ) -> Start:
-    """Balls evenly over the surface of the visual hull of the masks, or over the points that lie in it.
+    """``count`` balls evenly over the surface of the visual hull of the masks, or over the points that lie in it.
 
     Args:
         images: whose alpha > 0 is the object.
@@ -161,11 +155,8 @@ def start_object(
 def start_open(images: ImageSet, cloud: PointCloud, *, name: str) -> Start:
     """Balls on all points of an open scene, as large as the distances to their neighbours.
 
-    Args:
-        images: whose cameras look at it.
-        cloud: the points, with colours: those of a point that something may hide cannot be read from the images, and
-            kernels that begin with the colour of what is before or behind them grow into fog.
-        name: of the scene, for errors.
+    The points bring their colours: that of a point that something may hide cannot be read from the images, and kernels
+    that begin with the colour of what is before or behind them grow into fog.
 
     Raises:
         DataError: the points have no colours.

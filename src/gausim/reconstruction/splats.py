@@ -64,17 +64,7 @@ class Splats:
         rates: LearningRates,
         extent: float,
     ) -> None:
-        """Starts as balls.
-
-        Args:
-            points: centres [scene units].
-            colors: RGB in [0, 1].
-            scale: standard deviations [scene units].
-            sh_degree: degree of the spherical harmonics, 0..3.
-            opacity: opacity in (0, 1).
-            rates: Adam's step sizes.
-            extent: the scene's diagonal [scene units], the unit of the positions' step.
-        """
+        """Starts as balls at ``points`` of the standard deviations ``scale``; ``extent`` is the unit of their steps."""
         count = points.shape[0]
         quats = torch.zeros(count, 4)
         quats[:, 0] = 1

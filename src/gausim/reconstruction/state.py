@@ -39,12 +39,7 @@ class Partial:
     """The file of an unfinished reconstruction, beside the scene that it will write."""
 
     def __init__(self, scene: Path, key: str) -> None:
-        """Names the file.
-
-        Args:
-            scene: the scene file that is being made.
-            key: :func:`identity` of the reconstruction.
-        """
+        """Names the file of the scene that is being made; ``key`` is the :func:`identity` of its reconstruction."""
         self.path, self._key = scene.with_name(f".{scene.name}.partial"), key
 
     def read(self) -> dict[str, Tensor] | None:

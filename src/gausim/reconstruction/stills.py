@@ -62,7 +62,7 @@ def gather_stills(
     longest: int | None = None,
     coarse: float = 0.0,
 ) -> Material:
-    """The stills of one ``transforms.json``; some are left out and measured.
+    """The stills of the ``transforms.json`` at ``path``; some are left out and measured.
 
     Args:
         path: the file.

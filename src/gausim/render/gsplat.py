@@ -11,9 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import ConfigError, Rendered
+from gausim.render.reference import DILATION, require_options
 
-VERSION = "1.5.3"  # the ceiling of alpha is compiled in: 0.999 there, as our default, but 0.99 on gsplat's main branch
-DILATION = 0.3  # [pixels^2]
+VERSION, ALPHA_MAX = "1.5.3", 0.999  # the ceiling of alpha is compiled in; on gsplat's main branch it is 0.99
 DEVICE = "cuda"  # the type of the devices that gsplat draws on
 INSTALL = "pip install 'gausim[gpu]'"
 
@@ -60,8 +60,7 @@ class GsplatRenderer:
         Raises:
             ConfigError: an option is out of range.
         """
-        if not near > 0:
-            raise ConfigError(f"render.near: expected more than 0, got {near}.")
+        require_options(near, ALPHA_MAX)
         self.near = near
         self._rasterization: Callable[..., Any] | None = None
 

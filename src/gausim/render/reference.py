@@ -15,6 +15,14 @@ T_STOP = 1e-4  # a kernel that would leave less transmittance than this ends its
 TILE = 16  # [pixels]
 
 
+def require_options(near: float, alpha_max: float) -> None:
+    """Raises :class:`ConfigError` where the options that renderers share are out of range."""
+    if not near > 0:
+        raise ConfigError(f"render.near: expected more than 0, got {near}.")
+    if not 0 < alpha_max < 1:
+        raise ConfigError(f"render.alpha_max: expected a value between 0 and 1, got {alpha_max}.")
+
+
 class ReferenceRenderer:
     """EWA splatting after gsplat, sorted by depth and composited front to back (core.Renderer).
 
@@ -32,10 +40,7 @@ class ReferenceRenderer:
         Raises:
             ConfigError: an option is out of range.
         """
-        if not near > 0:
-            raise ConfigError(f"render.near: expected more than 0, got {near}.")
-        if not 0 < alpha_max < 1:
-            raise ConfigError(f"render.alpha_max: expected a value between 0 and 1, got {alpha_max}.")
+        require_options(near, alpha_max)
         self.near, self.alpha_max = near, alpha_max
 
     def __call__(

@@ -37,9 +37,15 @@ GONE = {
     "make_trainer": ("overwrite",),
     "TrainerSettings": ("overwrite",),
 }
-UNSUPPORTED = {
-    "Objective": ("input_noise",),
-    **dict.fromkeys(("PointSupervision", "TrackSupervision", "tracks_or_images"), ("velocity_weight",)),
+# The same of settings of which one value is left; a false one stands for all that are.
+UNSUPPORTED: dict[str, dict[str, Any]] = {
+    "Objective": {"input_noise": None},
+    **dict.fromkeys(("PointSupervision", "TrackSupervision", "tracks_or_images"), {"velocity_weight": None}),
+    "Discretisation": {"filling": None},
+    "ModulusField": {"parametrisation": "log"},
+    "PhysDreamer": {"gradients": True, "parametrisation": "log", "filling": None},
+    "PhysGaussian": {"filling": None},
+    **dict.fromkeys(("SpringMass", "ConstantVelocity"), {"gradients": True}),
 }
 IMAGES = "gausim.training.supervision.images.training_views"
 SIMULATOR = "gausim.models.step.simulator.GausSim"
@@ -78,16 +84,14 @@ ELASTIC = "gausim.models.template.elastic.ElasticTemplate"
 SETTLED: dict[str, Any] = {"damping": "full", "inertia": "trained", "hidden": 0}
 # The material points' settings that are in groups now; what flowed is gone.
 _MATERIAL = ("gausim.baselines.mpm.Material", ("young_modulus", "poisson_ratio", "density"))
-_GRID = (
-    "gausim.baselines.material_point.method.Discretisation", ("cells", "damping", "substeps", "courant", "filling"),
-)  # fmt: skip
+_GRID = ("gausim.baselines.material_point.method.Discretisation", ("cells", "damping", "substeps", "courant"))
 GROUPS: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
     "gausim.baselines.material_point.physdreamer.PhysDreamer": {
         "material": _MATERIAL,
         "discretisation": _GRID,
         "modulus": (
             "gausim.baselines.material_point.physdreamer.ModulusField",
-            ("parametrisation", "modulus_scale", "modulus_resolution"),
+            ("modulus_scale", "modulus_resolution"),
         ),
     },
     "gausim.baselines.material_point.physgaussian.PhysGaussian": {"material": _MATERIAL, "discretisation": _GRID},
@@ -106,10 +110,11 @@ def with_present_names(config: Any) -> Any:
         name = str(config.get("_target_")).rsplit(".", 1)[-1]
         if name == "ConstantSchedule":  # constant is what no schedule means
             return None
-        wanted = [k for k in UNSUPPORTED.get(name, ()) if config.get(k)]
+        unsupported = UNSUPPORTED.get(name, {})
+        wanted = [k for k, left in unsupported.items() if (config.get(k, left) or None) != left]
         if wanted:
             raise ValueError(f"{wanted[0]} is {config[wanted[0]]!r}, which is no longer supported: train the run again")
-        gone = GONE.get(name, ()) + UNSUPPORTED.get(name, ())
+        gone = (*GONE.get(name, ()), *unsupported)
         found = {
             k: _present(v) if k == "_target_" else with_present_names(v) for k, v in config.items() if k not in gone
         }

@@ -10,16 +10,9 @@ import torch
 
 pytest.importorskip("warp", reason="the material point method needs warp-lang (extra 'baselines')")
 
-from gausim.baselines.mpm import (  # noqa: E402
-    Grid,
-    Material,
-    MPMSolver,
-    Particles,
-    ParticleState,
-    TimeStep,
-)
+from gausim.baselines.mpm import Grid, Material, MPMSolver, Particles, ParticleState, TimeStep
 
-GRID = Grid(cells=24, size=2.4, gravity=(0.3, -0.2, -9.8), damping=1.5)
+GRID = Grid(cells=24, size=2.4, damping=1.5)
 STEPS, DT = 3, 0.004
 
 
@@ -55,7 +48,7 @@ def step(x, v, C, F, m, V, E, held, pinned, material):  # all float64
             momentum[node] += weight * (m[p] * v[p] + affine @ offset)
     velocity = np.zeros_like(momentum)
     full = mass >= 1e-15
-    velocity[full] = momentum[full] / mass[full][:, None] * (1 - GRID.damping * DT) + DT * np.array(GRID.gravity)
+    velocity[full] = momentum[full] / mass[full][:, None] * (1 - GRID.damping * DT)
     velocity[pinned] = 0
     moved, v, C, F = x.copy(), np.zeros_like(v), np.zeros_like(C), F.copy()
     for p in range(len(x)):
@@ -91,6 +84,5 @@ def test_three_substeps_agree_with_the_reference():
         reference = step(*reference, m, V, E, held, particles.pinned_nodes.numpy(), material)
     for name, found, true in zip("xvCF", end.tensors(), reference, strict=True):
         error = np.abs(found.numpy() - true).max() / np.abs(true).max()
-        print(name, f"{error:.1e}")
         assert error < 1e-4, name
-    assert np.abs(reference[0] - x).max() > 5e-3  # something happened
+    assert np.abs(reference[0] - x).max() > 2e-3  # something happened

@@ -9,15 +9,8 @@ import torch
 
 pytest.importorskip("warp", reason="the material point method needs warp-lang (extra 'baselines')")
 
-from gausim.baselines.mpm import (  # noqa: E402
-    Grid,
-    Material,
-    MPMSolver,
-    Particles,
-    ParticleState,
-    TimeStep,
-)
-from gausim.core import ConfigError, DivergenceError  # noqa: E402
+from gausim.baselines.mpm import Grid, Material, MPMSolver, Particles, ParticleState, TimeStep
+from gausim.core import ConfigError, DivergenceError
 
 SOFT = Material(young_modulus=20.0, poisson_ratio=0.3, density=1.0)
 
@@ -35,25 +28,6 @@ def momenta(state: ParticleState, mass: torch.Tensor, dx: float) -> tuple[torch.
     return linear, (m[:, None] * (torch.linalg.cross(x, v) + dx**2 / 4 * spin)).sum(0)
 
 
-def test_free_fall_follows_the_parabola_and_deforms_nothing(lattice):
-    grid = Grid(cells=16, size=1.0, gravity=(0.0, 0.5, -2.0))
-    x = lattice((0.35, 0.3, 0.5), (0.6, 0.5, 0.7), 1 / 32)
-    v = torch.tensor([0.3, -0.1, 0.4]).repeat(len(x), 1)
-    frames, frame_time, substeps = 4, 0.05, 256
-    solver = simulation(x, grid, frame_time=frame_time, substeps=substeps)
-    state = ParticleState.at_rest(x, v)
-    for frame in range(frames):
-        state = solver.advance(state, frame)
-    t, dt = frames * frame_time, frame_time / substeps
-    g = torch.tensor(grid.gravity, dtype=torch.float64)
-    moved = state.positions.double().mean(0) - x.double().mean(0)
-    error = (moved - (v[0].double() * t + 0.5 * g * t * t)).abs().max()
-    discrete = (moved - (v[0].double() * t + 0.5 * g * t * (t + dt))).abs().max()
-    print(f"centre of mass: {error:.1e} off the parabola, {discrete:.1e} off the explicit scheme's own")
-    assert error < 1e-4 and discrete < 2e-5 and moved.abs().max() > 0.03
-    assert (state.deformation_gradients - torch.eye(3)).abs().max() < 1e-4
-
-
 def test_momenta_are_conserved_without_boundary(lattice):
     grid = Grid(cells=16, size=1.0)
     x = lattice((0.35, 0.35, 0.4), (0.65, 0.55, 0.6), 1 / 32)
@@ -69,100 +43,44 @@ def test_momenta_are_conserved_without_boundary(lattice):
         state = solver.advance(state, frame, young_modulus=E)
     after = momenta(state, solver.particles.mass, grid.dx)
     relative = [float((a - b).norm() / b.norm()) for a, b in zip(after, before, strict=True)]
-    print(f"relative change of momentum {relative[0]:.1e}, angular momentum {relative[1]:.1e}")
     assert relative[0] < 1e-4 and relative[1] < 1e-3
     assert (state.deformation_gradients - torch.eye(3)).abs().max() > 0.1  # it deformed a lot meanwhile
 
 
-def quarter_crossings(values: list[float], frame_time: float) -> list[float]:
-    """Times at which a sampled curve changes its sign, by linear interpolation."""
-    pairs = enumerate(zip(values[:-1], values[1:], strict=True))
-    return [(n + a / (a - b)) * frame_time for n, (a, b) in pairs if a * b < 0]
-
-
-@pytest.mark.parametrize("clamped", [False, True], ids=["free", "clamped"])
-def test_axial_period_of_an_elastic_bar(lattice, clamped: bool):
-    """A free bar swings with T = 2 L / c, one that is held at an end with 4 L / c; c = sqrt(E / rho)."""
+def test_axial_period_of_a_bar_held_at_one_end(lattice):
+    """It swings with T = 4 L / c, c = sqrt(E / rho)."""
     grid = Grid(cells=32, size=1.0)
-    length, start = 0.625, 0.1875  # the bar begins and ends at nodes
-    x = lattice((start, 0.4375, 0.4375), (start + length, 0.5625, 0.5625), 1 / 64)
+    start, held, end = 0.1875, 0.25, 0.8125  # nodes
+    x = lattice((start, 0.4375, 0.4375), (end, 0.5625, 0.5625), 1 / 64)
     material = Material(young_modulus=1.0, poisson_ratio=0.3, density=1.0)
-    reach = length
-    pinned = None
-    if clamped:
-        pinned = x[:, 0] < start + 0.0625
-        reach = length - 0.0625
-    s = (x[:, 0] - (start + length - reach)) / reach
-    shape = torch.sin(math.pi / 2 * s.clamp_min(0)) if clamped else torch.cos(math.pi * s)
-    period = (4 if clamped else 2) * reach / 1.0
-    frame_time = period / 40
-    solver = simulation(x, grid, material=material, frame_time=frame_time, pinned=pinned)
-    v = torch.zeros_like(x)
-    v[:, 0] = 0.01 * shape
-    state = ParticleState.at_rest(x, v)
+    shape = torch.sin(math.pi / 2 * ((x[:, 0] - held) / (end - held)).clamp_min(0))
+    period = 4 * (end - held)
+    solver = simulation(x, grid, material=material, frame_time=period / 40, pinned=x[:, 0] < held)
+    state = ParticleState.at_rest(x, 0.01 * shape[:, None] * torch.tensor([1.0, 0.0, 0.0]))
     swing = [1.0]
-    for frame in range(42):
+    for frame in range(32):
         state = solver.advance(state, frame)
         swing.append(float((state.velocities[:, 0] * shape).sum()))
-    crossings = quarter_crossings(swing, frame_time)
-    found = 2 * (crossings[1] - crossings[0])
-    print(f"{'clamped' if clamped else 'free'}: period {found:.4f}, analytic {period:.4f} ({found / period - 1:+.1%})")
-    assert found == pytest.approx(period, rel=0.05)
-
-
-def bending_period(lattice, cells: int) -> float:
-    """First period of a clamped beam of length 0.5 and square section of edge 0.125, E = rho = 1."""
-    grid = Grid(cells=cells, size=1.0)
-    x = lattice((0.1875, 0.4375, 0.4375), (0.75, 0.5625, 0.5625), 0.5 / cells)
-    material = Material(young_modulus=1.0, poisson_ratio=0.3, density=1.0)
-    solver = simulation(x, grid, material=material, frame_time=0.2, pinned=x[:, 0] < 0.25)
-    v = torch.zeros_like(x)
-    v[:, 2] = 0.002 * ((x[:, 0] - 0.25).clamp_min(0) / 0.5) ** 2
-    state = ParticleState.at_rest(x, v)
-    tip = x[:, 0] > 0.7
-    swing = [1.0]
-    while sum(a * b < 0 for a, b in zip(swing[:-1], swing[1:], strict=True)) < 2:
-        state = solver.advance(state, len(swing) - 1)
-        swing.append(float((state.positions - x)[tip, 2].mean()))
-    crossings = quarter_crossings(swing[1:], 0.2)  # from above, then from below
-    return 2 * (crossings[1] - crossings[0])
-
-
-@pytest.mark.slow
-def test_bending_period_of_a_clamped_beam(lattice):
-    """Bending (Euler) and shear in series (Dunkerley): 1 / w^2 = 1 / w_b^2 + 1 / w_s^2."""
-    bending = 1.8751**2 * 0.125 / math.sqrt(12) / 0.5**2
-    shear = math.pi / (2 * 0.5) * math.sqrt(0.85 / 2.6)
-    analytic = 2 * math.pi * math.sqrt(1 / bending**2 + 1 / shear**2)
-    coarse, fine = bending_period(lattice, 32), bending_period(lattice, 48)
-    print(f"period {coarse:.3f} on 4 cells across, {fine:.3f} on 6, analytic {analytic:.3f}")
-    assert fine == pytest.approx(analytic, rel=0.05)
-    assert abs(fine / analytic - 1) < abs(coarse / analytic - 1) < 0.1
+    pairs = enumerate(zip(swing[:-1], swing[1:], strict=True))
+    crossings = [(n + a / (a - b)) * period / 40 for n, (a, b) in pairs if a * b < 0]
+    assert 2 * (crossings[1] - crossings[0]) == pytest.approx(period, rel=0.05)
 
 
 def test_pinned_particles_stay_and_the_rest_swings(lattice):
-    grid = Grid(cells=16, size=1.0, gravity=(0.0, 0.0, -2.0))
+    grid = Grid(cells=16, size=1.0)
     x = lattice((0.2, 0.4, 0.5), (0.7, 0.55, 0.6), 1 / 32)
     pinned = x[:, 0] < 0.3
     firm = Material(young_modulus=200.0, poisson_ratio=0.3, density=1.0)
     solver = simulation(x, grid, material=firm, pinned=pinned, frame_time=0.05)
-    state = ParticleState.at_rest(x)
-    for frame in range(6):
+    falling = torch.tensor([0.0, 0.0, -1.0]) * (x[:, :1] - 0.3).clamp_min(0)
+    state = ParticleState.at_rest(x, falling)
+    for frame in range(4):
         state = solver.advance(state, frame)
     assert torch.equal(state.positions[pinned], x[pinned])
     drop = x[:, 2] - state.positions[:, 2]
     assert drop[x[:, 0] > 0.65].mean() > 0.02
     joint = (x[:, 0] > 0.3) & (x[:, 0] < 0.34)
     assert drop[joint].abs().mean() < 0.1 * drop[x[:, 0] > 0.65].mean()
-
-
-def test_forces_accelerate(lattice):
-    grid = Grid(cells=16, size=1.0)
-    x = lattice((0.3, 0.4, 0.4), (0.6, 0.55, 0.55), 1 / 32)
-    solver = simulation(x, grid)
-    a = torch.tensor([0.0, 0.0, 1.5]).repeat(len(x), 1)
-    state = solver.advance(ParticleState.at_rest(x), 0, acceleration=a)
-    assert torch.allclose(state.velocities, 0.02 * a, atol=1e-5)
 
 
 def test_leaving_the_domain_names_particle_place_frame_and_remedy(lattice):
@@ -182,12 +100,12 @@ def test_leaving_the_domain_names_particle_place_frame_and_remedy(lattice):
 
 
 def test_a_frame_may_carry_particles_far_beyond_the_nodes_where_it_began(lattice):
-    grid = Grid(cells=32, size=1.0)
-    x = lattice((0.1, 0.4, 0.4), (0.2, 0.5, 0.5), 1 / 64)
+    grid = Grid(cells=20, size=1.0)
+    x = lattice((0.1, 0.4, 0.4), (0.2, 0.5, 0.5), 1 / 40)
     solver = simulation(x, grid, frame_time=0.5)
     v = torch.tensor([1.0, 0.5, 0.0]).repeat(len(x), 1).requires_grad_()
     end = solver.advance(ParticleState.at_rest(x, v), 0)
-    assert torch.allclose(end.positions, x + 0.5 * v, atol=1e-4)  # 16 cells
+    assert torch.allclose(end.positions, x + 0.5 * v, atol=1e-4)  # 10 cells
     end.positions[:, 0].sum().backward()
     assert float(v.grad[:, 0].sum()) == pytest.approx(0.5 * len(x), rel=1e-3)
 
@@ -214,3 +132,9 @@ def test_substeps_keep_the_bound_or_are_refused(lattice):
 def test_impossible_materials_are_refused(arguments):
     with pytest.raises(ConfigError, match=next(iter(arguments))):
         Material(**arguments)
+
+
+def test_particles_of_a_cell_share_its_volume():
+    x = torch.tensor([[0.51, 0.51, 0.51], [0.58, 0.52, 0.55], [0.65, 0.52, 0.55]])
+    volume = Particles.create(x, grid=Grid(cells=10, size=1.0), density=1.0).volume
+    assert torch.allclose(volume, torch.tensor([0.5, 0.5, 1.0]) * 1e-3)

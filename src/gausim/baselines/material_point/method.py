@@ -11,32 +11,65 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from gausim.baselines.fitted import Fitted
+from gausim.baselines.fitted import Fitted, Recorded, moved
 from gausim.baselines.material_point.driven import Driven
-from gausim.baselines.material_point.fields import TriPlaneField
-from gausim.baselines.mpm import (
-    Filling,
-    Grid,
-    Material,
-    MPMSolver,
-    Particles,
-    ParticleState,
-    SceneMapping,
-    TimeStep,
-    fill_interior,
-)
+from gausim.baselines.mpm import Grid, Material, MPMSolver, Particles, ParticleState, TimeStep
 from gausim.baselines.mpm.runtime import warp
 from gausim.core import ConfigError, FittedState, GaussianScene
-from gausim.ops.covariance import covariance_from_scales
+from gausim.nn.mlp import mlp, zero_output
+from gausim.nn.planes import SUM, Planes
 
 # Range of Young's modulus in PhysDreamer [simulation units]; outside nothing sensible is simulated.
 LEAST_MODULUS, GREATEST_MODULUS = 1e3, 5e8
+
+
+class TriPlaneField(nn.Module):
+    """A smooth function of space: summed features of three planes, a hidden layer, ``outputs`` numbers, 0 at first.
+
+    Attributes:
+        planes: the features, ``resolution`` numbers along both axes of each.
+        network: what makes numbers of them.
+    """
+
+    def __init__(self, resolution: int, *, features: int = 32, hidden: int = 32, outputs: int = 1) -> None:
+        """Draws its parameters from the global generator."""
+        super().__init__()
+        self.planes = Planes([resolution] * 3, features, combine=SUM)
+        self.network = mlp([features, hidden, outputs], "relu")
+        zero_output(self.network)
+
+    def forward(self, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P outputs"]:
+        """Values at points in [-1, 1]^3."""
+        found: Tensor = self.network(self.planes(points))
+        return found
+
+
+@dataclass(frozen=True)
+class SceneMapping:
+    """x_sim = scale x + offset: no rotation, so that gradients and rotations are the same in both.
+
+    Attributes:
+        scale: simulation units per scene unit.
+        offset: where the scene's origin goes [simulation units].
+    """
+
+    scale: float
+    offset: tuple[float, float, float]
+
+    def to_simulation(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
+        """Positions in the simulation."""
+        return self.scale * points + points.new_tensor(self.offset)
+
+    def to_scene(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
+        """Positions in the scene."""
+        return (points - points.new_tensor(self.offset)) / self.scale
 
 
 @dataclass(frozen=True)
@@ -48,14 +81,12 @@ class Discretisation:
         damping: rate at which the grid loses velocity [1 / s].
         substeps: per frame; None derives them from the bound of the time step.
         courant: c of that bound, dt < c dx / sqrt(E / rho); measured, 0.5 is stable up to nu = 0.4.
-        filling: how the interior is filled before particles are placed; None leaves it empty.
     """
 
     cells: int
     damping: float = 0.0
     substeps: int | None = None
     courant: float = 0.5
-    filling: Filling | None = None
 
 
 @dataclass(frozen=True)
@@ -66,7 +97,7 @@ class Domain:
         side: longest side of the scene in the simulation [simulation units].
         size: edge of the cubic domain, in whose middle the scene is [simulation units].
         cells: cells per axis over the whole domain.
-        settings: damping, substeps and filling.
+        settings: damping and substeps.
     """
 
     side: float
@@ -85,17 +116,6 @@ class Domain:
         scale = self.side / float((high - low).amax())
         x, y, z = (self.size / 2 - scale * (low + high) / 2).tolist()
         return SceneMapping(scale, (x, y, z))
-
-    def filled(self, scene: GaussianScene) -> Float[Tensor, "M 3"]:
-        """Points in the interior of a scene [scene units]."""
-        if self.settings.filling is None:
-            return scene.means.new_zeros(0, 3)
-        mapping, body = self.mapping(scene), scene.select(scene.simulated)
-        covars = mapping.scale**2 * covariance_from_scales(body.log_scales, body.quats)
-        opacities = torch.sigmoid(body.opacity_logits)
-        return mapping.to_scene(
-            fill_interior(mapping.to_simulation(body.means), covars, opacities, self.grid, self.settings.filling)
-        )
 
 
 def extent(scene: GaussianScene) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
@@ -131,22 +151,15 @@ class MaterialPoints(Fitted):
     def __init__(
         self,
         *,
-        scenes: Sequence[GaussianScene],
-        fps: Sequence[float],
-        scene_of_sequence: Sequence[int],
-        seen: int,
         material: Material,
         domain: Domain,
         velocity_resolution: int,
         velocity_scale: float,
+        **recorded: Unpack[Recorded],
     ) -> None:
         """Places the particles.
 
         Args:
-            scenes: the rest scenes.
-            fps: frames per second of each.
-            scene_of_sequence: the scene of each sequence.
-            seen: predicted frames that training may see.
             material: of all particles; their E where :meth:`modulus` does not say otherwise.
             domain: how they are simulated.
             velocity_resolution: of the planes of the velocity fields.
@@ -156,7 +169,7 @@ class MaterialPoints(Fitted):
             ConfigError: Warp is not installed, or a number is out of range.
             SceneError: too few kernels.
         """
-        super().__init__(scenes=scenes, fps=fps, scene_of_sequence=scene_of_sequence, seen=seen)
+        super().__init__(**recorded)
         if velocity_resolution < 2 or not velocity_scale > 0:
             raise ConfigError(
                 "model.method: expected velocity_resolution >= 2 and velocity_scale > 0, got "
@@ -195,7 +208,7 @@ class MaterialPoints(Fitted):
         """A scene on the device of the parameters."""
         found = self._bodies[scene_id]
         if found.driven.rest.device != self._device:
-            found = self._bodies[scene_id] = self._body(scene_id, found.driven.to(self._device))
+            found = self._bodies[scene_id] = self._body(scene_id, moved(found.driven, self._device))
         return found
 
     def begin(self, sequence_id: int) -> FittedState:
@@ -220,13 +233,9 @@ class MaterialPoints(Fitted):
         return FittedState(
             state.sequence_id,
             state.frame + 1,
-            *self.carry(body.driven, x, particles.deformation_gradients),
+            *body.driven.carried(x, particles.deformation_gradients),
             particles.tensors(),
         )
-
-    def carry(self, driven: Driven, x: Tensor, deformation_gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Positions, gradients and rotations of the kernels."""
-        return driven.carried(x, deformation_gradients)
 
     def speed(self, scene_id: int) -> Float[Tensor, " P"]:
         """The speed sqrt(E / rho) of waves in longest sides per frame: what a modulus means for the motion."""
@@ -245,7 +254,7 @@ class MaterialPoints(Fitted):
         least, mean, most = (f"{float(e):.3g}" for e in (own.amin(), own.log().mean().exp(), own.amax()))
         spread = "" if least == most else f" ({least} to {most})"
         return (
-            f"{self.scenes[scene_id].name}: {self._bodies[scene_id].driven.count} particles, Young's modulus "
+            f"{self.scenes[scene_id].name}: {len(self._bodies[scene_id].driven.rest)} particles, Young's modulus "
             f"{mean}{spread}, waves of {speed:.2g} sides per frame, {self.substeps(scene_id)} substeps per frame"
         )
 

@@ -8,20 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import Parameter
 
+from gausim.baselines.fitted import Recorded
 from gausim.baselines.material_point.driven import Driven, clustered
-from gausim.baselines.material_point.fields import TriPlaneField
 from gausim.baselines.material_point.method import (
     GREATEST_MODULUS,
     LEAST_MODULUS,
     Discretisation,
     Domain,
     MaterialPoints,
+    TriPlaneField,
     require_modulus,
 )
 from gausim.baselines.mpm import Material
@@ -32,28 +34,21 @@ from gausim.core import ConfigError, GaussianScene
 SIDE, CELLS, SUBSTEPS = 1 / 1.8, 64, 768
 # Edge of the domain; the original's is 1, which large motions leave. Only nodes round the particles cost anything.
 SIZE = 2.0
-LOG, LINEAR = "log", "linear"
 
 
 @dataclass(frozen=True)
 class ModulusField:
-    """How Young's modulus varies over an object.
+    """How Young's modulus varies over an object: E_0 exp(s f); the original's is E_0 + 1000 f.
 
     Attributes:
-        parametrisation: ``log``, E_0 exp(s f), or the original's ``linear``, E_0 + s f.
-        scale: s; the original's 1000 with ``linear``.
+        scale: s.
         resolution: of the planes of f.
     """
 
-    parametrisation: str = LOG
     scale: float = 1.0
     resolution: int = 8
 
     def __post_init__(self) -> None:
-        if self.parametrisation not in (LOG, LINEAR):
-            raise ConfigError(
-                f"model.method.modulus.parametrisation: expected log or linear, got '{self.parametrisation}'."
-            )
         if self.resolution < 2 or not self.scale > 0:
             raise ConfigError(
                 f"model.method.modulus: expected resolution >= 2 and scale > 0, got {self.resolution} and {self.scale}."
@@ -63,7 +58,7 @@ class ModulusField:
 class PhysDreamer(MaterialPoints):
     """Driving particles by k-means, fixed corotated elasticity, and fields of velocity and Young's modulus.
 
-    With the field's output f, E = clamp(E_0 exp(f)) or, the original's, clamp(E_0 + 1000 f).
+    Kernels follow the affine maps of their particles; the original's turn, but keep their shape.
     """
 
     name = "physdreamer (no diffusion prior)"
@@ -71,33 +66,23 @@ class PhysDreamer(MaterialPoints):
     def __init__(
         self,
         *,
-        scenes: Sequence[GaussianScene],
-        fps: Sequence[float],
-        scene_of_sequence: Sequence[int],
-        seen: int,
         particles: int,
         material: Material,
         discretisation: Discretisation,
         most_substeps: int = SUBSTEPS,
         modulus: ModulusField,
-        gradients: bool = True,
         velocity_resolution: int = 24,
         velocity_scale: float = 0.18,
+        **recorded: Unpack[Recorded],
     ) -> None:
         """Places the driving particles.
 
         Args:
-            scenes: the rest scenes.
-            fps: frames per second of each.
-            scene_of_sequence: the scene of each sequence.
-            seen: predicted frames that training may see.
             particles: at most so many per object.
             material: E_0, nu and rho [simulation units].
             discretisation: ``cells`` per simulation unit; the longest side has ``cells`` / 1.8.
             most_substeps: E is kept below what would need more.
             modulus: how E varies over the object.
-            gradients: kernels follow the affine maps of their particles; else their mean displacement and Kabsch
-                rotation (the original).
             velocity_resolution: of the planes of the velocity fields.
             velocity_scale: of their outputs [longest sides / s]; 0.18 is the original's 0.1 simulation units.
 
@@ -108,11 +93,11 @@ class PhysDreamer(MaterialPoints):
         cells = discretisation.cells
         if particles < 8 or cells < 4:
             raise ConfigError(f"model.method: expected particles >= 8 and cells >= 4, got {particles} and {cells}.")
-        self.most, self.gradients, self.cells, self.field = particles, gradients, cells, modulus
+        self.most, self.cells, self.field = particles, cells, modulus
         self.initial = require_modulus(material.young_modulus)
         domain = Domain(SIDE, SIZE, round(SIZE * cells), discretisation)
         most = discretisation.substeps or most_substeps
-        self.greatest = [self._bound(rate, most, material, domain) for rate in fps]
+        self.greatest = [self._bound(rate, most, material, domain) for rate in recorded["fps"]]
         if self.initial > min(self.greatest):
             raise ConfigError(
                 f"model.method.material.young_modulus: {self.initial:g} would need more than {most} "
@@ -120,10 +105,7 @@ class PhysDreamer(MaterialPoints):
                 "(or discretisation.substeps), or lower discretisation.cells."
             )
         super().__init__(
-            scenes=scenes,
-            fps=fps,
-            scene_of_sequence=scene_of_sequence,
-            seen=seen,
+            **recorded,
             material=material,
             domain=domain,
             velocity_resolution=velocity_resolution,
@@ -139,8 +121,8 @@ class PhysDreamer(MaterialPoints):
         return min(GREATEST_MODULUS, speed**2 * material.density)
 
     def drive(self, scene: GaussianScene) -> Driven:
-        """K-means of the simulated kernels and of filled points."""
-        return clustered(scene, self.domain.filled(scene), self.most, even=not self.gradients)
+        """K-means of the simulated kernels."""
+        return clustered(scene, self.most)
 
     def modulus(self, scene_id: int) -> Float[Tensor, " P"]:
         """Young's modulus of the driving particles [simulation units]."""
@@ -154,12 +136,7 @@ class PhysDreamer(MaterialPoints):
             places: as :meth:`MaterialPoints.places` gives them.
         """
         f = self.field.scale * self.modulus_field[scene_id](places)[:, 0]
-        found = self.initial * torch.exp(f) if self.field.parametrisation == LOG else self.initial + f
-        return found.clamp(LEAST_MODULUS, self.greatest[scene_id])
-
-    def carry(self, driven: Driven, x: Tensor, gradients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Kernels that follow their particles."""
-        return driven.carried(x, gradients) if self.gradients else driven.turned(x)
+        return (self.initial * torch.exp(f)).clamp(LEAST_MODULUS, self.greatest[scene_id])
 
     def notes(self) -> tuple[str, ...]:
         """What differs from the original, and what was found."""

@@ -8,12 +8,13 @@ at zero.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Unpack
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from gausim.baselines.fitted import Recorded
 from gausim.baselines.material_point.driven import Driven, opaque
 from gausim.baselines.material_point.method import Discretisation, Domain, MaterialPoints, require_modulus
 from gausim.baselines.material_point.physdreamer import PhysDreamer
@@ -33,23 +34,16 @@ class PhysGaussian(MaterialPoints):
     def __init__(
         self,
         *,
-        scenes: Sequence[GaussianScene],
-        fps: Sequence[float],
-        scene_of_sequence: Sequence[int],
-        seen: int,
         material: Material,
         discretisation: Discretisation,
         opacity: float = OPACITY,
         velocity_resolution: int = 24,
         velocity_scale: float = 0.18,
+        **recorded: Unpack[Recorded],
     ) -> None:
         """Places the particles.
 
         Args:
-            scenes: the rest scenes.
-            fps: frames per second of each.
-            scene_of_sequence: the scene of each sequence.
-            seen: predicted frames that training may see.
             material: E, nu and rho [simulation units].
             discretisation: ``cells`` per axis of the domain, whose edge is twice the longest side.
             opacity: above which a kernel is a particle.
@@ -63,22 +57,19 @@ class PhysGaussian(MaterialPoints):
         self.opacity = opacity
         require_modulus(material.young_modulus)
         super().__init__(
-            scenes=scenes,
-            fps=fps,
-            scene_of_sequence=scene_of_sequence,
-            seen=seen,
+            **recorded,
             material=material,
             domain=Domain(SIDE, SIZE, discretisation.cells, discretisation),
             velocity_resolution=velocity_resolution,
             velocity_scale=velocity_scale,
         )
         for scene_id in range(len(self.scenes)):
-            moduli = torch.full((self.body(scene_id).driven.count,), float(material.young_modulus))
+            moduli = torch.full((len(self.body(scene_id).driven.rest),), float(material.young_modulus))
             self.register_buffer(f"young_{scene_id}", moduli)
 
     def drive(self, scene: GaussianScene) -> Driven:
-        """Every opaque kernel, and filled points."""
-        return opaque(scene, self.domain.filled(scene), self.opacity)
+        """Every opaque kernel."""
+        return opaque(scene, self.opacity)
 
     def modulus(self, scene_id: int) -> Float[Tensor, " P"]:
         """Young's modulus of the particles [simulation units]."""

@@ -7,20 +7,14 @@ Warp is imported when the first solver is made, not before. Elastic particles th
 """
 
 from gausim.baselines.mpm.config import Grid, Material, TimeStep
-from gausim.baselines.mpm.filling import Filling, fill_interior
-from gausim.baselines.mpm.mapping import SceneMapping
-from gausim.baselines.mpm.particles import Particles, ParticleState, particle_volumes
+from gausim.baselines.mpm.particles import Particles, ParticleState
 from gausim.baselines.mpm.solver import MPMSolver
 
 __all__ = [
-    "Filling",
     "Grid",
     "MPMSolver",
     "Material",
     "ParticleState",
     "Particles",
-    "SceneMapping",
     "TimeStep",
-    "fill_interior",
-    "particle_volumes",
 ]

@@ -40,13 +40,11 @@ class Grid:
     Attributes:
         cells: cells per axis; nodes are one more.
         size: edge L of the domain [simulation units].
-        gravity: acceleration of everything [simulation units / s^2].
         damping: rate at which nodes lose velocity [1 / s]; 0 is none.
     """
 
     cells: int = 50
     size: float = 2.0
-    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     damping: float = 0.0
 
     def __post_init__(self) -> None:

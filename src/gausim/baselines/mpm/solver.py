@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.baselines.mpm.adjoint import Frame, FramePlan
+from gausim.baselines.mpm.adjoint import Frame
 from gausim.baselines.mpm.config import Grid, Material, TimeStep
 from gausim.baselines.mpm.particles import Particles, ParticleState, require_inside
 from gausim.baselines.mpm.substeps import Substeps
@@ -17,7 +17,7 @@ class MPMSolver:
     """MLS-MPM/APIC on quadratic B-splines, explicit (Hu et al. 2018, Jiang et al. 2015).
 
     All quantities are in simulation units and float32, on the device of the particles. A frame is differentiable with
-    respect to the state at its start, Young's modulus and the acceleration; whoever calls decides by
+    respect to the state at its start and Young's modulus; whoever calls decides by
     :meth:`ParticleState.detach` whether gradients go on to the frame before.
 
     Args:
@@ -46,7 +46,6 @@ class MPMSolver:
         frame: int,
         *,
         young_modulus: Float[Tensor, " N"] | None = None,
-        acceleration: Float[Tensor, "N 3"] | None = None,
     ) -> ParticleState:
         """The state at the end of a frame.
 
@@ -54,7 +53,6 @@ class MPMSolver:
             state: the state at its start.
             frame: its number, counted from 0, for what errors say.
             young_modulus: E per particle; the material's if not given.
-            acceleration: of every particle during the frame, beside gravity [simulation units / s^2].
 
         Raises:
             ConfigError: the configured number of substeps violates the bound of the time step.
@@ -62,13 +60,11 @@ class MPMSolver:
         """
         if young_modulus is None:
             young_modulus = state.positions.new_full((len(state.positions),), self.material.young_modulus)
-        if acceleration is None:
-            acceleration = torch.zeros_like(state.positions)
         count = self.substeps(young_modulus)
-        tensors = (*state.tensors(), young_modulus.float(), acceleration.float())
+        tensors = (*state.tensors(), young_modulus.float())
         keep = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-        plan = FramePlan(self._substeps, count, self.step.frame_time / count, self.grid.dx, keep)
-        following = ParticleState(*Frame.apply(plan, *tensors))
+        dt = self.step.frame_time / count
+        following = ParticleState(*Frame.apply(self._substeps, count, dt, self.grid.dx, keep, *tensors))
         self._check(following, frame + 1)
         return following
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -70,19 +70,9 @@ class Anchors:
         return Anchors(single[0], pinned, followed, single[1], single[2], scene.means, scene.diagonal)
 
     @property
-    def count(self) -> int:
-        """Number of anchors A."""
-        return len(self.rest)
-
-    @property
     def free(self) -> Float[Tensor, "A 1"]:
         """1 for anchors that move, else 0."""
         return (~self.pinned).to(self.rest)[:, None]
-
-    def to(self, device: torch.device) -> Anchors:
-        """The same on another device."""
-        names = ("rest", "pinned", "followed", "weights", "slopes", "means")
-        return replace(self, **{name: getattr(self, name).to(device) for name in names})
 
     def positions(self, displacement: Float[Tensor, "A 3"]) -> Float[Tensor, "K 3"]:
         """Kernels that follow displaced anchors [scene units]; ``displacement`` is in diagonals."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Unpack
 
 import numpy as np
 import torch
@@ -18,10 +19,10 @@ from scipy.sparse.linalg import eigsh
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from gausim.baselines.fitted import Fitted
+from gausim.baselines.fitted import Fitted, Recorded, moved
 from gausim.baselines.spring_gaus.anchors import Anchors
 from gausim.baselines.spring_gaus.springs import Net, move
-from gausim.core import ConfigError, DivergenceError, FittedState, GaussianScene
+from gausim.core import ConfigError, DivergenceError, FittedState
 
 # What the original takes.
 ANCHORS, NEIGHBOURS, SUBSTEPS, DAMPING = 2048, 256, 100, 0.1
@@ -32,45 +33,37 @@ MOST_SUBSTEPS = 16
 class AnchoredMotion(Fitted):
     """Kernels that follow anchors, and a velocity per anchor and sequence: a base for what moves anchors.
 
-    A velocity is in diagonals of the scene per frame; anchors of pinned kernels have none.
+    A velocity is in diagonals of the scene per frame; anchors of pinned kernels have none. Kernels turn and stretch
+    with their anchors; those of the original keep their shape.
     """
 
     def __init__(
         self,
         *,
-        scenes: Sequence[GaussianScene],
-        fps: Sequence[float],
-        scene_of_sequence: Sequence[int],
-        seen: int,
         anchors: int,
-        gradients: bool = True,
+        **recorded: Unpack[Recorded],
     ) -> None:
         """Places the anchors.
 
         Args:
-            scenes: the rest scenes.
-            fps: frames per second of each.
-            scene_of_sequence: the scene of each sequence.
-            seen: predicted frames that training may see.
             anchors: at most so many per scene.
-            gradients: kernels turn and stretch with their anchors; else they keep their shape (the original).
 
         Raises:
             ConfigError: fewer than four anchors are allowed.
             SceneError: the kernels of a scene occupy fewer than four grid cells.
         """
-        super().__init__(scenes=scenes, fps=fps, scene_of_sequence=scene_of_sequence, seen=seen)
+        super().__init__(**recorded)
         if anchors < 4:
             raise ConfigError(f"model.method.anchors: expected at least 4, got {anchors}.")
-        self.most, self.gradients = anchors, gradients
+        self.most = anchors
         self._anchors = [Anchors.of(scene, anchors) for scene in self.scenes]
-        self.velocity = nn.ParameterList(torch.zeros(self._anchors[i].count, 3) for i in self.scene_of_sequence)
+        self.velocity = nn.ParameterList(torch.zeros(len(self._anchors[i].rest), 3) for i in self.scene_of_sequence)
 
     def anchors(self, sequence_id: int) -> Anchors:
         """The anchors of a sequence's scene."""
         scene_id = self.scene_of_sequence[sequence_id]
         if self._anchors[scene_id].rest.device != self._device:
-            self._anchors[scene_id] = self._anchors[scene_id].to(self._device)
+            self._anchors[scene_id] = moved(self._anchors[scene_id], self._device)
         return self._anchors[scene_id]
 
     def begin(self, sequence_id: int) -> FittedState:
@@ -82,13 +75,8 @@ class AnchoredMotion(Fitted):
         """The kernels that follow anchors at ``x``."""
         anchors = self.anchors(sequence_id)
         displacement = x - anchors.rest
-        if self.gradients:
-            deformation_gradients, rotations = anchors.deformation_gradients(displacement)
-        else:
-            deformation_gradients = rotations = torch.eye(3).to(x).expand(len(anchors.means), 3, 3)
-        return FittedState(
-            sequence_id, frame, anchors.positions(displacement), deformation_gradients, rotations, (x, v)
-        )
+        turned = anchors.deformation_gradients(displacement)
+        return FittedState(sequence_id, frame, anchors.positions(displacement), *turned, (x, v))
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
         """``velocity``, one per sequence."""
@@ -123,40 +111,29 @@ class SpringMass(AnchoredMotion):
     def __init__(
         self,
         *,
-        scenes: Sequence[GaussianScene],
-        fps: Sequence[float],
-        scene_of_sequence: Sequence[int],
-        seen: int,
         anchors: int = ANCHORS,
         neighbours: int = NEIGHBOURS,
         substeps: int = SUBSTEPS,
         damping: float = DAMPING,
         stiffness: float | None = None,
         period: float = 8.0,
-        gradients: bool = True,
+        **recorded: Unpack[Recorded],
     ) -> None:
         """Places anchors and springs.
 
         Args:
-            scenes: the rest scenes.
-            fps: frames per second of each.
-            scene_of_sequence: the scene of each sequence.
-            seen: predicted frames that training may see.
             anchors: at most so many per scene.
             neighbours: springs from an anchor to so many of its nearest.
             substeps: per frame, at least; stiff springs get more.
             damping: of the closing speed of a spring's ends, times its rest length [diagonals / s].
             stiffness: k at the start; None derives it from ``period``.
             period: of the slowest vibration at the start [frames].
-            gradients: kernels turn and stretch with their anchors; else they keep their shape (the original).
 
         Raises:
             ConfigError: a number out of range.
             SceneError: too few anchors.
         """
-        super().__init__(
-            scenes=scenes, fps=fps, scene_of_sequence=scene_of_sequence, seen=seen, anchors=anchors, gradients=gradients
-        )
+        super().__init__(anchors=anchors, **recorded)
         if min(neighbours, substeps) < 1 or damping <= 0 or period <= 0:
             raise ConfigError(
                 "model.method: expected neighbours, substeps >= 1 and damping, period > 0, got "
@@ -166,7 +143,7 @@ class SpringMass(AnchoredMotion):
         self._nets = [Net.of(a.rest, a.pinned, neighbours) for a in self._anchors]
         self.attenuation = nn.ParameterList(torch.zeros(()) for _ in self.scenes)
         self.damping = nn.ParameterList(torch.tensor(math.log10(damping)) for _ in self.scenes)
-        self.stiffness = nn.ParameterList(torch.zeros(a.count) for a in self._anchors)
+        self.stiffness = nn.ParameterList(torch.zeros(len(a.rest)) for a in self._anchors)
         for scene_id, own in enumerate(self.stiffness):
             nn.init.constant_(own, self._matching(scene_id, period) if stiffness is None else stiffness)
 
@@ -188,7 +165,7 @@ class SpringMass(AnchoredMotion):
     def springs(self, scene_id: int) -> tuple[Float[Tensor, " E"], Float[Tensor, " E"]]:
         """Stiffness kappa [1 / frames^2] and drag [1 / frames] of every spring of a scene."""
         if self._nets[scene_id].length.device != self._device:
-            self._nets[scene_id] = self._nets[scene_id].to(self._device)
+            self._nets[scene_id] = moved(self._nets[scene_id], self._device)
         net = self._nets[scene_id]
         k, fps = self.stiffness[scene_id], self.fps[scene_id]
         firm = net.attenuation(self.attenuation[scene_id]) / net.length
@@ -242,7 +219,7 @@ def slowest_vibration(net: Net, anchors: Anchors, kappa: Float[Tensor, " E"]) ->
         rows.append(np.broadcast_to(row, blocks.shape).ravel())
         columns.append(np.broadcast_to(column, blocks.shape).ravel())
         values.append((blocks if a == b else -blocks).ravel())
-    size = 3 * anchors.count
+    size = 3 * len(anchors.rest)
     whole = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)).tocsc()
     free = np.repeat(~anchors.pinned.numpy(), 3)
     stiff = whole[free][:, free]

@@ -12,7 +12,7 @@ and b with -f: both ends alike, so that momentum is kept and, without damping, e
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numba
@@ -67,11 +67,6 @@ class Net:
         starts = torch.searchsorted(first.contiguous(), torch.arange(count + 1))
         return Net(first, second, starts, (rest[second] - rest[first]).norm(dim=1), best, reach)
 
-    def to(self, device: torch.device) -> Net:
-        """The same on another device."""
-        names = ("first", "second", "starts", "length", "rank")
-        return replace(self, **{name: getattr(self, name).to(device) for name in names})
-
     def attenuation(self, s: Float[Tensor, ""]) -> Float[Tensor, " E"]:
         """1 for the nearest :data:`FIRM`, else clamp(2 - exp(softplus(s) j / (reach - 16)), 0, 1), j = rank - 15."""
         j = (self.rank - FIRM + 1).clamp_min(0).to(s)
@@ -83,13 +78,6 @@ class Net:
         total = torch.zeros(len(self.starts) - 1).to(stiffness)
         total = total.index_add(0, self.first, stiffness).index_add(0, self.second, stiffness)
         return 2 * float(total.max())
-
-    def energy(self, x: Float[Tensor, "A 3"], stiffness: Float[Tensor, " E"]) -> Float[Tensor, ""]:
-        """Elastic energy: kappa L_0^2 (2/5 (1 + |e|)^(5/2) - 2/3 (1 + |e|)^(3/2) + 4/15), summed."""
-        length = (x[self.second] - x[self.first]).norm(dim=1)
-        e = (length / self.length - 1).abs()
-        shape = 0.4 * (1 + e) ** 2.5 - 2 / 3 * (1 + e) ** 1.5 + 4 / 15
-        return (stiffness * self.length**2 * shape).sum()
 
 
 def forces(

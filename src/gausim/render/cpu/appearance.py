@@ -12,6 +12,7 @@ from gausim.kernels.operations import array
 from gausim.kernels.pool import shared_pool
 from gausim.render.cpu.shading import shade, shade_adjoint
 from gausim.render.cpu.simd import LANES
+from gausim.render.draw import deformed_appearance as operation
 
 # Cuts of one call, independent of the number of threads, so that gradients are too.
 FORWARD_TASKS = 8
@@ -27,10 +28,15 @@ def deformed_appearance(
     sh: Tensor,
     centers: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """:func:`gausim.render.draw.deformed_appearance`, divided over torch's number of threads without effect on bits."""
+    """:func:`gausim.render.draw.deformed_appearance`, divided over torch's number of threads without effect on bits.
+
+    Gradients of the rest scene's covariances and coefficients are left to the plain form.
+    """
+    if torch.is_grad_enabled() and (covars.requires_grad or sh.requires_grad):
+        return operation.plain(positions, deformation_gradients, rotations, unit_of_kernel, covars, sh, centers)
     pool = shared_pool(torch.get_num_threads())
     found: tuple[Tensor, Tensor] = _Shade.apply(
-        positions, deformation_gradients, rotations, covars, sh, unit_of_kernel, centers, pool
+        positions, deformation_gradients, rotations, unit_of_kernel, covars, sh, centers, pool
     )
     return found
 
@@ -44,12 +50,6 @@ def _lanes(rows: Tensor) -> Any:
     return np.ascontiguousarray(padded.reshape(blocks, LANES, -1).transpose(0, 2, 1))
 
 
-def _rows(lanes: Any, like: Tensor) -> Tensor:
-    """The sum over states of (B, blocks, numbers, LANES), in the shape of ``like`` (n, ...)."""
-    total = lanes.sum(0).transpose(0, 2, 1)
-    return torch.from_numpy(total.reshape(-1, total.shape[2])[: like.shape[0]]).reshape(like.shape)
-
-
 def _cuts(blocks: int, tasks: int, states: int) -> list[tuple[int, int]]:
     parts = max(1, -(-tasks // states))
     edges = [i * blocks // parts for i in range(parts + 1)]
@@ -58,16 +58,8 @@ def _cuts(blocks: int, tasks: int, states: int) -> list[tuple[int, int]]:
 
 class _Shade(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        positions: Tensor,
-        deformation_gradients: Tensor,
-        rotations: Tensor,
-        covars: Tensor,
-        sh: Tensor,
-        *rest: Any,
-    ) -> Any:
-        unit, centers, pool = rest
+    def forward(ctx: Any, positions: Tensor, deformation_gradients: Tensor, rotations: Tensor, *rest: Any) -> Any:
+        unit, covars, sh, centers, pool = rest
         states, count = positions.shape[:2]
         inputs = [array(x) for x in (positions, deformation_gradients, rotations)]
         fixed = array(unit), _lanes(covars), _lanes(sh), round(sh.shape[1] ** 0.5) - 1, array(centers)
@@ -80,28 +72,26 @@ class _Shade(torch.autograd.Function):
             shade(*part, *(x[b] for x in inputs), *fixed, out_covars[b], out_colors[b])
 
         pool.run(task, [(b, part) for b in range(states) for part in cuts])
-        if any(ctx.needs_input_grad[:5]):
-            ctx.save_for_backward(positions, deformation_gradients, rotations, covars, sh)
+        if any(ctx.needs_input_grad):
+            ctx.save_for_backward(positions, deformation_gradients, rotations)
             ctx.inputs, ctx.fixed, ctx.pool = inputs, fixed, pool
         return torch.from_numpy(out_covars), torch.from_numpy(out_colors)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_covars: Tensor, grad_colors: Tensor) -> Any:
-        positions, deformation_gradients, _, covars, sh = ctx.saved_tensors
+        positions, deformation_gradients, _ = ctx.saved_tensors
         states, fixed, needed = positions.shape[0], ctx.fixed, ctx.needs_input_grad
         given = array(grad_covars), array(grad_colors)
         cuts = _cuts(fixed[1].shape[0], BACKWARD_TASKS, states)
         moved = np.empty(positions.shape, np.float32)
         of_units = np.zeros((2, states, len(cuts), *deformation_gradients.shape[1:]), np.float32)
-        of_rest = np.empty((states, *fixed[1].shape), np.float32) if needed[3] else None
-        of_sh = np.empty((states, *fixed[2].shape), np.float32) if needed[4] else None
 
         def task(item: tuple[int, int]) -> None:
             b, part = item
             shade_adjoint(
                 *cuts[part], *(x[b] for x in ctx.inputs), *fixed, *(x[b] for x in given), moved[b],
-                *of_units[:, b, part], *(None if x is None else x[b] for x in (of_rest, of_sh)),
+                *of_units[:, b, part],
             )  # fmt: skip
 
         ctx.pool.run(task, [(b, part) for b in range(states) for part in range(len(cuts))])
@@ -110,7 +100,5 @@ class _Shade(torch.autograd.Function):
             torch.from_numpy(moved) if needed[0] else None,
             torch.from_numpy(units[0]) if needed[1] else None,
             torch.from_numpy(units[1]) if needed[2] else None,
-            None if of_rest is None else _rows(of_rest, covars),
-            None if of_sh is None else _rows(of_sh, sh),
-            None, None, None,
-        )  # fmt: skip
+            *[None] * 5,
+        )

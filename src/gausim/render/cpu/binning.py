@@ -4,49 +4,40 @@
 # mypy: allow-untyped-defs, allow-untyped-calls
 from __future__ import annotations
 
+import math
+
 import numba
 import numpy as np
 
 from gausim.kernels.jit import FINITE_MATH_OFF, HELPER, KERNEL
 from gausim.render.cpu.projection import RECORD
-from gausim.render.cpu.simd import (
-    LANES,
-    lane_numbers,
-    maximum,
-    minimum,
-    rounded_down,
-    rounded_up,
-    square_root,
-    store,
-)
 
 # numba freezes constants into its cached code and looks only at the file that holds the function: after changing a
 # constant that other files import, delete their cache (__pycache__/*.nb?).
 TILE_WIDTH = 8  # [pixels]: half a vector of float32
 TILE_HEIGHT = 16  # [pixels]
-HALF, SEVEN, WIDTH, ZERO = np.float32(0.5), np.float32(7), np.float32(TILE_WIDTH), np.float32(0)
+HALF, ONE, SEVEN, WIDTH, ZERO = np.float32(0.5), np.float32(1), np.float32(7), np.float32(TILE_WIDTH), np.float32(0)
 
 
 @numba.njit(fastmath=FINITE_MATH_OFF, **HELPER)
-def strip_rows(extent, first_strip, low_row, high_row, rows):
-    """First and last pixel row within [low_row, high_row] that an ellipse touches in each of 16 column strips.
+def strip_rows(extent, strip, low_row, high_row):
+    """First and last pixel row within [low_row, high_row] that an ellipse touches in a column strip.
 
     Between the pixel centres xa..xb of a strip the ellipse is highest at its apex -(B/A) Y or at the border nearest to
-    it, where y = -(B/C) x + sqrt(t/C - det Q / C^2 x^2); likewise its lowest point. Rows go to ``rows[:16]`` and
-    ``rows[16:]``; the last is before the first where the strip is missed.
+    it, where y = -(B/C) x + sqrt(t/C - det Q / C^2 x^2); likewise its lowest point. The last is before the first where
+    the strip is missed.
     """
     reach, slack = extent[2], extent[3] + HALF
-    xs = lane_numbers() * WIDTH + (np.float32(first_strip) * WIDTH + HALF - extent[0])
-    left = minimum(maximum(xs, -reach), reach)
-    right = minimum(maximum(xs + SEVEN, -reach), reach)
-    at = minimum(maximum(left, extent[5]), right)
-    high = square_root(maximum(extent[6] - extent[7] * at * at, ZERO)) - extent[4] * at
-    at = minimum(maximum(left, -extent[5]), right)
-    low = ZERO - square_root(maximum(extent[6] - extent[7] * at * at, ZERO)) - extent[4] * at
-    first = rounded_up(low + (extent[1] - slack))
-    last = rounded_down(high + (extent[1] + slack - HALF - HALF))
-    store(rows, 0, minimum(maximum(first, low_row), high_row + HALF + HALF))
-    store(rows, LANES, maximum(minimum(last, high_row), low_row - HALF - HALF))
+    x = np.float32(strip) * WIDTH + HALF - extent[0]
+    left, right = min(max(x, -reach), reach), min(max(x + SEVEN, -reach), reach)
+    at = min(max(left, extent[5]), right)
+    high = math.sqrt(max(extent[6] - extent[7] * at * at, ZERO)) - extent[4] * at
+    at = min(max(left, -extent[5]), right)
+    low = ZERO - math.sqrt(max(extent[6] - extent[7] * at * at, ZERO)) - extent[4] * at
+    # Clamped before they become integers, which hold no row of a huge ellipse.
+    first = min(max(low + (extent[1] - slack), np.float32(low_row)), np.float32(high_row) + ONE)
+    last = max(min(high + (extent[1] + slack - ONE), np.float32(high_row)), np.float32(low_row) - ONE)
+    return math.ceil(first), math.floor(last)
 
 
 @numba.njit(fastmath=FINITE_MATH_OFF, **HELPER)
@@ -56,18 +47,15 @@ def collect_band(records, extents, order, spans, row_of, row_low, row_high, stri
     ``row_of`` (K,) receives the band-local row of the kernels that are copied.
 
     Returns:
-        band records (m + 1, RECORD), the last of a kernel that touches nothing; kernels of the others (m,); the first
-        and one past the last column strip of each (m, 2); and where the list of each strip starts when every kernel is
-        in the lists of all its strips (strips + 1,).
+        band records (m, RECORD); their kernels (m,); the first and one past the last column strip of each (m, 2); and
+        where the list of each strip starts when every kernel is in the lists of all its strips (strips + 1,).
     """
     chosen = np.empty(order.shape[0], np.int32)
     m = 0
     for i in range(order.shape[0]):
         chosen[m] = order[i]
         m += (spans[i, 0] <= row_high) & (spans[i, 1] >= row_low)  # without a branch, which nothing could predict
-    band_records, reach = np.empty((m + 1, RECORD), np.float32), np.empty((m, 2), np.int32)
-    band_records[m] = ZERO
-    band_records[m, 11] = HALF  # no exponent is that large
+    band_records, reach = np.empty((m, RECORD), np.float32), np.empty((m, 2), np.int32)
     begins = np.zeros(strips + 2, np.int64)
     for i in range(m):
         g = chosen[i]
@@ -95,21 +83,19 @@ def bin_band(records, extents, order, spans, row_of, row_low, row_high, strips):
     looks at every kernel of the strip but takes no branch, which pays while a band is a few tiles high.
 
     Returns:
-        band records (m + 1, RECORD), see collect_band; entries (E,), each ``row << 8 | first pair of pixel rows in the
+        band records (m, RECORD); entries (E,), each ``row << 8 | first pair of pixel rows in the
         tile << 4 | last``; and where each tile's entries start (tiles + 1,). Tiles are numbered row by row.
     """
     band_records, chosen, reach, begins = collect_band(
         records, extents, order, spans, row_of, row_low, row_high, strips
     )  # fmt: skip
     cursor, listed = begins[:-1].copy(), np.empty((begins[-1], 3), np.int32)
-    rows = np.empty(2 * LANES, np.float32)
     for m in range(chosen.shape[0]):
-        for base in range(reach[m, 0], reach[m, 1], LANES):
-            strip_rows(extents[chosen[m]], base, np.float32(row_low), np.float32(row_high), rows)
-            for j in range(min(LANES, reach[m, 1] - base)):
-                at = cursor[base + j]
-                cursor[base + j] = at + 1
-                listed[at, 0], listed[at, 1], listed[at, 2] = m, int(rows[j]) - row_low, int(rows[LANES + j]) - row_low
+        for strip in range(reach[m, 0], reach[m, 1]):
+            first, last = strip_rows(extents[chosen[m]], strip, row_low, row_high)
+            at = cursor[strip]
+            cursor[strip] = at + 1
+            listed[at, 0], listed[at, 1], listed[at, 2] = m, first - row_low, last - row_low
     tile_rows = (row_high - row_low) // TILE_HEIGHT + 1
     start = np.zeros(strips * tile_rows + 1, np.int64)
     entries = np.empty(begins[-1] * tile_rows + 1, np.int32)

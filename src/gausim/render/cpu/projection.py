@@ -11,6 +11,7 @@ import numpy as np
 
 from gausim.kernels.jit import FINITE_MATH_OFF, HELPER, KERNEL
 from gausim.render.cpu.simd import LANES, load, splat, store
+from gausim.render.reference import ALPHA_MIN, CLAMP_MARGIN, DILATION
 
 # Raster record, float32: integer and fractional part of the mean, x then y (so that offsets inside a tile stay exact
 # far from the image's origin), -A/16, -B/8, -C/16 of the inverse covariance, opacity, colour, the exponent below which
@@ -26,10 +27,6 @@ RELATIVE_SLACK = 2e-6  # and in proportion to the extent above that
 S, S_X, S_XX, S_Y, S_XY, S_YY = 0, 4, 2, 8, 12, 6
 S_RED, S_GREEN, S_BLUE, S_DEPTH = 1, 9, 14, 5
 AT_ONCE = 64  # kernels whose sums are gathered before they are used
-
-DILATION = 0.3  # [pixels^2], gsplat's and 3DGS's low-pass filter
-ALPHA_MIN = 1.0 / 255.0
-CLAMP_MARGIN = 0.3  # gsplat clamps x/z and y/z to the field of view widened by this fraction
 
 
 @numba.njit(**KERNEL)

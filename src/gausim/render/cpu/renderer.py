@@ -14,6 +14,7 @@ from gausim.kernels.announce import announced
 from gausim.kernels.operations import array
 from gausim.kernels.pool import shared_pool
 from gausim.render.cpu.batch import Batch, Images
+from gausim.render.reference import require_options
 
 
 class _Render(torch.autograd.Function):
@@ -82,10 +83,7 @@ class CpuRenderer:
         """
         if threads is not None and threads < 1:
             raise ConfigError(f"render.threads: expected at least 1, got {threads}.")
-        if not near > 0:
-            raise ConfigError(f"render.near: expected more than 0, got {near}.")
-        if not 0 < alpha_max < 1:
-            raise ConfigError(f"render.alpha_max: expected a value between 0 and 1, got {alpha_max}.")
+        require_options(near, alpha_max)
         self.threads, self.near, self.alpha_max = threads, near, alpha_max
 
     def __call__(

@@ -165,23 +165,17 @@ def shade(
 
 
 @numba.njit(fastmath=True, **HELPER)
-def view_adjoint(lanes, center, degree, coefficients, at_block, basis, grad_color, grad_coefficients):
-    """Adds one view's gradients to those of P and Q, which stand from OUT on, and of the block's coefficients."""
+def view_adjoint(lanes, center, degree, block, basis, grad_color):
+    """Adds one view's gradients to those of P and Q, which stand from OUT on; ``block`` as for :func:`colours`."""
     dx, dy, dz, x, y, z, inverse = direction(lanes, center)
     write_basis(x, y, z, degree, basis)
-    count, block = (degree + 1) ** 2, coefficients[at_block].reshape(-1)
+    count = (degree + 1) ** 2
     red, green, blue = colours(basis, count, block)
     red = select(red >= ZERO, load(grad_color, 0), ZERO)
     green = select(green >= ZERO, load(grad_color, LANES), ZERO)
     blue = select(blue >= ZERO, load(grad_color, 2 * LANES), ZERO)
     for b in range(count):
         at = 3 * b * LANES
-        if grad_coefficients is not None:
-            grad_block = grad_coefficients[at_block].reshape(-1)
-            value = load(basis, b * LANES)
-            store(grad_block, at, load(grad_block, at) + value * red)
-            store(grad_block, at + LANES, load(grad_block, at + LANES) + value * green)
-            store(grad_block, at + 2 * LANES, load(grad_block, at + 2 * LANES) + value * blue)
         w = load(block, at) * red + load(block, at + LANES) * green + load(block, at + 2 * LANES) * blue
         store(basis, b * LANES, w)
     x, y, z = basis_adjoint(x, y, z, degree, basis)
@@ -203,9 +197,8 @@ def view_adjoint(lanes, center, degree, coefficients, at_block, basis, grad_colo
 
 
 @numba.njit(fastmath=True, **HELPER)
-def covariance_adjoint(lanes, rest, at_block, grad_covar, work, grad_rest):
-    """dL/dG = H G S^T + H^T G S into the last nine of ``lanes``, and dL/dS = G^T H G unless ``grad_rest`` is None."""
-    covar = rest[at_block].reshape(-1)
+def covariance_adjoint(lanes, covar, grad_covar, work):
+    """dL/dG = H G S^T + H^T G S into the last nine of ``lanes``."""
     product(lanes, G, covar, 0, 3, 1, work, 0)  # G S
     product(lanes, G, covar, 0, 1, 3, work, 9 * LANES)  # G S^T
     for i in range(3):
@@ -215,26 +208,14 @@ def covariance_adjoint(lanes, rest, at_block, grad_covar, work, grad_rest):
                 total += load(grad_covar, (3 * i + k) * LANES) * load(work, (9 + 3 * k + j) * LANES)
                 total += load(grad_covar, (3 * k + i) * LANES) * load(work, (3 * k + j) * LANES)
             store(lanes, OUT + (12 + 3 * i + j) * LANES, total)
-    if grad_rest is not None:
-        grad_block = grad_rest[at_block].reshape(-1)
-        product(grad_covar, 0, lanes, G, 3, 1, work, 0)  # H G
-        for i in range(3):
-            for j in range(3):
-                total = splat(ZERO)
-                for k in range(3):
-                    total += load(lanes, G + (3 * k + i) * LANES) * load(work, (3 * k + j) * LANES)
-                store(grad_block, (3 * i + j) * LANES, total)
 
 
 @numba.njit(fastmath=True, **KERNEL)
 def shade_adjoint(
     first, end, positions, deformation_gradients, rotations, unit, rest, coefficients, degree, centers,
-    grad_covars, grad_colors, grad_positions, grad_gradients, grad_rotations, grad_rest, grad_coefficients,
+    grad_covars, grad_colors, grad_positions, grad_gradients, grad_rotations,
 ):  # fmt: skip
-    """Adjoint of :func:`shade`: writes ``grad_positions``, adds to the gradients of the units, writes the last two.
-
-    These are None unless the rest covariances or the coefficients need gradients.
-    """
+    """Adjoint of :func:`shade`: writes ``grad_positions`` and adds to the gradients of the units."""
     lanes, basis = np.empty(LANES_SIZE, np.float32), np.empty(16 * LANES, np.float32)
     grad, work = np.empty(9 * LANES, np.float32), np.empty(18 * LANES, np.float32)
     for block in range(first, end):
@@ -246,15 +227,13 @@ def shade_adjoint(
             k = min(base + j, positions.shape[0] - 1)
             for i in range(9):
                 grad[i * LANES + j] = grad_covars[k, i // 3, i % 3]
-        covariance_adjoint(lanes, rest, block, grad, work, grad_rest)
-        if grad_coefficients is not None:
-            grad_coefficients[block] = ZERO
+        covariance_adjoint(lanes, rest[block].reshape(-1), grad, work)
         for v in range(centers.shape[0]):
             for j in range(LANES):
                 k = min(base + j, positions.shape[0] - 1)
                 for i in range(3):
                     grad[i * LANES + j] = grad_colors[v, k, i]
-            view_adjoint(lanes, centers[v], degree, coefficients, block, basis, grad, grad_coefficients)
+            view_adjoint(lanes, centers[v], degree, coefficients[block].reshape(-1), basis, grad)
         for j in range(n):
             c = unit[base + j]
             for i in range(3):

@@ -1,9 +1,7 @@
-"""Vectors of sixteen float32, and of four times that, as values inside numba kernels, with Python's operators.
+"""Vectors of sixteen float32 as values inside numba kernels, with Python's operators.
 
 LLVM maps them onto what the processor has: one AVX-512 register, two of AVX, four of NEON. Loops written with them do
-not depend on the mood of the automatic vectoriser, and compile faster because it has nothing left to do. A quad is four
-vectors that go through the same operations side by side: of a chain of dependent operations a processor keeps only so
-many in view, and four chains in step keep it busy where four in a row leave it waiting.
+not depend on the mood of the automatic vectoriser, and compile faster because it has nothing left to do.
 """
 
 # Lowering rules of numba take what numba gives them; none of it has published types.
@@ -18,21 +16,19 @@ from numba.core.typing.templates import ConcreteTemplate, infer_global, signatur
 from numba.extending import intrinsic, lower_builtin, models, register_model
 
 LANES = 16
+_F32, _I1, _I32 = ir.FloatType(), ir.IntType(1), ir.IntType(32)
+_VECTOR = ir.VectorType(_F32, LANES)
 
 
 class _Lanes(types.Type):
-    """So many lanes of one LLVM type."""
+    """Sixteen lanes of one LLVM type."""
 
-    def __init__(self, name: str, element: ir.Type, lanes: int) -> None:
-        super().__init__(name=f"{name}x{lanes}")
-        self.lanes, self.llvm = lanes, ir.VectorType(element, lanes)
+    def __init__(self, name: str, element: ir.Type) -> None:
+        super().__init__(name=f"{name}x{LANES}")
+        self.llvm = ir.VectorType(element, LANES)
 
 
-_F32, _I1, _I32 = ir.FloatType(), ir.IntType(1), ir.IntType(32)
-vector, mask = _Lanes("f32", _F32, LANES), _Lanes("i1", _I1, LANES)
-quad, _quad_mask = _Lanes("f32", _F32, 4 * LANES), _Lanes("i1", _I1, 4 * LANES)
-_MASKS = {vector: mask, quad: _quad_mask}
-_VECTOR = vector.llvm
+vector, mask = _Lanes("f32", _F32), _Lanes("i1", _I1)
 
 
 @register_model(_Lanes)
@@ -41,35 +37,29 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, kind, kind.llvm)
 
 
-def _spread(builder, kind, value, lanes=LANES):
-    """A vector of so many lanes from either such a vector or a float32."""
-    if kind in _MASKS:
+def _spread(builder, kind, value):
+    """A vector from either a vector or a float32."""
+    if kind == vector:
         return value
-    one = ir.Constant(ir.VectorType(_F32, lanes), ir.Undefined)
-    one = builder.insert_element(one, value, ir.Constant(_I32, 0))
-    return builder.shuffle_vector(one, one, ir.Constant(ir.VectorType(_I32, lanes), [0] * lanes))
+    one = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(_I32, 0))
+    return _shuffle(builder, one, one, [0] * LANES)
 
 
-def _widest(*kinds):
-    """Quad if any of these is one, else vector."""
-    return quad if quad in kinds else vector
+def _shuffle(builder, a, b, picks):
+    """The lanes ``picks`` of a and, counted on, of b."""
+    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(picks)), list(picks)))
 
 
-def _alike(builder, kinds, values):
-    lanes = _widest(*kinds).lanes
-    return [_spread(builder, kind, value, lanes) for kind, value in zip(kinds, values, strict=True)]
-
-
-def _binary(symbol, compares, emit) -> None:
-    """Teaches numba ``symbol`` between two vectors or two quads, or one of them and a float32."""
-    pairs = [pair for v in (vector, quad) for pair in ((v, v), (v, types.float32), (types.float32, v))]
+def _binary(symbol, result, emit) -> None:
+    """Teaches numba ``symbol`` between two vectors, or one of them and a float32."""
+    pairs = (vector, vector), (vector, types.float32), (types.float32, vector)
 
     @infer_global(symbol)
     class _Template(ConcreteTemplate):
-        cases = [signature(_MASKS[_widest(*pair)] if compares else _widest(*pair), *pair) for pair in pairs]
+        cases = [signature(result, *pair) for pair in pairs]
 
     def lower(context, builder, sig, args):
-        return emit(builder, *_alike(builder, sig.args, args))
+        return emit(builder, *(_spread(builder, *pair) for pair in zip(sig.args, args, strict=True)))
 
     for pair in pairs:
         lower_builtin(symbol, *pair)(lower)
@@ -81,20 +71,19 @@ for _symbol, _emit in (
     (operator.mul, ir.IRBuilder.fmul),
     (operator.truediv, ir.IRBuilder.fdiv),
 ):
-    _binary(_symbol, False, _emit)
-    _binary(getattr(operator, "i" + _symbol.__name__), False, _emit)
+    _binary(_symbol, vector, _emit)
+    _binary(getattr(operator, "i" + _symbol.__name__), vector, _emit)
 
-for _symbol, _sign in ((operator.ge, ">="), (operator.gt, ">"), (operator.le, "<="), (operator.lt, "<")):
-    _binary(_symbol, True, lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b))
+for _symbol, _sign in ((operator.ge, ">="), (operator.gt, ">"), (operator.le, "<=")):
+    _binary(_symbol, mask, lambda builder, a, b, sign=_sign: builder.fcmp_ordered(sign, a, b))
 
 
 @infer_global(operator.and_)
 class _And(ConcreteTemplate):
-    cases = [signature(kind, kind, kind) for kind in (mask, _quad_mask)]
+    cases = [signature(mask, mask, mask)]
 
 
 @lower_builtin(operator.and_, mask, mask)
-@lower_builtin(operator.and_, _quad_mask, _quad_mask)
 def _lower_and(context, builder, sig, args):
     return builder.and_(*args)
 
@@ -162,36 +151,14 @@ def row_centres(typing):
 
 
 @intrinsic
-def lane_numbers(typing):
-    """0, 1, .. 15."""
-    return _constant(range(LANES))
-
-
-@intrinsic
 def select(typing, condition, yes, no):
     """``yes`` where the condition holds, else ``no``, lane by lane."""
 
     def emit(context, builder, sig, args):
-        lanes = sig.return_type.lanes
-        yes, no = (_spread(builder, *pair, lanes) for pair in zip(sig.args[1:], args[1:], strict=True))
+        yes, no = (_spread(builder, *pair) for pair in zip(sig.args[1:], args[1:], strict=True))
         return builder.select(args[0], yes, no)
 
-    return (quad if condition == _quad_mask else vector)(condition, yes, no), emit
-
-
-def _concatenated(builder, a, b, c, d):
-    halves = [_shuffle(builder, *pair, range(2 * LANES)) for pair in ((a, b), (c, d))]
-    return _shuffle(builder, *halves, range(4 * LANES))
-
-
-@intrinsic
-def four_times(typing, a):
-    """A quad of four times the same vector."""
-
-    def emit(context, builder, sig, args):
-        return _shuffle(builder, args[0], args[0], [*range(LANES)] * 4)
-
-    return quad(vector), emit
+    return vector(condition, yes, no), emit
 
 
 @intrinsic
@@ -205,94 +172,39 @@ def spread(typing, array, index):
     return vector(array, types.intp), emit
 
 
-@intrinsic
-def spread_four(typing, array, indices, offset):
-    """``array[index + offset]`` for each of four indices, a tuple, side by side."""
-
-    def emit(context, builder, sig, args):
-        data = _member(context, builder, sig.args[0], args[0], "data")
-        places = [builder.add(index, args[2]) for index in cgutils.unpack_tuple(builder, args[1])]
-        a, b, c, d = (_spread(builder, types.float32, builder.load(builder.gep(data, [at]))) for at in places)
-        return _concatenated(builder, a, b, c, d)
-
-    return quad(array, indices, types.intp), emit
-
-
-@intrinsic
-def numbers_of(typing, integers):
-    """Each of four integers, a tuple, as a float32 in sixteen lanes, side by side."""
-
-    def emit(context, builder, sig, args):
-        numbers = [builder.sitofp(value, _F32) for value in cgutils.unpack_tuple(builder, args[0])]
-        a, b, c, d = (_spread(builder, types.float32, number) for number in numbers)
-        return _concatenated(builder, a, b, c, d)
-
-    return quad(integers), emit
-
-
-@intrinsic
-def part(typing, whole, number):
-    """Vector ``number`` of a quad; the number is a literal."""
-    if not isinstance(number, types.IntegerLiteral):
-        return None
-
-    def emit(context, builder, sig, args):
-        low = LANES * sig.args[1].literal_value
-        return _shuffle(builder, args[0], args[0], range(low, low + LANES))
-
-    return vector(whole, number), emit
-
-
 def _call(builder, name, arguments, result=_VECTOR):
     kind = ir.FunctionType(result, [argument.type for argument in arguments])
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), arguments)
 
 
+def _extreme(a, b, sign):
+    def emit(context, builder, sig, args):
+        x, y = (_spread(builder, *pair) for pair in zip(sig.args, args, strict=True))
+        return builder.select(builder.fcmp_ordered(sign, x, y), x, y)
+
+    return vector(a, b), emit
+
+
 @intrinsic
 def minimum(typing, a, b):
     """The smaller of two, lane by lane; no lane may be NaN."""
-
-    def emit(context, builder, sig, args):
-        a, b = _alike(builder, sig.args, args)
-        return builder.select(builder.fcmp_ordered("<", a, b), a, b)
-
-    return _widest(a, b)(a, b), emit
+    return _extreme(a, b, "<")
 
 
 @intrinsic
 def maximum(typing, a, b):
     """The larger of two, lane by lane; no lane may be NaN."""
-
-    def emit(context, builder, sig, args):
-        a, b = _alike(builder, sig.args, args)
-        return builder.select(builder.fcmp_ordered(">", a, b), a, b)
-
-    return _widest(a, b)(a, b), emit
-
-
-def _unary(name):
-    def emit(context, builder, sig, args):
-        return _call(builder, f"llvm.{name}.v16f32", args)
-
-    return vector(vector), emit
+    return _extreme(a, b, ">")
 
 
 @intrinsic
 def square_root(typing, a):
     """Square roots of numbers that are not negative."""
-    return _unary("sqrt")
 
+    def emit(context, builder, sig, args):
+        return _call(builder, "llvm.sqrt.v16f32", args)
 
-@intrinsic
-def rounded_down(typing, a):
-    """The largest whole number that is not larger, lane by lane."""
-    return _unary("floor")
-
-
-@intrinsic
-def rounded_up(typing, a):
-    """The smallest whole number that is not smaller, lane by lane."""
-    return _unary("ceil")
+    return vector(a), emit
 
 
 @intrinsic
@@ -315,93 +227,8 @@ def folded(typing, a, b, half):
         return None
 
     def emit(context, builder, sig, args):
-        return _fold(builder, args[0], args[1], sig.args[2].literal_value)
+        half = sig.args[2].literal_value
+        low = [offset + base + i for base in range(0, LANES, 2 * half) for offset in (0, LANES) for i in range(half)]
+        return builder.fadd(*(_shuffle(builder, *args[:2], [i + shift for i in low]) for shift in (0, half)))
 
     return vector(a, b, half), emit
-
-
-def _fold(builder, a, b, half):
-    low = [offset + base + i for base in range(0, LANES, 2 * half) for offset in (0, LANES) for i in range(half)]
-    return builder.fadd(*(_shuffle(builder, a, b, [i + shift for i in low]) for shift in (0, half)))
-
-
-def _shuffle(builder, a, b, picks):
-    """The lanes ``picks`` of a and, counted on, of b."""
-    return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(picks)), list(picks)))
-
-
-@intrinsic
-def store_rows(typing, image, y, x, value):
-    """Writes two rows of eight pixels to ``image`` (H, W) from (y, x) on."""
-
-    def emit(context, builder, sig, args):
-        for row in range(2):
-            part = _shuffle(builder, args[3], args[3], range(8 * row, 8 * row + 8))
-            _store_at(builder, _place(context, builder, sig.args[0], args, row), part)
-        return context.get_dummy_value()
-
-    return types.none(image, y, x, value), emit
-
-
-@intrinsic
-def load_rows(typing, image, y, x):
-    """Two rows of eight pixels of ``image`` (H, W) from (y, x) on."""
-
-    def emit(context, builder, sig, args):
-        places = [_place(context, builder, sig.args[0], args, row) for row in range(2)]
-        return _shuffle(builder, *(_load_at(builder, place, 8) for place in places), range(LANES))
-
-    return vector(image, y, x), emit
-
-
-@intrinsic
-def store_colours(typing, image, y, x, red, green, blue):
-    """Writes two rows of eight colours to ``image`` (H, W, 3) from (y, x) on."""
-
-    def emit(context, builder, sig, args):
-        channels = args[3:]
-        for row in range(2):
-            place = _place(context, builder, sig.args[0], args, row)
-            for at in (0, 8):  # the two overlap: 24 numbers
-                stream = range(24 * row + at, 24 * row + at + LANES)
-                pair = _shuffle(builder, *channels[:2], [j // 3 + LANES * (j % 3 == 1) for j in stream])
-                picks = [LANES + j // 3 if j % 3 == 2 else i for i, j in enumerate(stream)]
-                _store_at(builder, builder.gep(place, [ir.Constant(_I32, at)]), _shuffle(builder, pair, args[5], picks))
-        return context.get_dummy_value()
-
-    return types.none(image, y, x, red, green, blue), emit
-
-
-@intrinsic
-def load_colours(typing, image, y, x):
-    """Red, green and blue of two rows of eight colours of ``image`` (H, W, 3) from (y, x) on."""
-
-    def emit(context, builder, sig, args):
-        rows = []
-        for row in range(2):
-            place = _place(context, builder, sig.args[0], args, row)
-            parts = [_load_at(builder, builder.gep(place, [ir.Constant(_I32, at)]), LANES) for at in (0, 8)]
-            rows.append(_shuffle(builder, *parts, [*range(LANES), *range(24, 32)]))
-        channels = [[3 * i + c + 24 * row for row in range(2) for i in range(8)] for c in range(3)]
-        found = [_shuffle(builder, *rows, picks) for picks in channels]
-        return context.make_tuple(builder, sig.return_type, found)
-
-    return types.containers.UniTuple(vector, 3)(image, y, x), emit
-
-
-def _place(context, builder, kind, args, row):
-    """Address of ``image[y + row, x]`` as that of a float32."""
-    strides = cgutils.unpack_tuple(builder, _member(context, builder, kind, args[0], "strides"))
-    y = builder.add(args[1], ir.Constant(args[1].type, row))
-    offset = builder.add(builder.mul(y, strides[0]), builder.mul(args[2], strides[1]))
-    return cgutils.pointer_add(builder, _member(context, builder, kind, args[0], "data"), offset)
-
-
-def _store_at(builder, place, value):
-    builder.store(value, builder.bitcast(place, value.type.as_pointer())).align = 4
-
-
-def _load_at(builder, place, lanes):
-    found = builder.load(builder.bitcast(place, ir.VectorType(_F32, lanes).as_pointer()))
-    found.align = 4
-    return found

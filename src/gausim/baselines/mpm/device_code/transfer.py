@@ -2,15 +2,13 @@
 
 MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015) and quadratic B-splines, whose inertia tensor is dx^2 / 4. Nodes
 lie at multiples of dx from the origin of the domain; the arrays of nodes hold a window of them, which begins at node
-``origin``. Every kernel reads its inputs and writes or adds to its outputs
-only, so that Warp's adjoint of it is exact. The loops over nodes run to a length that is no constant: unrolled, each
-kernel would be compiled 27 times.
+``origin``. Every kernel reads its inputs and writes or adds to its outputs only, so that Warp's adjoint of it is exact.
+The loops over nodes run to a length that is no constant: unrolled, each kernel would be compiled 27 times.
 """
 
 import warp as wp
 
-from gausim.baselines.mpm.device_code.elasticity import fixed_corotated, lame_lambda, shear_modulus
-from gausim.baselines.mpm.device_code.matrices import identity
+from gausim.baselines.mpm.device_code.elasticity import fixed_corotated, identity
 
 LEAST_NODE_MASS = wp.constant(1.0e-15)
 
@@ -42,8 +40,8 @@ def stress_kernel(
 ) -> None:
     """Kirchhoff stress per particle."""
     p = wp.tid()
-    mu = shear_modulus(young[p], poisson)
-    lam = lame_lambda(young[p], poisson)
+    mu = young[p] / (2.0 * (1.0 + poisson))
+    lam = young[p] * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
     stress[p] = fixed_corotated(deformation_gradients[p], mu, lam)
 
 
@@ -53,7 +51,6 @@ def particles_to_grid(
     velocities: wp.array[wp.vec3],
     affine: wp.array[wp.mat33],
     stress: wp.array[wp.mat33],
-    acceleration: wp.array[wp.vec3],
     mass: wp.array[float],
     volume: wp.array[float],
     inverse_dx: float,
@@ -64,7 +61,7 @@ def particles_to_grid(
 ) -> None:
     """Adds momentum (x, y, z) and mass (w) of the particles to the grid.
 
-    m_i v_i = sum_p w_ip (m_p (v_p + dt a_p) + (m_p C_p - dt V_p 4 / dx^2 tau_p) (x_i - x_p))
+    m_i v_i = sum_p w_ip (m_p v_p + (m_p C_p - dt V_p 4 / dx^2 tau_p) (x_i - x_p))
     """
     p = wp.tid()
     x = positions[p] * inverse_dx - origin
@@ -74,7 +71,7 @@ def particles_to_grid(
     f = x - wp.vec3(float(i), float(j), float(k))
     w = spline_weights(f)
     A = mass[p] * affine[p] - (dt * volume[p] * 4.0 * inverse_dx * inverse_dx) * stress[p]
-    momentum = mass[p] * (velocities[p] + dt * acceleration[p])
+    momentum = mass[p] * velocities[p]
     three = 3
     for a in range(three):
         for b in range(three):
@@ -89,18 +86,16 @@ def particles_to_grid(
 def grid_update(
     grid: wp.array3d[wp.vec4],
     pinned_nodes: wp.array3d[wp.uint8],
-    gravity: wp.vec3,
     kept: float,
     origin: wp.vec3,
-    dt: float,
     velocity: wp.array3d[wp.vec3],
 ) -> None:
-    """Velocity of nodes: momentum over mass, damping (the factor ``kept``) and gravity; 0 where nodes are pinned."""
+    """Velocity of nodes: momentum over mass, damped by the factor ``kept``; 0 where nodes are pinned."""
     i, j, k = wp.tid()
     node = grid[i, j, k]
     v = wp.vec3(0.0, 0.0, 0.0)
     if node[3] >= LEAST_NODE_MASS:
-        v = kept * wp.vec3(node[0], node[1], node[2]) / node[3] + dt * gravity
+        v = kept * wp.vec3(node[0], node[1], node[2]) / node[3]
     if pinned_nodes[i + int(origin[0]), j + int(origin[1]), k + int(origin[2])] != wp.uint8(0):
         v = wp.vec3(0.0, 0.0, 0.0)
     velocity[i, j, k] = v
