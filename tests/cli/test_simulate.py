@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gausim.cli.simulate import command as simulate
+from gausim.cli import simulate
 from gausim.core import ConfigError, DataError
 from gausim.io.trajectory import load_trajectory
 from gausim.io.video import read_video

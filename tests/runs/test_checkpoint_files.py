@@ -46,20 +46,19 @@ def test_written_and_read_without_running_code(tmp_path: Path) -> None:
     assert [p.name for p in path.parent.iterdir()] == ["last.ckpt"]
 
 
-@pytest.mark.parametrize("reason", [errno.ENOSPC, errno.EROFS, errno.EACCES])
 @pytest.mark.parametrize("failing", ["os.fsync", "os.replace", "os.open", "pathlib.Path.open"])
 def test_a_failed_save_is_an_error_and_keeps_the_last_good_file(
-    failing: str, reason: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    failing: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "last.ckpt"
     AtomicCheckpointIO().save_checkpoint(checkpoint(2.0), path)
 
     def refuse(*_: object, **__: object) -> None:
-        raise OSError(reason, os.strerror(reason))
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     with monkeypatch.context() as patch:
         patch.setattr(failing, refuse)
-        with pytest.raises(RunError, match=rf"last\.ckpt: .* could not be written .*{os.strerror(reason)}"):
+        with pytest.raises(RunError, match=rf"last\.ckpt: .* could not be written .*{os.strerror(errno.ENOSPC)}"):
             AtomicCheckpointIO().save_checkpoint(checkpoint(3.0), path)
     # Only where the name was taken already, and its entry in the directory could not be flushed, is it the new one.
     assert float(read_checkpoint(path)["state_dict"]["weight"][0, 0]) == (3.0 if failing == "os.open" else 2.0)
