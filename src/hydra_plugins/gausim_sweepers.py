@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.plugins import Plugins
 from hydra.plugins.sweeper import Sweeper
 
 if TYPE_CHECKING:
@@ -59,13 +60,13 @@ class OptunaSweeper(Sweeper):
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Builds the launcher."""
-        from gausim.cli.sweeps.jobs import Sweep
-
         self.hydra_context, self.config = hydra_context, config
-        self._sweep = Sweep(config, hydra_context, task_function)
+        self._launcher = Plugins.instance().instantiate_launcher(hydra_context, task_function, config)
 
     def sweep(self, arguments: list[str]) -> None:
         """Trains one trial after another."""
         from gausim.cli.sweeps.optuna import Search, SearchSettings
 
-        Search(self._sweep, SearchSettings(**self._settings)).run(arguments)
+        assert self.config is not None and self.hydra_context is not None
+        settings = SearchSettings(**self._settings)
+        Search(self.config, self.hydra_context, self._launcher, settings).run(arguments)

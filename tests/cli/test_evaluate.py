@@ -15,9 +15,9 @@ from gausim.render.reference import ReferenceRenderer
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
+def run(toy, tmp_path, monkeypatch):
     """A run whose model knows the toy's formula and reads the sequence from its initial state."""
-    toy = toy_object.write_toy_object(tmp_path / "data" / "toy")
+    toy = toy_object.ToyObject(toy, toy_object.toy_scene())
     names = list(toy.amplitudes)
     initial = SimpleNamespace(previous=lambda sequence: toy.scene.means + sequence)
 

@@ -20,7 +20,7 @@ NETWORK = "model.predictor.network."
 
 def tune(root: Path, source: Path, out: Path, *arguments: str) -> dict[str, Tensor]:
     asked = ["experiment=finetune", f"data.root={root}", f"init_from={source}", f"hydra.run.dir={out}/seed_0"]
-    assert command.main([*asked, *TINY, "model=gausim", "evaluate=false", *arguments]) == 0
+    assert command.main([*asked, *TINY, "evaluate=false", *arguments]) == 0
     return weights(out / "seed_0")
 
 
@@ -30,8 +30,8 @@ def test_objects_of_different_stores_share_the_network_and_nothing_else(joint: P
         ("toy", 24.0, 2, 2), ("other", 50.0, 3, 2),
     ]  # fmt: skip
     simulator, states = run.module.model, run.module.initial_states
-    assert [tuple(p.shape) for p in simulator.attributes] == [(36, 8), (63, 8)]
-    assert simulator.fps == (24.0, 50.0) and len(simulator.template.bodies) == 2
+    assert [tuple(p.shape) for p in simulator.attributes] == [(36, 4), (63, 4)]
+    assert simulator.fps == (24.0, 50.0) and len(simulator.template.scenes) == 2
     assert len(list(states.parameters())) == 5 and states.scene_of_sequence == (0, 0, 1, 1, 1)
     for own in (*simulator.log_density, *simulator.attributes, *states.parameters()):
         assert bool(own.detach().any())  # each has learned
@@ -70,6 +70,17 @@ def test_a_frozen_network_stays_bit_by_bit_and_a_free_one_learns_even_if_it_is_c
             tune(other, joint, tmp_path / "cut")
     resumed = tune(other, joint, tmp_path / "cut")
     assert all(torch.equal(value, free[name]) for name, value in resumed.items())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["gausim", "gausim_paper"])
+def test_other_models_hand_on_their_network_too(model: str, toy: Path, other: Path, tmp_path: Path) -> None:
+    run = tmp_path / "joint" / "seed_0"
+    asked = ["data=joint", both(toy, other), f"model={model}", "data.batch_size=3", f"hydra.run.dir={run}"]
+    assert command.main([*asked, *TINY]) == 0
+    frozen, source = tune(other, run, tmp_path / "frozen", f"model={model}", "freeze=network"), weights(run)
+    shared = [name for name in source if name.startswith("model.predictor.")]
+    assert shared and all(torch.equal(frozen[name], source[name]) for name in shared)
 
 
 def test_a_network_of_another_shape_is_refused_by_name(joint: Path, other: Path, tmp_path: Path) -> None:

@@ -36,7 +36,10 @@ def byte_bar(total: int, title: str, *, pieces: bool = False) -> Iterator[Callab
 
     with bars(DownloadColumn(), TransferSpeedColumn()) as shown:
         task = shown.add_task(title, total=total)
-        yield lambda count: shown.update(task, **{"advance" if pieces else "completed": count})
+        if pieces:
+            yield lambda count: shown.advance(task, count)
+        else:
+            yield lambda count: shown.update(task, completed=count)
 
 
 @contextmanager

@@ -179,13 +179,10 @@ def _inputs(
 
 
 def _renderer(name: str) -> Renderer:
-    if name == "cpu":
-        from gausim.render.cpu import CpuRenderer
-
-        return CpuRenderer()
+    from gausim.render.cpu import CpuRenderer
     from gausim.render.reference import ReferenceRenderer
 
-    return ReferenceRenderer()
+    return CpuRenderer() if name == "cpu" else ReferenceRenderer()
 
 
 def _cloud(path: str | None) -> PointCloud | None:

@@ -106,11 +106,7 @@ def _plain(cfg: DictConfig) -> dict[str, Any]:
 
 
 def _evaluate(run: RunDirectory) -> None:
-    """`gausim evaluate RUN` in a process of its own, so that its times and memory are those of a prediction alone.
-
-    Raises:
-        RunError: it failed; the trained run is unharmed.
-    """
+    """`gausim evaluate RUN` in a process of its own, so that its times and memory are those of a prediction alone."""
     import os
     import subprocess
 
@@ -311,11 +307,7 @@ def _trainer(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | No
 
 
 def _judges(cfg: DictConfig) -> list[EpochJudge]:
-    """What may end the running job early: the pruner of its search, where there is one.
-
-    Raises:
-        ConfigError: it trains on several devices.
-    """
+    """What may end the running job early: the pruner of its search, where there is one."""
     from hydra.core.hydra_config import HydraConfig
 
     from gausim.compose.config import in_sweep

@@ -5,21 +5,16 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
-from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn
 from hydra.errors import HydraException
-from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gausim.compose.places import spelled
 from gausim.core.errors import BusyError, GausSimError, RunError
 from gausim.runs.directory import RunDirectory, one_line
 
@@ -101,48 +96,6 @@ def _left_out(cfg: DictConfig, run: RunDirectory) -> JobResult | None:
 def _finished(run: RunDirectory, state: str) -> JobResult:
     facts = run.facts()
     return JobResult.of(facts["last_epoch"].get(OBJECTIVE), PRUNED if facts.get("pruned") else state, run)
-
-
-class Sweep:
-    """What a search needs of Hydra: overrides taken apart, jobs started and collected.
-
-    Attributes:
-        config: the composed configuration of the sweep, Hydra's own included.
-        folder: where the sweep lies.
-        results: of the jobs so far.
-    """
-
-    def __init__(self, config: DictConfig, context: HydraContext, task: TaskFunction) -> None:
-        """Builds the launcher."""
-        self.config, self._context = config, context
-        self.folder = Path(str(config.hydra.sweep.dir))
-        self.results: list[JobResult] = []
-        self._launcher = Plugins.instance().instantiate_launcher(context, task, config)
-
-    def begin(self) -> None:
-        """Makes the directory and writes down what the sweep was asked."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(self.config, self.folder / "multirun.yaml")
-
-    def overrides(self, params: Mapping[str, Any] | None, arguments: Sequence[str]) -> dict[str, Override]:
-        """The parsed overrides of a sweep by their keys: those of the command line win over the configuration's."""
-        parser = OverridesParser.create(config_loader=self._context.config_loader)
-        parsed = parser.parse_overrides([*spelled([f"{k}={v}" for k, v in (params or {}).items()]), *arguments])
-        return {override.get_key_element(): override for override in parsed}
-
-    def launch(self, jobs: Sequence[Sequence[str]]) -> list[JobResult]:
-        """Starts jobs, waits for them, and returns what became of each.
-
-        Raises:
-            ConfigError: a job cannot be composed; none was started.
-            RunError: the launcher lost a process.
-        """
-        for overrides in jobs:  # all at first: a misspelt value must not show after hours
-            self._context.config_loader.load_sweep_config(self.config, list(overrides))
-        with launching(self.folder):
-            results = [result_of(one) for one in self._launcher.launch(jobs, initial_job_idx=len(self.results))]
-        self.results += results
-        return results
 
 
 @contextmanager

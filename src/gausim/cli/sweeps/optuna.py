@@ -8,16 +8,21 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext
 from hydra.utils import get_object
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from gausim.cli.sweeps.jobs import BUSY, FAILED_BEFORE, OBJECTIVE, PRUNED, JobResult, Sweep, conclude
+from gausim.cli.sweeps.jobs import BUSY, FAILED_BEFORE, OBJECTIVE, PRUNED, JobResult, conclude, launching, result_of
 from gausim.compose.config import check_targets, instantiate
+from gausim.compose.places import spelled
 from gausim.core.errors import ConfigError
 from gausim.io.files import write_durably
 from gausim.runs.directory import RunDirectory, is_free
@@ -61,9 +66,11 @@ class SearchSettings:
 class Search:
     """One study: its trials and how they are trained."""
 
-    def __init__(self, sweep: Sweep, settings: SearchSettings) -> None:
-        """Keeps both; :meth:`run` does everything."""
-        self._sweep, self._settings = sweep, settings
+    def __init__(self, config: DictConfig, context: HydraContext, launcher: Launcher, settings: SearchSettings) -> None:
+        """Keeps what Hydra gives a sweeper; :meth:`run` does everything."""
+        self._config, self._context, self._launcher, self._settings = config, context, launcher, settings
+        self._folder = Path(str(config.hydra.sweep.dir))
+        self._results: list[JobResult] = []
 
     def run(self, arguments: Sequence[str]) -> None:
         """Trains trials until there are enough, then prints and writes the best.
@@ -76,7 +83,7 @@ class Search:
             BusyError: another process works on the study.
             RunError: a trial failed.
         """
-        overrides = self._sweep.overrides(self._settings.params, arguments)
+        overrides = self._overrides(arguments)
         space = {key: distribution(o) for key, o in overrides.items() if o.is_sweep_override()}
         fixed = [f"{key}={o.get_value_element_as_str()}" for key, o in overrides.items() if key not in space]
         if not space:
@@ -85,20 +92,36 @@ class Search:
                 "in hydra.sweeper.params, or choose a file of sweep/."
             )
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self._sweep.begin()
-        with sole_writer(self._sweep.folder / LOCK):
+        self._folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(self._config, self._folder / "multirun.yaml")
+        with sole_writer(self._folder / LOCK):
             study = self._open(space, fixed)
             failed = _failed(study)
-            if self._sweep.config.sweep.retry_failed:
+            if self._config.sweep.retry_failed:
                 for one in failed:
                     study.enqueue_trial(one.params, user_attrs={RETRY_OF: one.number})
             else:
-                self._sweep.results += [_failed_before(one) for one in failed]
+                self._results += [_failed_before(one) for one in failed]
             while batch := self._next(study, space):
                 if not self._do(study, batch, fixed):
                     break
             self._report(study)
-        conclude(self._sweep.folder, self._sweep.results)
+        conclude(self._folder, self._results)
+
+    def _overrides(self, arguments: Sequence[str]) -> dict[str, Override]:
+        """The parsed overrides by their keys: those of the command line win over the configuration's."""
+        parser = OverridesParser.create(config_loader=self._context.config_loader)
+        own = spelled([f"{key}={value}" for key, value in (self._settings.params or {}).items()])
+        return {override.get_key_element(): override for override in parser.parse_overrides([*own, *arguments])}
+
+    def _launch(self, jobs: Sequence[Sequence[str]]) -> list[JobResult]:
+        """Starts jobs, waits for them, and returns what became of each."""
+        for overrides in jobs:  # all at first: a misspelt value must not show after hours
+            self._context.config_loader.load_sweep_config(self._config, list(overrides))
+        with launching(self._folder):
+            results = [result_of(one) for one in self._launcher.launch(jobs, initial_job_idx=len(self._results))]
+        self._results += results
+        return results
 
     def _open(self, space: Mapping[str, BaseDistribution], fixed: Sequence[str]) -> optuna.Study:
         """The study, new or as it was left; another one under the same name is refused."""
@@ -166,7 +189,7 @@ class Search:
         for trial in batch:  # two that try the same are one job
             jobs.setdefault(tuple(f"{k}={_text(v)}" for k, v in trial.params.items()), []).append(trial)
         orders = [[*fixed, *values, f"hydra.sweeper.trial={same[0].number}"] for values, same in jobs.items()]
-        results = self._sweep.launch(orders)
+        results = self._launch(orders)
         for (values, same), result in zip(jobs.items(), results, strict=True):
             for trial in same:
                 _tell(study, trial, result)
@@ -190,7 +213,7 @@ class Search:
             **{f"best_{key}": known.get(key) for key in ("value", "params", "directory")},
             "trials": [_row(t) for t in trials],
         }
-        write_durably(self._sweep.folder / RESULTS, yaml.safe_dump(facts, sort_keys=False).encode())
+        write_durably(self._folder / RESULTS, yaml.safe_dump(facts, sort_keys=False).encode())
         return best
 
     def _report(self, study: optuna.Study) -> None:
@@ -201,7 +224,7 @@ class Search:
         if best:
             print(f"best: trial {best.number}, {OBJECTIVE} {best.value:.6g}, {best.user_attrs.get('directory')}")
             print("  " + " ".join(f"{k}={_text(v)}" for k, v in best.params.items()))
-        print(f"wrote {self._sweep.folder / RESULTS}", flush=True)
+        print(f"wrote {self._folder / RESULTS}", flush=True)
 
 
 def distribution(override: Override) -> BaseDistribution:
