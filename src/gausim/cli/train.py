@@ -313,7 +313,7 @@ def _judges(cfg: DictConfig) -> list[EpochJudge]:
     from gausim.compose.config import in_sweep
     from gausim.core import ConfigError
 
-    sweeper = HydraConfig.get().sweeper if HydraConfig.initialized() and in_sweep() else {}
+    sweeper = HydraConfig.get().sweeper if in_sweep() else {}
     if sweeper.get("pruner") is None or sweeper.get("trial") is None:
         return []
     if (devices := cfg.trainer.get("devices", 1)) != 1:

@@ -160,7 +160,7 @@ def run_dir() -> Path:
 
 def in_sweep() -> bool:
     """Returns whether the running job is one of a sweep (`-m`)."""
-    return HydraConfig.get().mode == RunMode.MULTIRUN
+    return bool(HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN)
 
 
 @contextmanager
