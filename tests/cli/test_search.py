@@ -72,6 +72,7 @@ def test_a_killed_search_goes_on_with_what_it_would_have_tried(do: Do) -> None:
     assert status == 2 and "changed: fixed" in output and len(tried(do, "cut")) == 4
 
 
+@pytest.mark.slow  # that jobs of a sweep are tried again is a default test of test_sweep.py
 def test_a_trial_that_fails_stops_no_other_and_is_tried_again_on_demand(do: Do, tmp_path: Path) -> None:
     late = tmp_path / "late"
     search = ("hydra/sweeper=optuna", f"data.root=choice({late},{do.folder}/toy)",  # type: ignore[attr-defined]
