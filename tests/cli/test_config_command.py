@@ -117,7 +117,7 @@ def test_the_schema_is_printed(capsys, schema, monkeypatch) -> None:
     ],
 )
 def test_what_is_in_order(what: list[str], once, capsys) -> None:
-    assert main(["config", "validate", *(word.replace("CONF", str(conf_dir())) for word in what)]) == 0
+    assert main(["config", "validate", *what]) == 0
     assert "in order" in capsys.readouterr().out
 
 
