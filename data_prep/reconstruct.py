@@ -17,7 +17,7 @@ from typing import Any
 from data_prep.common.command import headline, run_command, stage_parser
 from data_prep.common.progress import Tick
 from data_prep.common.stage import Stage, run_stage
-from gausim.cli.inspect import add_pin_options
+from gausim.cli.arguments import add_pin_options
 from gausim.cli.reconstruct import add_fit_options, fit_scene
 from gausim.core.errors import DataError
 
@@ -41,7 +41,7 @@ def reconstruct(root: Path, out: Path, arguments: argparse.Namespace, *, force: 
     stage = Stage("reconstruct", REVISION, _files(source, arguments), settings, PACKAGES)
 
     def make(work: Path) -> Mapping[str, Any]:
-        return fit_scene(source, work / "scene.ply", arguments).record
+        return fit_scene(source, work / "scene.ply", arguments)[0]
 
     return run_stage(stage, out, make, force=force)
 

@@ -17,7 +17,7 @@ import yaml
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from gausim.cli.main import COMMANDS
+from gausim.cli.main import COMMANDS, command
 from gausim.cli.prepare import STAGES
 from gausim.compose.places import Place, read_places
 from gausim.compose.root import RootConfig, conf_dir
@@ -146,8 +146,8 @@ def commands() -> str:
         "What `gausim COMMAND --help` prints, then the stages of `gausim prepare`. The exit "
         "status is 0 where a command worked, 2 on wrong usage or unusable input, 130 when interrupted.",
     ]
-    for name, command in COMMANDS.items():
-        parts += _help(f"gausim {name}", importlib.import_module(command.module).main)
+    for name in COMMANDS:
+        parts += _help(f"gausim {name}", command(name))
     for name in STAGES:
         parts += _help(f"gausim prepare {name}", importlib.import_module(f"data_prep.{name}").main)
     return "\n\n".join(parts)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import io
 import pkgutil
 import re
@@ -14,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from gausim.cli.main import COMMANDS
+from gausim.cli.main import command as command_of
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -36,7 +36,7 @@ def _commands() -> list[tuple[str, list[str]]]:
 def _help(command: str, *part: str) -> str:
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.suppress(SystemExit):
-        importlib.import_module(COMMANDS[command].module).main([*part, "--help"])
+        command_of(command)([*part, "--help"])
     return said.getvalue()
 
 

@@ -160,7 +160,6 @@ HYDRA = {
     "alias": {
         "job_logging": {**LOGGING, "handlers": {"evil": {"class": "logging.os.system", "command": "touch canary"}}}
     },
-    "class": {"job_logging": {**LOGGING, "handlers": {"evil": {"class": "subprocess.Popen", "args": "touch canary"}}}},
     "object": {
         "job_logging": {**LOGGING, "handlers": {"evil": {"class": "logging.Handler", "level": "ext://os.system"}}}
     },

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.plugins import Plugins
 from hydra.plugins.sweeper import Sweeper
 
 if TYPE_CHECKING:
     from hydra.types import HydraContext, TaskFunction
     from omegaconf import DictConfig
-
-    from gausim.cli.sweeps.grid import Sweep
 
 
 class GridSweeper(BasicSweeper):
@@ -21,12 +21,7 @@ class GridSweeper(BasicSweeper):
     """
 
     def __init__(self, max_batch_size: int | None = None, params: dict[str, str] | None = None) -> None:
-        """Keeps the settings.
-
-        Args:
-            max_batch_size: most jobs that are handed to the launcher at a time; None hands over all.
-            params: what is swept, key to comma-separated values, beside the command line.
-        """
+        """Keeps the settings, which conf/hydra/sweeper/grid.yaml explains."""
         super().__init__(max_batch_size, params)
 
     def _parse_config(self) -> list[str]:
@@ -35,33 +30,43 @@ class GridSweeper(BasicSweeper):
         return spelled(super()._parse_config())
 
     def sweep(self, arguments: list[str]) -> None:
-        """Trains what the overrides ask for."""
-        from pathlib import Path
+        """Trains what the overrides ask for, and tells what became of the jobs.
 
-        from gausim.cli.sweeps.grid import run_grid
+        Raises:
+            ConfigError: an override gives no value.
+            RunError: a job failed.
+        """
+        from gausim.cli.sweeps.jobs import conclude, launching, result_of
+        from gausim.core.errors import ConfigError
 
         assert self.config is not None
-        run_grid(super().sweep, arguments, Path(str(self.config.hydra.sweep.dir)))
+        folder = Path(str(self.config.hydra.sweep.dir))
+        with launching(folder):
+            batches: Any = super().sweep(arguments)
+            results = [result_of(one) for batch in batches for one in batch]
+        if not results:
+            raise ConfigError(
+                f"{' '.join(arguments)}: expected at least one value of every key, so there is nothing to run."
+            )
+        conclude(folder, results)
 
 
 class OptunaSweeper(Sweeper):
     """A search by Optuna that goes on where it was killed (`hydra/sweeper=optuna`)."""
 
     def __init__(self, **settings: Any) -> None:
-        """Keeps the settings; `gausim.cli.sweeps.optuna.SearchSettings` explains them."""
+        """Keeps the settings, which conf/hydra/sweeper/optuna.yaml explains."""
         self._settings = settings
-        self._sweep: Sweep | None = None
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Builds the launcher."""
-        from gausim.cli.sweeps.grid import Sweep
-
         self.hydra_context, self.config = hydra_context, config
-        self._sweep = Sweep(config, hydra_context, task_function)
+        self._launcher = Plugins.instance().instantiate_launcher(hydra_context, task_function, config)
 
     def sweep(self, arguments: list[str]) -> None:
         """Trains one trial after another."""
         from gausim.cli.sweeps.optuna import Search, SearchSettings
 
-        assert self._sweep is not None
-        Search(self._sweep, SearchSettings(**self._settings)).run(arguments)
+        assert self.config is not None and self.hydra_context is not None
+        settings = SearchSettings(**self._settings)
+        Search(self.config, self.hydra_context, self._launcher, settings).run(arguments)

@@ -24,7 +24,6 @@ from gausim.cli.main import COMMANDS, main
         ("evaluate --vi", {"--views"}),
         ("evaluate RUN --views ", {"all", "train", "heldout"}),
         ("evaluate RUN --out ", set()),  # files, which the shell knows better
-        ("evaluate RUN --views train --js", {"--json"}),
         ("nonsense ", set()),
         ("config ", {"validate", "schema", "completion"}),
         ("config completion ", {"bash", "zsh", "fish"}),
@@ -40,7 +39,6 @@ from gausim.cli.main import COMMANDS, main
         ("train -m ablation=none,no_hier", {"ablation=none,no_hierarchy"}),
         ("train trainer.progress=", {"trainer.progress=true", "trainer.progress=false"}),
         ("train hydra/swee", {"hydra/sweeper="}),
-        ("train sed=1 model=gausim_p", {"model=gausim_paper"}),
         ("train sed=1 model.simu", set()),  # beside what is wrong nothing composes
         ("config validate experiment=demo_", {"experiment=demo_tiny"}),
         ("adapt RUN --set trainer.max_e", {"trainer.max_epochs="}),
@@ -56,12 +54,12 @@ def test_directories_are_completed_behind_a_key(tmp_path: Path) -> None:
     assert complete(["train", f"data.root={tmp_path}/st"]) == [f"data.root={tmp_path}/stores/"]
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_offers_its_options(name: str) -> None:
-    assert "--help" in complete([name, "-"])
-    parser = getattr(importlib.import_module(COMMANDS[name].module), "_parser", _hydra_parser)()
-    named = set(re.findall(r"--[\w-]+", parser.format_usage()))
-    assert named <= set(complete([name, "--"])) and (len(named) > 1 or name in ("config", "prepare"))
+def test_every_command_offers_its_options() -> None:
+    for name in COMMANDS:
+        parser = getattr(importlib.import_module(f"gausim.cli.{name}"), "_parser", _hydra_parser)()
+        named = set(re.findall(r"--[\w-]+", parser.format_usage()))
+        assert named | {"--help"} <= set(complete([name, "--"])), name
+        assert len(named) > 1 or name in ("config", "prepare")
 
 
 ASK = """gausim() { "$PYTHON" -m gausim.cli.main "$@"; }

@@ -9,15 +9,15 @@ from helpers import toy_object
 
 from gausim.cli import evaluate
 from gausim.compose import build as _run
-from gausim.core import DataError, RunError, SimState
+from gausim.core import DataError, SimState
 from gausim.data.objects import ObjectData
 from gausim.render.reference import ReferenceRenderer
 
 
 @pytest.fixture
-def run(tmp_path, monkeypatch):
+def run(toy, tmp_path, monkeypatch):
     """A run whose model knows the toy's formula and reads the sequence from its initial state."""
-    toy = toy_object.write_toy_object(tmp_path / "data" / "toy")
+    toy = toy_object.ToyObject(toy, toy_object.toy_scene())
     names = list(toy.amplitudes)
     initial = SimpleNamespace(previous=lambda sequence: toy.scene.means + sequence)
 
@@ -60,15 +60,6 @@ def test_whole_evaluation(run, capsys):
     assert row["points"]["error_3d"]["ratio"] < 1e-3 and row["heldout"]["l2"]["mean"] < 0.003
 
 
-def test_tables_and_files_are_listed_on_demand(run, capsys):
-    assert evaluate.main([str(run.run_dir), "--verbose", "--sequences", "seq_000"]) == 0
-    shown = capsys.readouterr().out
-    assert (
-        "views never trained on" in shown and f"wrote {run.run_dir / 'evaluation' / 'partial' / 'metrics.npz'}" in shown
-    )
-    assert shown.splitlines()[-1] == f"next: gausim evaluate {run.run_dir}"  # a part leads to the whole
-
-
 def test_a_part_does_not_overwrite_the_whole(run, capsys):
     assert evaluate.main([str(run.run_dir), "--sequences", "seq_001", "--views", "heldout", "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -78,10 +69,14 @@ def test_a_part_does_not_overwrite_the_whole(run, capsys):
     assert (run.run_dir / "evaluation" / "partial" / "metrics.json").is_file()
 
 
-def test_an_unfinished_run_is_measured_with_a_warning(run, capsys):
+def test_an_unfinished_run_is_measured_with_a_warning_and_lists_its_tables_on_demand(run, capsys):
     (run.run_dir / "FINISHED").unlink()
-    assert evaluate.main([str(run.run_dir), "--sequences", "seq_000", "--out", str(run.run_dir / "here")]) == 0
-    assert "warning" in capsys.readouterr().err
+    here = ["--out", str(run.run_dir / "here")]
+    assert evaluate.main([str(run.run_dir), "--verbose", "--sequences", "seq_000", *here]) == 0
+    told = capsys.readouterr()
+    assert "warning" in told.err and "views never trained on" in told.out
+    assert f"wrote {run.run_dir / 'here' / 'metrics.npz'}" in told.out
+    assert told.out.splitlines()[-1] == f"next: gausim evaluate {run.run_dir}"  # a part leads to the whole
     assert json.loads((run.run_dir / "here" / "metrics.json").read_text())["run"]["finished"] is False
 
 
@@ -90,8 +85,3 @@ def test_what_is_not_there_is_named(run):
         evaluate.main([str(run.run_dir), "--object", "cat"])
     with pytest.raises(DataError, match="no sequence .*seq_7"):
         evaluate.main([str(run.run_dir), "--sequences", "seq_7"])
-
-
-def test_a_missing_run_is_an_error_that_says_what_to_do(tmp_path):
-    with pytest.raises(RunError, match="no run here .*gausim train"):
-        evaluate.main([str(tmp_path / "nowhere")])

@@ -8,11 +8,13 @@ import cv2
 import pytest
 import torch
 
+from gausim.cli import inspect as command
 from gausim.cli.main import main
 from gausim.compose.config import compose
 from gausim.compose.places import more_settings
 from gausim.core.scene import GaussianScene
-from gausim.io.ply import load_scene, masks_path, save_scene
+from gausim.io.ply import load_scene, save_scene
+from gausim.report.pictures import clusters
 
 
 @pytest.fixture
@@ -31,57 +33,45 @@ def scene_file(tmp_path: Path) -> Path:
     return tmp_path / "block.ply"
 
 
-def lines_of(text: str) -> dict[str, str]:
-    return {line.split()[0]: line for line in text.splitlines() if line}
+def inspect(scene_file: Path, capsys: pytest.CaptureFixture[str], *options: str) -> str:
+    assert main(["inspect", str(scene_file), "--out", str(scene_file.parent / "clusters.png"), *options]) == 0
+    return capsys.readouterr().out
 
 
 def test_figures_picture_and_masks(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    picture = scene_file.parent / "clusters.png"
-    arguments = ["inspect", str(scene_file), "--pin-below", "z=0.1", "--radii", "0.3", "0.7", "--save-masks"]
-    assert main([*arguments, "--out", str(picture)]) == 0
-    text = capsys.readouterr().out
-    lines = lines_of(text)
-    assert lines["kernels"].split() == ["kernels", "60"]
-    assert lines["SH"].split()[-1] == "1"
-    assert "z 0 .. 2" in lines["box"]
-    assert lines["masks"].startswith("masks      ") and "pinned 12" in text
+    text = inspect(scene_file, capsys, "--pin-below", "z=0.1", "--radii", "0.3", "0.7", "--save-masks")
+    lines = {line.split()[0]: line for line in text.splitlines() if line}
+    assert lines["kernels"].split() == ["kernels", "60"] and lines["SH"].split()[-1] == "1"
+    assert "z 0 .. 2" in lines["box"] and "pinned 12" in text
     counts = [int(part) for part in lines["levels"].split()[1:] if part.isdigit()]
     assert counts[0] == 60 and 60 > counts[1] > counts[2] >= 2
     for level in ("0", "1", "2"):
         assert float(lines[level].split()[-1]) == pytest.approx(60.0, rel=1e-6)  # mass sum, level by level
     free = [int(lines[level].split()[2]) for level in ("1", "2")]
     assert f"{sum(free)} / 60" in lines["N_F"]
-    image = cv2.imread(str(picture))
+    image = cv2.imread(str(scene_file.parent / "clusters.png"))
     assert image is not None and image.shape[0] > 500
     assert (image.max(-1) > image.min(-1)).any()  # units in colours, not grey only
-    assert masks_path(scene_file).is_file()
     assert torch.equal(load_scene(scene_file).pinned, load_scene(scene_file).means[:, 2] < 0.1)
 
 
-def test_up_points_away_from_the_pins_unless_given(scene_file: Path) -> None:
-    pictures = [scene_file.parent / f"{i}.png" for i in range(3)]
-    for picture, more in zip(pictures, ([], ["--up=-z"], ["--up=z"]), strict=True):
-        assert main(["inspect", str(scene_file), "--pin-above", "z=1.9", *more, "--out", str(picture)]) == 0
-    first, second, third = (picture.read_bytes() for picture in pictures)
-    assert first == second != third
+@pytest.mark.parametrize(("more", "down"), [([], True), (["--up=-z"], True), (["--up=z"], False)])
+def test_up_points_away_from_the_pins_unless_given(scene_file: Path, monkeypatch, more: list[str], down: bool) -> None:
+    drawn: list[bool] = []
+    monkeypatch.setattr(clusters, "draw_clusters", lambda *_, flip, **__: drawn.append(flip))
+    assert main(["inspect", str(scene_file), "--pin-above", "z=1.9", *more]) == 0
+    assert drawn == [down]
 
 
 def test_simulated_half(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["inspect", str(scene_file), "--simulate-below", "x=0.5", "--pin-below", "z=0.1", "--radii", "0.5"]
-    assert main([*arguments, "--out", str(scene_file.parent / "half.png")]) == 0
-    text = capsys.readouterr().out
-    assert "simulated 30  pinned 6" in text
-
-
-def test_scene_without_pins_says_how_to_mark_one(scene_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["inspect", str(scene_file)]) == 2
-    error = capsys.readouterr().err
-    assert "no kernel is pinned" in error and "--pin-below z=0.2" in error and "--save-masks" in error
+    options = ["--simulate-below", "x=0.5", "--pin-below", "z=0.1", "--radii", "0.5"]
+    assert "simulated 30  pinned 6" in inspect(scene_file, capsys, *options)
 
 
 @pytest.mark.parametrize(
     ("arguments", "needle"),
     [
+        ([], "no kernel is pinned"),
         (["--pin-below", "z=-5"], "holds none of 60 kernels"),
         (["--pin-below", "height=3"], "AXIS=VALUE"),
         (["--pin-below", "z=0.1", "--radii", "40"], "--radii"),
@@ -95,29 +85,8 @@ def test_wrong_options_are_explained(
     assert needle in capsys.readouterr().err
 
 
-def test_missing_scene_is_explained(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["inspect", str(tmp_path / "absent.ply")]) == 2
-    assert "absent.ply: no such file" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("option", ["gausim", "gausim_paper"])
-def test_the_default_hierarchy_is_that_of_the_models(
-    option: str, scene_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    simulator = compose("train", [f"model={option}"]).model.simulator
-    common = ["inspect", str(scene_file), "--pin-below", "z=0.1", "--out", str(scene_file.parent / "clusters.png")]
-    assert main(common) == 0
-    default = capsys.readouterr().out
-    hierarchy = simulator.hierarchy
-    clustering = more_settings()["model.simulator.hierarchy.clustering"]
-    radii = [str(level.diameter) for level in reversed(hierarchy.levels)]
-    assert main([*common, "--clustering", clustering, "--radii", *radii]) == 0
-    assert capsys.readouterr().out == default
-    assert all(f"{float(radius):.3g} of diagonal" in default for radius in radii)
-
-
-def test_help_says_what_radii_are_fractions_of(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["inspect", "--help"])
-    text = " ".join(capsys.readouterr().out.split())
-    assert "fractions of the diagonal" in text and "0.13 0.4" in text
+def test_the_default_hierarchy_is_that_of_the_models(option: str) -> None:
+    levels = compose("train", [f"model={option}"]).model.simulator.hierarchy.levels
+    assert tuple(level.diameter for level in reversed(levels)) == command.DEFAULT_RADII
+    assert more_settings()["model.simulator.hierarchy.clustering"] == command.DEFAULT_CLUSTERING

@@ -1,20 +1,12 @@
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
-import pytest
 from helpers import report_runs
 
 from gausim.cli import main as cli
 
 
-@pytest.fixture
-def sweep(tmp_path) -> Path:
-    return report_runs.write_sweep(tmp_path / "sweep")
-
-
-def test_the_whole_report(sweep, capsys):
+def test_the_whole_report(tmp_path, capsys):
+    sweep = report_runs.write_sweep(tmp_path / "sweep")
     assert cli.main(["report", str(sweep)]) == 0
     shown = capsys.readouterr()
     files = ["report.html", "report.md", "tables.tex", "numbers.csv"]
@@ -34,22 +26,15 @@ def test_the_whole_report(sweep, capsys):
     # Four pictures, three videos of runs with a poster each, and one of both rows side by side.
     kinds = [page.count(f"data:{kind};base64,") for kind in ("image/webp", "image/jpeg", "video/mp4")]
     assert kinds == [4, 3, 4]
-    # Made again, the report does not take itself for a run and comes out the same (but for the video's encoder).
-    assert cli.main(["report", str(sweep)]) == 0
-    again = (sweep / "report" / "report.html").read_text()
-    assert re.sub(r"data:video[^\"]+", "", again) == re.sub(r"data:video[^\"]+", "", page)
-
-
-def test_several_places_without_pictures(sweep, tmp_path, capsys):
+    # The report does not take itself for a run.
     folders = [str(sweep / "full"), str(sweep / "no_mass")]
     out = tmp_path / "elsewhere"
+    assert cli.main(["report", str(sweep), "--out", str(out), "--no-pictures"]) == 0
+    assert "5 runs: 3 evaluated, 1 failed, 1 unfinished" in capsys.readouterr().out
     assert cli.main(["report", *folders, "--out", str(out), "--title", "Mine & yours", "--no-pictures"]) == 0
     page = (out / "report.html").read_text()
     assert "<h1>Mine &amp; yours</h1>" in page and "data:image" not in page
     assert not (sweep / "full" / "report").exists()
-
-
-def test_nothing_there_is_an_error(tmp_path, capsys):
     assert cli.main(["report", str(tmp_path / "nowhere")]) == 2
     assert "no such directory" in capsys.readouterr().err
     assert not (tmp_path / "nowhere").exists()

@@ -61,31 +61,28 @@ def test_a_killed_search_goes_on_with_what_it_would_have_tried(do: Do) -> None:
     assert runs == [["started", "finished"]] * 2 + [["started", "resumed", "finished"], ["started", "finished"]]
     best = results(do, "cut")
     assert best["best_value"] == min(value for _, _, value in tried(do, "cut"))
-    assert (
-        f"best: trial {best['best_trial']}," in output
-        and (Path(best["best_directory"]) / "FINISHED").exists()
-        and best["best_params"] == best["trials"][best["best_trial"]]["params"]
-    )
+    assert f"best: trial {best['best_trial']}," in output and (Path(best["best_directory"]) / "FINISHED").exists()
+    assert best["best_params"] == best["trials"][best["best_trial"]]["params"]
     # Nothing is left; more trials are; another search in the same storage is refused.
     status, output = do("cut", *few)
     assert status == 0 and "nothing left to do" in output
     status, output = do("cut", *few, "model.simulator.network.layers=range(1,4)")
-    assert status == 2 and "changed: model.simulator.layers" in output
+    assert status == 2 and "changed: model.simulator.network.layers" in output
     status, output = do("cut", *few, "loss.static_weight=2")
     assert status == 2 and "changed: fixed" in output and len(tried(do, "cut")) == 4
 
 
+@pytest.mark.slow  # that jobs of a sweep are tried again is a default test of test_sweep.py
 def test_a_trial_that_fails_stops_no_other_and_is_tried_again_on_demand(do: Do, tmp_path: Path) -> None:
     late = tmp_path / "late"
     search = ("hydra/sweeper=optuna", f"data.root=choice({late},{do.folder}/toy)",  # type: ignore[attr-defined]
-              "hydra.sweeper.n_trials=3", "hydra.sweeper.n_jobs=3", "hydra.sweeper.seed=1")  # fmt: skip
+              "hydra.sweeper.n_trials=3", "hydra.sweeper.n_jobs=3", "hydra.sweeper.seed=1", "data.repeats=1",
+              "trainer.max_epochs=1")  # fmt: skip
     status, output = do("mixed", *search)
     states = [state for state, _, _ in tried(do, "mixed")]
     assert status == 2 and {"fail", "complete"} == set(states), output
     # Trials that try the same are one job.
     assert "sweep of 2 jobs: 1 trained, 1 failed" in output and f"DataError: {late}: no data set here" in output
-    status, again = do("mixed", *search)
-    assert status == 2 and len(tried(do, "mixed")) == 3, again
     write_toy_object(late, frames=8)
     status, output = do("mixed", *search, "sweep.retry_failed=true")
     assert status == 0, output

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,7 @@ import torch
 from helpers import played
 from msgspec.structs import replace
 
-from gausim.cli import main
-from gausim.cli.simulate import command as simulate
+from gausim.cli import main, simulate
 from gausim.compose import build as _run
 from gausim.core import DataError
 from gausim.interaction import words as _force_words
@@ -42,37 +42,39 @@ def same(a: Path, b: Path) -> bool:
 def test_forces_write_files_and_their_session_replays_them(run, tmp_path: Path, capsys) -> None:
     words = ["--force", "on=tip", "weights=3", "direction=x", "at=2", "frames=4", "--wind", "weights=0.5",
              "direction=0,1,0", "gusts=0.5", "--pin", "on=kernels:3", "at=6"]  # fmt: skip
-    options = ["--frames", "12", "--view", "cam_1", "--background", "white"]
+    options = ["--frames", "8", "--view", "cam_1", "--background", "white"]
     assert simulate.main([str(run.run_dir), *words, *options, "--gif", "--out", str(tmp_path / "a")]) == 0
     folder = tmp_path / "a" / "toy" / "forces"
     names = {"trajectory.safetensors", "session.json", "cam_1.mp4", "cam_1.gif", "cam_1_sheet.png"}
     assert {p.name for p in folder.iterdir()} == names
     session = load_session(folder / "session.json")
-    assert [e.at for e in session.entries] == [0, 2, 6] and session.steps == 11 and session.fps == 24.0
+    assert [e.at for e in session.entries] == [0, 2, 6] and session.steps == 7 and session.fps == 24.0
+    event = json.loads((folder / "session.json").read_text())["events"][1]  # people read and edit it
+    assert event["do"] == "force" and event["weights"] == 3.0 and event["on"]["radius"] == 0.15
     assert session.made_with.run == "demo/seed_0" and session.made_with.initial == "rest"
     trajectory = load_trajectory(folder / "trajectory.safetensors")
     scene = run.module.model.scenes[0]
     moved = (trajectory.positions - scene.means).norm(dim=-1)
-    assert trajectory.frames == 12 and float(moved[5].max()) > 1e-3
+    assert trajectory.frames == 8 and float(moved[5].max()) > 1e-3
     assert float(moved[:, scene.pinned].max()) == 0
-    assert torch.equal(trajectory.positions[6:, 3], trajectory.positions[6, 3].expand(6, 3))
+    assert torch.equal(trajectory.positions[6:, 3], trajectory.positions[6, 3].expand(2, 3))
     printed = capsys.readouterr().out
     assert "what is pinned moved by 0." in printed and f"videos: {folder.as_uri()}\nnext: gausim view" in printed
     assert len(printed.splitlines()) <= 6
     shown = list(read_video(folder / "cam_1.mp4"))
-    assert len(shown) == 12 and (shown[3] != shown[0]).mean() > 0.01
+    assert len(shown) == 8 and (shown[3] != shown[0]).mean() > 0.01
 
     again = [str(run.run_dir), "--session", str(folder / "session.json"), "--view", "cam_1"]
     assert simulate.main([*again, "--out", str(tmp_path / "b")]) == 0
     assert "warning" not in capsys.readouterr().err
     assert same(folder / "trajectory.safetensors", tmp_path / "b" / "toy" / "session" / "trajectory.safetensors")
-    assert simulate.main([*again, "--frames", "5", "--out", str(tmp_path / "c")]) == 0
+    assert simulate.main([*again, "--frames", "3", "--out", str(tmp_path / "c")]) == 0
     short = load_trajectory(tmp_path / "c" / "toy" / "session" / "trajectory.safetensors")
-    assert torch.equal(short.positions, trajectory.positions[:5])
+    assert torch.equal(short.positions, trajectory.positions[:3])
 
 
 def test_an_initial_state_and_a_changed_model(run, tmp_path: Path, capsys) -> None:
-    words = ["--gravity", "weights=1", "direction=-z", "--sequence", "seq_001", "--frames", "6", "--view", "cam_0"]
+    words = ["--gravity", "weights=1", "direction=-z", "--sequence", "seq_001", "--frames", "4", "--view", "cam_0"]
     assert simulate.main([str(run.run_dir), *words, "--out", str(tmp_path)]) == 0
     path = tmp_path / "toy" / "forces" / "session.json"
     session = load_session(path)
@@ -93,19 +95,14 @@ def test_an_initial_state_and_a_changed_model(run, tmp_path: Path, capsys) -> No
     ("options", "message"),
     [
         (["--force", "weights=3"], "--force weights=3: 'direction=' is missing"),
-        (["--force", "weights=3", "direction=up"], "direction=up: expected x, -x"),
         (["--force", "weights=heavy", "direction=x"], "'heavy': expected a number"),
         (["--force", "weights=nan", "direction=x"], "field 'weights': expected float >= 0.0, got 'nan'"),
         (["--force", "weights=11", "direction=x"], "'weights': expected at most 10"),
         (["--force", "weights=1", "direction=x", "weight=2"], "'weight=2': expected KEY=VALUE"),
-        (["--force", "weights=1", "direction=x", "weights=2"], "each once"),
         (["--force", "weights=1", "direction=x", "on=head"], "on=head: expected whole, tip"),
         (["--force", "weights=1", "direction=x", "on=unit:7/1"], "level 7: 'toy' has levels 0 to 2"),
-        (["--force", "weights=1", "direction=x", "at=1.5"], "'1.5': expected a whole number"),
         (["--force", "weights=1", "direction=x", "at=99"], "at=99: expected 0 to 19"),
-        (["--force", "weights=1", "direction=x", "at=-1"], "field 'at': expected int >= 0"),
         (["--pin"], "expected at least one argument"),
-        (["--impulse", "weight_seconds=1", "direction=x"], "'weight_seconds': expected at most"),
         (["--wind", "weights=1", "direction=x", "--metre", "0"], "--metre 0.0: expected more than 0"),
         (["--wind", "weights=1", "direction=x", "--sequence", "seq_000", "seq_001"], "name one --object"),
         (["--wind", "weights=1", "direction=x", "--sequence", "seq_009"], "has no sequence 'seq_009'"),
@@ -115,8 +112,6 @@ def test_an_initial_state_and_a_changed_model(run, tmp_path: Path, capsys) -> No
     ],
 )
 def test_wrong_words_are_named(run, monkeypatch, capsys, options: list[str], message: str) -> None:
-    import re
-
     monkeypatch.delenv("GAUSIM_DEBUG", raising=False)
     try:
         assert main.main(["simulate", str(run.run_dir), *options]) == 2
@@ -141,29 +136,3 @@ def test_parts_and_directions(run) -> None:
     assert tip.radius == 0.2 and tip.centre[2] == pytest.approx(1.05)
     impulse = _force_words.entry_of("impulse", ["weight_seconds=.1", "direction=1,2,-3"], scene).event
     assert impulse == Impulse(Whole(), (1.0, 2.0, -3.0), 0.1)
-
-
-def test_help_says_the_words(capsys) -> None:
-    with pytest.raises(SystemExit):
-        simulate.main(["--help"])
-    shown = capsys.readouterr().out
-    assert "on=PART weights=W direction=D" in shown and "tip[:RADIUS]" in shown and "--session FILE" in shown
-
-
-def test_a_session_is_readable(run, tmp_path: Path) -> None:
-    words = [
-        "--force",
-        "on=tip",
-        "weights=3",
-        "direction=x",
-        "--frames",
-        "3",
-        "--view",
-        "cam_0",
-        "--out",
-        str(tmp_path),
-    ]
-    assert simulate.main([str(run.run_dir), *words]) == 0
-    value = json.loads((tmp_path / "toy" / "forces" / "session.json").read_text())
-    event = value["events"][0]
-    assert event["do"] == "force" and event["weights"] == 3.0 and event["on"]["radius"] == 0.15

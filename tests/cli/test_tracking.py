@@ -9,23 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers.simulators import LEVELS
+from helpers.joint_runs import PAPER, weights
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from gausim.cli import train as command
-from gausim.runs.checkpoint import read_checkpoint
 from gausim.training.callbacks import panels
 from gausim.training.module import GausSimModule
 
-TESTS = Path(__file__).parents[1]
-FakeWandb = runpy.run_path(str(TESTS / "training" / "test_dashboards.py"))["FakeWandb"]
-TINY = (
-    "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
-    "data.curriculum.t_max=2", "data.curriculum.t_start=1", "data.repeats=1", "data.batch_size=2",
-    "trainer.max_epochs=2", "trainer.accelerator=cpu",
-    "trainer.progress=false", "trainer.threads=1", "trainer.log_every_n_steps=1", "render=reference", "name=toy",
-    "callbacks.panels.every_epochs=1",
-)  # fmt: skip
+FakeWandb = runpy.run_path(str(Path(__file__).parents[1] / "training" / "test_dashboards.py"))["FakeWandb"]
+TINY = [word for word in PAPER if not word.startswith(("callbacks.panels", "logger"))]
+SHOWN = "callbacks.panels.every_epochs=1"
 
 
 @pytest.fixture
@@ -33,12 +26,12 @@ def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> lis
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "wandb", FakeWandb)
     FakeWandb.runs.clear()
-    return [f"data.root={toy}", *TINY]
+    return [f"data.root={toy}", *TINY, "trainer.log_every_n_steps=1"]
 
 
 @pytest.mark.slow
 def test_a_sweep_names_its_jobs_and_ends_each_once(arguments: list[str]) -> None:
-    swept = ["logger=wandb", "ablation=none,no_momentum", "loss.static_weight=1,2", "seed=3"]
+    swept = [SHOWN, "logger=wandb", "ablation=none,no_momentum", "loss.static_weight=1,2", "seed=3"]
     assert command.main(["-m", *arguments, *swept]) == 0
     given = [run.given for run in FakeWandb.runs]
     assert [g["group"] for g in given] == ["toy/none/gausim_paper"] * 2 + ["toy/no_momentum/gausim_paper"] * 2
@@ -46,8 +39,7 @@ def test_a_sweep_names_its_jobs_and_ends_each_once(arguments: list[str]) -> None
     assert [run.exits for run in FakeWandb.runs] == [[0]] * 4
     assert given[2]["config"]["model"]["simulator"]["conserve_momentum"] is False
     assert len({g["id"] for g in given}) == 4
-    rows = FakeWandb.runs[0].rows
-    names = {name for _, row in rows for name in row}
+    names = {name for _, row in FakeWandb.runs[0].rows for name in row}
     assert {"train/grad_network", "train/steps", "epoch/loss_image", "objects/toy/l2", "media/objects"} <= names
     assert "media/toy_seq_000/video" in names
 
@@ -58,16 +50,14 @@ def test_a_job_that_fails_ends_its_run_as_failed(arguments: list[str], monkeypat
 
     monkeypatch.setattr(GausSimModule, "on_train_epoch_end", fail)
     with pytest.raises(MemoryError):
-        command.main([*arguments, "logger=wandb"])
+        command.main([*arguments, "callbacks.panels=null", "logger=wandb"])
     (run,) = FakeWandb.runs
     assert run.exits == [1] and run.given["name"] == "seed_0" and run.given["group"] == "toy/none/gausim_paper"
 
 
-def weights(run: str) -> dict[str, torch.Tensor]:
-    return read_checkpoint(Path("outputs") / run / "seed_0" / "last.ckpt")["state_dict"]
-
-
-def test_what_is_shown_does_not_change_what_is_learned(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_panels_see_training_frames_only_and_do_not_change_what_is_learned(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     step, clip = GausSimModule.training_step, panels._clip
 
     def careless_step(self: GausSimModule, *args: object) -> None:
@@ -81,16 +71,12 @@ def test_what_is_shown_does_not_change_what_is_learned(arguments: list[str], mon
 
     monkeypatch.setattr(GausSimModule, "training_step", careless_step)
     monkeypatch.setattr(panels, "_clip", careless_clip)
-    command.main([*arguments, "name=shown", "logger=wandb"])
+    command.main([*arguments, SHOWN])
     command.main([*arguments, "name=hidden", "logger=none", "callbacks.panels=null"])
-    shown, hidden = weights("shown"), weights("hidden")
-    for name, value in shown.items():
-        torch.testing.assert_close(hidden[name], value, rtol=0, atol=0)
-
-
-def test_panels_see_training_frames_and_the_first_training_camera_only(arguments: list[str]) -> None:
-    command.main(arguments)
     run = Path("outputs/toy/seed_0")
+    hidden = weights(Path("outputs/hidden/seed_0"))
+    assert all(torch.equal(value, hidden[name]) for name, value in weights(run).items())
+
     events = EventAccumulator(str(run / "tensorboard")).Reload()
     assert [e.step for e in events.Images("toy_seq_000/video")] == [1, 2]
     assert {"objects/toy/l2", "objects/toy/ratio_static", "train/grad_network"} <= set(events.Tags()["scalars"])
@@ -110,6 +96,6 @@ def test_a_panel_that_cannot_be_drawn_is_left_out(
         return torch.full((3, 1, 32, 32, 3), torch.nan)
 
     monkeypatch.setattr(GausSimModule, "predict_images", explode)
-    assert command.main(arguments) == 0
+    assert command.main([*arguments, SHOWN, "logger=none", "trainer.max_epochs=1"]) == 0
     assert "no panel of toy at step 1: the predicted images are not finite" in capsys.readouterr().out
     assert list(Path("outputs/toy/seed_0/panels").glob("step_*")) == []

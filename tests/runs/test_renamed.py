@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 
 import pytest
 import yaml
@@ -15,13 +15,8 @@ from gausim.runs.renamed import ELASTIC, MOVED, with_present_names, with_present
 from gausim.training.trainer import TrainerSettings
 
 
-@pytest.mark.parametrize("new", sorted(MOVED.values()))
-def test_every_new_name_exists(new: str) -> None:
-    module, _, name = new.rpartition(".")
-    if name[0].isupper():
-        assert hasattr(importlib.import_module(module), name)
-    else:
-        importlib.import_module(new)
+def test_every_new_name_exists() -> None:
+    assert all(pkgutil.resolve_name(new) is not None for new in MOVED.values())
 
 
 OLD = {
@@ -78,13 +73,8 @@ def test_weights_of_before_are_read_by_present_names() -> None:
 
 
 def test_settings_of_the_elastic_template_that_are_gone_are_dropped_or_refused() -> None:
-    old = {
-        "_target_": "gausim.models.elastic.ElasticTemplate",
-        "modes": 8,
-        "solid": 0.12,
-        "hidden": 0,
-        "damping": "full",
-    }
+    old = {"_target_": "gausim.models.elastic.ElasticTemplate", "modes": 8, "solid": 0.12}
+    old |= {"hidden": 0, "damping": "full"}
     assert with_present_names(old) == {"_target_": ELASTIC, "modes": 8, "solid": 0.12}
     for name, value in {"damping": "rayleigh", "hidden": 64, "solid": None}.items():
         with pytest.raises(ValueError, match=f"template.{name} is"):

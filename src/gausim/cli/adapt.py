@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from gausim.cli.arguments import command_parser
+
 if TYPE_CHECKING:
     from gausim.data.objects import ObjectData
 
-HELP = "Fit how new sequences begin to their first frames, with a trained run as it is."
 EPILOG = """The result is a run of its own: `gausim evaluate`, `simulate` and `report` take it. What is learned is the
 state before frame 0 of each sequence, nothing else: network, densities, attributes and template stay bit by bit.
 Only frames 0 .. FRAMES - 1 of the training views are looked at.
@@ -19,7 +20,6 @@ Only frames 0 .. FRAMES - 1 of the training views are looked at.
   gausim adapt outputs/bunny/seed_0 --data NEW_STORE --frames 3
   gausim adapt outputs/bunny/seed_0 --data NEW_STORE --set trainer.threads=1 optimizer.initial_lr=0.02"""
 EPOCHS, REPEATS = 60, 4
-ALL_EPOCHS = {"max_minutes": None, "convergence": None}
 # What `--supervision` stands for (the defaults of these are those of conf/supervision).
 SUPERVISIONS = {
     "images": "gausim.training.supervision.images.training_views",
@@ -29,19 +29,7 @@ SUPERVISIONS = {
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        RunError: the run is missing or was not trained on the scene, or the target is finished already.
-        ConfigError: too few frames, or an override that is not of the form KEY=VALUE or names no key.
-        DataError: an object or sequence that is not there, or broken data.
-    """
+    """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
     from omegaconf import OmegaConf
 
@@ -57,28 +45,17 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="gausim adapt", description=HELP, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("adapt", epilog=EPILOG)
     add = parser.add_argument
     add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
     add("--data", metavar="STORE", nargs="+", help="directories of the same objects (default: those of the run)")
     add("--sequences", nargs="+", metavar="NAME", help="only these sequences (default: all)")
     add("--frames", type=int, default=16, help="frames of each sequence that are looked at (default: 16)")
-    add(
-        "--epochs",
-        type=int,
-        default=EPOCHS,
-        help=f"rounds over the sequences, {REPEATS} steps each (default: {EPOCHS})",
-    )
+    add("--epochs", type=int, default=EPOCHS, help=f"rounds over the sequences, {REPEATS} steps each (default: "
+        f"{EPOCHS})")  # fmt: skip
     add("--out", metavar="DIR", type=Path, help="run directory to write (default: NAME_adapted_FRAMES beside RUN's)")
-    add(
-        "--set",
-        metavar="KEY=VALUE",
-        nargs="+",
-        default=[],
-        help="settings other than the run's, e.g. trainer.threads=1",
-    )
+    add("--set", metavar="KEY=VALUE", nargs="+", default=[], help="settings other than the run's, e.g. "
+        "trainer.threads=1")  # fmt: skip
     add("--supervision", choices=tuple(SUPERVISIONS), help="what is compared (default: as in the run)")
     return parser
 
@@ -98,21 +75,24 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
 
     if arguments.frames < 2:
         raise ConfigError(f"--frames: expected at least 2 (frame 0 shows rest only), got {arguments.frames}.")
-    roots = _roots(config, run, arguments.data)
-    data = {**config["data"], "root": roots, "scene": None, "masks": None, "selections": None}
-    count = len(arguments.sequences or ())
-    data |= {"sequences": arguments.sequences, "repeats": REPEATS}
-    data["batch_size"] = min(4, count) if count else config["data"].get("batch_size", 1)
-    steps = arguments.frames - 1
-    data["curriculum"] = {"_target_": "gausim.data.curriculum.Curriculum", "t_start": steps, "t_max": steps}
-    adapted = {
-        **config,
+    steps, count = arguments.frames - 1, len(arguments.sequences or ())
+    data = config["data"] | {
+        "root": _roots(config, run, arguments.data),
+        "scene": None,
+        "masks": None,
+        "selections": None,
+        "sequences": arguments.sequences,
+        "repeats": REPEATS,
+        "batch_size": min(4, count) if count else config["data"].get("batch_size", 1),
+        "curriculum": {"_target_": "gausim.data.curriculum.Curriculum", "t_start": steps, "t_max": steps},
+    }
+    adapted = config | {
         "data": data,
         "name": f"{config['name']}_adapted_{arguments.frames}",
         "init_from": str(run.resolve()),
         "freeze": "model",
         "evaluate": True,
-        "trainer": {**config["trainer"], "max_epochs": arguments.epochs, **ALL_EPOCHS},
+        "trainer": config["trainer"] | {"max_epochs": arguments.epochs, "max_minutes": None, "convergence": None},
         "overwrite": False,
     }
     if arguments.supervision is not None:
@@ -130,11 +110,11 @@ def _checked(overrides: Sequence[str]) -> list[str]:
     from gausim.compose.places import spelled
     from gausim.core.errors import ConfigError
 
-    wrong = [text for text in overrides if "=" not in text.lstrip("=")]
-    if wrong:
-        raise ConfigError(
-            f"--set {wrong[0]}: expected KEY=VALUE, e.g. trainer.threads=1. `gausim adapt --help` explains."
-        )
+    for text in overrides:
+        if "=" not in text.lstrip("="):
+            raise ConfigError(
+                f"--set {text}: expected KEY=VALUE, e.g. trainer.threads=1. `gausim adapt --help` explains."
+            )
     return [override.lstrip("+") for override in spelled(overrides)]
 
 
@@ -157,6 +137,6 @@ def _roots(config: dict[str, Any], run: Path, stores: Sequence[str] | None) -> l
 
 
 def _entry(root: Path, trained: ObjectData) -> dict[str, Any]:
-    own = {"scene": trained.scene_path, "masks": trained.masks_path}
-    paths = {key: None if value is None else str(Path(value).resolve()) for key, value in own.items()}
-    return {"root": str(Path(root).resolve()), **paths, "selections": trained.selections or None}
+    paths = {"root": root, "scene": trained.scene_path, "masks": trained.masks_path}
+    placed = {key: None if path is None else str(Path(path).resolve()) for key, path in paths.items()}
+    return {**placed, "selections": trained.selections or None}

@@ -1,12 +1,47 @@
-"""Values of command lines that several commands read."""
+"""What the command lines of several commands share."""
 
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from gausim.cli.main import COMMANDS
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+    from gausim.core.scene import GaussianScene
+
+
+def command_parser(name: str, more: str = "", epilog: str = "") -> argparse.ArgumentParser:
+    """The parser of a command, described by its line of `gausim --help` and more; line breaks of the texts stay."""
+    raw: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter} if "\n" in more + epilog else {}
+    return argparse.ArgumentParser(prog=f"gausim {name}", description=COMMANDS[name] + more, epilog=epilog, **raw)
+
+
+def add_data_option(parser: argparse.ArgumentParser) -> None:
+    """Adds ``--data``, which :func:`gausim.compose.data_paths.data_option` reads."""
+    parser.add_argument(
+        "--data", action="append", default=[], metavar="DIR|scene=FILE",
+        help="where the run's data set lies now, and scene=FILE or masks=FILE where its configuration names such; of "
+        "several sets give each, in the configuration's order (default: where it was trained)",
+    )  # fmt: skip
+
+
+def add_pin_options(parser: argparse.ArgumentParser) -> None:
+    """Adds --pin-below and --pin-above, which mark roots by height."""
+    add = parser.add_argument
+    add("--pin-below", metavar="AXIS=VALUE", help="pin kernels whose coordinate is below, e.g. z=0.33")
+    add("--pin-above", metavar="AXIS=VALUE", help="pin kernels whose coordinate is above (scenes with up = -y)")
+
+
+def pinned_by(scene: GaussianScene, arguments: argparse.Namespace) -> GaussianScene:
+    """The scene with its pins replaced by --pin-below and --pin-above (either side counts); as it is without them."""
+    from gausim.ops.selection import apply_masks, parse_half_space
+
+    sides = ((arguments.pin_below, False), (arguments.pin_above, True))
+    chosen = [parse_half_space(text, above=above) for text, above in sides if text]
+    return apply_masks(scene, pinned=chosen[0] | chosen[-1]) if chosen else scene
 
 
 def positive(text: str) -> int:

@@ -8,14 +8,12 @@ import json
 import sys
 from typing import TYPE_CHECKING, Any
 
-from gausim.cli.arguments import positive
+from gausim.cli.arguments import command_parser, positive
 
 if TYPE_CHECKING:
     from gausim.benchmark.harness import Options, Row
     from gausim.core import GaussianScene
     from gausim.models.step.simulator import GausSim
-
-HELP = "Measure the speed of rendering, stepping, training and clustering as ratios within one run."
 
 CASES = {
     "render": "the CPU renderer against plain torch and the peak of the processor, threads, views, compilation",
@@ -30,18 +28,7 @@ DEFAULT_OVERRIDES = ("experiment=demo",)
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        ConfigError: there is no such device, or the training configuration is wrong.
-        DataError: the training case's data set is missing.
-    """
+    """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
     import torch
 
@@ -50,33 +37,29 @@ def main(argv: list[str]) -> int:
 
     options = Options(_device(arguments.device), arguments.threads, arguments.quick, arguments.rounds)
     torch.manual_seed(0)
-    chosen = list(CASES) if arguments.case == "all" else [arguments.case]
     rows: list[Row] = []
     with torch_threads(options.threads):
         described = machine(options)
         if not arguments.json:
             print("\n".join(f"{key:<10} {value}" for key, value in described.items()), flush=True)
-        for name in chosen:
+        for name in CASES if arguments.case == "all" else [arguments.case]:
             print(f"measuring {name} ...", file=sys.stderr, flush=True)
             made = _run(name, options, arguments.overrides, optional=arguments.case == "all")
             rows += made
             if not arguments.json:
                 _print(name, made)
     if arguments.json:
-        document = {"machine": described, "rows": [vars(row) for row in rows]}
-        json.dump(document, sys.stdout, indent=1)
-        print()
+        print(json.dumps({"machine": described, "rows": [vars(row) for row in rows]}, indent=1))
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
     cases = "\n".join(f"  {name:<9} {text}" for name, text in CASES.items())
-    parser = argparse.ArgumentParser(
-        prog="gausim benchmark",
-        description=f"{HELP}\n\ncases:\n{cases}\n  all       all of them",
+    parser = command_parser(
+        "benchmark",
+        f"\n\ncases:\n{cases}\n  all       all of them",
         epilog="docs/results.md has tables of one machine. Close everything else first: single times drift "
         "with the machine's load, ratios within one run hold.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
     add("case", choices=[*CASES, "all"], metavar="CASE", help="one of the cases above, or all")
@@ -141,13 +124,12 @@ def simulator_of(preset: str, scene: GaussianScene, *settings: str) -> GausSim:
 
 def _print(name: str, rows: list[Row]) -> None:
     print(f"\n{name}")
-    widths = [
-        max((len(text) for text in column), default=0) for column in ([r.case for r in rows], [r.metric for r in rows])
-    ]
+    cases, metrics = (max((len(text) for text in column), default=0)
+                      for column in ([r.case for r in rows], [r.metric for r in rows]))  # fmt: skip
     for row in rows:
         reference = f"  ({row.reference})" if row.reference else ""
         value, unit = _readable(row.value, row.unit)
-        print(f"  {row.case:<{widths[0]}}  {row.metric:<{widths[1]}}  {value:>9} {unit}{reference}", flush=True)
+        print(f"  {row.case:<{cases}}  {row.metric:<{metrics}}  {value:>9} {unit}{reference}", flush=True)
 
 
 def _readable(value: float, unit: str) -> tuple[str, str]:

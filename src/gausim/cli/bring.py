@@ -12,6 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from gausim.cli.bars import byte_bar
 from gausim.core.errors import FetchError
 from gausim.io.archive import only_folder, remove_tree, unpack
 from gausim.io.download import continue_download
@@ -58,7 +59,8 @@ def fetch(entry: Entry, target: Path, addresses: Sequence[str]) -> bool:
             _check_room(entry, archive, target)
             _download(entry, archive, addresses)
             folder = _unpack(entry, archive, unpacked)
-            write_json(folder / FETCHED, _note(entry))
+            note = {key: value for key, value in asdict(entry).items() if key not in ("addresses", "unpacked")}
+            write_json(folder / FETCHED, note)
             _take_name(folder, target)
             archive.unlink()
         finally:
@@ -98,7 +100,7 @@ def _download(entry: Entry, archive: Path, addresses: Sequence[str]) -> None:
     refused: list[str] = []
     for address in addresses:
         try:
-            with _bar(f"fetch {entry.name}", entry.size) as bar:
+            with byte_bar(entry.size, f"fetch {entry.name}") as bar:
                 continue_download(address, archive, size=entry.size, advance=bar)
         except FetchError as error:
             refused.append(str(error))
@@ -117,17 +119,10 @@ def _download(entry: Entry, archive: Path, addresses: Sequence[str]) -> None:
 
 def _unpack(entry: Entry, archive: Path, unpacked: Path) -> Path:
     """The folder with what was in the archive; an archive that is not what it should be is removed."""
-    done = 0
     remove_tree(unpacked)
-    with _bar(f"unpack {entry.name}", entry.unpacked) as bar:
-
-        def advance(count: int) -> None:
-            nonlocal done
-            done += count
-            bar(done)
-
+    with byte_bar(entry.unpacked, f"unpack {entry.name}", pieces=True) as bar:
         try:
-            unpack(archive, unpacked, most_bytes=entry.unpacked, advance=advance)
+            unpack(archive, unpacked, most_bytes=entry.unpacked, advance=bar)
             _check_content(entry, only_folder(unpacked))
         except FetchError:
             archive.unlink()
@@ -146,11 +141,6 @@ def _check_content(entry: Entry, folder: Path) -> None:
             f"{entry.file}: expected a {entry.kind}, found none: {' and '.join(missing)} missing. Nothing of it was "
             "kept. Tell whoever keeps the registry."
         )
-
-
-def _note(entry: Entry) -> dict[str, Any]:
-    """What the directory says of where it came from."""
-    return {key: value for key, value in asdict(entry).items() if key not in ("addresses", "unpacked")}
 
 
 def _take_name(folder: Path, target: Path) -> None:
@@ -177,15 +167,3 @@ def _disk_errors(target: Path, work: Path) -> Iterator[None]:
             f"{error.filename or target}: cannot be written or read ({error.strerror or error}). Correct the "
             "permissions, or name another directory with --out DIR."
         ) from error
-
-
-@contextmanager
-def _bar(title: str, total: int) -> Iterator[Any]:
-    """A progress bar in bytes on the standard error; what it gives takes the bytes so far."""
-    from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TransferSpeedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=total)
-        yield lambda count: bar.update(task, completed=count)

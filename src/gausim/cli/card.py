@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from gausim.cli.arguments import add_data_option, command_parser
 
 if TYPE_CHECKING:
     from gausim.report.card import CardFacts
     from gausim.report.gather.runs import RunRecord
 
-HELP = "Write the card of a run: data, figures, cost, limitations, licence."
 # Groups of the configuration in which a run chooses; the rest says where and how it is shown.
 _GROUPS = (
     "data", "model", "supervision", "loss", "optimizer", "render", "trainer", "logger", "callbacks", "budget",
@@ -27,18 +29,7 @@ _ABSENT = "(absent)"
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        RunError: there is no run, its files are broken, or a card is there already.
-        DataError: the data set given with ``--data`` is not there.
-    """
+    """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
     from gausim.core.errors import RunError
     from gausim.io.files import write_durably
@@ -55,12 +46,10 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from gausim.compose.data_paths import add_data_option
-
-    parser = argparse.ArgumentParser(
-        prog="gausim card",
-        description=f"{HELP} Markdown with the front matter of Hugging Face, from what the run's directory records; "
-        "what is missing is named with the command that makes it.",
+    parser = command_parser(
+        "card",
+        " Markdown with the front matter of Hugging Face, from what the run's directory records; what is missing is "
+        "named with the command that makes it.",
     )
     add = parser.add_argument
     add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
@@ -104,7 +93,7 @@ def _facts(run: RunRecord, arguments: argparse.Namespace) -> CardFacts:
 
 def _data(run: RunRecord, words: list[str]) -> dict[str, Mapping[str, Any]] | None:
     """What ``dataset.json`` of every object says; None where the data set is not on this machine."""
-    from gausim.compose.data_paths import data_option, located
+    from gausim.compose.data_paths import data_option, listed, located
     from gausim.core.errors import DataError
     from gausim.data.objects import find_objects
     from gausim.io.transforms import read_json
@@ -112,18 +101,13 @@ def _data(run: RunRecord, words: list[str]) -> dict[str, Mapping[str, Any]] | No
     data: Mapping[str, Any] = run.config.get("data", {})
     try:
         roots = located(run.path, data, data_option(words))["root"]
-        folders = [
-            folder
-            for root in (roots if isinstance(roots, list) else [roots])
-            if root is not None
-            for folder in find_objects(root["root"] if isinstance(root, Mapping) else root)
-        ]
+        places = [root["root"] if isinstance(root, Mapping) else root for root in listed(roots) if root is not None]
+        every = [(folder, read_json(folder / "dataset.json")) for place in places for folder in find_objects(place)]
     except DataError:
         if words:
             raise
         return None
-    every = [(folder.name, read_json(folder / "dataset.json")) for folder in folders]
-    facts = {str(said.get("name", name)): said for name, said in every}
+    facts = {str(said.get("name", folder.name)): said for folder, said in every}
     return {name: said for name, said in facts.items() if name in (data.get("names") or facts)}
 
 
@@ -148,12 +132,8 @@ def _about(preset: str | None) -> str:
     path = conf_dir() / "model" / f"{preset}.yaml"
     if preset is None or not path.is_file():
         return ""
-    lines = []
-    for line in path.read_text().splitlines():
-        if not line.startswith("#"):
-            break
-        lines.append(line.lstrip("# ").strip())
-    return " ".join(lines)
+    head = takewhile(lambda line: line.startswith("#"), path.read_text().splitlines())
+    return " ".join(line.lstrip("# ").strip() for line in head)
 
 
 def _overrides(folder: Path) -> list[str]:
@@ -163,8 +143,8 @@ def _overrides(folder: Path) -> list[str]:
         said = yaml.safe_load((folder / ".hydra" / "overrides.yaml").read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError):
         return []
-    words = [str(word) for word in said] if isinstance(said, list) else []
-    return [f"{word.partition('=')[0]}=..." if _is_one_of(word.partition("=")[0], _PATHS) else word for word in words]
+    words = [(str(word), str(word).partition("=")[0]) for word in said] if isinstance(said, list) else []
+    return [f"{key}=..." if _is_one_of(key, _PATHS) else word for word, key in words]
 
 
 def _is_one_of(key: str, keys: Sequence[str]) -> bool:

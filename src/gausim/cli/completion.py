@@ -26,7 +26,7 @@ def complete(words: Sequence[str]) -> list[str]:
     if not before:
         offered = [*COMMANDS, *(("--help", "--version") if word.startswith("-") else ())]
     elif before[0] in COMMANDS:
-        module = importlib.import_module(COMMANDS[before[0]].module)
+        module = importlib.import_module(f"gausim.cli.{before[0]}")
         make = getattr(module, "_parser", _hydra_parser)  # of `gausim train` Hydra reads the arguments
         offered = list(_arguments(make(), before[1:], word))
     else:
@@ -72,9 +72,7 @@ def _arguments(parser: argparse.ArgumentParser, before: Sequence[str], word: str
 
 def _most(action: argparse.Action) -> float:
     """How many words belong to an argument at most."""
-    if isinstance(action.nargs, int):
-        return action.nargs
-    return float("inf") if action.nargs in ("*", "+") else 1
+    return action.nargs if isinstance(action.nargs, int) else float("inf") if action.nargs in ("*", "+") else 1
 
 
 def _options(parser: argparse.ArgumentParser, word: str) -> Iterator[str]:

@@ -6,7 +6,8 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-HELP = "Check a training configuration, print its JSON schema, complete it in the shell."
+from gausim.cli.arguments import command_parser
+
 SHELLS = ("bash", "zsh", "fish")
 
 VALIDATE = """Composes a configuration and checks it without training: unknown keys (with the nearest known one), values
@@ -34,17 +35,7 @@ What is offered is what the installed version has; the script itself does not ch
 
 
 def main(argv: Sequence[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status; 1 where a configuration is wrong.
-
-    Raises:
-        ConfigError: an argument is no configuration.
-    """
+    """Runs the command; returns the exit status."""
     if argv[:1] == ["complete"]:  # the scripts ask this way; words of any kind follow, so no parser can have them
         from gausim.cli.completion import complete
 
@@ -56,7 +47,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="gausim config", description=HELP)
+    parser = command_parser("config")
     parts = parser.add_subparsers(metavar="WHAT", required=True)
 
     def add(name: str, help: str, text: str) -> argparse.ArgumentParser:

@@ -7,30 +7,16 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gausim.cli.inspect import add_pin_options, pinned_by
+from gausim.cli.arguments import add_pin_options, command_parser, pinned_by
+from gausim.cli.bars import step_bars
 
 if TYPE_CHECKING:
     from gausim.core.scene import GaussianScene
     from gausim.data.objects import ObjectData
-    from gausim.doctor.evidence import Tick
-    from gausim.doctor.examine import Examination
-
-HELP = "Look at cameras, masks, clock and motion of a data set before training: what to mend."
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        0 where a training may begin, 1 where a fault would ruin it.
-
-    Raises:
-        DataError: there is no data set at ROOT, or the scene that was named is not there.
-        SceneError: the scene is unusable.
-    """
+    """Runs the command; returns 0 where a training may begin, 1 where a fault would ruin it."""
     arguments = _parser().parse_args(argv)
     import torch
 
@@ -38,10 +24,9 @@ def main(argv: list[str]) -> int:
 
     torch.set_num_threads(arguments.threads)
     roots = find_objects(arguments.root)
-    alone = len(roots) == 1
     told: dict[str, Any] = {}
     for root in roots:
-        out = None if arguments.out is None else arguments.out if alone else arguments.out / root.name
+        out = arguments.out / root.name if arguments.out and len(roots) > 1 else arguments.out
         told[str(root)] = _one(root, arguments, out)
     if arguments.json:
         print(json.dumps(told, indent=1))
@@ -49,10 +34,10 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="gausim doctor",
-        description=f"{HELP} Exits with 1 if a fault would ruin a training. Files and formats are checked first, as "
-        "`gausim verify --quick` does.",
+    parser = command_parser(
+        "doctor",
+        " Exits with 1 if a fault would ruin a training. Files and formats are checked first, as `gausim verify "
+        "--quick` does.",
     )
     add = parser.add_argument
     add("root", metavar="ROOT", type=Path, help="object directory, or a folder of them")
@@ -70,7 +55,8 @@ def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[st
     from gausim.data.objects import ObjectData
     from gausim.data.verify import verify
     from gausim.doctor.examine import examine
-    from gausim.doctor.page import findings_text, plain_findings
+    from gausim.doctor.page import findings_text, plain_findings, write_page
+    from gausim.doctor.pictures import draw_pictures
 
     # Masks and pins are judged below: they may be given here, and no pin is a finding among others.
     faults = verify(root, quick=True, scene=False)
@@ -81,13 +67,13 @@ def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[st
             print("\n".join(f"  {fault.where}: {fault.what}" for fault in faults))
         return {"ruinous": True, "faults": [[f.where, f.what] for f in faults], "findings": [], "left_out": {}}
     data = ObjectData(root, scene=arguments.scene, masks=arguments.masks)
-    with _bars() as tick:
+    with step_bars() as tick:
         found = examine(data, _scene(data, arguments), tick)
-        if out is not None and found.evidence is not None:
-            _show(found, out, tick)
+        if out and found.evidence:
+            write_page(out / "index.html", found, draw_pictures(found.evidence, out, tick))
     if not arguments.json:
         print(findings_text(str(root), found))
-        if out is not None and found.evidence is not None:
+        if out and found.evidence:
             print(f"page  {out / 'index.html'}")
     return {"ruinous": found.ruinous, "faults": [], **plain_findings(found)}
 
@@ -101,36 +87,4 @@ def _scene(data: ObjectData, arguments: argparse.Namespace) -> GaussianScene | N
         if arguments.scene is not None:
             raise DataError(f"{data.scene_path}: no such file. Give --scene the PLY that `gausim reconstruct` wrote.")
         return None
-    scene = load_scene(data.scene_path, masks=data.masks_path, name=data.name)
-    return pinned_by(scene, arguments.pin_below, arguments.pin_above)
-
-
-def _show(found: Examination, out: Path, tick: Tick) -> None:
-    from gausim.doctor.page import write_page
-    from gausim.doctor.pictures import draw_pictures
-
-    assert found.evidence is not None
-    write_page(out / "index.html", found, draw_pictures(found.evidence, out, tick))
-
-
-def _bars() -> Any:
-    """A context manager that gives what advances a progress bar per step, on standard error."""
-    from contextlib import contextmanager
-
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    @contextmanager
-    def bars():  # type: ignore[no-untyped-def]
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-            known: dict[str, Any] = {}
-
-            def tick(step: str, done: int, total: int) -> None:
-                if step not in known:
-                    known[step] = progress.add_task(step, total=total)
-                progress.update(known[step], completed=done, total=total)
-
-            yield tick
-
-    return bars()
+    return pinned_by(load_scene(data.scene_path, masks=data.masks_path, name=data.name), arguments)

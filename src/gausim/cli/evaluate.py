@@ -1,4 +1,4 @@
-"""`gausim evaluate RUN`: figures of a run on seen, unseen and held-out frames, beside the static prediction."""
+"""`gausim evaluate RUN`: measures a trained run on seen, unseen and held-out frames."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from gausim.cli.arguments import add_data_option, command_parser
 from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -15,26 +16,17 @@ if TYPE_CHECKING:
     from gausim.data.objects import ObjectData
     from gausim.results.curves import ObjectCurves
 
-HELP = "Measure a run on seen, unseen and held-out frames."
 WRITTEN = ("metrics.json", "metrics.npz", "pictures.npz", "table.md")
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        RunError: the run is missing, has no checkpoint, or predicts what cannot be measured.
-        DataError: an object or sequence that is not there, or broken data.
-    """
+    """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
     if arguments.endurance is not None and arguments.endurance < 300:
         raise ConfigError(f"--endurance: expected at least 300 frames, got {arguments.endurance}.")
+    from rich.console import Console
+    from rich.markdown import Markdown
+
     from gausim.cli.end import end, told
     from gausim.compose.build import load_run
     from gausim.compose.data_paths import data_option
@@ -44,10 +36,10 @@ def main(argv: list[str]) -> int:
     from gausim.report.pictures.figures import error_figure
 
     run = load_run(arguments.run, data=data_option(arguments.data))
-    state = state_of(run)
+    facts = {"name": run.config.get("name"), "seed": run.config.get("seed"), "views": arguments.views, **state_of(run)}
     results = _evaluate(run, arguments)
-    folder = Path(arguments.out) if arguments.out else _default_folder(run, arguments)
-    summary = write_evaluation(folder, results, _facts(run, arguments, state))
+    whole, folder = _folder(run, arguments)
+    summary = write_evaluation(folder, results, facts)
     drawn: list[str] = []
     for curves in results:
         name = curves.facts.name
@@ -60,28 +52,24 @@ def main(argv: list[str]) -> int:
         print((folder / "metrics.json").read_text(), end="")
         return 0
     if arguments.verbose:
-        _print_tables(summary)
+        # Rich would cut columns at 80 characters where the output goes to a file.
+        Console(width=None if sys.stdout.isatty() else 200).print(Markdown((folder / "table.md").read_text()))
         print("\n".join(f"wrote {folder / name}" for name in [*WRITTEN, *drawn]))
-    whole = folder == Path(run.run_dir) / "evaluation"
     commands = [["report", arguments.run], ["simulate", arguments.run]] if whole else [["evaluate", arguments.run]]
     end(told(summary["objects"]), "tables", folder / "table.md", *commands)
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    from gausim.compose.data_paths import add_data_option
-
-    parser = argparse.ArgumentParser(
-        prog="gausim evaluate",
-        description=f"{HELP} Writes metrics.json, metrics.npz, table.md and an error plot per object.",
-    )
+    parser = command_parser("evaluate", " Writes metrics.json, metrics.npz, table.md and an error plot per object.")
     add = parser.add_argument
     add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
     add("--object", nargs="+", metavar="NAME", help="only these objects")
     add("--sequences", nargs="+", metavar="NAME", help="only these sequences (of every object)")
     add("--views", default="all", choices=("all", "train", "heldout"), help="which cameras (default: all)")
     add_data_option(parser)
-    add("--out", metavar="DIR", help="folder to write; default RUN/evaluation, or RUN/evaluation/partial for a part")
+    add("--out", metavar="DIR", type=Path, help="folder to write; default RUN/evaluation, or RUN/evaluation/partial "
+        "for a part")  # fmt: skip
     add(
         "--endurance", type=int, metavar="N",
         help="also roll N frames far, free and under random pushes in the first 240 (at least 300; 1000 is a good "
@@ -93,27 +81,24 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _evaluate(run: LoadedRun, arguments: argparse.Namespace) -> list[ObjectCurves]:
-    from gausim.compose.predict import TrainedPrediction, progress, run_objects, scene_of
+    from gausim.cli.bars import named_bar
+    from gausim.compose.predict import TrainedPrediction, run_objects, scene_of
     from gausim.evaluation.evaluation import evaluate_object
 
     items = run_objects(run, arguments.object)
-    total = sum(len(arguments.sequences or item.data.sequences) for item in items)
-    bar, advance = progress(total, "evaluate")
-    results = []
-    with bar:
-        for item in items:
-            results.append(
-                evaluate_object(
-                    item.data,
-                    scene_of(run, item),
-                    {run.module.method_name: TrainedPrediction(run, item)},
-                    run.renderer,
-                    sequences=arguments.sequences,
-                    views=_views(item.data, arguments.views),
-                    advance=advance,
-                )
+    with named_bar(sum(len(arguments.sequences or item.data.sequences) for item in items), "evaluate") as advance:
+        return [
+            evaluate_object(
+                item.data,
+                scene_of(run, item),
+                {run.module.method_name: TrainedPrediction(run, item)},
+                run.renderer,
+                sequences=arguments.sequences,
+                views=_views(item.data, arguments.views),
+                advance=advance,
             )
-    return results
+            for item in items
+        ]
 
 
 def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list[str]:
@@ -140,35 +125,9 @@ def _views(data: ObjectData, group: str) -> list[str]:
     return list(chosen)
 
 
-def _default_folder(run: LoadedRun, arguments: argparse.Namespace) -> Path:
-    """The run's evaluation is never overwritten by that of a part of it."""
-    folder = Path(run.run_dir) / "evaluation"
+def _folder(run: LoadedRun, arguments: argparse.Namespace) -> tuple[bool, Path]:
+    """Whether this is the run's whole evaluation, which that of a part never overwrites; and where it goes."""
+    whole = run.run_dir / "evaluation"
     partial = arguments.object or arguments.sequences or arguments.views != "all"
-    return folder / "partial" if partial else folder
-
-
-def _facts(run: LoadedRun, arguments: argparse.Namespace, state: dict[str, Any]) -> dict[str, Any]:
-    name, seed = run.config.get("name"), run.config.get("seed")
-    return {"name": name, "seed": seed, "views": arguments.views, **state}
-
-
-def _print_tables(summary: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    from gausim.results.table import gaps, object_tables
-
-    # Rich would cut columns at 80 characters where the output goes to a file.
-    console = Console(width=None if sys.stdout.isatty() else 200)
-    for name, entry in summary["objects"].items():
-        for table in object_tables(name, entry):
-            shown = Table(title=table.title, title_justify="left")
-            for i, head in enumerate(table.head):
-                shown.add_column(head.replace("[", r"\["), justify="left" if i < 2 else "right")
-            for i, row in enumerate(table.rows):
-                if i in table.breaks and i:
-                    shown.add_section()
-                shown.add_row(*row)
-            console.print(shown)
-    for gap in gaps(summary):
-        console.print(gap, markup=False, highlight=False)
+    folder = arguments.out or (whole / "partial" if partial else whole)
+    return folder == whole, folder

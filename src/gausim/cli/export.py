@@ -4,75 +4,18 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from gausim.cli.arguments import positive
+from gausim.cli.arguments import add_data_option, command_parser, parse_background, positive
 from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from gausim.compose.build import LoadedRun
     from gausim.core import Cameras, GaussianScene, Renderer, Trajectory
-
-HELP = "Write a motion as PLY, OpenUSD, safetensors, viser, HTML, MP4 or GIF, and read it back."
-
-
-@dataclass(frozen=True)
-class Format:
-    """A kind of file.
-
-    Attributes:
-        suffix: of the file; empty for a folder.
-        keeps: what of a motion is in it.
-        loses: what is not.
-        reader: what reads it here; empty: nothing.
-    """
-
-    suffix: str
-    keeps: str
-    loses: str
-    reader: str = ""
-
-
-FORMATS: dict[str, Format] = {
-    "safetensors": Format(
-        ".safetensors",
-        "every number of the trajectory, bit for bit: positions, gradients and rotations per unit",
-        "the rest scene (keep SCENE.ply beside it)",
-        "gausim (--scene SCENE.ply), any safetensors reader",
-    ),
-    "ply": Format(
-        "",
-        "one 3DGS PLY per frame, name_0001.ply as SuperSplat's timeline plays; covariances as axes and lengths, turned "
-        "spherical harmonics, masks of the first frame",
-        "which unit a kernel belongs to; gradients",
-        "gausim, SuperSplat, every 3DGS viewer",
-    ),
-    "usd": Format(
-        ".usdc",
-        "one ParticleField3DGaussianSplat with time samples: positions, orientations, scales, opacities, turned "
-        "spherical harmonics, float32",
-        "masks, units, gradients",
-        "gausim, OpenUSD 26.3 or newer",
-    ),
-    "viser": Format(
-        ".viser",
-        "positions, covariances (float16), one colour per kernel and frame",
-        "spherical harmonics, masks, units",
-    ),
-    "html": Format(
-        ".html",
-        "as viser, in one page that plays in a browser without a network",
-        "spherical harmonics, masks, units",
-    ),
-    "mp4": Format(".mp4", "pictures of one camera", "everything else"),
-    "gif": Format(".gif", "pictures of one camera, 256 colours, whole hundredths of a second", "everything else"),
-}
-# What is made from a scene and a trajectory, not from scenes of single frames.
-_FROM_TRAJECTORY = ("safetensors", "viser", "html")
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,56 +44,33 @@ class Motion:
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        ConfigError: arguments that do not go together, or an extra that is not installed.
-        RunError: the run is missing or has no checkpoint.
-        DataError: a source that is missing or broken.
-        SceneError: a scene that is missing or broken.
-        DivergenceError: the prediction left the finite numbers.
-    """
+    """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
-    motion = _opened(arguments)
-    if arguments.every != 1:
-        motion = _thinned(motion, arguments.every)
+    motion = _thinned(_opened(arguments), arguments.every)
     form = FORMATS[arguments.format]
-    path = Path(arguments.out) if arguments.out else Path(f"{motion.name}{form.suffix}")
-    if arguments.format in _FROM_TRAJECTORY and motion.trajectory is None:
+    path = arguments.out or Path(f"{motion.name}{form.suffix}")
+    if form.write in (_write_safetensors, _write_recording) and motion.trajectory is None:
         raise ConfigError(
             f"--format {arguments.format}: {arguments.source} holds frames without units, which make no trajectory. "
             "Export from a run or a trajectory, or as ply, usd, mp4 or gif."
         )
-    count = _WRITERS[arguments.format](motion, path, arguments)
+    count = form.write(motion, path, arguments)
     print(f"wrote {path}: {count} frames of {motion.first.count} kernels at {motion.fps:g} frames per second")
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    from gausim.compose.data_paths import add_data_option
-
     width = max(map(len, FORMATS))
     rows = []
     for name, form in FORMATS.items():
         rows += [f"  {name:<{width}}  keeps  {form.keeps}", f"  {'':<{width}}  loses  {form.loses}"]
         rows += [f"  {'':<{width}}  read by {form.reader}"] if form.reader else []
-    parser = argparse.ArgumentParser(
-        prog="gausim export",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        description=HELP,
-        epilog="formats:\n" + "\n".join(rows),
-    )
+    parser = command_parser("export", epilog="formats:\n" + "\n".join(rows))
     add = parser.add_argument
     add("source", metavar="SOURCE", type=Path, help="a RUN; a trajectory.safetensors (with --scene); a folder of "
         "name_0001.ply, ...; or a .usd, .usda, .usdc file")  # fmt: skip
     add("--format", required=True, choices=list(FORMATS), help="what to write, see below")
-    add("--out", metavar="PATH", help="file to write (a folder for ply); default NAME.SUFFIX here")
+    add("--out", metavar="PATH", type=Path, help="file to write (a folder for ply); default NAME.SUFFIX here")
     add("--scene", type=Path, metavar="SCENE.ply", help="the rest scene of a trajectory")
     add("--object", metavar="NAME", help="of a run; default its first")
     add("--sequence", metavar="NAME", help="of a run; default its first")
@@ -168,34 +88,20 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-# -------------------------------------------------------------------------------------------------------- sources
-
-
 def _opened(arguments: argparse.Namespace) -> Motion:
-    from gausim.io.usd import SUFFIXES
+    from gausim.io.ply_sequence import load_ply_sequence
+    from gausim.io.usd import SUFFIXES, load_usd
 
     source: Path = arguments.source
     if source.suffix in SUFFIXES:
-        return _from_usd(source)
+        clip = load_usd(source)
+        return Motion(source.stem, clip.fps, clip.frames, clip.scenes, next(clip.scenes()))
     if source.is_dir() and not (source / "config.yaml").is_file():
-        return _from_ply(source, arguments.fps)
+        scenes, count, fps = load_ply_sequence(source, fps=arguments.fps)
+        return Motion(source.name, fps, count, lambda: load_ply_sequence(source, fps=fps)[0], next(scenes))
     if source.suffix == ".safetensors":
         return _from_trajectory(source, arguments.scene)
     return _from_run(arguments)
-
-
-def _from_usd(source: Path) -> Motion:
-    from gausim.io.usd import load_usd
-
-    clip = load_usd(source)
-    return Motion(source.stem, clip.fps, clip.frames, clip.scenes, next(clip.scenes()))
-
-
-def _from_ply(source: Path, fps: float | None) -> Motion:
-    from gausim.io.ply_sequence import load_ply_sequence
-
-    scenes, count, rate = load_ply_sequence(source, fps=fps)
-    return Motion(source.name, rate, count, lambda: load_ply_sequence(source, fps=fps)[0], next(scenes))
 
 
 def _from_trajectory(source: Path, scene_path: Path | None) -> Motion:
@@ -213,44 +119,28 @@ def _from_trajectory(source: Path, scene_path: Path | None) -> Motion:
 def _from_run(arguments: argparse.Namespace) -> Motion:
     from gausim.compose.build import load_run
     from gausim.compose.data_paths import data_option
-    from gausim.compose.predict import TrainedPrediction, head, run_objects, scene_of, state_of
+    from gausim.compose.predict import TrainedPrediction, run_objects, scene_of, sequence_of, state_of
 
-    run: LoadedRun = load_run(arguments.source, data=data_option(arguments.data))
+    run = load_run(arguments.source, data=data_option(arguments.data))
     state_of(run)
     item = run_objects(run, None if arguments.object is None else [arguments.object])[0]
-    records = {record.name: record for record in item.data.sequences}
-    name = arguments.sequence or next(iter(records))
-    if name not in records:
-        raise DataError(f"{item.data.root}: has no sequence '{name}'; it has {list(records)}.")
-    predict = TrainedPrediction(run, item, frames=arguments.frames or 0)
-    trajectory = head(predict.full(records[name]), arguments.frames or records[name].count)
-    cameras = records[name].cameras
-    return _of_trajectory(
-        f"{item.data.name}_{name}", scene_of(run, item), trajectory, cameras=cameras, renderer=run.renderer
-    )
+    record = sequence_of(item, arguments.sequence or item.data.sequences[0].name)
+    trajectory = TrainedPrediction(run, item)(record, arguments.frames)
+    motion = _of_trajectory(f"{item.data.name}_{record.name}", scene_of(run, item), trajectory)
+    return replace(motion, cameras=record.cameras, renderer=run.renderer)
 
 
-def _of_trajectory(
-    name: str,
-    scene: GaussianScene,
-    trajectory: Trajectory,
-    *,
-    cameras: Cameras | None = None,
-    renderer: Renderer | None = None,
-) -> Motion:
+def _of_trajectory(name: str, scene: GaussianScene, trajectory: Trajectory) -> Motion:
     from gausim.ops.deformed_scene import deformed_scene
 
     def scenes() -> Iterator[GaussianScene]:
         for state in zip(trajectory.positions, trajectory.deformation_gradients, trajectory.rotations, strict=True):
             yield deformed_scene(scene, *state, trajectory.unit_of_kernel)
 
-    return Motion(name, trajectory.fps, trajectory.frames, scenes, scene, trajectory, cameras, renderer)
+    return Motion(name, trajectory.fps, trajectory.frames, scenes, scene, trajectory)
 
 
 def _thinned(motion: Motion, every: int) -> Motion:
-    from dataclasses import replace
-    from itertools import islice
-
     trajectory = motion.trajectory
     if trajectory is not None:
         trajectory = replace(
@@ -267,9 +157,6 @@ def _thinned(motion: Motion, every: int) -> Motion:
         scenes=lambda: islice(motion.scenes(), 0, None, every),
         trajectory=trajectory,
     )
-
-
-# -------------------------------------------------------------------------------------------------------- writers
 
 
 def _write_safetensors(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
@@ -303,27 +190,13 @@ def _write_recording(motion: Motion, path: Path, arguments: argparse.Namespace) 
 def _write_pictures(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
     from gausim.io.video import write_gif, write_video
 
-    pictures = _pictures(motion, arguments)
-    if arguments.format == "gif":
-        return write_gif(path, pictures, motion.fps)
-    return write_video(path, pictures, motion.fps)
-
-
-_WRITERS: dict[str, Callable[[Motion, Path, argparse.Namespace], int]] = {
-    "safetensors": _write_safetensors,
-    "ply": _write_ply,
-    "usd": _write_usd,
-    "viser": _write_recording,
-    "html": _write_recording,
-    "mp4": _write_pictures,
-    "gif": _write_pictures,
-}
+    write = write_gif if arguments.format == "gif" else write_video
+    return write(path, _pictures(motion, arguments), motion.fps)
 
 
 def _pictures(motion: Motion, arguments: argparse.Namespace) -> Iterator[np.ndarray]:
     import torch
 
-    from gausim.cli.arguments import parse_background
     from gausim.compose.config import compose, instantiate
     from gausim.render.draw import draw, to_bytes
 
@@ -353,3 +226,56 @@ def _camera(motion: Motion, arguments: argparse.Namespace) -> Cameras:
             f"--view {arguments.view}: expected one of {names} (cameras of a run's data set), or --azimuth."
         )
     return motion.cameras.select([names.index(arguments.view)])
+
+
+class Format(NamedTuple):
+    """A kind of file: its suffix (empty for a folder), what of a motion is in it and what not, and who reads it."""
+
+    suffix: str
+    write: Callable[[Motion, Path, argparse.Namespace], int]
+    keeps: str
+    loses: str
+    reader: str = ""
+
+
+FORMATS = {
+    "safetensors": Format(
+        ".safetensors",
+        _write_safetensors,
+        "every number of the trajectory, bit for bit: positions, gradients and rotations per unit",
+        "the rest scene (keep SCENE.ply beside it)",
+        "gausim (--scene SCENE.ply), any safetensors reader",
+    ),
+    "ply": Format(
+        "",
+        _write_ply,
+        "one 3DGS PLY per frame, name_0001.ply as SuperSplat's timeline plays; covariances as axes and lengths, turned "
+        "spherical harmonics, masks of the first frame",
+        "which unit a kernel belongs to; gradients",
+        "gausim, SuperSplat, every 3DGS viewer",
+    ),
+    "usd": Format(
+        ".usdc",
+        _write_usd,
+        "one ParticleField3DGaussianSplat with time samples: positions, orientations, scales, opacities, turned "
+        "spherical harmonics, float32",
+        "masks, units, gradients",
+        "gausim, OpenUSD 26.3 or newer",
+    ),
+    "viser": Format(
+        ".viser",
+        _write_recording,
+        "positions, covariances (float16), one colour per kernel and frame",
+        "spherical harmonics, masks, units",
+    ),
+    "html": Format(
+        ".html",
+        _write_recording,
+        "as viser, in one page that plays in a browser without a network",
+        "spherical harmonics, masks, units",
+    ),
+    "mp4": Format(".mp4", _write_pictures, "pictures of one camera", "everything else"),
+    "gif": Format(
+        ".gif", _write_pictures, "pictures of one camera, 256 colours, whole hundredths of a second", "everything else"
+    ),
+}

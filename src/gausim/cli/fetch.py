@@ -6,10 +6,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gausim.cli.arguments import command_parser
+
 if TYPE_CHECKING:
     from gausim.io.registry import Entry, Registry
 
-HELP = "Fetch a published run or data set, or pack one for others."
 EPILOG = """\
 A registry is a TOML file that names archives with address, size, SHA-256, licence and card (docs/reference/files.md).
 Nothing is unpacked before size and SHA-256 are right, and nothing in an archive is executed. An interrupted download
@@ -22,19 +23,7 @@ goes on when the same command is given again.
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        FetchError: an entry is unknown, cannot be reached, is not what the registry says, or there is no room.
-        RunError: what is to be packed is no finished run.
-        DataError: what is to be packed is no data set.
-    """
+    """Runs the command; returns the exit status."""
     parser = _parser()
     arguments = parser.parse_args(argv)
     wanted = [bool(arguments.names), arguments.list, arguments.pack is not None]
@@ -43,7 +32,9 @@ def main(argv: list[str]) -> int:
     if arguments.out is not None and len(arguments.names) > 1:
         parser.error("--out is the directory of one NAME")
     if arguments.pack is not None:
-        return _pack(arguments, parser)
+        if arguments.name is None:
+            parser.error("--pack: expected --name NAME, by which the entry is asked for")
+        return _pack(arguments)
     from gausim.io.registry import SHIPPED, read_registry
 
     registry = read_registry(arguments.registry or SHIPPED)
@@ -57,9 +48,7 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="gausim fetch", description=HELP, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = command_parser("fetch", epilog=EPILOG)
     add = parser.add_argument
     add("names", metavar="NAME", nargs="*", help="entries of the registry")
     add("--list", action="store_true", help="print what the registry lists")
@@ -115,11 +104,9 @@ def _fetch(entry: Entry, arguments: argparse.Namespace, registry: Registry) -> N
     print(f"next: gausim evaluate {target} --data {data}")
 
 
-def _pack(arguments: argparse.Namespace, parser: argparse.ArgumentParser) -> int:
+def _pack(arguments: argparse.Namespace) -> int:
     from gausim.cli.pack import pack_published
 
-    if arguments.name is None:
-        parser.error("--pack: expected --name NAME, by which the entry is asked for")
     entry = pack_published(
         arguments.pack, arguments.out or Path("published"), name=arguments.name, title=arguments.title,
         licence=arguments.licence, data=arguments.data,

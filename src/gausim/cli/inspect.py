@@ -7,11 +7,11 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gausim.cli.arguments import add_pin_options, command_parser, pinned_by
+
 if TYPE_CHECKING:
     from gausim.core.scene import GaussianScene
     from gausim.models.hierarchy.clusters import Hierarchy
-
-HELP = "Print a scene's kernels and hierarchy and draw its clusters."
 
 # The hierarchy of the model configurations (conf/model), which take a while to compose.
 DEFAULT_RADII = (0.13, 0.4)
@@ -19,17 +19,7 @@ DEFAULT_CLUSTERING = "agglomerative"
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        SceneError: the scene is unusable, or no kernel is pinned.
-    """
+    """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
     from gausim.core.errors import SceneError
     from gausim.io.ply import load_scene, masks_path, save_masks
@@ -41,11 +31,11 @@ def main(argv: list[str]) -> int:
     _print_scene(scene)
     hierarchy = build_hierarchy(scene, radii=arguments.radii, clustering=arguments.clustering)
     _print_hierarchy(hierarchy, arguments.radii)
-    out = Path(arguments.out) if arguments.out else Path(f"{Path(arguments.scene).stem}.clusters.png")
+    out = arguments.out or Path(f"{arguments.scene.stem}.clusters.png")
     _draw(scene, hierarchy, arguments, out)
     print(f"picture    {out}")
     if arguments.save_masks:
-        side = Path(arguments.masks) if arguments.masks else masks_path(arguments.scene)
+        side = arguments.masks or masks_path(arguments.scene)
         save_masks(scene, side)
         print(f"masks      {side}")
     return 0
@@ -54,10 +44,10 @@ def main(argv: list[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     from gausim.ops.clustering import CLUSTERINGS
 
-    parser = argparse.ArgumentParser(prog="gausim inspect", description=HELP)
+    parser = command_parser("inspect")
     add = parser.add_argument
-    add("scene", metavar="SCENE", help="3DGS scene (PLY)")
-    add("--masks", metavar="FILE", help="masks (npz); default <stem>.masks.npz next to the scene, if there")
+    add("scene", metavar="SCENE", type=Path, help="3DGS scene (PLY)")
+    add("--masks", metavar="FILE", type=Path, help="masks (npz); default <stem>.masks.npz next to the scene, if there")
     add_pin_options(parser)
     add("--simulate-below", metavar="AXIS=VALUE", help="simulate only kernels below (others are drawn, never moved)")
     add("--simulate-above", metavar="AXIS=VALUE", help="simulate only kernels above")
@@ -69,27 +59,8 @@ def _parser() -> argparse.ArgumentParser:
         help="clustering method; default %(default)s, as in the model configurations")  # fmt: skip
     add("--up", choices=("x", "y", "z", "-x", "-y", "-z"),
         help="axis drawn upwards (write --up=-y); default away from the pins, else z")  # fmt: skip
-    add("--out", metavar="PICTURE.png", help="picture of the clusters; default <stem>.clusters.png")
+    add("--out", metavar="PICTURE.png", type=Path, help="picture of the clusters; default <stem>.clusters.png")
     return parser
-
-
-def add_pin_options(parser: argparse.ArgumentParser) -> None:
-    """Adds --pin-below and --pin-above, which mark roots by height."""
-    add = parser.add_argument
-    add("--pin-below", metavar="AXIS=VALUE", help="pin kernels whose coordinate is below, e.g. z=0.33")
-    add("--pin-above", metavar="AXIS=VALUE", help="pin kernels whose coordinate is above (scenes with up = -y)")
-
-
-def pinned_by(scene: GaussianScene, below: str | None, above: str | None) -> GaussianScene:
-    """The scene with its pins replaced by --pin-below and --pin-above (either side counts); as it is without them."""
-    from gausim.ops.selection import apply_masks, parse_half_space
-
-    low = parse_half_space(below) if below else None
-    high = parse_half_space(above, above=True) if above else None
-    if low is None and high is None:
-        return scene
-    both = low | high if low is not None and high is not None else low or high
-    return apply_masks(scene, pinned=both)
 
 
 def _marked(scene: GaussianScene, arguments: argparse.Namespace) -> GaussianScene:
@@ -99,14 +70,12 @@ def _marked(scene: GaussianScene, arguments: argparse.Namespace) -> GaussianScen
         if text:
             mask = scene.simulated & parse_half_space(text, above=above)(scene)
             scene = apply_masks(scene, simulated=mask)
-    return pinned_by(scene, arguments.pin_below, arguments.pin_above)
+    return pinned_by(scene, arguments)
 
 
 def _print_scene(scene: GaussianScene) -> None:
     low, high = scene.means.amin(0).tolist(), scene.means.amax(0).tolist()
-    print(f"scene      {scene.name}")
-    print(f"kernels    {scene.count}")
-    print(f"SH degree  {scene.sh_degree}")
+    print(f"scene      {scene.name}\nkernels    {scene.count}\nSH degree  {scene.sh_degree}")
     print("box        " + "  ".join(f"{a} {low[i]:.4g} .. {high[i]:.4g}" for i, a in enumerate("xyz")))
     if scene.simulated.any():
         print(f"diagonal   {scene.diagonal:.4g} scene units (simulated kernels)")
@@ -133,18 +102,17 @@ def _print_hierarchy(hierarchy: Hierarchy, radii: list[float]) -> None:
 def _draw(scene: GaussianScene, hierarchy: Hierarchy, arguments: argparse.Namespace, out: Path) -> None:
     from gausim.report.pictures.clusters import draw_clusters
 
-    count = len(hierarchy.levels)
-    labels = [hierarchy.ancestor(0, level).numpy() for level in range(1, count)]
+    above = range(1, len(hierarchy.levels))
     upward = arguments.up or _away_from_pins(arguments)
     up = "xyz".index(upward[-1])
     first, second = (axis for axis in range(3) if axis != up)
     draw_clusters(
         out,
         scene.means[hierarchy.kernels].cpu().numpy(),
-        labels,
+        [hierarchy.ancestor(0, level).numpy() for level in above],
         scene.pinned[hierarchy.kernels].cpu().numpy(),
         title=f"{scene.name}: {hierarchy.levels[0].count} simulated kernels (pinned grey)",
-        names=[f"level {level}: {hierarchy.levels[level].count} units" for level in range(1, count)],
+        names=[f"level {level}: {hierarchy.levels[level].count} units" for level in above],
         sides=((first, up), (second, up)),
         flip=upward.startswith("-"),
     )
@@ -152,5 +120,5 @@ def _draw(scene: GaussianScene, hierarchy: Hierarchy, arguments: argparse.Namesp
 
 def _away_from_pins(arguments: argparse.Namespace) -> str:
     if arguments.pin_below:
-        return arguments.pin_below.strip()[0]
+        return str(arguments.pin_below.strip()[0])
     return "-" + arguments.pin_above.strip()[0] if arguments.pin_above else "z"

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import gausim
+from gausim.cli import prepare_lpips
+from gausim.cli.arguments import command_parser
 
-HELP = "Make a data set of films and photos, stage by stage; fetch the LPIPS weights."
 # Modules of data_prep, with one line of help each.
 STAGES = {
     "ingest": "films of several cameras to synchronised frames",
@@ -29,18 +30,7 @@ STAGES = {
 
 
 def main(argv: Sequence[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        ConfigError: the stages are not part of this installation.
-        DataError: something cannot be fetched or read, or is not what was published.
-    """
+    """Runs the command; returns the exit status."""
     if argv and argv[0] in STAGES:
         root = str(stages_root())
         if root not in sys.path:
@@ -53,11 +43,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def stages_root() -> Path:
-    """The folder that holds the package ``data_prep``: the wheel's own copy, or the checkout.
-
-    Raises:
-        ConfigError: neither is there.
-    """
+    """The folder that holds the package ``data_prep``: the wheel's own copy, or the checkout."""
     package = Path(gausim.__file__).resolve().parent
     candidates = (package / "stages", package.parents[1])
     for candidate in candidates:
@@ -72,13 +58,9 @@ def stages_root() -> Path:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from gausim.cli import prepare_lpips as _prepare_lpips
-
-    parser = argparse.ArgumentParser(
-        prog="gausim prepare", description=HELP, epilog="`gausim prepare WHAT --help` explains each."
-    )
+    parser = command_parser("prepare", epilog="`gausim prepare WHAT --help` explains each.")
     parts = parser.add_subparsers(metavar="WHAT", required=True)
     for name, line in STAGES.items():
         parts.add_parser(name, help=line, add_help=False)
-    _prepare_lpips.add_to(parts)
+    prepare_lpips.add_to(parts)
     return parser

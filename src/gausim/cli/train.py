@@ -8,19 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from lightning.pytorch import Trainer
     from omegaconf import DictConfig
 
     from gausim.core import FittedMethod
     from gausim.data.datamodule import ReadyDataModule
     from gausim.runs.directory import RunDirectory
+    from gausim.training.callbacks.judge import EpochJudge
     from gausim.training.contracts import Transferable
     from gausim.training.module import GausSimModule
     from gausim.training.ranks.launch import Crew
-
-HELP = "Learn an object's dynamics from multi-view videos."
 
 USAGE = """usage: gausim train [KEY=VALUE ...] [-m] [--cfg job] [--info] [--resolve]
 
@@ -53,17 +50,7 @@ COMPARED = {
 
 
 def main(argv: Sequence[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: Hydra overrides and options.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        GausSimError: the configuration or the data are wrong, the directory cannot be written, training diverged.
-    """
+    """Runs the command; returns the exit status."""
     if any(a in ("-h", "--help") for a in argv):
         print(USAGE)
         return 0
@@ -82,21 +69,18 @@ def main(argv: Sequence[str]) -> int:
 def train(cfg: DictConfig) -> float | None:
     """Trains one run; returns its last loss above the floor as a fraction of the static prediction's.
 
-    In a sweep none of these stops the other jobs: it is told, and told again in the summary at the end.
+    In a sweep no error stops the other jobs: it is told, and told again in the summary at the end.
 
     Raises:
-        RunError: the run is finished already, was started with another configuration, has no whole checkpoint, or its
-            directory cannot be written.
-        BusyError: it is being trained by another process.
-        DivergenceError: a number is no longer finite.
+        GausSimError: the run is finished, of another configuration, damaged or another process's; training diverged.
     """
-    from gausim.cli.sweeps import grid as _sweep
-    from gausim.compose import config as _config
+    from gausim.cli.sweeps.jobs import do_job
+    from gausim.compose.config import in_sweep, run_dir
     from gausim.runs.directory import RunDirectory
 
-    run = RunDirectory(_config.run_dir())
-    if _config.in_sweep():
-        return _sweep.do_job(cfg, run, train_run)
+    run = RunDirectory(run_dir())
+    if in_sweep():
+        return do_job(cfg, run, train_run)
     with run.writing():
         return train_run(cfg, run)
 
@@ -122,11 +106,7 @@ def _plain(cfg: DictConfig) -> dict[str, Any]:
 
 
 def _evaluate(run: RunDirectory) -> None:
-    """`gausim evaluate RUN` in a process of its own, so that its times and memory are those of a prediction alone.
-
-    Raises:
-        RunError: it failed; the trained run is unharmed.
-    """
+    """`gausim evaluate RUN` in a process of its own, so that its times and memory are those of a prediction alone."""
     import os
     import subprocess
 
@@ -190,20 +170,19 @@ def _fit(
     crew: Crew,
 ) -> float | None:
     from gausim.cli.end import end
-    from gausim.compose import config as _config
-    from gausim.training.callbacks.convergence import Convergence
+    from gausim.compose.config import in_sweep
     from gausim.training.callbacks.judge import EpochJudge
     from gausim.training.fitted.fitting import StagedFit
 
     module, datamodule = parts
     plan = module.method.plan if isinstance(module.method, StagedFit) else None
-    trainer = make(cfg, run, crew, epochs=None if plan is None else plan.epochs)
+    trainer = _trainer(cfg, run, crew, epochs=None if plan is None else plan.epochs)
     faults: list[str] = []
     for logger in trainer.loggers:
         logger.log_hyperparams(_plain(cfg))
     if crew.is_first:
         _introduce(trainer, module, datamodule, run, resumed=resume is not None)
-        if cfg.doctor and not _config.in_sweep():
+        if cfg.doctor and not in_sweep():
             faults = _warn_of_data(datamodule)
     trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
     if plan is not None and not plan.order:  # nothing to learn: no epoch has saved it
@@ -211,19 +190,26 @@ def _fit(
     if trainer.interrupted:
         raise KeyboardInterrupt
     if crew.is_first:
-        # Counted by `processed`: of a run that is resumed after its last save, `current_epoch` lags behind.
-        epochs = cast(Any, trainer.fit_loop.epoch_progress.current).processed
+        facts = _facts(trainer, module) | ({"data_faults": faults} if faults else {})
         pruned = any(isinstance(callback, EpochJudge) and callback.stopped for callback in cast(Any, trainer).callbacks)
-        facts: dict[str, Any] = {"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary}
-        if plan is not None:
-            facts["notes"] = module.notes()
-        judged = [c.summary() for c in cast(Any, trainer).callbacks if isinstance(c, Convergence)]
-        facts |= {"learning": judged[0]} if judged and judged[0] else {}
-        facts |= {"data_faults": faults} if faults else {}
-        run.finish({**facts, **({"pruned": True} if pruned else {})})
+        run.finish(facts | ({"pruned": True} if pruned else {}))
         commands = [] if cfg.evaluate else [["evaluate", run.path], ["report", run.path]]
         end(_result(facts), "run", run.path, *commands)
     return module.summary.get("excess_static")
+
+
+def _facts(trainer: Trainer, module: GausSimModule) -> dict[str, Any]:
+    """What a finished run says of itself."""
+    from gausim.training.callbacks.convergence import Convergence
+    from gausim.training.fitted.fitting import StagedFit
+
+    # Counted by `processed`: of a run that is resumed after its last save, `current_epoch` lags behind.
+    epochs = cast(Any, trainer.fit_loop.epoch_progress.current).processed
+    facts: dict[str, Any] = {"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary}
+    if isinstance(module.method, StagedFit):
+        facts["notes"] = module.notes()
+    judged = [c.summary() for c in cast(Any, trainer).callbacks if isinstance(c, Convergence)]
+    return facts | ({"learning": judged[0]} if judged and judged[0] else {})
 
 
 def _result(facts: dict[str, Any]) -> list[str]:
@@ -246,11 +232,7 @@ def _result(facts: dict[str, Any]) -> list[str]:
 
 
 def _warn_of_data(datamodule: ReadyDataModule) -> list[str]:
-    """Prints faults and warnings that `gausim doctor` finds in the objects; notes are left to the command itself.
-
-    Returns:
-        The faults, a sentence each.
-    """
+    """Prints faults and warnings that `gausim doctor` finds in the objects; returns the faults, a sentence each."""
     from gausim.doctor.examine import examine
     from gausim.doctor.page import findings_text
 
@@ -264,12 +246,7 @@ def _warn_of_data(datamodule: ReadyDataModule) -> list[str]:
 
 
 def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None:
-    """Takes weights of another run over (a resumed run has its own in its checkpoint), and freezes them if asked to.
-
-    Raises:
-        ConfigError: no run is named, something is to be frozen that nothing was loaded into, or it has another shape.
-        RunError: that run is not there, or knows another scene.
-    """
+    """Takes weights of another run over (a resumed run has its own in its checkpoint), and freezes them if asked to."""
     from gausim.core import ConfigError
     from gausim.training.fitted.fitting import StagedFit
     from gausim.training.transfer import load_shared, load_simulator
@@ -311,29 +288,42 @@ def _take_over_fit(cfg: DictConfig, method: FittedMethod, *, resumed: bool) -> N
         method.take_over(source.method.fitted if isinstance(source.method, StagedFit) else source.simulator)
 
 
-def make(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | None = None) -> Trainer:
+def _trainer(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | None) -> Trainer:
     """The trainer of a configuration, with its callbacks and, on the first rank, loggers that write into the run.
 
-    Args:
-        cfg: the configuration.
-        run: where it trains.
-        crew: the ranks.
-        epochs: instead of ``trainer.max_epochs``.
+    A plan's epochs, if given, take the place of ``trainer.max_epochs``.
     """
-    from gausim.cli.sweeps.pruning import judges
     from gausim.compose.config import instantiate
     from gausim.training.trainer import make_trainer
 
-    callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node] + judges(cfg)
+    callbacks = [instantiate(node) for node in (cfg.callbacks or {}).values() if node] + _judges(cfg)
     wanted = (cfg.logger or {}).values() if crew.is_first else ()
     loggers = [instantiate(node, save_dir=str(run.path)) for node in wanted if node]
-    length: dict[str, Any] = {"max_epochs": cfg.trainer.max_epochs * run.allowances}
+    length: dict[str, Any] = {"max_epochs": cfg.trainer.max_epochs * run.allowances if epochs is None else epochs}
     if cfg.trainer.max_minutes is not None:
         length["max_minutes"] = cfg.trainer.max_minutes * run.allowances
-    if epochs is not None:
-        length["max_epochs"] = epochs
     settings = instantiate(cfg.trainer, **length)
     return make_trainer(settings, run_dir=run.path, callbacks=callbacks, loggers=loggers, crew=crew)
+
+
+def _judges(cfg: DictConfig) -> list[EpochJudge]:
+    """What may end the running job early: the pruner of its search, where there is one."""
+    from hydra.core.hydra_config import HydraConfig
+
+    from gausim.compose.config import in_sweep
+    from gausim.core import ConfigError
+
+    sweeper = HydraConfig.get().sweeper if in_sweep() else {}
+    if sweeper.get("pruner") is None or sweeper.get("trial") is None:
+        return []
+    if (devices := cfg.trainer.get("devices", 1)) != 1:
+        raise ConfigError(
+            f"hydra.sweeper.pruner: expected trainer.devices=1, got {devices}. Train without a pruner "
+            "(hydra.sweeper.pruner=null)."
+        )
+    from gausim.cli.sweeps.optuna import pruning_judge
+
+    return [pruning_judge()]
 
 
 def _introduce(
@@ -344,34 +334,32 @@ def _introduce(
     from gausim.training.fitted.fitting import StagedFit
 
     datamodule.setup("fit")
-    batches = len(datamodule.train_dataloader())
-    epochs = trainer.max_epochs or 0
-    device = trainer.strategy.root_device
+    count = torch.get_num_threads()
     ranks = f"{trainer.world_size} ranks, " if trainer.world_size > 1 else ""
-    threads = f"({ranks}{(count := torch.get_num_threads())} torch thread{'s' if count != 1 else ''})"
-    lines = [f"{'resuming' if resumed else 'training'} on {device} {threads}: {run.path}"]
+    threads = f"({ranks}{count} torch thread{'s' if count != 1 else ''})"
+    print(f"{'resuming' if resumed else 'training'} on {trainer.strategy.root_device} {threads}: {run.path}")
     for item, scene in zip(datamodule.objects, module.simulator.scenes, strict=True):
         cameras = item.sequences[0].cameras
-        lines.append(
+        print(
             f"  {item.name}: {scene.count} kernels ({int(scene.pinned.sum())} pinned), {len(item.sequences)} "
             f"sequences, {len(item.train_views)} views of {cameras.width}x{cameras.height}, {item.fps:g} fps"
         )
     sizes = {name: sum(p.numel() for p in own) for name, own in module.groups().items()}
-    lines.append("  parameters: " + (", ".join(f"{name} {count}" for name, count in sizes.items()) or "none"))
+    print("  parameters: " + (", ".join(f"{name} {count}" for name, count in sizes.items()) or "none"))
     if isinstance(module.method, StagedFit):
-        lines += [f"  {name}: {stage.iterations} iterations per sequence" for name, stage in module.method.plan.order]
-        lines += [f"  note: {note}" for note in module.method.fitted.notes()]
-        print("\n".join(lines), file=sys.stdout, flush=True)
-        return
-    kind = type(module.supervision).__name__
-    lines.append(f"  compared with {COMPARED.get(kind, kind)}")
-    frames = sum(datamodule.steps(epoch) * batches for epoch in range(epochs))
-    lines.append(
-        f"  at most {epochs} epochs of {batches} steps, {epochs * datamodule.repeats} shows of each sequence; "
-        f"T {datamodule.steps(0)} to {datamodule.curriculum.t_max}, {frames} predicted frames"
-    )
-    lines += _slow_beginnings(module, epochs * datamodule.repeats)
-    print("\n".join(lines), file=sys.stdout, flush=True)
+        lines = [f"{name}: {stage.iterations} iterations per sequence" for name, stage in module.method.plan.order]
+        lines += [f"note: {note}" for note in module.method.fitted.notes()]
+    else:
+        kind = type(module.supervision).__name__
+        batches, epochs = len(datamodule.train_dataloader()), trainer.max_epochs or 0
+        shows, frames = epochs * datamodule.repeats, sum(datamodule.steps(epoch) * batches for epoch in range(epochs))
+        lines = [
+            f"compared with {COMPARED.get(kind, kind)}",
+            f"at most {epochs} epochs of {batches} steps, {shows} shows of each sequence; "
+            f"T {datamodule.steps(0)} to {datamodule.curriculum.t_max}, {frames} predicted frames",
+            *_slow_beginnings(module, shows),
+        ]
+    print("".join(f"  {line}\n" for line in lines), end="", flush=True)
 
 
 def _slow_beginnings(module: GausSimModule, shows: int) -> list[str]:
@@ -381,7 +369,7 @@ def _slow_beginnings(module: GausSimModule, shows: int) -> list[str]:
     if reach >= FIRST_STEP:
         return []
     return [
-        f"  warning: in {shows} shows at optimizer.initial_lr={rate:g} an initial state moves by {reach:.2g} of the "
+        f"warning: in {shows} shows at optimizer.initial_lr={rate:g} an initial state moves by {reach:.2g} of the "
         f"diagonal at most; objects that are pushed move by up to {FIRST_STEP:g} in their first frame. Raise "
         f"optimizer.initial_lr to {rate * FIRST_STEP / max(reach, 1e-12):.2g}, or trainer.max_epochs."
     ]

@@ -6,21 +6,11 @@ import argparse
 import json
 from pathlib import Path
 
-HELP = "Check a data set and name every fault."
+from gausim.cli.arguments import command_parser
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        0 if all is well, 1 if there are faults.
-
-    Raises:
-        DataError: there is no data set at a path.
-    """
+    """Runs the command; returns 0 if all is well, 1 if there are faults."""
     arguments = _parser().parse_args(argv)
     from gausim.data.objects import find_objects
     from gausim.data.verify import verify
@@ -38,7 +28,7 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="gausim verify", description=f"{HELP} Exits with 1 if there are some.")
+    parser = command_parser("verify", " Exits with 1 if there are some.")
     parser.add_argument("root", metavar="ROOT", nargs="+", type=Path, help="object directories, or folders of them")
     parser.add_argument("--quick", action="store_true", help="headers and sizes only: no image is read or hashed")
     parser.add_argument("--json", action="store_true", help="print an object: {DIRECTORY: [[file, fault], ...]}")

@@ -9,29 +9,15 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gausim.cli.arguments import add_data_option, add_pin_options, command_parser, pinned_by
+
 if TYPE_CHECKING:
     from gausim.cli.view_subject import Playable
     from gausim.viewer.subject import Subject
 
-HELP = "Show a run or a scene in the browser and pull it about."
-_UP = ("x", "y", "z", "-x", "-y", "-z")
-
 
 def main(argv: list[str]) -> int:
-    """Runs the command until it is interrupted.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        ConfigError: viser is not installed, or options are unsafe or do not go together.
-        RunError: the run is missing or has no checkpoint.
-        DataError: an object or sequence that is not there.
-        SceneError: the scene is unusable, or nothing of it is pinned.
-    """
+    """Runs the command until it is interrupted; returns the exit status."""
     arguments = _parser().parse_args(argv)
     from gausim.core.errors import ConfigError
 
@@ -48,22 +34,18 @@ def main(argv: list[str]) -> int:
     if arguments.allow_remote:
         print("The connection is not encrypted: whoever can listen in on it reads the token.", file=sys.stderr)
     try:
-        while arguments.seconds is None or arguments.seconds > 0:
+        end = float("inf") if arguments.seconds is None else time.monotonic() + arguments.seconds
+        while time.monotonic() < end:
             time.sleep(1.0)
-            if arguments.seconds is not None:
-                arguments.seconds -= 1
     finally:
         viewer.stop()
     return 0
 
 
 def _parser() -> argparse.ArgumentParser:
-    from gausim.cli.inspect import add_pin_options
-    from gausim.compose.data_paths import add_data_option
-
-    parser = argparse.ArgumentParser(
-        prog="gausim view",
-        description=f"{HELP} A scene without a run is moved by the elastic template of the untrained default model.",
+    parser = command_parser(
+        "view",
+        " A scene without a run is moved by the elastic template of the untrained default model.",
         epilog="GAUSIM_VIEW_TOKEN in the environment sets the token (16 or more letters and digits) and has it asked "
         "for on 127.0.0.1 too.",
     )
@@ -74,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--beside", metavar="RUN", type=Path, help="another run of the same object, to which the same is done")
     add_data_option(parser)
     add("--gravity", type=float, metavar="G", help="what makes a weight of a mass [scene units / s^2] (default: 9.81)")
-    add("--up", choices=_UP, default="z", help="vertical axis of the scene (default: z)")
+    add("--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="z", help="vertical axis of the scene (default: z)")
     add("--sessions", metavar="DIR", type=Path, help="where sessions are saved; default RUN/sessions or ./sessions")
     add("--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen at (default: 127.0.0.1)")
     add("--port", type=int, default=8080, help="0 takes a free one (default: 8080)")
@@ -89,27 +71,28 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _subject(arguments: argparse.Namespace) -> Subject:
-    from gausim.cli.view_subject import subject_of
+    from gausim.cli.view_subject import playable_scene, subject_of
     from gausim.core.errors import ConfigError
+    from gausim.io.ply import load_scene
 
-    beside = None
-    if arguments.what.is_dir():
-        made = _of_run(arguments.what, arguments)
-        if arguments.beside is not None:
-            beside = _of_run(arguments.beside, arguments, name=made.interaction.scene.name)
+    is_run, beside = arguments.what.is_dir(), None
+    if arguments.beside is not None and not is_run:
+        raise ConfigError("--beside: expected a RUN before it, got a scene. Give two runs of one object.")
+    if is_run:
+        made = _of_run(arguments.what, arguments, arguments.object)
     else:
-        if arguments.beside is not None:
-            raise ConfigError("--beside: expected a RUN before it, got a scene. Give two runs of one object.")
-        made = _of_scene(arguments)
-    default = arguments.what / "sessions" if arguments.what.is_dir() else Path("sessions")
+        bare = pinned_by(load_scene(arguments.what), arguments)
+        made = playable_scene(bare, fps=arguments.fps, seed=arguments.seed, gravity=arguments.gravity)
+    if arguments.beside is not None:
+        beside = _of_run(arguments.beside, arguments, made.interaction.scene.name)
+    sessions = arguments.sessions or (arguments.what / "sessions" if is_run else Path("sessions"))
     scene = made.interaction.scene
     method = made.run.module.method_name if made.run is not None else "untrained: elastic template only"
     title = f"{scene.name}: {scene.count} kernels, {method}"
-    sessions = arguments.sessions or default
     return subject_of(made, title=title, beside=beside, up=arguments.up, sessions=sessions)
 
 
-def _of_run(path: Path, arguments: argparse.Namespace, *, name: str | None = None) -> Playable:
+def _of_run(path: Path, arguments: argparse.Namespace, name: str | None) -> Playable:
     from gausim.cli.view_subject import playable_run
     from gausim.compose.build import load_run
     from gausim.compose.data_paths import data_option
@@ -117,15 +100,4 @@ def _of_run(path: Path, arguments: argparse.Namespace, *, name: str | None = Non
 
     run = load_run(path, data=data_option(arguments.data))
     state_of(run)
-    return playable_run(
-        run, name=name or arguments.object, sequence=arguments.sequence, gravity=arguments.gravity
-    )  # fmt: skip
-
-
-def _of_scene(arguments: argparse.Namespace) -> Playable:
-    from gausim.cli.inspect import pinned_by
-    from gausim.cli.view_subject import playable_scene
-    from gausim.io.ply import load_scene
-
-    scene = pinned_by(load_scene(arguments.what), arguments.pin_below, arguments.pin_above)
-    return playable_scene(scene, fps=arguments.fps, seed=arguments.seed, gravity=arguments.gravity)
+    return playable_run(run, name=name, sequence=arguments.sequence, gravity=arguments.gravity)

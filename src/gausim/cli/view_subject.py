@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gausim.compose.live import REST, energy_ceiling, open_interaction
 from gausim.core import ConfigError, GaussianScene, SimState, Trajectory
@@ -14,9 +15,8 @@ from gausim.models.rollout.dynamics import SceneDynamics
 
 if TYPE_CHECKING:
     from gausim.compose.build import LoadedRun
-    from gausim.compose.predict import RunObject, TrainedPrediction
+    from gausim.compose.predict import RunObject
     from gausim.interaction.interaction import Interaction
-    from gausim.viewer.companion import Companion
     from gausim.viewer.shown import Take
     from gausim.viewer.subject import Subject
 
@@ -30,15 +30,22 @@ class Playable:
 
     Attributes:
         interaction: what is pushed.
-        predict: what it foresees of the recorded sequences; None for a bare scene.
         item: the run's object; None for a bare scene.
         run: the run; None for a bare scene.
     """
 
     interaction: Interaction
-    predict: TrainedPrediction | None = None
     item: RunObject | None = None
     run: LoadedRun | None = None
+
+    def predictions(self) -> dict[str, Callable[[], Trajectory]]:
+        """What it foresees of the recorded sequences, by their names, each made when it is asked for."""
+        from gausim.compose.predict import TrainedPrediction
+
+        if self.item is None or self.run is None:
+            return {}
+        predict = TrainedPrediction(self.run, self.item)
+        return {record.name: partial(predict, record) for record in self.item.data.sequences}
 
 
 def playable_run(
@@ -49,24 +56,11 @@ def playable_run(
     gravity: float | None = None,
     keep: int | None = 0,
 ) -> Playable:
-    """The object of a run.
-
-    Args:
-        run: the loaded run.
-        name: of the object; the first one when None.
-        sequence: whose beginning is the initial state, or ``rest``.
-        gravity: acceleration that makes a weight of a mass [scene units / s^2].
-        keep: so many of the latest frames are kept; None keeps all.
-
-    Raises:
-        DataError: there is no such object or sequence.
-        ConfigError: the model cannot be simulated on its own.
-    """
-    from gausim.compose.predict import TrainedPrediction, run_objects
+    """An object of a run, by default its first; the options are those of :func:`open_interaction`."""
+    from gausim.compose.predict import run_objects
 
     item = run_objects(run, [name] if name is not None else None)[0]
-    interaction = open_interaction(run, name=name, sequence=sequence, gravity=gravity, keep=keep)
-    return Playable(interaction, TrainedPrediction(run, item), item, run)
+    return Playable(open_interaction(run, name=name, sequence=sequence, gravity=gravity, keep=keep), item, run)
 
 
 def playable_scene(
@@ -100,56 +94,29 @@ def playable_scene(
     return Playable(interaction)
 
 
-def takes_of(made: Playable, beside: Playable | None, frames: int | None) -> list[Take]:
-    """The recorded sequences as the method foresees them, each made when it is first shown."""
+def takes_of(made: Playable, beside: Playable | None) -> list[Take]:
+    """The recorded sequences as the method foresees them, and as the one beside it does."""
     from gausim.viewer.shown import Take
 
-    if made.predict is None or made.item is None:
-        return []
-    other: dict[str, Any] = {}
-    if beside is not None and beside.item is not None:
-        other = {record.name: record for record in beside.item.data.sequences}
-    takes = []
-    for record in made.item.data.sequences:
-        second = None
-        if beside is not None and beside.predict is not None and record.name in other:
-            second = partial(_predicted, beside.predict, other[record.name], frames)
-        first = partial(_predicted, made.predict, record, frames)
-        takes.append(Take(f"Predicted: {record.name}", first, record.name, second))
-    return takes
-
-
-def _predicted(predict: TrainedPrediction, record: Any, frames: int | None) -> Trajectory:
-    from gausim.compose.predict import head
-
-    return head(predict.full(record), frames or record.count)
-
-
-def companion_of(made: Playable, name: str) -> Companion:
-    """A method to stand beside another."""
-    from gausim.viewer.companion import Companion
-
-    return Companion(name, made.interaction)
+    other = {} if beside is None else beside.predictions()
+    return [Take(f"Predicted: {name}", load, name, other.get(name)) for name, load in made.predictions().items()]
 
 
 def subject_of(made: Playable, *, title: str, beside: Playable | None, up: str, sessions: Path) -> Subject:
     """Everything the viewer shows."""
+    from gausim.viewer.companion import Companion
     from gausim.viewer.films import Films
     from gausim.viewer.subject import Subject
 
-    films = cameras = None
+    films = cameras = companion = None
     if made.run is not None and made.item is not None:
         records = {record.name: record for record in made.item.data.sequences}
         films = Films(records, made.interaction.scene, made.run.renderer)
         cameras = next(iter(records.values())).cameras
+    if beside is not None and beside.run is not None:
+        name = f"{beside.run.module.method_name} ({Path(beside.run.run_dir).name})"
+        companion = Companion(name, beside.interaction)
     return Subject(
-        title=title, interaction=made.interaction, takes=takes_of(made, beside, None),
-        companion=None if beside is None else companion_of(beside, _name_of(beside)), films=films, cameras=cameras,
-        up=up, sessions=sessions,
+        title=title, interaction=made.interaction, takes=takes_of(made, beside), companion=companion, films=films,
+        cameras=cameras, up=up, sessions=sessions,
     )  # fmt: skip
-
-
-def _name_of(made: Playable) -> str:
-    if made.run is None:
-        return "untrained"
-    return f"{made.run.module.method_name} ({Path(made.run.run_dir).name})"

@@ -49,9 +49,7 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
     """Builds the module and the data of a training configuration.
 
     Raises:
-        ConfigError: a node is wrong, or the model cannot be trained by `gausim train`.
-        DataError: the data set is missing or broken.
-        SceneError: a rest scene is missing or broken.
+        GausSimError: a node is wrong, or the model cannot be trained; the data or a rest scene are missing or broken.
     """
     config = cfg if isinstance(cfg, DictConfig) else OmegaConf.create(dict(cfg))
     if "method" in config.model:
@@ -82,9 +80,8 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
 
 
 def _supervision(config: DictConfig, sources: Sources) -> Supervision | None:
-    if not config.get("supervision"):
-        return None
-    made: Supervision | None = instantiate(config.supervision)(sources)
+    node = config.get("supervision")
+    made: Supervision | None = instantiate(node)(sources) if node else None
     return made
 
 

@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -109,16 +110,15 @@ def _check_more(config: DictConfig, overrides: Sequence[str]) -> None:
             raise ConfigError(f"{key[2:]}: unknown key. This configuration builds nothing that it would be set of.")
 
 
+@dataclass
 class Job:
     """What Hydra calls for every job. Of this module, so that a process that is sent one has our resolvers too."""
 
-    def __init__(self, task: Callable[[DictConfig], float | None]) -> None:
-        """Keeps the function that does the work."""
-        self._task = task
+    task: Callable[[DictConfig], float | None]
 
     def __call__(self, config: DictConfig) -> float | None:
-        """Does it."""
-        return self._task(config)
+        """Does the work."""
+        return self.task(config)
 
 
 def run_hydra(config_name: str, task: Callable[[DictConfig], float | None], argv: Sequence[str]) -> int:
@@ -134,11 +134,9 @@ def run_hydra(config_name: str, task: Callable[[DictConfig], float | None], argv
 
     Raises:
         ConfigError: an unknown key, group or option, or a value missing.
-        GausSimError: whatever the task raises on purpose.
     """
-    runner = hydra.main(version_base=HYDRA_VERSION_BASE, config_path=str(conf_dir()), config_name=config_name)(
-        Job(task)
-    )
+    decorate = hydra.main(version_base=HYDRA_VERSION_BASE, config_path=str(conf_dir()), config_name=config_name)
+    runner = decorate(Job(task))
     saved_argv, saved_flag = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
     # Hydra reads sys.argv; with its full errors on it raises them, which are then told in our way, instead of exiting.
     sys.argv = [saved_argv[0], *spelled(argv)]
@@ -162,7 +160,7 @@ def run_dir() -> Path:
 
 def in_sweep() -> bool:
     """Returns whether the running job is one of a sweep (`-m`)."""
-    return HydraConfig.get().mode == RunMode.MULTIRUN
+    return bool(HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN)
 
 
 @contextmanager

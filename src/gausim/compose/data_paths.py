@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,17 +15,8 @@ _KEYS = ("root", "scene", "masks")
 _FILES = ("scene", "masks")
 
 
-def add_data_option(parser: argparse.ArgumentParser) -> None:
-    """Adds ``--data``, which :func:`data_option` reads."""
-    parser.add_argument(
-        "--data", action="append", default=[], metavar="DIR|scene=FILE",
-        help="where the run's data set lies now, and scene=FILE or masks=FILE where its configuration names such; of "
-        "several sets give each, in the configuration's order (default: where it was trained)",
-    )  # fmt: skip
-
-
 def data_option(words: Sequence[str]) -> dict[str, Any]:
-    """What ``--data`` says, as keys of the data configuration.
+    """What the words of ``--data`` say, as keys of the data configuration.
 
     Raises:
         ConfigError: a key is given twice.
@@ -67,7 +57,7 @@ def located(run_dir: Path, data: Mapping[str, Any], given: Mapping[str, Any]) ->
             for i, entry in enumerate(merged["root"])
         ]
     merged = _placed(run_dir, merged, "data")
-    for root in merged["root"] if isinstance(merged["root"], list) else [merged["root"]]:
+    for root in listed(merged["root"]):
         path = root.get("root") if isinstance(root, Mapping) else root
         if path is not None and not Path(path).is_dir():
             raise DataError(_missing(run_dir, "data.root", path, "--data DIR", "a directory"))
@@ -81,7 +71,7 @@ def outside_files(run_dir: Path, data: Mapping[str, Any]) -> list[Path]:
         DataError: one is not there.
     """
     data = located(run_dir, data, {})
-    entries = [entry for entry in _listed(data["root"]) if isinstance(entry, Mapping)]
+    entries = [entry for entry in listed(data["root"]) if isinstance(entry, Mapping)]
     found = []
     for entry in [data, *entries]:
         scene, masks = entry.get("scene"), entry.get("masks")
@@ -91,7 +81,8 @@ def outside_files(run_dir: Path, data: Mapping[str, Any]) -> list[Path]:
     return found
 
 
-def _listed(root: Any) -> list[Any]:
+def listed(root: Any) -> list[Any]:
+    """The entries of ``data.root``, which may be one alone."""
     return list(root) if isinstance(root, list) else [root]
 
 
@@ -99,7 +90,7 @@ def _roots(own: Any, given: Any) -> Any:
     """The given directories; of as many entries as the configuration has, each keeps what else it says."""
     if given is None:
         return own
-    entries, replaced = _listed(own), _listed(given)
+    entries, replaced = listed(own), listed(given)
     if len(entries) != len(replaced) or not any(isinstance(entry, Mapping) for entry in entries):
         return given
     return [

@@ -6,7 +6,6 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import yaml
@@ -54,20 +53,16 @@ class Place:
 def choices() -> dict[str, list[str]]:
     """The groups of conf/ and the names of their files, e.g. `{"model": ["gausim", ...], "hydra/sweeper": [...]}`."""
     found: dict[str, list[str]] = {}
-    for path in _files():
+    for path in sorted(conf_dir().rglob("*.yaml")):
         if path.parent != conf_dir() and path.parent.name != BASE:
             found.setdefault(path.parent.relative_to(conf_dir()).as_posix(), []).append(path.stem)
     return found
 
 
 def read_places() -> Place:
-    """The root of all places that conf/ knows.
-
-    Raises:
-        ConfigError: there is no conf/.
-    """
+    """The root of all places that conf/ knows."""
     root = Place()
-    for path in _files():
+    for path in sorted(conf_dir().rglob("*.yaml")):
         text = path.read_text()
         folder = path.parent.relative_to(conf_dir()).parts
         is_global = not folder or GLOBAL_PACKAGE in text.splitlines()
@@ -104,10 +99,6 @@ def _leaves(node: Any, key: str) -> Iterator[tuple[str, Any]]:
         return
     for name, child in node.items():
         yield from _leaves(child, f"{key}.{name}" if key else name)
-
-
-def _files() -> Iterator[Path]:
-    yield from sorted(conf_dir().rglob("*.yaml"))
 
 
 def _read(node: yaml.MappingNode, place: Place, lines: list[str]) -> None:

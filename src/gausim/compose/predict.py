@@ -1,9 +1,8 @@
-"""What `evaluate` and `simulate` share: predictions of a trained run, its facts, choices of objects and views."""
+"""Predictions of a trained run, its facts, and choices of its objects and sequences."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -53,6 +52,18 @@ def run_objects(run: LoadedRun, names: list[str] | None = None) -> list[RunObjec
     return [item for item in found if names is None or item.data.name in names]
 
 
+def sequence_of(item: RunObject, name: str) -> SequenceRecord:
+    """A sequence of an object by its name.
+
+    Raises:
+        DataError: there is none.
+    """
+    records = {record.name: record for record in item.data.sequences}
+    if name not in records:
+        raise DataError(f"{item.data.root}: has no sequence '{name}'; it has {list(records)}.")
+    return records[name]
+
+
 def scene_of(run: LoadedRun, item: RunObject) -> GaussianScene:
     """The rest scene that the run was trained on."""
     return run.module.simulator.scenes[item.scene_id]
@@ -69,12 +80,8 @@ def state_of(run: LoadedRun) -> dict[str, Any]:
     directory = RunDirectory(run.run_dir)
     if not directory.is_finished:
         print(f"warning: {run.run_dir} is not finished; its latest checkpoint is used.", file=sys.stderr)
-    checkpoint = read_checkpoint(directory.checkpoint)
-    return {
-        "finished": directory.is_finished,
-        "epoch": checkpoint.get("epoch"),
-        "updates": checkpoint.get("global_step"),
-    }
+    known = read_checkpoint(directory.checkpoint)
+    return {"finished": directory.is_finished, "epoch": known.get("epoch"), "updates": known.get("global_step")}
 
 
 class TrainedPrediction:
@@ -88,8 +95,7 @@ class TrainedPrediction:
 
     def __init__(self, run: LoadedRun, item: RunObject, *, frames: int = 0) -> None:
         self._run, self._item, self._frames = run, item, frames
-        names = [record.name for record in item.data.sequences]
-        self._ids = {name: item.first_sequence + i for i, name in enumerate(names)}
+        self._ids = {record.name: item.first_sequence + i for i, record in enumerate(item.data.sequences)}
         self._known: dict[str, Trajectory] = {}
 
     @property
@@ -125,16 +131,19 @@ class TrainedPrediction:
         note = f"Largest eigenvalue of the step, linearised at rest: {largest:.4f}; small motions grow above 1."
         return {**said, "largest_eigenvalue": largest, "notes": [*said["notes"], note]}
 
-    def full(self, record: SequenceRecord) -> Trajectory:
-        """All predicted frames of a sequence, the recorded ones and those asked for beyond."""
-        if record.name not in self._known:
-            steps = max(record.count, self._frames) - 1
-            self._known[record.name] = self._run.module.predict(self._ids[record.name], steps)
-        return self._known[record.name]
-
-    def __call__(self, record: SequenceRecord) -> Trajectory:
-        """Exactly the recorded frames of a sequence."""
-        return head(self.full(record), record.count)
+    def __call__(self, record: SequenceRecord, frames: int | None = None) -> Trajectory:
+        """The first frames of a sequence, by default exactly the recorded ones."""
+        count = frames or record.count
+        known = self._known.get(record.name)
+        if known is None or known.frames < count:
+            steps = max(record.count, self._frames, count) - 1
+            known = self._known[record.name] = self._run.module.predict(self._ids[record.name], steps)
+        return replace(
+            known,
+            positions=known.positions[:count],
+            deformation_gradients=known.deformation_gradients[:count],
+            rotations=known.rotations[:count],
+        )
 
 
 def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
@@ -158,28 +167,3 @@ def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
         "free": endure(dynamics, SimState(scene.means, previous), scene.means, scene.diagonal, frames),
         "pushed": endure(dynamics, still, scene.means, scene.diagonal, frames, pushes=pushes),
     }
-
-
-def head(trajectory: Trajectory, frames: int) -> Trajectory:
-    """The first frames of a trajectory."""
-    return replace(
-        trajectory,
-        positions=trajectory.positions[:frames],
-        deformation_gradients=trajectory.deformation_gradients[:frames],
-        rotations=trajectory.rotations[:frames],
-    )
-
-
-def progress(total: int, title: str) -> tuple[Any, Callable[[str], None]]:
-    """A progress bar (a context manager, on the standard error) and what advances it by one named item."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = Progress(*columns, console=Console(stderr=True), transient=True)
-    task = bar.add_task(title, total=total)
-
-    def advance(name: str) -> None:
-        bar.update(task, advance=1, description=f"{title}: {name}")
-
-    return bar, advance

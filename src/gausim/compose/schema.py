@@ -39,13 +39,7 @@ def training_schema() -> Schema:
     """The schema of every file that sets training keys: an experiment, or the saved `config.yaml` of a run.
 
     Every key is optional, as an experiment sets only what it changes. Unknown keys are errors wherever conf/ or a
-    signature says which are known.
-
-    Returns:
-        A JSON schema (draft 7).
-
-    Raises:
-        ConfigError: there is no conf/.
+    signature says which are known. It is of draft 7.
     """
     builder = _Builder()
     root, notes = read_places(), documented(RootConfig)
@@ -157,13 +151,11 @@ class _Builder:
 
 def _closed(properties: Schema, *, closed: bool = True) -> Schema:
     found: Schema = {"type": ["object", "null"], "properties": properties}
-    return {**found, "additionalProperties": False} if closed else found
+    return found | ({"additionalProperties": False} if closed else {})
 
 
 def _described(schema: Schema, text: str) -> Schema:
-    if not text or "description" in schema:
-        return schema
-    return {"description": text, **schema}
+    return {**({"description": text} if text else {}), **schema}
 
 
 def _or_interpolation(schema: Schema) -> Schema:

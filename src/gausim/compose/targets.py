@@ -55,9 +55,6 @@ def check_targets(node: DictConfig | ListConfig) -> None:
     A name is judged by where its object really lives: `torch.nn.modules.module.torch.load` begins well, but is not of
     torch.nn. Methods are refused: a configuration names classes and functions.
 
-    Args:
-        node: the configuration to look through.
-
     Raises:
         ConfigError: naming the key and the target.
     """
@@ -66,12 +63,7 @@ def check_targets(node: DictConfig | ListConfig) -> None:
 
 
 def target_faults(config: Any, root: str = "") -> Iterator[str]:
-    """Every `_target_` of a configuration that may not be built or does not exist, in words.
-
-    Args:
-        config: plain containers, interpolations resolved.
-        root: key of the node that they are.
-    """
+    """Every `_target_` of plain containers below the key ``root`` that may not be built or does not exist, in words."""
     for key, target in _targets(config, root):
         try:
             allowed = target in ALLOWED_TARGETS or _is_allowed(target, ALLOWED_PACKAGES, REFUSED_MODULES)
@@ -91,14 +83,10 @@ def check_hydra(node: DictConfig) -> None:
     Its launcher, sweeper and callbacks must be of Hydra, its plugins or gausim, its logging of the module logging, and
     it may not set environment variables, which choose the programs that are started later.
 
-    Args:
-        node: the node `hydra` of a composed configuration.
-
     Raises:
         ConfigError: naming the key and its value.
     """
-    content = OmegaConf.to_container(node, resolve=False)
-    assert isinstance(content, dict)
+    content: Any = OmegaConf.to_container(node, resolve=False)
     for key, target in _targets(content, "hydra"):
         if not _is_allowed(target, HYDRA_PACKAGES, REFUSED_MODULES):
             raise ConfigError(f"{key}._target_: expected something from {', '.join(HYDRA_PACKAGES)}, got {target!r}.")
@@ -108,38 +96,28 @@ def check_hydra(node: DictConfig) -> None:
             "shell instead."
         )
     for name in ("hydra_logging", "job_logging"):
-        for key, text in _leaves(content[name], f"hydra.{name}"):
-            _check_logging(key, text)
+        for key, text in _nodes(content[name], f"hydra.{name}"):
+            # No factories, no classes outside of logging, and no object but the standard streams.
+            names_code = key.endswith((".()", ".class")) and not _LOGGING_CLASS.fullmatch(str(text))
+            protocol = isinstance(text, str) and text.startswith("ext://") and text not in _STREAMS
+            if names_code or protocol:
+                raise ConfigError(f"{key}: expected a class of logging, or {' or '.join(_STREAMS)}, got {text!r}.")
 
 
-def _check_logging(key: str, text: Any) -> None:
-    """Refuses factories, classes outside of logging and any object but the standard streams."""
-    names_code = key.endswith((".()", ".class")) and not _LOGGING_CLASS.fullmatch(str(text))
-    protocol = isinstance(text, str) and text.startswith("ext://") and text not in _STREAMS
-    if names_code or protocol:
-        raise ConfigError(f"{key}: expected a class of logging, or {' or '.join(_STREAMS)}, got {text!r}.")
+def _nodes(value: Any, key: str) -> Iterator[tuple[str, Any]]:
+    """A value and all below it, by their keys."""
+    yield key, value
+    if isinstance(value, dict):
+        for name, child in value.items():
+            yield from _nodes(child, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, list):
+        for index, child in enumerate(value):
+            yield from _nodes(child, f"{key}[{index}]")
 
 
 def _targets(value: Any, key: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, dict):
-        if "_target_" in value:
-            yield key or "configuration", value["_target_"]
-        for name, child in value.items():
-            yield from _targets(child, f"{key}.{name}" if key else str(name))
-    elif isinstance(value, list):
-        for index, child in enumerate(value):
-            yield from _targets(child, f"{key}[{index}]")
-
-
-def _leaves(value: Any, key: str) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, dict):
-        for name, child in value.items():
-            yield from _leaves(child, f"{key}.{name}")
-    elif isinstance(value, list):
-        for index, child in enumerate(value):
-            yield from _leaves(child, f"{key}[{index}]")
-    else:
-        yield key, value
+    nodes = _nodes(value, key)
+    return ((where or "configuration", n["_target_"]) for where, n in nodes if isinstance(n, dict) and "_target_" in n)
 
 
 def _within(name: str, packages: Sequence[str]) -> bool:

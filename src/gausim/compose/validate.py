@@ -86,11 +86,7 @@ def _search_path(arguments: Sequence[str]) -> list[str]:
 
 
 def _override(argument: str) -> str:
-    """What an argument is on the command line of `gausim train`; nothing, if it is conf/train.yaml itself.
-
-    Raises:
-        ConfigError: it is neither an override, an experiment nor a file.
-    """
+    """What an argument is on the command line of `gausim train`; nothing, if it is conf/train.yaml itself."""
     path, experiments = Path(argument), choices()["experiment"]
     if path.is_file() and (group := _group(path)) is not None:
         return f"{group}={path.stem}" if group else ""

@@ -35,11 +35,7 @@ class AtomicCheckpointIO(CheckpointIO):
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Writes a checkpoint.
-
-        Raises:
-            RunError: the disk refuses, or what was written cannot be read back; the previous file is untouched.
-        """
+        """Writes a checkpoint; a RunError leaves the previous file untouched."""
         target, buffer = Path(path), io.BytesIO()
         try:
             expected = digest(checkpoint)
@@ -164,11 +160,7 @@ def fingerprints(scenes: Sequence[GaussianScene]) -> list[dict[str, Any]]:
 
 
 def check_scenes(checkpoint: dict[str, Any], scenes: Sequence[GaussianScene], source: str) -> None:
-    """Refuses a checkpoint that was trained on other scenes.
-
-    Raises:
-        RunError: naming the scenes of both.
-    """
+    """Refuses a checkpoint that was trained on other scenes, naming those of both."""
     trained, given = checkpoint["gausim"]["scenes"], fingerprints(scenes)
     if trained != given:
         raise RunError(
@@ -179,9 +171,8 @@ def check_scenes(checkpoint: dict[str, Any], scenes: Sequence[GaussianScene], so
 
 def tell(prints: Sequence[dict[str, Any]]) -> str:
     """Fingerprints in words."""
-    return "; ".join(
-        f"'{p['name']}' ({p['kernels']} kernels, {p['pinned']} pinned, means {p['means']})" for p in prints
-    )  # fmt: skip
+    told = (f"'{p['name']}' ({p['kernels']} kernels, {p['pinned']} pinned, means {p['means']})" for p in prints)
+    return "; ".join(told)
 
 
 class WeightAverage:
@@ -222,11 +213,7 @@ def averaged_weights(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def load_weights(module: nn.Module, checkpoint: dict[str, Any]) -> None:
-    """Loads the weights of a checkpoint into a module, the averaged ones where there are any.
-
-    Raises:
-        RunError: the checkpoint has other parameters than the module.
-    """
+    """Loads the weights of a checkpoint into a module of the same parameters, the averaged ones where there are any."""
     try:
         module.load_state_dict(averaged_weights(checkpoint))
     except RuntimeError as error:

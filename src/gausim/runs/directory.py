@@ -22,17 +22,9 @@ from gausim.io.files import remove_leftovers, write_durably
 from gausim.runs.checkpoint import BEFORE_THE_END, PREVIOUS_CHECKPOINT, check_resumable
 from gausim.runs.defaults import with_defaults
 from gausim.runs.files import sole_writer, unwritable
-from gausim.runs.names import (
-    CONFIG,
-    EPOCHS,
-    EVALUATION,
-    FAILED,
-    FINISHED,
-    LAST_CHECKPOINT,
-    MLFLOW_ID,
-    MOTION,
-    WANDB_ID,
-)
+from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT, MOTION
+
+from gausim.runs.names import MLFLOW_ID, WANDB_ID  # isort: skip
 from gausim.runs.renamed import with_present_names
 
 LOCK, EVENTS = ".lock", "events.jsonl"
@@ -55,11 +47,7 @@ OWN_FOLDERS = ("panels", "snapshots", "tensorboard", "csv", "wandb")
 
 
 class RunDirectory:
-    """A directory that holds exactly one training run.
-
-    Attributes:
-        path: the directory.
-    """
+    """A directory that holds exactly one training run."""
 
     def __init__(self, path: Path | str) -> None:
         """Names the directory; :meth:`prepare` makes it."""
@@ -137,12 +125,7 @@ class RunDirectory:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """The block that trains: no other process may, and what the disk refuses becomes a RunError.
-
-        Raises:
-            BusyError: another process trains here.
-            RunError: the directory cannot be written.
-        """
+        """The block that trains: to others it is a BusyError, and what the disk refuses becomes a RunError."""
         try:
             if getattr(rank_zero_only, "rank", 0):  # the other ranks of a run belong to its first
                 yield
@@ -220,9 +203,8 @@ class RunDirectory:
 
     def record(self, event: str) -> None:
         """Adds a line to the run's history: what happened, when, and in which process."""
-        line = {"time": _now(), "event": event, "host": platform.node(), "process": os.getpid()}
         with (self.path / EVENTS).open("a") as file:
-            file.write(json.dumps(line) + "\n")
+            file.write(json.dumps({"time": _now(), "event": event, **_who()}) + "\n")
 
     @contextmanager
     def noting_failure(self) -> Iterator[None]:
@@ -241,16 +223,14 @@ class RunDirectory:
     def _note(self, error: Exception) -> None:
         # An error meant for people explains itself; of any other the way to it is wanted. The last line says which.
         trace = "" if isinstance(error, GausSimError) else "".join(traceback.format_exception(error)) + "\n"
-        head = f"time: {_now()}\nhost: {platform.node()}\nprocess: {os.getpid()}\n\n"
-        write_durably(self.path / FAILED, f"{head}{trace}{one_line(error)}\n".encode())
+        head = "".join(f"{key}: {value}\n" for key, value in {"time": _now(), **_who()}.items())
+        write_durably(self.path / FAILED, f"{head}\n{trace}{one_line(error)}\n".encode())
         self.record("failed")
 
     def _whole_checkpoint(self) -> Path | None:
         """The last checkpoint, or the one before it where the last is damaged (which is then set aside)."""
         problems: list[str] = []
-        for path in (self.checkpoint, self.path / PREVIOUS_CHECKPOINT):
-            if not path.is_file():
-                continue
+        for path in filter(Path.is_file, (self.checkpoint, self.path / PREVIOUS_CHECKPOINT)):
             try:
                 check_resumable(path)
             except RunError as error:
@@ -296,14 +276,22 @@ def one_line(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
+def _who() -> dict[str, Any]:
+    return {"host": platform.node(), "process": os.getpid()}
+
+
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def changed_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """Dotted keys whose values differ between two configurations, those aside that a resumed run may change."""
-    different = differing_keys(old, new)
-    return [k for k in different if not any(k == free or k.startswith(f"{free}.") for free in FREE_KEYS)]
+    return [key for key in differing_keys(old, new) if not is_free(key)]
+
+
+def is_free(key: str) -> bool:
+    """Whether a dotted key may change when a run is resumed."""
+    return any(key == free or key.startswith(f"{free}.") for free in FREE_KEYS)
 
 
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:

@@ -96,7 +96,7 @@ GROUPS: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
     },
     "gausim.baselines.material_point.physgaussian.PhysGaussian": {"material": _MATERIAL, "discretisation": _GRID},
 }
-# Settings that no longer exist and had no effect on results.
+# What weights of the predictor were called within the model.
 WEIGHTS = ("network.", "node_normaliser.", "edge_normaliser.")
 
 

@@ -8,19 +8,24 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import yaml
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext
 from hydra.utils import get_object
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
-from gausim.cli.sweeps.grid import BUSY, FAILED_BEFORE, OBJECTIVE, PRUNED, JobResult, Sweep, conclude
+from gausim.cli.sweeps.jobs import BUSY, FAILED_BEFORE, OBJECTIVE, PRUNED, JobResult, conclude, launching, result_of
 from gausim.compose.config import check_targets, instantiate
+from gausim.compose.places import spelled
 from gausim.core.errors import ConfigError
 from gausim.io.files import write_durably
-from gausim.runs.directory import FREE_KEYS, RunDirectory
+from gausim.runs.directory import RunDirectory, is_free
 from gausim.runs.files import sole_writer
 from gausim.training.callbacks.judge import EpochJudge
 
@@ -37,24 +42,11 @@ RETRY_OF = "retry_of"
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """The node `hydra.sweeper` of a search.
-
-    Attributes:
-        n_trials: trials in all, those of earlier starts included and repeated ones counted once.
-        n_jobs: trials that are chosen and given to the launcher at a time.
-        direction: `minimize` or `maximize`.
-        params: what is searched, key to Hydra's notation of a choice, range or interval.
-        study_name: of the study in the storage.
-        storage: Optuna's address of a data base.
-        seed: of the sampler.
-        sampler: node with the `_target_` of one of `optuna.samplers`.
-        pruner: node with the `_target_` of one of `optuna.pruners`; None lets every trial come to its end.
-        trial: number of the trial, of a job.
-    """
+    """The node `hydra.sweeper` of a search; conf/hydra/sweeper/optuna.yaml explains its keys."""
 
     n_trials: int
     n_jobs: int
-    direction: str
+    direction: Literal["minimize", "maximize"]
     params: Mapping[str, str] | None
     study_name: str
     storage: str
@@ -64,7 +56,6 @@ class SearchSettings:
     trial: int | None
 
     def __post_init__(self) -> None:
-        """Checks the numbers."""
         if self.n_trials < 1 or self.n_jobs < 1 or self.direction not in ("minimize", "maximize"):
             raise ConfigError(
                 "hydra.sweeper: expected n_trials >= 1, n_jobs >= 1 and direction minimize or maximize, got "
@@ -75,9 +66,11 @@ class SearchSettings:
 class Search:
     """One study: its trials and how they are trained."""
 
-    def __init__(self, sweep: Sweep, settings: SearchSettings) -> None:
-        """Keeps both; :meth:`run` does everything."""
-        self._sweep, self._settings = sweep, settings
+    def __init__(self, config: DictConfig, context: HydraContext, launcher: Launcher, settings: SearchSettings) -> None:
+        """Keeps what Hydra gives a sweeper; :meth:`run` does everything."""
+        self._config, self._context, self._launcher, self._settings = config, context, launcher, settings
+        self._folder = Path(str(config.hydra.sweep.dir))
+        self._results: list[JobResult] = []
 
     def run(self, arguments: Sequence[str]) -> None:
         """Trains trials until there are enough, then prints and writes the best.
@@ -90,42 +83,57 @@ class Search:
             BusyError: another process works on the study.
             RunError: a trial failed.
         """
-        overrides = self._sweep.overrides(self._settings.params, arguments)
-        space = {o.get_key_element(): distribution(o) for o in overrides if o.is_sweep_override()}
-        fixed = [
-            f"{o.get_key_element()}={o.get_value_element_as_str()}" for o in overrides if not o.is_sweep_override()
-        ]
+        overrides = self._overrides(arguments)
+        space = {key: distribution(o) for key, o in overrides.items() if o.is_sweep_override()}
+        fixed = [f"{key}={o.get_value_element_as_str()}" for key, o in overrides.items() if key not in space]
         if not space:
             raise ConfigError(
                 "hydra/sweeper=optuna: nothing to search. Name keys as in 'optimizer.network_lr=interval(1e-4,1e-2)', "
                 "in hydra.sweeper.params, or choose a file of sweep/."
             )
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        self._sweep.begin()
-        with sole_writer(self._sweep.folder / LOCK):
+        self._folder.mkdir(parents=True, exist_ok=True)
+        OmegaConf.save(self._config, self._folder / "multirun.yaml")
+        with sole_writer(self._folder / LOCK):
             study = self._open(space, fixed)
             failed = _failed(study)
-            if self._sweep.config.sweep.retry_failed:
+            if self._config.sweep.retry_failed:
                 for one in failed:
                     study.enqueue_trial(one.params, user_attrs={RETRY_OF: one.number})
             else:
-                self._sweep.results += [_failed_before(one) for one in failed]
+                self._results += [_failed_before(one) for one in failed]
             while batch := self._next(study, space):
                 if not self._do(study, batch, fixed):
                     break
             self._report(study)
-        conclude(self._sweep.folder, self._sweep.results)
+        conclude(self._folder, self._results)
+
+    def _overrides(self, arguments: Sequence[str]) -> dict[str, Override]:
+        """The parsed overrides by their keys: those of the command line win over the configuration's."""
+        parser = OverridesParser.create(config_loader=self._context.config_loader)
+        own = spelled([f"{key}={value}" for key, value in (self._settings.params or {}).items()])
+        return {override.get_key_element(): override for override in parser.parse_overrides([*own, *arguments])}
+
+    def _launch(self, jobs: Sequence[Sequence[str]]) -> list[JobResult]:
+        """Starts jobs, waits for them, and returns what became of each."""
+        for overrides in jobs:  # all at first: a misspelt value must not show after hours
+            self._context.config_loader.load_sweep_config(self._config, list(overrides))
+        with launching(self._folder):
+            results = [result_of(one) for one in self._launcher.launch(jobs, initial_job_idx=len(self._results))]
+        self._results += results
+        return results
 
     def _open(self, space: Mapping[str, BaseDistribution], fixed: Sequence[str]) -> optuna.Study:
         """The study, new or as it was left; another one under the same name is refused."""
         wanted = self._settings
-        direction = optuna.study.StudyDirection[wanted.direction.upper()]
         study = optuna.create_study(
-            storage=wanted.storage, study_name=wanted.study_name, direction=direction, load_if_exists=True
+            storage=wanted.storage, study_name=wanted.study_name, direction=wanted.direction, load_if_exists=True
         )
-        asked: dict[str, Any] = {name: json.loads(optuna.distributions.distribution_to_json(space[name]))
-                                 for name in sorted(space)}  # fmt: skip
-        asked |= {"direction": wanted.direction, "fixed": sorted(o for o in fixed if not _is_free(o))}
+        asked = {name: json.loads(optuna.distributions.distribution_to_json(one)) for name, one in space.items()}
+        asked |= {
+            "direction": wanted.direction,
+            "fixed": sorted(o for o in fixed if not is_free(o.lstrip("+~").split("=")[0])),
+        }
         known = study.user_attrs.get("asked")
         if known is None:
             study.set_user_attr("asked", asked)
@@ -166,7 +174,7 @@ class Search:
             study.sampler = self._sampler(self._settings.seed + number)
             trial = study.ask() if known is None else Trial(study, known._trial_id)
             for name, one in space.items():
-                _suggest(trial, name, one)
+                trial._suggest(name, one)  # which gives a value that it has already again
         return trial
 
     def _sampler(self, seed: int) -> optuna.samplers.BaseSampler:
@@ -181,7 +189,7 @@ class Search:
         for trial in batch:  # two that try the same are one job
             jobs.setdefault(tuple(f"{k}={_text(v)}" for k, v in trial.params.items()), []).append(trial)
         orders = [[*fixed, *values, f"hydra.sweeper.trial={same[0].number}"] for values, same in jobs.items()]
-        results = self._sweep.launch(orders)
+        results = self._launch(orders)
         for (values, same), result in zip(jobs.items(), results, strict=True):
             for trial in same:
                 _tell(study, trial, result)
@@ -193,46 +201,36 @@ class Search:
         """Writes what is known so far; returns the best trial."""
         trials = study.get_trials(deepcopy=False)
         done = [t for t in trials if t.state == TrialState.COMPLETE]
-        sign = 1 if self._settings.direction == "minimize" else -1
-        best = min(done, key=lambda t: sign * (t.value if t.value is not None else math.inf), default=None)
+        choose = min if self._settings.direction == "minimize" else max
+        best = choose(done, key=lambda trial: trial.values[0], default=None)
+        known = _row(best) if best else {}
         facts = {
             "name": "optuna",
             "study": self._settings.study_name,
             "objective": OBJECTIVE,
             "direction": self._settings.direction,
-            "best_trial": best.number if best else None,
-            "best_value": best.value if best else None,
-            "best_params": dict(best.params) if best else None,
-            "best_directory": best.user_attrs.get("directory") if best else None,
+            "best_trial": known.get("number"),
+            **{f"best_{key}": known.get(key) for key in ("value", "params", "directory")},
             "trials": [_row(t) for t in trials],
         }
-        write_durably(self._sweep.folder / RESULTS, yaml.safe_dump(facts, sort_keys=False).encode())
+        write_durably(self._folder / RESULTS, yaml.safe_dump(facts, sort_keys=False).encode())
         return best
 
     def _report(self, study: optuna.Study) -> None:
         best = self._write(study)
         states = [t.state for t in study.get_trials(deepcopy=False)]
-        counts = {s.name.lower(): states.count(s) for s in TrialState if states.count(s)}
-        print(f"\nstudy {self._settings.study_name}: " + ", ".join(f"{n} {name}" for name, n in counts.items()))
+        counts = [f"{states.count(s)} {s.name.lower()}" for s in TrialState if s in states]
+        print(f"\nstudy {self._settings.study_name}: {', '.join(counts)}")
         if best:
             print(f"best: trial {best.number}, {OBJECTIVE} {best.value:.6g}, {best.user_attrs.get('directory')}")
             print("  " + " ".join(f"{k}={_text(v)}" for k, v in best.params.items()))
-        print(f"wrote {self._sweep.folder / RESULTS}", flush=True)
-
-
-def _is_free(override: str) -> bool:
-    """Whether an override changes nothing that is learned."""
-    key = override.lstrip("+~").split("=")[0]
-    return any(key == free or key.startswith(f"{free}.") for free in FREE_KEYS)
+        print(f"wrote {self._folder / RESULTS}", flush=True)
 
 
 def distribution(override: Override) -> BaseDistribution:
     """Optuna's distribution of an override: a choice, `range` or `interval` of Hydra, `tag(log, …)` for logarithmic.
 
     A range ends before its stop, as everywhere in Hydra; an interval has whole numbers as `int(interval(…))`.
-
-    Raises:
-        ConfigError: it is empty.
     """
     value: Any = override.value()
     log_scale = "log" in getattr(value, "tags", ())
@@ -244,19 +242,9 @@ def distribution(override: Override) -> BaseDistribution:
         raise ConfigError(f"{override.input_line}: expected at least one value, got none.")
     if override.is_range_sweep() and not log_scale:
         numbers = list(value.range())
-        if all(isinstance(n, int) for n in numbers):
-            return IntDistribution(min(numbers), max(numbers), step=abs(value.step))
-        return FloatDistribution(min(numbers), max(numbers), step=abs(value.step))
+        kind = IntDistribution if all(isinstance(n, int) for n in numbers) else FloatDistribution
+        return kind(min(numbers), max(numbers), step=abs(value.step))
     return CategoricalDistribution(texts)
-
-
-def _suggest(trial: Trial, name: str, one: BaseDistribution) -> None:
-    if isinstance(one, FloatDistribution):
-        trial.suggest_float(name, one.low, one.high, step=one.step, log=one.log)
-    elif isinstance(one, IntDistribution):
-        trial.suggest_int(name, one.low, one.high, step=one.step, log=one.log)
-    elif isinstance(one, CategoricalDistribution):
-        trial.suggest_categorical(name, one.choices)
 
 
 def _text(value: Any) -> str:

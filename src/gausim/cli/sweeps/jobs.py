@@ -1,26 +1,21 @@
-"""Sweeps: what a job does about a run that is there already, grids of jobs, and the summary at the end."""
+"""Jobs of a sweep: what each does about a run that is there already, how they are launched, and the summary."""
 
 from __future__ import annotations
 
 import logging
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
-from hydra.core.plugins import Plugins
 from hydra.core.utils import JobReturn
 from hydra.errors import HydraException
-from hydra.types import HydraContext, TaskFunction
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gausim.compose.places import spelled
-from gausim.core.errors import BusyError, ConfigError, GausSimError, RunError
+from gausim.core.errors import BusyError, GausSimError, RunError
 from gausim.runs.directory import RunDirectory, one_line
 
 log = logging.getLogger(__name__)
@@ -103,51 +98,8 @@ def _finished(run: RunDirectory, state: str) -> JobResult:
     return JobResult.of(facts["last_epoch"].get(OBJECTIVE), PRUNED if facts.get("pruned") else state, run)
 
 
-class Sweep:
-    """What a search needs of Hydra: overrides taken apart, jobs started and collected.
-
-    Attributes:
-        config: the composed configuration of the sweep, Hydra's own included.
-        folder: where the sweep lies.
-        results: of the jobs so far.
-    """
-
-    def __init__(self, config: DictConfig, context: HydraContext, task: TaskFunction) -> None:
-        """Builds the launcher."""
-        self.config, self._context = config, context
-        self.folder = Path(str(config.hydra.sweep.dir))
-        self.results: list[JobResult] = []
-        self._launcher = Plugins.instance().instantiate_launcher(context, task, config)
-
-    def begin(self) -> None:
-        """Makes the directory and writes down what the sweep was asked."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        OmegaConf.save(self.config, self.folder / "multirun.yaml")
-
-    def overrides(self, params: Mapping[str, Any] | None, arguments: Sequence[str]) -> list[Override]:
-        """The parsed overrides of a sweep, each key once: those of the command line win over the configuration's."""
-        parser = OverridesParser.create(config_loader=self._context.config_loader)
-        parsed = parser.parse_overrides([*spelled([f"{k}={v}" for k, v in (params or {}).items()]), *arguments])
-        return list({override.get_key_element(): override for override in parsed}.values())
-
-    def launch(self, jobs: Sequence[Sequence[str]]) -> list[JobResult]:
-        """Starts jobs, waits for them, and returns what became of each.
-
-        Raises:
-            ConfigError: a job cannot be composed; none was started.
-            RunError: the launcher lost a process.
-        """
-        for overrides in jobs:  # all at first: a misspelt value must not show after hours
-            self._context.config_loader.load_sweep_config(self.config, list(overrides))
-        with _launching(self.folder):
-            returned = self._launcher.launch(jobs, initial_job_idx=len(self.results))
-        results = [_result(one) for one in returned]
-        self.results += results
-        return results
-
-
 @contextmanager
-def _launching(folder: Path) -> Iterator[None]:
+def launching(folder: Path) -> Iterator[None]:
     """The block in which jobs run: what is no fault of the configuration is the launcher's."""
     try:
         yield
@@ -160,6 +112,15 @@ def _launching(folder: Path) -> Iterator[None]:
         ) from error
 
 
+def result_of(returned: JobReturn) -> JobResult:
+    """What became of a job that a launcher has run; raises what ended it outside our hands."""
+    value = returned.return_value
+    if isinstance(value, JobResult):
+        return value
+    assert returned.hydra_cfg is not None
+    return JobResult.of(value, TRAINED, RunDirectory(returned.hydra_cfg.hydra.runtime.output_dir))
+
+
 def conclude(folder: Path, results: Sequence[JobResult]) -> None:
     """Prints the summary of a sweep.
 
@@ -167,42 +128,14 @@ def conclude(folder: Path, results: Sequence[JobResult]) -> None:
         RunError: a job failed, now or before.
     """
     counts = Counter(result.state for result in results)
-    told = ", ".join(f"{counts[s]} {s}" for s in (TRAINED, PRUNED, FINISHED_BEFORE, BUSY) if counts[s])
+    told = [f"{counts[s]} {s}" for s in (TRAINED, PRUNED, FINISHED_BEFORE, BUSY) if counts[s]]
     failed = {r.directory: r for r in results if r.state in (FAILED, FAILED_BEFORE)}
-    told = ", ".join(part for part in (told, f"{len(failed)} failed" if failed else "") if part)
-    print(f"\nsweep of {len(results)} jobs: {told or 'nothing left to do'}\nnext: gausim report {folder}", flush=True)
+    told += [f"{len(failed)} failed"] if failed else []
+    shown = ", ".join(told) or "nothing left to do"
+    print(f"\nsweep of {len(results)} jobs: {shown}\nnext: gausim report {folder}", flush=True)
     if failed:
         lines = [f"\n  {r.directory}: {r.detail}" for r in failed.values()]
         raise RunError(
             f"{len(failed)} of {len(results)} jobs failed:{''.join(lines)}\n"
             "The same command with sweep.retry_failed=true tries these again, from their last checkpoints."
         )
-
-
-def _result(returned: JobReturn) -> JobResult:
-    value = returned.return_value  # raises what ended the job outside our hands
-    if isinstance(value, JobResult):
-        return value
-    assert returned.hydra_cfg is not None
-    return JobResult.of(value, TRAINED, RunDirectory(returned.hydra_cfg.hydra.runtime.output_dir))
-
-
-def run_grid(sweep: Callable[[list[str]], Any], arguments: list[str], folder: Path) -> None:
-    """Has Hydra train every combination of the values, and tells what became of the jobs.
-
-    Args:
-        sweep: Hydra's own, which returns its batches of jobs.
-        arguments: overrides of the command line.
-        folder: where the sweep lies.
-
-    Raises:
-        ConfigError: an override gives no value.
-        RunError: a job failed.
-    """
-    with _launching(folder):
-        results = [_result(one) for batch in sweep(arguments) for one in batch]
-    if not results:
-        raise ConfigError(
-            f"{' '.join(arguments)}: expected at least one value of every key, so there is nothing to run."
-        )
-    conclude(folder, results)

@@ -7,36 +7,20 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.cli.arguments import positive
+from gausim.cli.arguments import add_data_option, command_parser, parse_background, positive
 
 if TYPE_CHECKING:
     import numpy as np
     from torch import Tensor
 
     from gausim.compose.build import LoadedRun
-    from gausim.compose.predict import RunObject, TrainedPrediction
+    from gausim.compose.predict import RunObject
+    from gausim.core import Trajectory
     from gausim.data.records import SequenceRecord
-    from gausim.report.pictures.frames import Timeline
-
-HELP = "Roll a run forward and write videos, figures and trajectories."
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command.
-
-    Args:
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
-
-    Raises:
-        ConfigError: arguments that do not go together.
-        RunError: the run is missing or has no checkpoint.
-        DataError: an object, sequence or view that is not there.
-        DivergenceError: the prediction left the finite numbers.
-    """
-    from gausim.cli.arguments import parse_background
+    """Runs the command; returns the exit status."""
     from gausim.interaction.words import has_forces
 
     arguments = _parser().parse_args(argv)
@@ -48,11 +32,11 @@ def main(argv: list[str]) -> int:
 
     run = load_run(arguments.run, data=data_option(arguments.data))
     state_of(run)
+    folder = arguments.out or run.run_dir / "simulation"
     if arguments.session or has_forces(arguments):
-        from gausim.cli.simulate.forces import simulate_forces
+        from gausim.cli.simulate_forces import simulate_forces
 
-        return simulate_forces(run, arguments)
-    folder = Path(arguments.out) if arguments.out else Path(run.run_dir) / "simulation"
+        return simulate_forces(run, arguments, folder)
     items = run_objects(run, arguments.object)
     sentences = [_simulate_object(run, item, arguments, folder / item.data.name) for item in items]
     first = items[0].data.name
@@ -62,13 +46,11 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    from gausim.compose.data_paths import add_data_option
     from gausim.interaction.words import EPILOG, add_force_options
 
-    parser = argparse.ArgumentParser(
-        prog="gausim simulate",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        description=f"{HELP}\nPer sequence: trajectory.safetensors, errors.png, and per view an MP4 (ground truth |\n"
+    parser = command_parser(
+        "simulate",
+        "\nPer sequence: trajectory.safetensors, errors.png, and per view an MP4 (ground truth |\n"
         "prediction | error), space-time slices and a contact sheet. With forces or a session:\n"
         "trajectory.safetensors, session.json, and per view an MP4 with the forces drawn, and a sheet.",
         epilog=EPILOG,
@@ -80,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--frames", type=positive, metavar="N", help="frames to predict; default as many as were recorded")
     add("--view", nargs="+", metavar="NAME", help="cameras; default the first trained and the first held-out one")
     add_data_option(parser)
-    add("--out", metavar="DIR", help="folder to write; default RUN/simulation")
+    add("--out", metavar="DIR", type=Path, help="folder to write; default RUN/simulation")
     add("--background", default="black", metavar="COLOR", help="black, white or R,G,B in 0..1 (default: black)")
     add("--brighten", type=float, default=1.0, metavar="GAIN", help="gain of the pictures; numbers are never touched")
     add("--slow", type=float, default=1.0, metavar="FACTOR", help="slow motion of the videos, e.g. 3")
@@ -92,36 +74,33 @@ def _parser() -> argparse.ArgumentParser:
 
 def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namespace, folder: Path) -> str:
     """Writes everything of an object's sequences; returns a sentence on how far off they are."""
+    from gausim.cli.bars import named_bar
     from gausim.cli.end import told
-    from gausim.compose.predict import TrainedPrediction, progress, scene_of
-    from gausim.core.errors import DataError
+    from gausim.cli.simulate_forces import write_trajectory
+    from gausim.compose.predict import TrainedPrediction, scene_of, sequence_of
     from gausim.data.records import SequenceRecord
     from gausim.evaluation.evaluation import evaluate_object
     from gausim.report.pictures.figures import error_figure
     from gausim.results.summary import summarise
 
-    records = {record.name: record for record in item.data.sequences}
-    names = arguments.sequence or list(records)[:1]
-    names = list(records) if names == ["all"] else names
-    unknown = [name for name in names if name not in records]
-    if unknown:
-        raise DataError(f"{item.data.root}: has no sequence {unknown}; it has {list(records)}.")
+    names = arguments.sequence or [item.data.sequences[0].name]
+    names = [record.name for record in item.data.sequences] if names == ["all"] else names
     views = arguments.view or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
     for name in names:
-        records[name].camera_indices(views)  # likewise an unknown view
-    scene = scene_of(run, item)
+        sequence_of(item, name).camera_indices(views)  # an unknown sequence or view ends it before the long work
     predict = TrainedPrediction(run, item, frames=arguments.frames or 0)
-    bar, advance = progress(len(names) * (1 + len(views)), f"simulate {item.data.name}")
-    with bar:
+    with named_bar(len(names) * (1 + len(views)), f"simulate {item.data.name}") as advance:
         curves = evaluate_object(
-            item.data, scene, {run.module.method_name: predict}, run.renderer, sequences=names, advance=advance
-        )
+            item.data, scene_of(run, item), {run.module.method_name: predict}, run.renderer, sequences=names,
+            advance=advance,
+        )  # fmt: skip
         for name in names:
-            record = SequenceRecord(records[name].root, views=item.data.views, fps=item.data.fps)
+            record = SequenceRecord(sequence_of(item, name).root, views=item.data.views, fps=item.data.fps)
+            trajectory = predict(record, arguments.frames)
             error_figure(curves, folder / name / "errors.png", sequence=name)
-            _write_sequence(run, item, record, predict, arguments, folder / name)
+            write_trajectory(run, item, name, trajectory, folder / name)
             for view in views:
-                _write_view(run, item, record, predict, view, arguments, folder / name)
+                _write_view(run, item, record, trajectory, view, arguments, folder / name)
                 advance(f"{name} {view}")
     if arguments.verbose:
         for name in names:
@@ -130,51 +109,37 @@ def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namesp
     return told({f"{item.data.name} {of}": summarise(curves)})[0]
 
 
-def _write_sequence(
-    run: LoadedRun,
-    item: RunObject,
-    record: SequenceRecord,
-    predict: TrainedPrediction,
-    arguments: argparse.Namespace,
-    folder: Path,
-) -> None:
-    from gausim.compose.predict import head
-    from gausim.io.trajectory import save_trajectory
-
-    trajectory = head(predict.full(record), arguments.frames or record.count)
-    facts = {"object": item.data.name, "sequence": record.name, "run": Path(run.run_dir).name}
-    save_trajectory(folder / "trajectory.safetensors", trajectory, facts=facts)
-
-
 def _write_view(
     run: LoadedRun,
     item: RunObject,
     record: SequenceRecord,
-    predict: TrainedPrediction,
+    trajectory: Trajectory,
     view: str,
     arguments: argparse.Namespace,
     folder: Path,
 ) -> None:
-    from gausim.cli.arguments import parse_background
-    from gausim.compose.predict import head, scene_of
+    from gausim.compose.predict import scene_of
     from gausim.io.video import write_gif, write_video
     from gausim.render.draw import film
     from gausim.report.pictures.figures import contact_sheet, slice_figure
-    from gausim.report.pictures.frames import Timeline, brighten
+    from gausim.report.pictures.frames import Timeline, brighten, video_frame
 
-    frames, background = arguments.frames or record.count, parse_background(arguments.background)
-    scene = scene_of(run, item)
+    background, scene = parse_background(arguments.background), scene_of(run, item)
     drawn = film(
-        run.renderer, scene, head(predict.full(record), frames), record.cameras_of([view]),
-        background=background, mask=scene.foreground,
-    )  # fmt: skip
+        run.renderer, scene, trajectory, record.cameras_of([view]), background=background, mask=scene.foreground
+    )
     prediction = brighten(drawn[:, 0].cpu().numpy(), arguments.brighten)
-    truth = brighten(_truth(record, view, min(frames, record.count), background), arguments.brighten)
+    truth = brighten(_truth(record, view, min(trajectory.frames, record.count), background), arguments.brighten)
     unseen, title = item.data.train_frames.stop, f"{item.data.name} {record.name} {view}"
-    fps, timeline = item.data.fps / arguments.slow, Timeline(frames, unseen)
-    write_video(folder / f"{view}.mp4", _compare(truth, prediction, timeline, title), fps)
+    fps, timeline = item.data.fps / arguments.slow, Timeline(trajectory.frames, unseen)
+
+    def compared() -> Iterator[np.ndarray]:
+        for number, image in enumerate(prediction):
+            yield video_frame(truth[number] if number < len(truth) else None, image, number, timeline, title)
+
+    write_video(folder / f"{view}.mp4", compared(), fps)
     if arguments.gif:
-        write_gif(folder / f"{view}.gif", _compare(truth, prediction, timeline, title), fps)
+        write_gif(folder / f"{view}.gif", compared(), fps)
     slice_figure(truth, prediction, folder / f"{view}_slices.png", title=title, first_unseen=unseen)
     contact_sheet(truth, prediction, folder / f"{view}_sheet.png", title=title, first_unseen=unseen)
 
@@ -189,10 +154,3 @@ def _truth(record: SequenceRecord, view: str, frames: int, background: Tensor | 
     pieces = [range(start, min(start + 16, frames)) for start in range(0, frames, 16)]
     parts = [to_bytes(composite(record.frames(piece, [view])[:, 0], background)[0]).numpy() for piece in pieces]
     return np.concatenate(parts)
-
-
-def _compare(truth: np.ndarray, prediction: np.ndarray, timeline: Timeline, title: str) -> Iterator[np.ndarray]:
-    from gausim.report.pictures.frames import video_frame
-
-    for number, image in enumerate(prediction):
-        yield video_frame(truth[number] if number < len(truth) else None, image, number, timeline, title)

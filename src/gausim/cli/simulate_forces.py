@@ -1,0 +1,184 @@
+"""`gausim simulate RUN --force ...` and `--session FILE`: an object that is pushed."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gausim.cli.arguments import parse_background
+from gausim.core.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from gausim.compose.build import LoadedRun
+    from gausim.compose.predict import RunObject
+    from gausim.core import Cameras, Trajectory
+    from gausim.interaction.arrows import Arrow
+    from gausim.interaction.interaction import Interaction
+    from gausim.interaction.session import ForceSession
+
+
+def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -> int:
+    """Pushes one object of a run and writes its trajectory, session, videos and pictures; returns the exit status.
+
+    Raises:
+        ConfigError: options that do not go together, or an event that cannot be done.
+        DataError: a session that is broken or of another scene; an object, sequence or view that is not there.
+        DivergenceError: the simulation left the finite numbers.
+    """
+    from gausim.cli.end import end
+    from gausim.interaction.arrows import arrows_of
+    from gausim.interaction.interaction import replay
+    from gausim.interaction.session import load_session, save_session
+    from gausim.interaction.words import has_forces
+
+    if arguments.session and has_forces(arguments):
+        raise ConfigError("--session has its own forces: leave --force and the like out, or edit the session's file.")
+    if len(arguments.object or []) > 1 or len(arguments.sequence or []) > 1:
+        raise ConfigError("forces act on one object from one initial state: name one --object and one --sequence.")
+    if not arguments.metre > 0:
+        raise ConfigError(f"--metre {arguments.metre}: expected more than 0 scene units.")
+    found = load_session(arguments.session) if arguments.session else None
+    item, interaction = _opened(run, arguments, found)
+    session = _new_session(item, interaction, arguments) if found is None else _known(interaction, found, arguments)
+    views = arguments.view or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
+    item.data.sequences[0].camera_indices(views)  # an unknown view ends it before the long work
+    arrows: list[list[Arrow]] = []
+    trajectory = replay(interaction, session, other_model=True, watch=lambda live: arrows.append(arrows_of(live)))
+    folder = out / item.data.name / (Path(arguments.session).stem if arguments.session else "forces")
+    write_trajectory(run, item, session.made_with.initial, trajectory, folder)
+    save_session(session, folder / "session.json")
+    for view in views:
+        _write_view(run, item, trajectory, arrows, view, arguments, folder)
+    if arguments.verbose:
+        print("\n".join(f"wrote {path}" for path in sorted(folder.iterdir())))
+    replayed = ["simulate", arguments.run, "--session", folder / "session.json"]
+    end(_told(interaction, trajectory), "videos", folder, ["view", arguments.run], replayed)
+    return 0
+
+
+def _opened(run: LoadedRun, arguments: argparse.Namespace, found: ForceSession | None) -> tuple[RunObject, Interaction]:
+    """The object that is pushed; where none is named, that of the session, or the first."""
+    from gausim.compose.live import REST, open_interaction
+    from gausim.compose.predict import run_objects
+    from gausim.interaction.interaction import STANDARD_GRAVITY
+
+    names = arguments.object
+    if names is None and found and found.made_with.scene in [item.data.name for item in run_objects(run)]:
+        names = [found.made_with.scene]
+    item = run_objects(run, names)[0]
+    start = arguments.sequence[0] if arguments.sequence else (found.made_with.initial if found else REST)
+    return item, open_interaction(
+        run, name=item.data.name, sequence=start, gravity=STANDARD_GRAVITY * arguments.metre,
+        most_force=arguments.most_force,
+    )  # fmt: skip
+
+
+def _new_session(item: RunObject, interaction: Interaction, arguments: argparse.Namespace) -> ForceSession:
+    from gausim.interaction.session import ForceSession
+    from gausim.interaction.words import entries_of
+
+    steps = (arguments.frames or item.data.sequences[0].count) - 1
+    entries = tuple(entries_of(arguments, interaction.scene))
+    late = [entry.at for entry in entries if entry.at > steps]
+    if late:
+        raise ConfigError(f"at={late[0]}: expected 0 to {steps}, the last frame. Ask for more with --frames.")
+    return ForceSession(interaction.made_with, interaction.fps, steps, entries, interaction.gravity)
+
+
+def _known(interaction: Interaction, found: ForceSession, arguments: argparse.Namespace) -> ForceSession:
+    """A session that is played again, or as many frames of it as are asked for."""
+    from msgspec.structs import replace
+
+    from gausim.interaction.interaction import differences
+
+    for text, allowed in differences(interaction, found):
+        if not allowed:
+            raise DataError(f"{arguments.session}: {text}. Replay it with what it was made with.")
+        print(f"warning: {arguments.session}: {text}; its forces act, its numbers differ.", file=sys.stderr)
+    if not arguments.frames:
+        return found
+    steps = arguments.frames - 1
+    return replace(found, steps=steps, entries=tuple(e for e in found.entries if e.at <= steps))
+
+
+def write_trajectory(run: LoadedRun, item: RunObject, sequence: str, trajectory: Trajectory, folder: Path) -> None:
+    """Writes ``trajectory.safetensors`` of an object that began as a sequence did."""
+    from gausim.io.trajectory import save_trajectory
+
+    facts = {"object": item.data.name, "sequence": sequence, "run": run.run_dir.name}
+    save_trajectory(folder / "trajectory.safetensors", trajectory, facts=facts)
+
+
+def _write_view(
+    run: LoadedRun,
+    item: RunObject,
+    trajectory: Trajectory,
+    arrows: list[list[Arrow]],
+    view: str,
+    arguments: argparse.Namespace,
+    folder: Path,
+) -> None:
+    import numpy as np
+
+    from gausim.compose.predict import scene_of
+    from gausim.interaction.arrows import draw_arrows
+    from gausim.io.video import write_gif, write_video
+    from gausim.render.draw import film
+    from gausim.report.pictures.figures import picture_grid
+    from gausim.report.pictures.frames import brighten, label_bar
+
+    scene, cameras = scene_of(run, item), _sharp(item.data.sequences[0].cameras_of([view]))
+    background = parse_background(arguments.background)
+    drawn = film(run.renderer, scene, trajectory, cameras, background=background, mask=scene.foreground)
+    images = brighten(drawn[:, 0].cpu().numpy(), arguments.brighten)
+    fps, title = item.data.fps / arguments.slow, f"{item.data.name} {view}"
+
+    def pictures() -> Iterator[np.ndarray]:
+        for number, image in enumerate(images):
+            shown = draw_arrows(image, arrows[number], cameras.viewmats[0], cameras.Ks[0])
+            acting = ", ".join(dict.fromkeys(arrow.label for arrow in arrows[number]))
+            text = f"{title}   {number}/{len(images) - 1}   {acting}"
+            yield np.concatenate((shown, label_bar(text, shown.shape[1])))
+
+    write_video(folder / f"{view}.mp4", pictures(), fps)
+    if arguments.gif:
+        write_gif(folder / f"{view}.gif", pictures(), fps)
+    chosen = list(range(0, len(images), max(1, len(images) // 12)))[:12]
+    picture_grid(
+        [images[f] for f in chosen], [f"frame {f}" for f in chosen], folder / f"{view}_sheet.png", title=title,
+        columns=6,
+    )  # fmt: skip
+
+
+def _sharp(cameras: Cameras) -> Cameras:
+    """The same views with as many pixels as a video's panel has, where the data set's have fewer."""
+    from gausim.core import Cameras
+    from gausim.report.pictures.frames import PANEL_HEIGHT
+
+    zoom = max(1.0, PANEL_HEIGHT / cameras.height)
+    Ks = cameras.Ks.clone()
+    Ks[:, :2] *= zoom
+    return Cameras(cameras.viewmats, Ks, round(cameras.width * zoom), round(cameras.height * zoom), cameras.names)
+
+
+def _told(interaction: Interaction, trajectory: Trajectory) -> list[str]:
+    """How far it went, and what kept it from going further."""
+    scene = interaction.scene
+    away = (trajectory.positions - scene.means.to(trajectory.positions)).norm(dim=-1) / scene.diagonal
+    held = ~scene.simulated | scene.pinned
+    slipped = float(away[:, held].max()) if bool(held.any()) else 0.0
+    sentences = [
+        f"{scene.name}: {trajectory.frames} frames; it is farthest from rest at frame {int(away.amax(1).argmax())}, by "
+        f"{float(away.max()):.3f} of its diagonal; what is pinned moved by {slipped:g}."
+    ]
+    if interaction.limited:
+        sentences.append(
+            f"In {interaction.limited} frames forces acted only in part: they would carry {scene.name} beyond what was "
+            "learned."
+        )
+    return sentences

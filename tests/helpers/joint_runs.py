@@ -1,0 +1,57 @@
+"""Settings of the smallest runs of `gausim train`, and an object beside the toy to train jointly with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gausim.core import Cameras, GaussianScene
+from gausim.runs.checkpoint import averaged_weights, read_checkpoint
+from helpers import toy_object
+from helpers.simulators import LEVELS
+
+TINY = (
+    "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
+    "data.curriculum.t_start=2", "data.curriculum.t_max=2", "data.repeats=1", "trainer.max_epochs=2",
+    "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1", "render=reference",
+    "callbacks.panels=null", "logger=none", "doctor=false",
+)  # fmt: skip
+# One of the paper's model, without pictures and dashboards.
+PAPER = (
+    "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
+    "data.curriculum.t_max=2", "data.curriculum.t_start=1", "data.repeats=1", "data.batch_size=2",
+    "trainer.max_epochs=2", "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1",
+    "render=reference", "doctor=false", "name=toy", "callbacks.panels=null", "logger=none",
+)  # fmt: skip
+
+
+def other_object(root: Path) -> Path:
+    """An object of other kernels, frame rate, image size, cameras, frames and sequences than the toy's."""
+    means = toy_object.toy_scene().means
+    scene = GaussianScene.create(
+        means=torch.cat((means * 2, means[9:] * 2 + 0.1)),
+        log_scales=torch.full((63, 3), -1.6),
+        quats=torch.tensor([1.0, 0, 0, 0]).expand(63, 4).clone(),
+        opacity_logits=torch.full((63,), 2.0),
+        sh=torch.rand(63, 1, 3, generator=torch.Generator().manual_seed(1)),
+        pinned=torch.cat((means, means[9:]))[:, 2] < 0.1,
+        name="other",
+    )
+    seen = toy_object.cameras().select([0, 1])
+    smaller = seen.Ks * torch.tensor([[0.75], [0.75], [1.0]])
+    cameras = Cameras(seen.viewmats, smaller, 24, 20, ("left", "right"))
+    amplitudes = {"a": 0.2, "b": 0.1, "c": -0.2}
+    settings = {"frames": 12, "first_unseen": 6, "fps": 50.0, "amplitudes": amplitudes, "cameras": cameras}
+    return toy_object.write_object(toy_object.ToyObject(root, scene, **settings)).root
+
+
+def both(toy: Path, other: Path) -> str:
+    """The override that names both stores, the second pinned by its own selection."""
+    return f'data.root=[{toy},{{root: {other}, selections: {{pinned: "z=0.05"}}}}]'
+
+
+def weights(run: Path) -> dict[str, Tensor]:
+    """What a run has learned; averaged, where it averages."""
+    return averaged_weights(read_checkpoint(run / "last.ckpt"))
