@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import tracemalloc
 from collections.abc import Callable
@@ -149,16 +148,3 @@ def test_counts_are_not_believed(tmp_path: Path, role: str) -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 1 << 20
-
-
-def test_a_real_model_is_read_as_pycolmap_reads_it() -> None:
-    root = os.environ.get("GAUSIM_TEST_DATA")
-    if not root:
-        pytest.skip("GAUSIM_TEST_DATA names no folder of real data")
-    folder = find_colmap(Path(root) / "photos" / "backyard_colmap")
-    ours, theirs = read_colmap(folder), pycolmap.Reconstruction(folder)
-    assert len(ours.images) == theirs.num_reg_images() == 15
-    assert (
-        len(ours.points.ids) == theirs.num_points3D() and ours.points.tracks.sum() == theirs.compute_num_observations()
-    )
-    assert ours.points.error.mean() == pytest.approx(theirs.compute_mean_reprojection_error())

@@ -124,10 +124,10 @@ def _frames_of_views(
         table[frame.camera][number] = i
     count = max(max(row, default=-1) for row in table.values()) + 1
     for view, row in table.items():
-        absent = [f for f in range(count) if f not in row]
-        if absent:
+        if len(row) < count:
+            first = next(f for f in range(count) if f not in row)
             raise DataError(
-                f"{path}: view '{view}' lacks {len(absent)} of {count} frames (first: {absent[0]}). "
+                f"{path}: view '{view}' lacks {count - len(row)} of {count} frames (first: {first}). "
                 "Restore them, or take the view out of dataset.json."
             )
     index = [[table[view][f] for f in range(count)] for view in views]

@@ -23,31 +23,20 @@ STILLS_PER_HELDOUT = 10
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """True motion of P points of one sequence.
+    """True motion of P points of one sequence."""
 
-    Attributes:
-        rest: positions in the rest state [scene units].
-        positions: positions in every frame, frame 0 first [scene units].
-    """
-
-    rest: Float[Tensor, "P 3"]
-    positions: Float[Tensor, "F P 3"]
+    rest: Float[Tensor, "P 3"]  # positions in the rest state [scene units]
+    positions: Float[Tensor, "F P 3"]  # positions in every frame, frame 0 first [scene units]
 
 
 @dataclass(frozen=True, eq=False)
 class Stills:
-    """Posed images of the rest state.
+    """Posed images of the rest state."""
 
-    Attributes:
-        images: straight-alpha RGBA.
-        cameras: one per image.
-        train: indices to reconstruct from.
-        heldout: indices of those left out to measure the reconstruction on, every tenth unless told otherwise.
-    """
-
-    images: UInt8[Tensor, "N H W 4"]
-    cameras: Cameras
-    train: tuple[int, ...]
+    images: UInt8[Tensor, "N H W 4"]  # straight-alpha RGBA
+    cameras: Cameras  # one per image
+    train: tuple[int, ...]  # indices to reconstruct from
+    # indices of those left out to measure the reconstruction on, every tenth unless told otherwise
     heldout: tuple[int, ...]
 
 

@@ -29,19 +29,12 @@ Tick = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """Consecutive frames of one sequence from frame 0 on, reduced.
+    """Consecutive frames of one sequence from frame 0 on, reduced."""
 
-    Attributes:
-        name: of the sequence.
-        cameras: of the reduced pictures.
-        rgb: over black.
-        alpha: foreground.
-    """
-
-    name: str
-    cameras: Cameras
-    rgb: UInt8[np.ndarray, "F V h w 3"]
-    alpha: UInt8[np.ndarray, "F V h w"]
+    name: str  # of the sequence
+    cameras: Cameras  # of the reduced pictures
+    rgb: UInt8[np.ndarray, "F V h w 3"]  # over black
+    alpha: UInt8[np.ndarray, "F V h w"]  # foreground
 
     @cached_property
     def gray(self) -> Float[np.ndarray, "F V h w"]:
@@ -51,23 +44,14 @@ class Watched:
 
 @dataclass(eq=False)
 class Evidence:
-    """What is known of one object; :func:`gather` reads it.
+    """What is known of one object; :func:`gather` reads it."""
 
-    Attributes:
-        data: its facts.
-        sequences: how many there are.
-        scene: the rest scene, pinned or not; None where there is none yet.
-        scale: length of a pixel of the pictures over one of the reduced pictures, at most 1.
-        watched: sequences whose motion is watched.
-        first: frame 0 of sequences, these and more.
-    """
-
-    data: ObjectData
-    sequences: int
-    scene: GaussianScene | None
-    scale: float
-    watched: tuple[Watched, ...]
-    first: tuple[Watched, ...]
+    data: ObjectData  # its facts
+    sequences: int  # how many there are
+    scene: GaussianScene | None  # the rest scene, pinned or not; None where there is none yet
+    scale: float  # length of a pixel of the pictures over one of the reduced pictures, at most 1
+    watched: tuple[Watched, ...]  # sequences whose motion is watched
+    first: tuple[Watched, ...]  # frame 0 of sequences, these and more
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -79,11 +63,11 @@ class Evidence:
         """The rest scene as the cameras of each of :attr:`first` draw it; None without a scene."""
         if self.scene is None:
             return None
-        drawn: list[tuple[Cameras, Silhouettes]] = []
+        drawn: list[Silhouettes] = []
         for item in self.first:
-            if not any(same_cameras(known, item.cameras) for known, _ in drawn):
-                drawn.append((item.cameras, draw_silhouettes(self.scene, item.cameras)))
-        return tuple(next(s for known, s in drawn if same_cameras(known, i.cameras)) for i in self.first)
+            same = next((i for i in range(len(drawn)) if same_cameras(self.first[i].cameras, item.cameras)), None)
+            drawn.append(draw_silhouettes(self.scene, item.cameras) if same is None else drawn[same])
+        return tuple(drawn)
 
     @cached_property
     def fits(self) -> tuple[tuple[Fit, ...], ...] | None:
@@ -105,12 +89,7 @@ def same_cameras(a: Cameras, b: Cameras) -> bool:
 
 
 def gather(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Evidence:
-    """Reads and reduces what the checks need.
-
-    Args:
-        data: the object.
-        scene: its rest scene, where there is one.
-        tick: is told how far it is.
+    """Reads and reduces what the checks need; ``tick`` is told how far it is.
 
     Raises:
         DataError: an image is missing or malformed.

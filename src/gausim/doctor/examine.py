@@ -36,17 +36,11 @@ CHECKS = (
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """What was found in one object.
+    """What was found in one object."""
 
-    Attributes:
-        findings: faults first.
-        left_out: checks that another check's fault made useless, with that check.
-        evidence: what was looked at; None where it could not be read.
-    """
-
-    findings: tuple[Finding, ...]
-    left_out: dict[str, str]
-    evidence: Evidence | None
+    findings: tuple[Finding, ...]  # faults first
+    left_out: dict[str, str]  # checks that another check's fault made useless, with that check
+    evidence: Evidence | None  # what was looked at; None where it could not be read
 
     @property
     def ruinous(self) -> bool:
@@ -94,5 +88,4 @@ def examine(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Examin
 def _without_consequences(findings: list[Finding]) -> list[Finding]:
     """Leaves out that a camera is off the rest scene where its frame 0 is a later one, which says all."""
     early = {f.measured["view"] for f in findings if f.check == "clock" and f.severity != "note"}
-    return [f for f in findings if f.check != "calibration" or not f.measured.get("views")
-            or not set(f.measured["views"]) <= early]  # fmt: skip
+    return [f for f in findings if f.check != "calibration" or not {*f.measured.get("views", "-")} <= early]

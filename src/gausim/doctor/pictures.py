@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
@@ -24,16 +23,7 @@ _OUTLINE = "#f0962a"
 
 
 def draw_pictures(evidence: Evidence, out: Path, tick: Tick) -> list[tuple[str, str]]:
-    """Writes all pictures into a folder.
-
-    Args:
-        evidence: what was looked at.
-        out: the folder.
-        tick: is told how far it is.
-
-    Returns:
-        Name and caption of each.
-    """
+    """Writes all pictures into a folder; returns name and caption of each."""
     drawn: list[tuple[str, str, Callable[[Evidence], Figure]]] = [
         ("views.png", "Frame 0 of the first sequence in every view; orange: outline of the rest scene, drawn by the "
          "camera that the file states. Both must lie on each other.", _views),
@@ -119,20 +109,15 @@ def _coverage(evidence: Evidence) -> Figure:
         axes.scatter(means[:, first], means[:, second], s=1, color="#999999")
     axes.plot(middle[first], middle[second], "+", color="#555555")
     for v, view in enumerate(evidence.views):
-        _camera(axes, centers[v, [first, second]], forward[v, [first, second]], view,
-                trained=view in evidence.data.train_views)  # fmt: skip
+        (x, y), ahead = centers[v, [first, second]], forward[v, [first, second]]
+        color = METHOD_COLORS[0 if view in evidence.data.train_views else 1]
+        tip = (x, y) + 0.35 * ahead * np.hypot(x, y)
+        axes.plot(x, y, "o", color=color)
+        axes.annotate("", xy=tuple(tip), xytext=(x, y), arrowprops={"arrowstyle": "->", "color": color})
+        axes.annotate(view, xy=(x, y), xytext=(6, 6), textcoords="offset points", fontsize=8, color=color)
     axes.set(aspect="equal", xlabel=f"{'xyz'[first]} [scene units]", ylabel=f"{'xyz'[second]} [scene units]")
     axes.set_title(f"from {'+' if ups[up] > 0 else '-'}{'xyz'[up]}", fontsize=9)
     axes.margins(0.15)
     if (ups[up] > 0) == (up == 1):  # two axes in their order are seen from the other side
         axes.invert_yaxis()
     return figure
-
-
-def _camera(axes: Axes, center: np.ndarray, direction: np.ndarray, name: str, *, trained: bool) -> None:
-    color = METHOD_COLORS[0] if trained else METHOD_COLORS[1]
-    x, y = (float(value) for value in center)
-    u, v = (float(value) for value in center + 0.35 * direction * np.linalg.norm(center))
-    axes.plot(x, y, "o", color=color)
-    axes.annotate("", xy=(u, v), xytext=(x, y), arrowprops={"arrowstyle": "->", "color": color})
-    axes.annotate(name, xy=(x, y), xytext=(6, 6), textcoords="offset points", fontsize=8, color=color)

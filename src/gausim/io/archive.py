@@ -137,7 +137,7 @@ def _members(archive: Path) -> Iterator[_Member]:
     with archive.open("rb") as file:
         # By its first bytes: a tar that ends with an .npz would pass for a zip, which is known by its end.
         is_zip = file.read(4) in _ZIP_BEGINNINGS
-    yield from _of_zip(archive) if is_zip else _of_tar(archive)
+    return _of_zip(archive) if is_zip else _of_tar(archive)
 
 
 def _of_tar(archive: Path) -> Iterator[_Member]:

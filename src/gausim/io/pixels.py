@@ -32,19 +32,12 @@ def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What an image file states before its pixels.
+    """What an image file states before its pixels."""
 
-    Attributes:
-        width: as stored [pixels].
-        height: as stored [pixels].
-        mode: Pillow's name of the channels, e.g. ``RGBA``.
-        exif: camera's facts by tag, those of the sub-directory included.
-    """
-
-    width: int
-    height: int
-    mode: str
-    exif: Mapping[int, Any]
+    width: int  # as stored [pixels]
+    height: int  # as stored [pixels]
+    mode: str  # Pillow's name of the channels, e.g. ``RGBA``
+    exif: Mapping[int, Any]  # camera's facts by tag, those of the sub-directory included
 
 
 def read_header(path: Path) -> ImageHeader | None:

@@ -29,7 +29,7 @@ def save_ply_sequence(folder: Path | str, name: str, frames: Iterable[GaussianSc
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    there = [path.name for _, path in _numbered(folder) if _stem(path) == name]
+    there = [path.name for _, stem, path in _numbered(folder) if stem == name]
     if there:
         raise DataError(f"{folder}: holds '{there[0]}' already. Choose another folder or name, or delete its frames.")
     written = []
@@ -61,17 +61,20 @@ def load_ply_sequence(folder: Path | str, *, fps: float | None = None) -> tuple[
     """
     folder = Path(folder)
     found = _numbered(folder)
-    stems = sorted({_stem(path) for _, path in found})
+    stems = sorted({stem for _, stem, _ in found})
     if len(stems) != 1:
         what = f"frames of several sequences: {stems[:5]}" if stems else "no files NAME_0001.ply, NAME_0002.ply, ..."
         raise DataError(f"{folder}: has {what}; expected those of one sequence.")
-    numbers = [number for number, _ in found]
+    numbers = [number for number, _, _ in found]
     if numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         missing = sorted(set(range(numbers[0], numbers[-1])) - set(numbers))
         what = f"number {missing[0]} is missing" if missing else "a number stands there twice"
         raise DataError(f"{folder}: {what}. Complete the sequence.")
-    rate = _rate(folder / f"{stems[0]}.json", fps)
-    return _scenes([path for _, path in found], folder / f"{stems[0]}.masks.npz"), len(found), rate
+    path = folder / f"{stems[0]}.json"
+    if fps is None and not path.is_file():
+        raise DataError(f"{path}: no such file, so the frame rate is unknown. State it (--fps).")
+    rate = positive_field(read_json(path) if fps is None else {"fps": fps}, "fps", str(path))
+    return _scenes([path for *_, path in found], folder / f"{stems[0]}.masks.npz"), len(found), rate
 
 
 def _scenes(paths: list[Path], masks: Path) -> Iterator[GaussianScene]:
@@ -84,19 +87,8 @@ def _scenes(paths: list[Path], masks: Path) -> Iterator[GaussianScene]:
         yield scene
 
 
-def _numbered(folder: Path) -> list[tuple[int, Path]]:
+def _numbered(folder: Path) -> list[tuple[int, str, Path]]:
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder. Expected one with NAME_0001.ply, NAME_0002.ply, ...")
     matches = [(match, path) for path in folder.iterdir() if (match := _NAME.fullmatch(path.name))]
-    return sorted((int(match["number"]), path) for match, path in matches)
-
-
-def _stem(path: Path) -> str:
-    match = _NAME.fullmatch(path.name)
-    return match["stem"] if match else ""
-
-
-def _rate(path: Path, fps: float | None) -> float:
-    if fps is None and not path.is_file():
-        raise DataError(f"{path}: no such file, so the frame rate is unknown. State it (--fps).")
-    return positive_field(read_json(path) if fps is None else {"fps": fps}, "fps", str(path))
+    return sorted((int(match["number"]), match["stem"], path) for match, path in matches)
