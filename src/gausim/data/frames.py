@@ -22,15 +22,11 @@ FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".hevc", ".h265", ".mt
 
 
 def open_frames(root: Path, views: Sequence[str], fps: float) -> PackedSource | ImageSource:
-    """The frames of a sequence's folder; only headers are read.
-
-    Args:
-        root: the folder.
-        views: names of all cameras, in the order that is wanted.
-        fps: frames per second that it must have.
+    """The frames of a sequence's folder, cameras in the order of ``views``; only headers are read.
 
     Raises:
-        DataError: a file is missing or a field is wrong, a view or a frame of a view is missing, or a camera moves.
+        DataError: a file is missing or a field is wrong, ``fps`` is another, a view or a frame is missing, or a camera
+            moves.
     """
     if is_packed(root):
         return PackedSource(root, views, fps)

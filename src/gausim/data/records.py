@@ -41,12 +41,9 @@ class Stills:
 
 
 def read_stills(path: Path, *, every: int = STILLS_PER_HELDOUT, opaque: bool = False) -> Stills:
-    """Reads all images named by a ``transforms.json`` of the rest scene, and splits them.
+    """Reads all images named by a ``transforms.json`` of the rest scene; one in ``every`` is not for training.
 
-    Args:
-        path: the file.
-        every: one still in so many is left out of the training ones.
-        opaque: take all of every image, whatever its alpha says; images without alpha will do.
+    ``opaque`` takes all of every image, whatever its alpha says; images without alpha will do.
 
     Raises:
         DataError: an image or pose is unusable.
@@ -108,11 +105,7 @@ class SequenceRecord:
         return self._source.absent()
 
     def ground_truth(self, rest: Float[Tensor, "P 3"] | None) -> GroundTruth | None:
-        """True motion of the object's points, or None where the data set has none (real captures).
-
-        Args:
-            rest: rest positions of the same points, from :meth:`ObjectData.rest_points`.
-        """
+        """True motion of the points with these rest positions, or None where the data set has none (real captures)."""
         path = self.root / "ground_truth.npz"
         if rest is None or not path.is_file():
             return None

@@ -54,12 +54,9 @@ class Examination:
 
 
 def examine(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Examination:
-    """Looks at some frames of an object and at its rest scene.
+    """Looks at some frames of an object, whose files are in order, and at its rest scene, pinned or not.
 
-    Args:
-        data: the object, whose files are in order (:func:`gausim.data.verify.verify`).
-        scene: its rest scene, pinned or not; None where there is none yet.
-        tick: is told (step, how much is done, of how much).
+    ``tick`` is told (step, how much is done, of how much).
     """
     try:
         evidence = gather(data, scene, tick)

@@ -272,10 +272,8 @@ class _Binary:
         for i in range(count):
             yield f"{self.path}: {self.path.stem}[{i}]"
         if self.at < len(self.data):
-            raise DataError(
-                f"{self.path}: {len(self.data) - self.at} bytes follow the last record. The counts are wrong; export "
-                "the model again."
-            )
+            left = len(self.data) - self.at
+            raise DataError(f"{self.path}: {left} bytes follow the last record. Its counts are wrong; export it again.")
 
 
 # Of each camera where it stands, its number and what it is; of each image its pose (w x y z and translation) besides.
@@ -353,9 +351,7 @@ def _points_text(path: Path) -> Iterator[tuple[np.ndarray, int]]:
     for where, words in _lines(path):
         track, odd = divmod(len(words) - _POINT_COLUMNS, 2)
         if words and (track < 0 or odd):
-            raise DataError(
-                f"{where}: expected POINT3D_ID X Y Z R G B ERROR and pairs of a track, got {len(words)} words."
-            )
+            raise DataError(f"{where}: expected ID X Y Z R G B ERROR and pairs of a track, got {len(words)} words.")
         if words:
             yield _numbers(where, words)[:_POINT_COLUMNS], track
 

@@ -60,7 +60,6 @@ def continue_download(address: str, part: Path, *, size: int, advance: Callable[
 
     Raises:
         FetchError: the address cannot be reached or has a file of another size.
-        OSError: the disk refuses.
     """
     tries = 0
     while (have := _length(part)) != size:

@@ -27,9 +27,11 @@ from gausim.io.transforms import read_json
 
 HEADER, PIXELS = "frames.json", "frames.bin"
 # Sequences beyond these sizes are a broken file rather than a film.
-_Count, _Side = Annotated[int, Meta(ge=1, le=1_000_000)], Annotated[int, Meta(ge=1, le=1 << 16)]
+_Count = Annotated[int, Meta(ge=1, le=1_000_000)]
+_Side = Annotated[int, Meta(ge=1, le=1 << 16)]
 _Natural = Annotated[int, Meta(ge=0, le=1 << 62)]
-_Row, _LongRow = tuple[float, float, float], tuple[float, float, float, float]
+_Row = tuple[float, float, float]
+_LongRow = tuple[float, float, float, float]
 
 
 class _View(Struct):
@@ -137,12 +139,8 @@ def write_packed(
 ) -> None:
     """Writes one sequence; ``frames.json``, which makes it one, comes last and whole.
 
-    Args:
-        folder: where.
-        cameras: one per view.
-        views: the straight-alpha RGBA of each, asked for one by one.
-        fps: frames per second.
-        margin: transparent pixels kept around what the foreground ever touches.
+    The views are the straight-alpha RGBA of each camera, asked for one by one; ``margin`` is how many transparent
+    pixels are kept around what the foreground ever touches.
 
     Raises:
         DataError: a view has another size than its camera or another number of frames than the first.

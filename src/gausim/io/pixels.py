@@ -16,12 +16,7 @@ _EXIF = 0x8769
 
 
 def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
-    """Pixels of an image as ``cv2.imread`` gives them (BGR, rows first); None where it cannot be decoded.
-
-    Args:
-        path: the file.
-        flags: of ``cv2.imread``.
-    """
+    """Pixels of an image as ``cv2.imread`` gives them (BGR, rows first); None where it cannot be decoded."""
     if read_header(path) is None:
         return None
     try:

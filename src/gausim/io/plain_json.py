@@ -28,13 +28,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def checked(value: Any, kind: type[T], where: str, remedy: str) -> T:
-    """Plain data as a record or another annotated type.
-
-    Args:
-        value: what a file says.
-        kind: what it must be.
-        where: the file, or a part of it, for messages.
-        remedy: a sentence for messages.
+    """Plain data as a record or another annotated ``kind``; messages begin with ``where`` and end with ``remedy``.
 
     Raises:
         DataError: a value is missing, of another type or out of its range; names the field.

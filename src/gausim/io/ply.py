@@ -6,9 +6,9 @@ The PLY holds what every 3DGS viewer reads; what the dynamics needs besides (mas
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,7 +37,8 @@ _SHAPE = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2",
 _HEADER_LIMIT = 1 << 16
 
 
-class _Header(NamedTuple):
+@dataclass(frozen=True)
+class _Header:
     """What a PLY header declares about its vertices."""
 
     encoding: str
@@ -102,13 +103,7 @@ def load_points(path: Path | str) -> np.ndarray:
 
 
 def save_scene(scene: GaussianScene, path: Path | str, *, masks: bool = True) -> None:
-    """Writes the scene as little-endian float32 PLY in INRIA order, and its masks next to it; replaces atomically.
-
-    Args:
-        scene: what to write.
-        path: the PLY file.
-        masks: write ``<stem>.masks.npz``, too.
-    """
+    """Writes the scene as little-endian float32 PLY in INRIA order, and its masks next to it; replaces atomically."""
     path = Path(path)
     rest_count = 3 * (scene.sh.shape[1] - 1)
     names = [*_POSITION, "nx", "ny", "nz", *_COLOR, *(f"f_rest_{i}" for i in range(rest_count)), *_SHAPE]

@@ -16,13 +16,7 @@ _NAME = re.compile(r"(?P<stem>.+)_(?P<number>\d{4,6})\.ply")
 
 
 def save_ply_sequence(folder: Path | str, name: str, frames: Iterable[GaussianScene], fps: float) -> list[Path]:
-    """Writes one PLY per frame, NAME_0001.ply first, with NAME.masks.npz and NAME.json (frames per second) beside.
-
-    Args:
-        folder: is created; may hold no other frames of this name.
-        name: of the sequence.
-        frames: the deformed scenes; masks are taken from the first.
-        fps: frames per second.
+    """Writes one PLY per frame, NAME_0001.ply first, with NAME.masks.npz (of the first) and NAME.json (fps) beside.
 
     Raises:
         DataError: there are frames of this name already, or none to write.
@@ -47,12 +41,8 @@ def save_ply_sequence(folder: Path | str, name: str, frames: Iterable[GaussianSc
 def load_ply_sequence(folder: Path | str, *, fps: float | None = None) -> tuple[Iterator[GaussianScene], int, float]:
     """Reads numbered PLY files, one at a time as they are asked for.
 
-    Args:
-        folder: with the files of one sequence.
-        fps: frames per second where no NAME.json says them.
-
     Returns:
-        The scenes in the order of their numbers, how many there are, and frames per second.
+        The scenes in the order of their numbers, how many there are, and frames per second (``fps`` or NAME.json).
 
     Raises:
         DataError: there are no such files, those of several sequences, a number is missing, or the frame rate is

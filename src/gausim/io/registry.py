@@ -69,10 +69,7 @@ class Registry:
 
 
 def read_registry(source: str | Path = SHIPPED) -> Registry:
-    """Reads a registry.
-
-    Args:
-        source: a path or a URL of http or https. Relative addresses in it start where it lies.
+    """Reads a registry from a path or a URL of http or https; relative addresses in it start where it lies.
 
     Raises:
         FetchError: it cannot be had, or a field is missing or wrong.

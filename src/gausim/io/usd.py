@@ -59,8 +59,8 @@ def save_usd(path: Path | str, frames: Iterable[GaussianScene], fps: float, *, u
 
     Args:
         path: the file: .usd and .usdc are binary, .usda is text.
-        frames: deformed scenes of equal size.
-        fps: frames per second; frame n has time code n.
+        frames: deformed scenes of equal size; frame n has time code n.
+        fps: frames per second.
         up: vertical axis, ``y`` or ``z``.
 
     Raises:

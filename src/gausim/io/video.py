@@ -23,13 +23,8 @@ FINE, SMALL = 16, 21
 def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float, *, quality: int = FINE) -> int:
     """Writes (H, W, 3) uint8 RGB frames as MP4 (H.264), one at a time as they come; returns their number.
 
-    Odd sizes grow by one repeated row or column, because the chroma planes have half the size.
-
-    Args:
-        path: the file, with suffix .mp4.
-        frames: at least one frame, all of one size.
-        fps: frames per second.
-        quality: constant rate factor.
+    Odd sizes grow by one repeated row or column, because the chroma planes have half the size. ``quality`` is the
+    constant rate factor.
 
     Raises:
         DataError: no frames, frames of different size or type, or the encoder fails.
