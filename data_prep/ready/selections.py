@@ -117,7 +117,9 @@ def read_points(path: Path) -> np.ndarray:
 
 def _text_points(path: Path) -> np.ndarray:
     try:
-        return np.loadtxt(path.read_text("utf-8").replace(",", " ").splitlines(), ndmin=2)
+        lines = path.read_text("utf-8").replace(",", " ").splitlines()
+        rows = [[float(word) for word in line.split()] for line in lines if line.strip() and line.strip()[0] != "#"]
+        return np.array(rows)
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: expected three numbers per line ({error!s:.80}).") from error
 

@@ -159,18 +159,15 @@ def test_missing_dataset_and_broken_json(spoilt: Path, tmp_path: Path) -> None:
         ObjectData(spoilt)
 
 
-def test_true_motion_of_another_shape(spoilt: Path) -> None:
+def test_true_motion_that_is_missing_or_of_another_shape(spoilt: Path) -> None:
     path = spoilt / "sequences" / "seq_000" / "ground_truth.npz"
-    np.savez(path, displacement=np.zeros((FRAMES, POINTS + 1, 3), np.float32))
     item = ObjectData(spoilt)
+    np.savez(path, displacement=np.zeros((FRAMES, POINTS + 1, 3), np.float32))
     with pytest.raises(DataError, match=r"ground_truth.npz: field 'displacement'"):
         item.ground_truth(item.sequences[0])
     np.savez(path, other=np.zeros(3))
     with pytest.raises(DataError, match="array 'displacement' is missing"):
         item.ground_truth(item.sequences[0])
-
-
-def test_true_motion_is_none_where_unknown(spoilt: Path) -> None:
     (spoilt / "rest_points.npz").unlink()
     item = ObjectData(spoilt)
     assert item.ground_truth(item.sequences[0]) is None

@@ -124,12 +124,11 @@ def test_broken_files_are_named(tmp_path: Path, change: dict[str, str], message:
 def test_what_is_no_usd_is_refused(tmp_path: Path) -> None:
     save_usd(tmp_path / "m.usdc", motion(random_scene(40, 2)), 24.0)
     whole = (tmp_path / "m.usdc").read_bytes()
-    cut = [whole[: int(share * len(whole))] for share in (0.1, 0.5, 0.9, 0.99)]
-    for content in (b"", b"#usda 1.0\ndef {", b"PXR-USDC" + bytes(80), b"\x80\x04\x95junk", *cut):
-        for suffix in (".usda", ".usdc", ".usd"):
-            (tmp_path / f"bad{suffix}").write_bytes(content)
-            with pytest.raises(DataError, match="bad.usd"):
-                load_usd(tmp_path / f"bad{suffix}")
+    for number, content in enumerate((b"", b"#usda 1.0\ndef {", b"PXR-USDC" + bytes(80), whole[:200], whole[:-50])):
+        path = tmp_path / f"bad_{number}.usd"
+        path.write_bytes(content)
+        with pytest.raises(DataError, match=path.name):
+            load_usd(path)
 
 
 def test_names_and_sizes_are_checked(tmp_path: Path, monkeypatch) -> None:

@@ -8,9 +8,10 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import asdict
 
 from gausim.core.errors import FetchError
 from gausim.io.archive import only_folder, remove_tree, unpack

@@ -12,7 +12,6 @@ from gausim.cli.inspect import add_pin_options, pinned_by
 if TYPE_CHECKING:
     from gausim.core.scene import GaussianScene
     from gausim.data.objects import ObjectData
-    from gausim.doctor.evidence import Tick
     from gausim.doctor.examine import Examination
 
 HELP = "Look at cameras, masks, clock and motion of a data set before training: what to mend."
@@ -81,14 +80,10 @@ def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[st
             print("\n".join(f"  {fault.where}: {fault.what}" for fault in faults))
         return {"ruinous": True, "faults": [[f.where, f.what] for f in faults], "findings": [], "left_out": {}}
     data = ObjectData(root, scene=arguments.scene, masks=arguments.masks)
-    with _bars() as tick:
-        found = examine(data, _scene(data, arguments), tick)
-        if out is not None and found.evidence is not None:
-            _show(found, out, tick)
+    found = examine(data, _scene(data, arguments))
+    page = "" if out is None or found.evidence is None else _show(found, out)
     if not arguments.json:
-        print(findings_text(str(root), found))
-        if out is not None and found.evidence is not None:
-            print(f"page  {out / 'index.html'}")
+        print(findings_text(str(root), found), page, sep="")
     return {"ruinous": found.ruinous, "faults": [], **plain_findings(found)}
 
 
@@ -105,32 +100,10 @@ def _scene(data: ObjectData, arguments: argparse.Namespace) -> GaussianScene | N
     return pinned_by(scene, arguments.pin_below, arguments.pin_above)
 
 
-def _show(found: Examination, out: Path, tick: Tick) -> None:
+def _show(found: Examination, out: Path) -> str:
     from gausim.doctor.page import write_page
     from gausim.doctor.pictures import draw_pictures
 
     assert found.evidence is not None
-    write_page(out / "index.html", found, draw_pictures(found.evidence, out, tick))
-
-
-def _bars() -> Any:
-    """A context manager that gives what advances a progress bar per step, on standard error."""
-    from contextlib import contextmanager
-
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    @contextmanager
-    def bars():  # type: ignore[no-untyped-def]
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-            known: dict[str, Any] = {}
-
-            def tick(step: str, done: int, total: int) -> None:
-                if step not in known:
-                    known[step] = progress.add_task(step, total=total)
-                progress.update(known[step], completed=done, total=total)
-
-            yield tick
-
-    return bars()
+    write_page(out / "index.html", found, draw_pictures(found.evidence, out))
+    return f"\npage  {out / 'index.html'}"

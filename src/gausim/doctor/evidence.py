@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from rich.console import Console
+from rich.progress import track
 
 from gausim.core import Cameras, GaussianScene
 from gausim.data.objects import ObjectData
@@ -23,8 +26,7 @@ WATCHED_FRAMES, FRAMES_AT_A_TIME = 64, 8
 # Pictures are reduced to this length of their longer side [pixels].
 LONGEST = 192
 
-# What a progress bar shows: step, how much of it is done, how much there is.
-Tick = Callable[[str, int, int], None]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +90,14 @@ def same_cameras(a: Cameras, b: Cameras) -> bool:
     return bool(torch.equal(a.viewmats, b.viewmats) and torch.equal(a.Ks, b.Ks))
 
 
-def gather(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Evidence:
-    """Reads and reduces what the checks need; ``tick`` is told how far it is.
+def with_bar(items: Sequence[T], step: str) -> Iterable[T]:
+    """The items; a bar shows how many were taken, where standard error is a terminal."""
+    console = Console(stderr=True)
+    return track(items, step, console=console, transient=True, disable=not console.is_terminal)
+
+
+def gather(data: ObjectData, scene: GaussianScene | None) -> Evidence:
+    """Reads and reduces what the checks need.
 
     Raises:
         DataError: an image is missing or malformed.
@@ -98,15 +106,13 @@ def gather(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Evidenc
     watched_names, first_names = _spread(names, WATCHED_SEQUENCES), _spread(names, FIRST_FRAMES)
     watched, first, scale = [], [], 1.0
     chosen = [name for name in names if name in watched_names or name in first_names]
-    for number, name in enumerate(chosen):
-        tick("frames", number, len(chosen))
+    for name in with_bar(chosen, "frames"):
         # Not one of data.sequences: these keep all pictures that were ever decoded.
         record = SequenceRecord(data.root / "sequences" / name, views=data.views, fps=data.fps)
         frames = min(record.count, WATCHED_FRAMES) if name in watched_names else 1
         item, scale = _reduced(record, frames), _factor(record.cameras)
         watched += [item] if name in watched_names else []
         first.append(Watched(item.name, item.cameras, item.rgb[:1], item.alpha[:1]))
-    tick("frames", len(chosen), len(chosen))
     return Evidence(data, len(names), scene, scale, tuple(watched), tuple(first))
 
 

@@ -17,7 +17,7 @@ from gausim.doctor.coverage import (
     find_pins,
     find_tiny,
 )
-from gausim.doctor.evidence import Evidence, Tick, gather
+from gausim.doctor.evidence import Evidence, gather, with_bar
 from gausim.doctor.finding import SEVERITIES, Check, Finding
 from gausim.doctor.masks import find_mask_faults
 from gausim.doctor.motion import find_odd_motion, find_unrest
@@ -53,21 +53,17 @@ class Examination:
         return replace(self, findings=tuple(f for f in self.findings if f.severity != "note"))
 
 
-def examine(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Examination:
-    """Looks at some frames of an object, whose files are in order, and at its rest scene, pinned or not.
-
-    ``tick`` is told (step, how much is done, of how much).
-    """
+def examine(data: ObjectData, scene: GaussianScene | None) -> Examination:
+    """Looks at some frames of an object, whose files are in order, and at its rest scene, pinned or not."""
     try:
-        evidence = gather(data, scene, tick)
+        evidence = gather(data, scene)
     except DataError as error:
         remedy = "Mend this file; `gausim verify` without --quick finds all others that cannot be read."
         return Examination((Finding("fault", "certain", str(error), remedy, check="files"),), {}, None)
     findings: list[Finding] = []
     spoilt: set[str] = set()
     left_out: dict[str, str] = {}
-    for number, check in enumerate(CHECKS):
-        tick("checks", number, len(CHECKS))
+    for check in with_bar(CHECKS, "checks"):
         blocking = next((name for name in check.needs if name in spoilt), None)
         if blocking is not None:
             left_out[check.name] = blocking
@@ -76,7 +72,6 @@ def examine(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Examin
         findings += found
         if any(finding.severity == "fault" for finding in found):
             spoilt.add(check.name)
-    tick("checks", len(CHECKS), len(CHECKS))
     findings = _without_consequences(findings)
     ordered = sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
     return Examination(tuple(ordered), left_out, evidence)

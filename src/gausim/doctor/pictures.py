@@ -11,7 +11,7 @@ from matplotlib.text import Text
 
 from gausim.doctor.clock import motion_energy
 from gausim.doctor.coverage import view_directions
-from gausim.doctor.evidence import Evidence, Tick
+from gausim.doctor.evidence import Evidence, with_bar
 from gausim.doctor.motion import swing
 from gausim.report.pictures.figures import METHOD_COLORS, save_figure
 
@@ -22,7 +22,7 @@ _BEHIND = 90
 _OUTLINE = "#f0962a"
 
 
-def draw_pictures(evidence: Evidence, out: Path, tick: Tick) -> list[tuple[str, str]]:
+def draw_pictures(evidence: Evidence, out: Path) -> list[tuple[str, str]]:
     """Writes all pictures into a folder; returns name and caption of each."""
     drawn: list[tuple[str, str, Callable[[Evidence], Figure]]] = [
         ("views.png", "Frame 0 of the first sequence in every view; orange: outline of the rest scene, drawn by the "
@@ -33,14 +33,12 @@ def draw_pictures(evidence: Evidence, out: Path, tick: Tick) -> list[tuple[str, 
          "rate.", _spectrum),
         ("coverage.png", "Cameras seen from above. Orange: training views, blue: held-out ones.", _coverage),
     ]  # fmt: skip
-    for number, (name, _, figure) in enumerate(drawn):
-        tick("pictures", number, len(drawn))
+    for name, _, figure in with_bar(drawn, "pictures"):
         finished = figure(evidence)
         for text in finished.findobj(Text):  # a dollar sign in a name would start a formula
             assert isinstance(text, Text)
             text.set_parse_math(False)
         save_figure(finished, out / name)
-    tick("pictures", len(drawn), len(drawn))
     return [(name, caption) for name, caption, _ in drawn]
 
 

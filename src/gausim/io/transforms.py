@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -20,6 +21,7 @@ from gausim.io.plain_json import parse_json
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _LONGEST_NAME = 255
+_Row = tuple[float, float, float, float]
 # OpenGL looks along -z with y up, OpenCV along +z with y down.
 OPENGL_TO_OPENCV = (1.0, -1.0, -1.0, 1.0)
 
@@ -175,14 +177,14 @@ def viewmat_of(entry: dict[str, Any], field: str) -> Float[Tensor, "4 4"]:
     """
     if "transform_matrix" not in entry:
         raise DataError(f"{field}: field 'transform_matrix' is missing (camera to world, 4 x 4, OpenGL axes).")
+    wrong = f"{field}: field 'transform_matrix' must be a finite 4 x 4 matrix that ends in 0 0 0 1."
     try:
-        pose = torch.tensor(entry["transform_matrix"], dtype=torch.float64)
-    except (TypeError, ValueError):
-        pose = torch.empty(0)
-    last_row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    if pose.shape != (4, 4) or not torch.isfinite(pose).all() or not torch.allclose(pose[3], last_row, atol=1e-6):
-        raise DataError(f"{field}: field 'transform_matrix' must be a finite 4 x 4 matrix that ends in 0 0 0 1.")
-    pose = pose * torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
+        rows = msgspec.convert(entry["transform_matrix"], tuple[_Row, _Row, _Row, _Row])
+    except msgspec.ValidationError as error:
+        raise DataError(wrong) from error
+    if max(abs(a - b) for a, b in zip(rows[3], (0, 0, 0, 1), strict=True)) > 1e-6:
+        raise DataError(wrong)
+    pose = torch.tensor(rows, dtype=torch.float64) * torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
     # The transpose is the inverse of a rotation, and unlike a general inverse it keeps whatever is wrong with the
     # matrix visible to Cameras.validated (a singular pose must reach that message, not a linear-algebra error).
     rotation = pose[:3, :3].T
