@@ -89,8 +89,7 @@ def _make(data: ObjectData, names: list[str], work: Path, margin: int, tick: Tic
 def _sequence(data: ObjectData, name: str, folder: Path, margin: int) -> tuple[int, int, int]:
     """Writes one sequence unless it is there; returns its images and their bytes, packed and whole."""
     from gausim.data.frames import open_frames
-    from gausim.io.packed import is_packed, read_packed
-    from gausim.io.packed_writer import write_packed
+    from gausim.io.packed import is_packed, read_packed, write_packed
 
     root = data.root / "sequences" / name
     copy_missing(root / "ground_truth.npz", folder / "ground_truth.npz")

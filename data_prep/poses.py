@@ -25,8 +25,7 @@ from data_prep.common.photos import list_images, open_photo
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, run_stage
 from gausim.core.errors import DataError
-from gausim.io.colmap import read_colmap
-from gausim.io.colmap_files import PointTable
+from gausim.io.colmap import PointTable, read_colmap
 from gausim.io.files import replacing
 
 # Raise when the same inputs and settings give another result than before.

@@ -14,7 +14,7 @@ from data_prep.capture.cameras.sources import Posed, fitted
 from data_prep.common.photos import list_images, natural, open_photo
 from gausim.core.errors import DataError
 from gausim.io.colmap import ColmapImage, ColmapModel, colmap_files, find_colmap, read_colmap
-from gausim.io.plain_json import parse_json
+from gausim.io.plain_json import checked, parse_json
 from gausim.io.transforms import read_json
 
 _VIDEO = re.compile(r"(seq_[0-9]+)_(cam_[0-9]+)")
@@ -23,42 +23,41 @@ _LISTS = ("train", "test", "invalid", "force_invalid")
 SCENE, MOVING, OBJECT, PINS = "point_cloud.ply", "moving_part_points.ply", "clean_object_points.ply", "pin_mask.json"
 
 
+@dataclass(frozen=True)
 class Meta:
-    """``meta.json``: lists of sequences by name, and pairs that share their cameras.
+    """``meta.json``: lists of sequences by name, and pairs that share their cameras."""
+
+    lists: dict[str, tuple[str, ...]]
+    twins: dict[str, str]
+
+
+def read_meta(path: Path) -> Meta:
+    """Reads ``meta.json``.
 
     Raises:
         DataError: it is missing or malformed.
     """
-
-    def __init__(self, path: Path) -> None:
-        """Reads the file."""
-        data = read_json(path)
-        self.lists = {key: tuple(_sequence(path, key, v) for v in _list(path, key, data.get(key))) for key in _LISTS}
-        both = set(self.lists["train"]) & set(self.lists["test"])
-        if both:
-            raise DataError(f"{path}: fields 'train' and 'test' share {sorted(both)}.")
-        self.twins: dict[str, str] = {}
-        for key in (k for k in data if "twin" in k.lower()):
-            value = data[key]
-            for pair in list(value.items()) if isinstance(value, dict) else _list(path, key, value):
-                if not isinstance(pair, list | tuple) or len(pair) != 2:
-                    raise DataError(f"{path}: field '{key}' must hold pairs of sequences, got {pair!r:.60}.")
-                a, b = (_sequence(path, key, v) for v in pair)
-                self.twins[a], self.twins[b] = b, a
+    data, twins = read_json(path), dict[str, str]()
+    lists = {key: _sequences(path, key, data.get(key) or []) for key in _LISTS}
+    both = set(lists["train"]) & set(lists["test"])
+    if both:
+        raise DataError(f"{path}: fields 'train' and 'test' share {sorted(both)}.")
+    for key in (k for k in data if "twin" in k.lower()):
+        pairs = list(data[key].items()) if isinstance(data[key], dict) else data[key] or []
+        for pair in checked(pairs, list[tuple[str | int, str | int]], f"{path}: field '{key}'", "Expected pairs."):
+            a, b = _sequences(path, key, list(pair))
+            twins |= {a: b, b: a}
+    return Meta(lists, twins)
 
 
-def _list(path: Path, key: str, value: Any) -> list[Any]:
-    if value is not None and not isinstance(value, list):
-        raise DataError(f"{path}: field '{key}' must be a list, got a {type(value).__name__}.")
-    return value or []
-
-
-def _sequence(path: Path, key: str, value: Any) -> str:
-    """Name of a sequence that is given by its number, as text or number, or by its name."""
-    text = str(value)
-    if isinstance(value, bool) or not isinstance(value, int | str) or not re.fullmatch(r"(seq_)?[0-9]{1,9}", text):
-        raise DataError(f"{path}: field '{key}': expected sequences like 'seq_00001' or 1, got {value!r:.60}.")
-    return text if text.startswith("seq_") else f"seq_{int(text):05d}"
+def _sequences(path: Path, key: str, values: Any) -> tuple[str, ...]:
+    """Names of sequences that are given by their numbers, as texts or numbers, or by their names."""
+    names = []
+    for value in checked(values, list[str | int], f"{path}: field '{key}'", "Expected a list of sequences."):
+        if not re.fullmatch(r"(seq_)?[0-9]{1,9}", text := str(value)):
+            raise DataError(f"{path}: field '{key}': expected sequences like 'seq_00001' or 1, got {value!r:.60}.")
+        names.append(text if text.startswith("seq_") else f"seq_{int(text):05d}")
+    return tuple(names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +116,7 @@ def find_files(root: Path, image_masks: Path | None = None, video_masks: Path | 
     Raises:
         DataError: the model or ``meta.json`` is missing or malformed, an image is missing, or no sequence is usable.
     """
-    model, meta = read_colmap(find_colmap(root)), Meta(root / "meta.json")
+    model, meta = read_colmap(find_colmap(root)), read_meta(root / "meta.json")
     videos: dict[str, dict[str, Path]] = {}
     place = root / "video_images"
     for found in sorted(place.iterdir(), key=lambda p: natural(p.name)) if place.is_dir() else ():

@@ -14,7 +14,7 @@ from gausim.compose.build import build
 from gausim.compose.config import compose
 from gausim.compose.root import conf_dir
 from gausim.core import SimState
-from gausim.data.dataset import SampleKey, SequenceSample, TrainingDataset
+from gausim.data.dataset import SampleKey, SequenceSample
 from gausim.training.module import GausSimModule
 
 ABLATIONS = sorted(path.stem for path in (conf_dir() / "ablation").glob("*.yaml"))
@@ -30,7 +30,7 @@ def fresh(toy: Path, ablation: str, model: str) -> tuple[GausSimModule, list[Seq
     torch.manual_seed(0)
     tiny = [x for x in TINY if x != LEVELS or "no_hierarchy" not in ablation]  # what is given by hand wins
     module, datamodule = build(compose("train", [f"data.root={toy}", *tiny, f"model={model}", f"ablation={ablation}"]))
-    dataset = TrainingDataset(datamodule.index)
+    dataset = datamodule.index
     return module, [dataset[SampleKey(i, 3)] for i in range(2)]
 
 
@@ -119,7 +119,7 @@ def test_the_sum_over_steps_is_T_times_the_mean(toy: Path) -> None:
         config = ["loss.static_weight=0", "optimizer.clip_norm=0", "model=gausim_paper", f"ablation={ablation}"]
         torch.manual_seed(0)
         module, datamodule = build(compose("train", [f"data.root={toy}", *TINY, *config]))
-        samples = [TrainingDataset(datamodule.index)[SampleKey(i, 3)] for i in range(2)]
+        samples = [datamodule.index[SampleKey(i, 3)] for i in range(2)]
         module.optimise(samples, module.configure_optimizers(), torch.Generator().manual_seed(0))
         loss_gradients[ablation] = {n: p.grad.clone() for n, p in module.named_parameters() if p.grad is not None}
     mean, total = loss_gradients["none"], loss_gradients["sum_over_steps"]

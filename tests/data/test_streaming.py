@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 from data_prep.pack import pack
-from gausim.core import Cameras, ConfigError, DataError
+from gausim.core import Cameras, DataError
 from gausim.data import frames as frames_module
 from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.prefetch import read_ahead
 from gausim.data.records import SequenceRecord
-from gausim.io.packed import HEADER, PIXELS, Crop
-from gausim.io.packed_writer import header
+from gausim.io.packed import HEADER, PIXELS, Crop, header
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +57,7 @@ def epoch(data: ReadyDataModule, number: int) -> list[list[tuple[int, int]]]:
     return [[(s.sequence_id, int(s.frames[-1, 0, -1, -1, 2]) - 3) for s in batch] for batch in loader]
 
 
-@pytest.mark.parametrize("prefetch", [1, 2, 7])
+@pytest.mark.parametrize("prefetch", [1, 7])
 def test_reading_ahead_changes_nothing(mixed: Path, prefetch: int) -> None:
     plain, ahead = stream(mixed, prefetch=0, repeats=3), stream(mixed, prefetch=prefetch, repeats=3)
     for number in (0, 2):
@@ -116,11 +115,6 @@ def test_an_epoch_that_is_left_does_not_move_the_next(mixed: Path) -> None:
     assert [[s.sequence_id for s in b] for b in loader] == [[i for i, _ in b] for b in expected]
 
 
-def test_prefetch_below_zero_is_refused(mixed: Path) -> None:
-    with pytest.raises(ConfigError, match=r"data\.prefetch: .*got -1"):
-        stream(mixed, prefetch=-1).train_dataloader()
-
-
 def test_memory_is_bounded_by_the_batches_in_flight(tmp_path: Path, tiny: SimpleNamespace) -> None:
     """A packed set of ten batches: over three epochs no more than the batches in flight are in memory."""
     root = tiny.object(tmp_path / "large", sequences=1)
@@ -156,8 +150,7 @@ def _sparse_sequence(folder: Path, cameras: Cameras, frames: int, side: int, blo
     (folder / HEADER).write_bytes(header(cameras, crops, count=frames, fps=24.0, size=3 * block, sha256="0" * 64))
 
 
-@pytest.mark.parametrize("world", [2, 3])
-def test_a_rank_reads_only_its_share(mixed: Path, monkeypatch: pytest.MonkeyPatch, world: int) -> None:
+def test_a_rank_reads_only_its_share(mixed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[tuple[str, str]] = []
     original = SequenceRecord.frames
 
@@ -167,16 +160,15 @@ def test_a_rank_reads_only_its_share(mixed: Path, monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(SequenceRecord, "frames", noted)
     shares = []
-    for rank in range(world):
+    for rank in range(2):
         data = ReadyDataModule(mixed, batch_size=3, repeats=1, curriculum=Curriculum(t_max=5), prefetch=2)
-        data.trainer = SimpleNamespace(global_rank=rank, world_size=world)  # type: ignore[assignment]
+        data.trainer = SimpleNamespace(global_rank=rank, world_size=2)  # type: ignore[assignment]
         data.setup("fit")
         read.clear()
         shown = [(s.object_name, s.sequence_name) for batch in data.train_dataloader() for s in batch]
         assert sorted(read) == sorted(shown) and len(set(read)) == len(read)
-        shares.append(shown)
-    every = sorted(s for share in shares for s in share)
-    assert every == sorted([("apple", f"seq_{i:03d}") for i in range(3)] + [("pear", f"seq_{i:03d}") for i in range(2)])
+        shares += shown
+    assert sorted(shares) == [*(("apple", f"seq_{i:03d}") for i in range(3)), ("pear", "seq_000"), ("pear", "seq_001")]
 
 
 def test_a_growing_rollout_reads_no_frame_twice(mixed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -192,12 +184,6 @@ def test_a_growing_rollout_reads_no_frame_twice(mixed: Path, monkeypatch: pytest
     for number in range(6):
         epoch(data, number)
         assert len(set(decoded)) == len(decoded) == (number + 2 if number < 5 else 6) * (3 * 2 + 2 * 1)
-
-
-def test_one_batch_holds_objects_of_other_rates_views_and_lengths(mixed: Path) -> None:
-    (batch,) = list(stream(mixed, batch_size=5).train_dataloader())
-    found = {(s.object_name, s.fps, tuple(s.frames.shape[:2])) for s in batch}
-    assert found == {("apple", 24.0, (2, 2)), ("pear", 50.0, (2, 1))}
 
 
 def test_a_packed_and_an_unpacked_object_train_together(mixed: Path, tmp_path: Path) -> None:

@@ -14,12 +14,11 @@ import torch
 from helpers import toy_object
 
 from data_prep.pack import pack
-from gausim.data.dataset import SampleKey, SequenceIndex, TrainingDataset
+from gausim.data.dataset import SampleKey, SequenceIndex
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.data.verify import verify
-from gausim.io.packed import HEADER, PIXELS, read_packed
-from gausim.io.packed_writer import bounding_crop
+from gausim.io.packed import HEADER, PIXELS, bounding_crop, read_packed
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +42,7 @@ def test_a_packed_object_gives_the_same_samples(toy: Path, packed: Path) -> None
             assert float(found[1].amax()) > 0
             a, b = ours.cameras_of(views), theirs.cameras_of(views)
             assert torch.equal(a.viewmats, b.viewmats) and torch.equal(a.Ks, b.Ks) and a.names == b.names
-    samples = [TrainingDataset(SequenceIndex([ObjectData(root)]))[SampleKey(1, 4)] for root in (packed, toy)]
+    samples = [SequenceIndex([ObjectData(root)])[SampleKey(1, 4)] for root in (packed, toy)]
     assert samples[0].facts == samples[1].facts
     assert torch.equal(composite(samples[0].frames)[0], composite(samples[1].frames)[0])
 
@@ -93,7 +92,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str, str]] = {
     "header gone": (lambda s: (s / "sequences/seq_001" / HEADER).unlink(), "seq_001", "transforms.json: no such file"),
     "schema": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d.update(schema=9)), "seq_000", "schema"),
     "nan": (lambda s: _edit(s / "sequences/seq_000" / HEADER,
-                            lambda d: d["views"][1]["viewmat"][0].__setitem__(3, float("nan"))), "seq_000", "viewmat"),
+                            lambda d: d["views"][1]["viewmat"][0].__setitem__(3, float("nan"))), "seq_000", "as JSON"),
     "crop": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d["views"][0].update(crop=[30, 0, 9, 9])),
              "seq_000", "leaves the image"),
     "offset": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d["views"][2].update(offset=10**9)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -27,17 +28,17 @@ from data_prep.pack import pack
 from data_prep.ready.authors import read_pins
 from data_prep.ready.gathered import gather
 from gausim.core.errors import GausSimError
-from gausim.data.images import read_rgba
+from gausim.data.images import read_rgba, write_rgba
 from gausim.data.objects import ObjectData
 from gausim.data.records import read_array, read_stills
 from gausim.data.verify import verify
 from gausim.interaction.selections import Ball, Kernels
 from gausim.interaction.session import Entry, Force, ForceSession, MadeWith, Pin, Reset, load_session, save_session
 from gausim.io.colmap import read_colmap
-from gausim.io.ply import load_masks, load_points, load_scene
+from gausim.io.ply import load_masks, load_points, load_scene, save_scene
 from gausim.io.ply_sequence import load_ply_sequence, save_ply_sequence
 from gausim.io.trajectory import load_trajectory, save_trajectory
-from gausim.io.transforms import read_json, read_transforms
+from gausim.io.transforms import read_json, read_transforms, write_transforms
 from gausim.io.video import read_video, video_rate
 from gausim.results.summary import SCHEMA, load_summary
 from gausim.runs.directory import RunDirectory
@@ -52,21 +53,13 @@ SESSION = ForceSession(_MADE, 24.0, 8, (Entry(1, _PUSH), Entry(4, Pin(Kernels((1
 
 @dataclass(frozen=True)
 class Reader:
-    """One way to read a file.
+    """One way to read a file."""
 
-    Attributes:
-        name: what it is called.
-        file: the file that is damaged.
-        kind: how, see :func:`mutations.mutated`.
-        read: reads it (and what it needs beside it); what it returns has to be finite.
-        weight: damaged files in proportion to the others'.
-    """
-
-    name: str
-    file: Path
-    kind: str
-    read: Callable[[Path], Any]
-    weight: int = 4
+    name: str  # what it is called
+    file: Path  # the file that is damaged
+    kind: str  # how, see :func:`mutations.mutated`
+    read: Callable[[Path], Any]  # reads it (and what it needs beside it); what it returns has to be finite
+    weight: int = 4  # damaged files in proportion to the others'
 
 
 def readers(folder: Path) -> list[Reader]:
@@ -80,8 +73,6 @@ def readers(folder: Path) -> list[Reader]:
 def _scenes(folder: Path) -> Iterator[Reader]:
     toy = toy_object.ToyObject(folder / "scene", SCENE)
     (folder / "scene").mkdir()
-    from gausim.io.ply import save_scene
-
     path = folder / "scene" / "scene.ply"
     save_scene(SCENE, path)
     yield Reader("scene", path, "text", load_scene, 8)
@@ -150,9 +141,6 @@ def _posed(folder: Path) -> Iterator[Reader]:
     (root / "images").mkdir(parents=True)
     views = toy_object.cameras()
     pixels = toy_object.rgba(SCENE, toy_object.ToyObject(root, SCENE).truth("seq_000", 1))[0]
-    from gausim.data.images import write_rgba
-    from gausim.io.transforms import write_transforms
-
     for name, image in zip(views.names, pixels, strict=True):
         write_rgba(root / "images" / f"{name}.png", image)
     path = root / "transforms.json"
@@ -195,8 +183,6 @@ def _ready(folder: Path) -> Iterator[Reader]:
     out = folder / "ready_out"
 
     def imported(_: Path) -> Any:
-        import shutil
-
         try:
             return import_ready(root, out, ReadyOptions(train_frames=2))["results"]
         finally:

@@ -25,12 +25,9 @@ NUMBER = re.compile(rb"-?[0-9]+(\.[0-9]*)?([eE][+-]?[0-9]+)?")
 
 
 def mutated(data: bytes, kind: str, rng: random.Random) -> bytes:
-    """Another file, made of this one; one to three things are wrong with it.
+    """Another file, made of a good one; one to three things are wrong with it.
 
-    Args:
-        data: a good file.
-        kind: ``json``, ``text``, ``npz``, ``png`` or ``binary``: what may be damaged besides bytes.
-        rng: decides what.
+    ``kind`` is ``json``, ``text``, ``npz``, ``png`` or ``binary``: what may be damaged besides bytes.
     """
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         aware = MEANINGS.get(kind)

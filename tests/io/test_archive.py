@@ -36,27 +36,21 @@ def some_files(root: Path) -> dict[str, Path]:
     return {path.relative_to(root).as_posix(): path for path in files_below(root)}
 
 
-def test_what_was_packed_is_unpacked(tmp_path):
-    files = some_files(tmp_path / "from")
-    total = pack(tmp_path / "x.tar", {f"top/{name}": path for name, path in files.items()})
-    assert total == sum(path.stat().st_size for path in files.values())
-    counted = []
-    unpack(tmp_path / "x.tar", tmp_path / "to", most_bytes=total, advance=counted.append)
-    made = only_folder(tmp_path / "to")
-    assert made == tmp_path / "to" / "top" and sum(counted) == total
-    assert {n: (made / n).read_bytes() for n in files} == {n: path.read_bytes() for n, path in files.items()}
-
-
-def test_the_same_files_give_the_same_bytes_whenever_and_whoever_packs(tmp_path):
+def test_the_same_files_give_the_same_bytes_and_come_back(tmp_path):
     archives = []
     for i, time in enumerate((10.0, 2e9)):
         files = some_files(tmp_path / str(i))
         for path in files.values():
             os.utime(path, (time, time))
             path.chmod(0o600 if i else 0o755)
-        pack(tmp_path / f"{i}.tar", dict(reversed(list(files.items()))) if i else files)
+        files = {f"top/{name}": path for name, path in (reversed(files.items()) if i else files.items())}
+        total = pack(tmp_path / f"{i}.tar", files)
         archives.append((tmp_path / f"{i}.tar").read_bytes())
-    assert archives[0] == archives[1]
+    assert archives[0] == archives[1] and total == sum(path.stat().st_size for path in files.values())
+    counted = []
+    unpack(tmp_path / "1.tar", tmp_path / "to", most_bytes=total, advance=counted.append)
+    assert only_folder(tmp_path / "to") == tmp_path / "to" / "top" and sum(counted) == total
+    assert all((tmp_path / "to" / name).read_bytes() == path.read_bytes() for name, path in files.items())
 
 
 def test_links_and_hidden_files_are_not_packed(tmp_path):
@@ -72,16 +66,13 @@ def test_links_and_hidden_files_are_not_packed(tmp_path):
     ("members", "what"),
     [
         ([member("top/a"), member("../escaped")], "leaves the folder"),
-        ([member("top/../../escaped")], "leaves the folder"),
         ([member("/tmp/escaped")], "leaves the folder"),
         ([member("top\\..\\..\\escaped")], "leaves the folder"),
         ([member("C:/escaped")], "leaves the folder"),
         ([member("top/link", tarfile.SYMTYPE, "/etc")], "a link"),
         ([member("top/hard", tarfile.LNKTYPE, "/etc/passwd")], "a link"),
         ([member("top/null", tarfile.CHRTYPE)], "a device"),
-        ([member("top/pipe", tarfile.FIFOTYPE)], "a device"),
         ([member("top/a"), member("top/A")], "there twice"),
-        ([member("top/a"), member("top/a/b")], "there twice"),
         ([member("top/a/b"), member("top/a")], "there twice"),
         ([member("top/a"), member("top/a", tarfile.DIRTYPE)], "a folder where there is a file"),
         ([member("top/a\x1b[2J")], "characters that no name"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import tracemalloc
 from collections.abc import Callable
@@ -49,18 +48,19 @@ def test_pycolmap_reads_the_same(model: Path) -> None:
         np.testing.assert_allclose(by_name[image.name].cam_from_world().matrix(), image.viewmat[:3], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", colmap_files.MODEL_NUMBERS)
-def test_every_lens_model_is_read_with_its_intrinsics(tmp_path: Path, name: str) -> None:
-    theirs = pycolmap.Camera.create_from_model_name(1, name, 500.0, 640, 480)
-    theirs.params = [v + 0.01 * i for i, v in enumerate(theirs.params)]
+def test_every_lens_model_is_read_with_its_intrinsics(tmp_path: Path) -> None:
+    theirs = {i: pycolmap.Camera.create_from_model_name(i, n, 500.0, 640, 480)
+              for i, n in enumerate(colmap_files.MODEL_NUMBERS)}  # fmt: skip
+    for camera in theirs.values():
+        camera.params = [v + 0.01 * i for i, v in enumerate(camera.params)]
     _, images, points = colmap_files.small_model()
-    images = {n: (i[0], 1, *i[2:]) for n, i in images.items()}
+    cameras = {i: (c.model.name, 640, 480, list(map(float, c.params))) for i, c in theirs.items()}
     for form, write in WRITERS.items():
-        write(tmp_path / form, {1: (name, 640, 480, [float(v) for v in theirs.params])}, images, points)
-        camera = read_colmap(tmp_path / form).cameras[1]
-        k = theirs.calibration_matrix()
-        np.testing.assert_allclose((k[0, 0], k[1, 1], k[0, 2], k[1, 2]), camera.intrinsics)
-        assert camera.distorted is not name.endswith("PINHOLE")
+        write(tmp_path / form, cameras, {n: (i[0], 1, *i[2:]) for n, i in images.items()}, points)
+        for number, camera in read_colmap(tmp_path / form).cameras.items():
+            k = theirs[number].calibration_matrix()
+            np.testing.assert_allclose((k[0, 0], k[1, 1], k[0, 2], k[1, 2]), camera.intrinsics)
+            assert camera.distorted is not camera.model.endswith("PINHOLE")
 
 
 def test_a_scaled_camera_sees_the_same_directions() -> None:
@@ -88,7 +88,6 @@ def test_the_model_is_found_where_colmap_puts_it(tmp_path: Path) -> None:
 FAULTS = {
     "model": ("cameras", "PINHOLE 64", "EQUIRECTANGULAR 64", "'model'"),
     "focal length": ("cameras", "60.0 61.0", "60.0 -61.0", "focal lengths"),
-    "infinite focal length": ("cameras", "60.0 61.0", "inf 61.0", "'params'"),
     "size": ("cameras", "64 48", "64 0", "'height'"),
     "too few parameters": ("cameras", " 24.0\n", "\n", "expected 8 words"),
     "not a number": ("cameras", "61.0", "x61", "expected a number"),
@@ -96,13 +95,11 @@ FAULTS = {
     "camera of an image": ("images", " 7 photo_1", " 8 photo_1", "'camera_id'"),
     "name twice": ("images", "photo_1", "photo_0", "stands twice"),
     "name outside": ("images", "photo_1", "../photo_1", "inside the folder"),
-    "name absolute": ("images", "photo_1", "/etc/photo_1", "inside the folder"),
     "translation": ("images", " 4.0 7 photo_1", " nan 7 photo_1", "'translation'"),
     "keypoints": ("images", "11.5 20.25 5", "11.5 20.25", "triples"),
     "keypoint": ("images", "11.5 20.25 5", "nan 20.25 5", "keypoints"),
     "keypoint's point": ("images", "11.5 20.25 5", "11.5 20.25 5.5", "whole number"),
     "point": ("points3D", "0.1 -0.2 0.3", "0.1 nan 0.3", "'xyz'"),
-    "huge point": ("points3D", "0.1 -0.2 0.3", "0.1 1e300 0.3", "'xyz'"),
     "error": ("points3D", " 0.5 ", " inf ", "'error'"),
     "colour": ("points3D", "250 10 7", "256 10 7", "'rgb'"),
     "track": ("points3D", "0.5 3 0 4 0", "0.5 3 0 4", "pairs"),
@@ -149,16 +146,3 @@ def test_counts_are_not_believed(tmp_path: Path, role: str) -> None:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 1 << 20
-
-
-def test_a_real_model_is_read_as_pycolmap_reads_it() -> None:
-    root = os.environ.get("GAUSIM_TEST_DATA")
-    if not root:
-        pytest.skip("GAUSIM_TEST_DATA names no folder of real data")
-    folder = find_colmap(Path(root) / "photos" / "backyard_colmap")
-    ours, theirs = read_colmap(folder), pycolmap.Reconstruction(folder)
-    assert len(ours.images) == theirs.num_reg_images() == 15
-    assert (
-        len(ours.points.ids) == theirs.num_points3D() and ours.points.tracks.sum() == theirs.compute_num_observations()
-    )
-    assert ours.points.error.mean() == pytest.approx(theirs.compute_mean_reprojection_error())

@@ -47,20 +47,15 @@ def test_without_range_it_begins_anew(mirror, tmp_path):
     assert [asked for _, asked in server.asked] == [None, "bytes=300000-"]
 
 
-@pytest.mark.parametrize("source", ["web", "disk"])
-def test_what_an_earlier_call_left_is_not_asked_for_again(mirror, tmp_path, source):
-    (tmp_path / "part").write_bytes(DATA[:500_000])
+def test_what_an_earlier_call_left_is_not_asked_for_again_and_what_is_too_long_thrown_away(mirror, tmp_path):
+    part = tmp_path / "part"
     with serving(mirror) as server:
-        bring(f"{server.url}/x.tar" if source == "web" else str(mirror / "x.tar"), tmp_path / "part")
-        assert server.asked == ([("/x.tar", "bytes=500000-")] if source == "web" else [])
-        bring(f"{server.url}/gone.tar", tmp_path / "part")  # whole: nobody is asked
-
-
-def test_too_long_a_rest_is_thrown_away(mirror, tmp_path):
-    (tmp_path / "part").write_bytes(DATA + b"more")
-    with serving(mirror) as server:
-        bring(f"{server.url}/x.tar", tmp_path / "part")
-    assert [asked for _, asked in server.asked] == [None]
+        for left in (DATA[:500_000], DATA, DATA + b"more"):
+            part.write_bytes(left)
+            bring(f"{server.url}/x.tar", part)
+    assert [asked for _, asked in server.asked] == ["bytes=500000-", None]
+    part.write_bytes(DATA[:500_000])
+    assert bring(str(mirror / "x.tar"), part)[0] > 500_000
 
 
 def test_servers_that_are_busy_are_asked_again_and_those_that_refuse_are_not(mirror, tmp_path):
@@ -93,7 +88,7 @@ def test_nobody_there_names_the_mirror_as_a_way_out(mirror, tmp_path):
         pass
     with pytest.raises(FetchError, match=r"cannot be read \(.*refused.*\). Check the connection .* --mirror DIR"):
         bring(f"{server.url}/x.tar", tmp_path / "part")
-    with pytest.raises(FetchError, match=r"nowhere.tar: cannot be read \(No such file.*Check that the file is there"):
+    with pytest.raises(FetchError, match=r"nowhere.tar: cannot be read \(.*No such file.*Check that the file is there"):
         bring(str(mirror / "nowhere.tar"), tmp_path / "part")
 
 

@@ -114,8 +114,3 @@ def test_malformed_fields_are_named(tmp_path: Path, changes: dict[str, object], 
     with pytest.raises(DataError, match=message) as error:
         read_transforms(path)
     assert str(path) in str(error.value)
-
-
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no such file"):
-        read_transforms(tmp_path / "transforms.json")

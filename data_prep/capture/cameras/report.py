@@ -12,7 +12,7 @@ from data_prep.capture.cameras.lenses import project
 from data_prep.capture.cameras.sources import Posed
 from data_prep.capture.cameras.world import centers
 from data_prep.common.photos import Photo, read_photo
-from gausim.io.colmap_files import PointTable
+from gausim.io.colmap import PointTable
 
 # Fewer features than this are a photo without texture, fewer inliers one that no other photo shares a view with.
 _FEW_FEATURES, _FEW_MATCHES = 300, 60

@@ -22,7 +22,7 @@ from data_prep.capture.cameras.world import (
 )
 from data_prep.common.command import Options, option
 from gausim.core.errors import ConfigError
-from gausim.io.colmap_files import PointTable
+from gausim.io.colmap import PointTable
 
 _PICK = re.compile(r"(.+)@(-?[0-9.]+),(-?[0-9.]+)")
 # Distances that disagree by more than this were measured or marked wrongly.

@@ -16,8 +16,7 @@ from gausim.benchmark.harness import Options, Row, medians, peak_resident, proce
 from gausim.core import Cameras
 from gausim.data.frames import ImageSource, PackedSource
 from gausim.data.images import write_rgba
-from gausim.io.packed import HEADER, PIXELS, Crop, read_packed
-from gausim.io.packed_writer import header, write_packed
+from gausim.io.packed import HEADER, PIXELS, Crop, header, read_packed, write_packed
 from gausim.io.transforms import write_transforms
 
 FPS, FRAMES, VIEWS, CROPPED = 24.0, 16, 4, 0.2

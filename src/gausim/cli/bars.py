@@ -40,17 +40,3 @@ def byte_bar(total: int, title: str, *, pieces: bool = False) -> Iterator[Callab
             yield lambda count: shown.advance(task, count)
         else:
             yield lambda count: shown.update(task, completed=count)
-
-
-@contextmanager
-def step_bars() -> Iterator[Callable[[str, int, int], None]]:
-    """A bar for every step that is named; what it gives takes the step's name, how much is done, and of how much."""
-    with bars() as shown:
-        known = {}
-
-        def tick(step: str, done: int, total: int) -> None:
-            if step not in known:
-                known[step] = shown.add_task(step, total=total)
-            shown.update(known[step], completed=done, total=total)
-
-        yield tick

@@ -8,9 +8,10 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+from msgspec.structs import asdict
 
 from gausim.cli.bars import byte_bar
 from gausim.core.errors import FetchError

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gausim.cli.arguments import add_pin_options, command_parser, pinned_by
-from gausim.cli.bars import step_bars
 
 if TYPE_CHECKING:
     from gausim.core.scene import GaussianScene
     from gausim.data.objects import ObjectData
+    from gausim.doctor.examine import Examination
 
 
 def main(argv: list[str]) -> int:
@@ -55,8 +55,7 @@ def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[st
     from gausim.data.objects import ObjectData
     from gausim.data.verify import verify
     from gausim.doctor.examine import examine
-    from gausim.doctor.page import findings_text, plain_findings, write_page
-    from gausim.doctor.pictures import draw_pictures
+    from gausim.doctor.page import findings_text, plain_findings
 
     # Masks and pins are judged below: they may be given here, and no pin is a finding among others.
     faults = verify(root, quick=True, scene=False)
@@ -67,14 +66,10 @@ def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[st
             print("\n".join(f"  {fault.where}: {fault.what}" for fault in faults))
         return {"ruinous": True, "faults": [[f.where, f.what] for f in faults], "findings": [], "left_out": {}}
     data = ObjectData(root, scene=arguments.scene, masks=arguments.masks)
-    with step_bars() as tick:
-        found = examine(data, _scene(data, arguments), tick)
-        if out and found.evidence:
-            write_page(out / "index.html", found, draw_pictures(found.evidence, out, tick))
+    found = examine(data, _scene(data, arguments))
+    page = "" if out is None or found.evidence is None else _show(found, out)
     if not arguments.json:
-        print(findings_text(str(root), found))
-        if out and found.evidence:
-            print(f"page  {out / 'index.html'}")
+        print(findings_text(str(root), found), page, sep="")
     return {"ruinous": found.ruinous, "faults": [], **plain_findings(found)}
 
 
@@ -87,4 +82,14 @@ def _scene(data: ObjectData, arguments: argparse.Namespace) -> GaussianScene | N
         if arguments.scene is not None:
             raise DataError(f"{data.scene_path}: no such file. Give --scene the PLY that `gausim reconstruct` wrote.")
         return None
-    return pinned_by(load_scene(data.scene_path, masks=data.masks_path, name=data.name), arguments)
+    scene = load_scene(data.scene_path, masks=data.masks_path, name=data.name)
+    return pinned_by(scene, arguments)
+
+
+def _show(found: Examination, out: Path) -> str:
+    from gausim.doctor.page import write_page
+    from gausim.doctor.pictures import draw_pictures
+
+    assert found.evidence is not None
+    write_page(out / "index.html", found, draw_pictures(found.evidence, out))
+    return f"\npage  {out / 'index.html'}"

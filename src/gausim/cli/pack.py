@@ -14,7 +14,7 @@ from gausim.core.errors import FetchError, RunError
 from gausim.data.objects import find_objects
 from gausim.io.archive import files_below, pack
 from gausim.io.files import sha256
-from gausim.io.registry import Entry, check_names, entry_text
+from gausim.io.registry import Entry, check_name, entry_text
 from gausim.io.transforms import read_json
 from gausim.report.card import CARD
 from gausim.runs.checkpoint import LAST_CHECKPOINT, read_checkpoint
@@ -46,7 +46,7 @@ def pack_published(source: Path, out: Path, *, name: str, title: str | None, lic
         DataError: there is no data set, or a link in it.
     """
     archive = out / f"{name}.tar"
-    check_names(name, archive.name)
+    check_name(name)
     is_run = (source / CONFIG).is_file()
     files, objects = _of_run(source) if is_run else _of_data(source)
     known = licence or (None if is_run else _licence_of(source))

@@ -238,7 +238,7 @@ def _warn_of_data(datamodule: ReadyDataModule) -> list[str]:
 
     faults: list[str] = []
     for item in datamodule.objects:
-        found = examine(item, item.scene(), lambda step, done, total: None).graver
+        found = examine(item, item.scene()).graver
         if found.findings:
             print(findings_text(str(item.root), found), flush=True)
         faults += [f"{item.name}: {finding.what}" for finding in found.findings if finding.severity == "fault"]

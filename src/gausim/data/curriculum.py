@@ -9,18 +9,12 @@ from gausim.core import ConfigError
 
 @dataclass
 class Curriculum:
-    """T grows by one every few epochs up to ``t_max`` (METHOD section 4).
+    """T grows by one every few epochs up to ``t_max`` (METHOD section 4)."""
 
-    Attributes:
-        t_start: predicted steps in epoch 0.
-        t_max: most predicted steps; 15 steps see frames 0..15 and no unseen one.
-        epochs_per_increase: epochs between increases.
-        longest: most predicted steps for now, at most ``t_max``; what judges a run holds frames back by it.
-    """
-
-    t_start: int = 1
-    t_max: int = 15
-    epochs_per_increase: int = 1
+    t_start: int = 1  # predicted steps in epoch 0
+    t_max: int = 15  # most predicted steps; 15 steps see frames 0..15 and no unseen one
+    epochs_per_increase: int = 1  # epochs between increases
+    # most predicted steps for now, at most ``t_max``; what judges a run holds frames back by it
     longest: int = field(default=0, init=False, repr=False)
 
     def __post_init__(self) -> None:

@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 
 from gausim.core import ConfigError
 from gausim.data.curriculum import Curriculum
-from gausim.data.dataset import SampleKey, SequenceIndex, SequenceSample, TrainingDataset, collate
+from gausim.data.dataset import SampleKey, SequenceIndex, SequenceSample, collate
 from gausim.data.objects import ObjectData, find_objects
 from gausim.data.prefetch import PrefetchingLoader
 from gausim.data.sampler import SequenceBatchSampler
@@ -51,7 +51,7 @@ class ReadyDataModule(LightningDataModule):
                 with ``root`` and its own ``scene``, ``masks`` and ``selections``.
             scene: PLY of the rest scene of a single object; ``scene.ply`` in its directory when None.
             masks: npz of its masks; beside the PLY when None.
-            selections: what replaces its masks, see :func:`gausim.data.scenes.select_masks`.
+            selections: what replaces its masks, see :func:`gausim.data.objects.select_masks`.
             batch_size: sequences per optimiser step, divided over the ranks; a third of all, 1 to 4, when None.
             repeats: how many times each sequence is shown per epoch.
             curriculum: predicted steps per epoch; METHOD's when None.
@@ -63,8 +63,7 @@ class ReadyDataModule(LightningDataModule):
         super().__init__()
         self._root, self._names, self._sequences = root, names, sequences
         self._options: dict[str, Any] = {"scene": scene, "masks": masks, "selections": selections}
-        self._batch_size, self.repeats, self._seed = batch_size, repeats, seed
-        self._prefetch = prefetch
+        self._batch_size, self.repeats, self._seed, self._prefetch = batch_size, repeats, seed, prefetch
         self.curriculum = curriculum if curriculum is not None else Curriculum()
         self._sampler: SequenceBatchSampler | None = None
 
@@ -97,25 +96,16 @@ class ReadyDataModule(LightningDataModule):
         """Opens the objects and fixes the order of training (before a checkpoint's position is loaded)."""
         if stage in (None, "fit"):
             self._check_curriculum()
+            rank, ranks = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+            size = max(ranks, min(4, len(self.index) // 3)) if self._batch_size is None else self._batch_size
             self._sampler = SequenceBatchSampler(
-                len(self.index),
-                batch_size=self._sequences_per_step(),
-                repeats=self.repeats,
-                curriculum=self.curriculum,
-                seed=self._seed,
-                rank=self.trainer.global_rank if self.trainer else 0,
-                world_size=self.trainer.world_size if self.trainer else 1,
-            )
-
-    def _sequences_per_step(self) -> int:
-        if self._batch_size is not None:
-            return self._batch_size
-        ranks = self.trainer.world_size if self.trainer else 1
-        return max(ranks, min(4, len(self.index) // 3), 1)
+                len(self.index), batch_size=size, repeats=self.repeats, curriculum=self.curriculum, seed=self._seed,
+                rank=rank, world_size=ranks,
+            )  # fmt: skip
 
     def training_sample(self, sequence: int, steps: int) -> SequenceSample:
         """Frames 0..``steps`` of a sequence in the training views."""
-        return TrainingDataset(self.index)[SampleKey(sequence, steps)]
+        return self.index[SampleKey(sequence, steps)]
 
     def steps(self, epoch: int) -> int:
         """Predicted steps T in an epoch."""
@@ -127,10 +117,7 @@ class ReadyDataModule(LightningDataModule):
         Image files are decoded once and stay in memory, packed frames are read where they lie: no worker is needed.
         """
         return PrefetchingLoader(
-            TrainingDataset(self.index),
-            batch_sampler=self._ready_sampler(),
-            collate_fn=collate,
-            prefetch=self._prefetch,
+            self.index, batch_sampler=self._ready_sampler(), collate_fn=collate, prefetch=self._prefetch
         )
 
     def state_dict(self) -> dict[str, Any]:

@@ -17,57 +17,34 @@ from gausim.data.records import GroundTruth, SequenceRecord
 
 
 class SampleKey(NamedTuple):
-    """What the batch sampler asks the training dataset for.
+    """What the batch sampler asks the training dataset for."""
 
-    Attributes:
-        sequence: global sequence id.
-        steps: predicted steps T; frames 0..T are handed out.
-    """
-
-    sequence: int
-    steps: int
+    sequence: int  # global sequence id
+    steps: int  # predicted steps T; frames 0..T are handed out
 
 
 @dataclass(frozen=True)
 class SampleFacts:
-    """What ranks tell each other of a sample.
+    """What ranks tell each other of a sample."""
 
-    Attributes:
-        scene_id: index of the object.
-        object_name: its name.
-        sequence_id: running index of the sequence over all objects.
-        sequence_name: its name within the object.
-        steps: predicted steps T.
-    """
-
-    scene_id: int
-    object_name: str
-    sequence_id: int
-    sequence_name: str
-    steps: int
+    scene_id: int  # index of the object
+    object_name: str  # its name
+    sequence_id: int  # running index of the sequence over all objects
+    sequence_name: str  # its name within the object
+    steps: int  # predicted steps T
 
 
 @dataclass(frozen=True, eq=False)
 class SequenceSample:
-    """One stretch of one sequence, from frame 0 on.
+    """One stretch of one sequence, from frame 0 on."""
 
-    Attributes:
-        scene_id: index of the object.
-        object_name: its name.
-        sequence_id: running index of the sequence over all objects.
-        sequence_name: its name within the object.
-        frames: straight-alpha RGBA of T + 1 frames in V views.
-        cameras: the V cameras.
-        fps: frames per second.
-    """
-
-    scene_id: int
-    object_name: str
-    sequence_id: int
-    sequence_name: str
-    frames: UInt8[Tensor, "F V H W 4"]
-    cameras: Cameras
-    fps: float
+    scene_id: int  # index of the object
+    object_name: str  # its name
+    sequence_id: int  # running index of the sequence over all objects
+    sequence_name: str  # its name within the object
+    frames: UInt8[Tensor, "F V H W 4"]  # straight-alpha RGBA of T + 1 frames in V views
+    cameras: Cameras  # the V cameras
+    fps: float  # frames per second
 
     @property
     def steps(self) -> int:
@@ -84,8 +61,11 @@ class SequenceSample:
         return replace(self, frames=self.frames.to(device, non_blocking=True), cameras=self.cameras.to(device))
 
 
-class SequenceIndex:
-    """Numbers the sequences of several objects: 0.. over the first object, on over the next."""
+class SequenceIndex(Dataset):
+    """The sequences of several objects, numbered: 0.. over the first object, on over the next.
+
+    As a data set for training it has nothing but frames 0..T of the training views, whatever is asked.
+    """
 
     def __init__(self, objects: Sequence[ObjectData]) -> None:
         """Lists all sequences of these objects (their transforms are read, no image is)."""
@@ -97,6 +77,22 @@ class SequenceIndex:
     def __len__(self) -> int:
         """Number of sequences over all objects."""
         return len(self.entries)
+
+    def __getitem__(self, key: SampleKey) -> SequenceSample:
+        """Frames 0..steps of one sequence in the training views.
+
+        Raises:
+            DataError: the steps reach beyond the training frames.
+        """
+        sequence, steps = key
+        item = self.objects[self.entries[sequence][0]]
+        if not 1 <= steps < len(item.train_frames):
+            raise DataError(
+                f"{item.name}: {steps} predicted steps asked for, the training frames "
+                f"{item.train_frames.start}..{item.train_frames.stop - 1} allow 1..{len(item.train_frames) - 1}. "
+                "Lower the curriculum's t_max."
+            )
+        return self.sample(sequence, range(steps + 1), item.train_views)
 
     def sample(self, sequence: int, frames: range, views: Sequence[str]) -> SequenceSample:
         """The sample of these frames and views of a sequence."""
@@ -115,34 +111,6 @@ class SequenceIndex:
         """True motion of a sequence, or None where it is unknown."""
         scene_id, record = self.entries[sequence]
         return self.objects[scene_id].ground_truth(record)
-
-
-class TrainingDataset(Dataset):
-    """Frames 0..T of the training views; nothing else can be had from it, whatever is asked."""
-
-    def __init__(self, index: SequenceIndex) -> None:
-        """Serves the sequences of ``index``, keyed by :class:`SampleKey`."""
-        self._index = index
-
-    def __len__(self) -> int:
-        """Number of sequences."""
-        return len(self._index)
-
-    def __getitem__(self, key: SampleKey) -> SequenceSample:
-        """Frames 0..steps of one sequence in the training views.
-
-        Raises:
-            DataError: the steps reach beyond the training frames.
-        """
-        sequence, steps = key
-        item = self._index.objects[self._index.entries[sequence][0]]
-        if not 1 <= steps < len(item.train_frames):
-            raise DataError(
-                f"{item.name}: {steps} predicted steps asked for, the training frames "
-                f"{item.train_frames.start}..{item.train_frames.stop - 1} allow 1..{len(item.train_frames) - 1}. "
-                "Lower the curriculum's t_max."
-            )
-        return self._index.sample(sequence, range(steps + 1), item.train_views)
 
 
 def collate(samples: list[SequenceSample]) -> list[SequenceSample]:

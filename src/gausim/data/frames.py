@@ -22,15 +22,11 @@ FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".hevc", ".h265", ".mt
 
 
 def open_frames(root: Path, views: Sequence[str], fps: float) -> PackedSource | ImageSource:
-    """The frames of a sequence's folder; only headers are read.
-
-    Args:
-        root: the folder.
-        views: names of all cameras, in the order that is wanted.
-        fps: frames per second that it must have.
+    """The frames of a sequence's folder, cameras in the order of ``views``; only headers are read.
 
     Raises:
-        DataError: a file is missing or a field is wrong, a view or a frame of a view is missing, or a camera moves.
+        DataError: a file is missing or a field is wrong, ``fps`` is another, a view or a frame is missing, or a camera
+            moves.
     """
     if is_packed(root):
         return PackedSource(root, views, fps)
@@ -124,10 +120,10 @@ def _frames_of_views(
         table[frame.camera][number] = i
     count = max(max(row, default=-1) for row in table.values()) + 1
     for view, row in table.items():
-        absent = [f for f in range(count) if f not in row]
-        if absent:
+        if len(row) < count:
+            first = next(f for f in range(count) if f not in row)
             raise DataError(
-                f"{path}: view '{view}' lacks {len(absent)} of {count} frames (first: {absent[0]}). "
+                f"{path}: view '{view}' lacks {count - len(row)} of {count} frames (first: {first}). "
                 "Restore them, or take the view out of dataset.json."
             )
     index = [[table[view][f] for f in range(count)] for view in views]

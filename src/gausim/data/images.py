@@ -22,14 +22,9 @@ DECODER_THREADS = 4
 def composite(
     frames: UInt8[Tensor, "*B H W 4"], background: Float[Tensor, " 3"] | None = None
 ) -> tuple[Float[Tensor, "*B H W 3"], Float[Tensor, "*B H W"]]:
-    """Straight-alpha RGBA over a constant background, in the file's own (sRGB) values.
+    """RGB and alpha in [0, 1] of straight-alpha RGBA over a background in [0, 1] (None: black), in sRGB.
 
-    Args:
-        frames: straight-alpha 8-bit RGBA.
-        background: colour in [0, 1]; None is black.
-
-    Returns:
-        RGB in [0, 1] and alpha in [0, 1] (the foreground mask is alpha > 0).
+    The foreground mask is alpha > 0.
     """
     rgb, alpha = over_black(frames)
     if background is not None:
@@ -46,10 +41,7 @@ def over_black(frames: UInt8[Tensor, "*B H W 4"]) -> tuple[Float[Tensor, "*B H W
 def read_rgba(path: Path, size: tuple[int, int], *, opaque: bool = False) -> np.ndarray:
     """Decodes one 8-bit RGBA image of ``size`` = (width, height) to (H, W, 4).
 
-    Args:
-        path: the file.
-        size: that it must have.
-        opaque: alpha is 255 everywhere, whatever the file says; RGB will do.
+    ``opaque`` makes alpha 255 everywhere, whatever the file says; RGB will do.
 
     Raises:
         DataError: the file is missing, no image, of another size or depth, or has no alpha.

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
+from msgspec import Meta, Struct
 from torch import Tensor
 
-from gausim.core import DataError, GaussianScene
+from gausim.core import ConfigError, DataError, GaussianScene
 from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_array, read_stills
-from gausim.data.scenes import select_masks
-from gausim.io.ply import load_scene
-from gausim.io.transforms import positive_field, read_json
-from gausim.ops.selection import Selection, require_pinned
+from gausim.io.plain_json import checked
+from gausim.io.ply import MASK_NAMES, load_scene
+from gausim.io.transforms import read_json
+from gausim.ops.selection import Selection, apply_masks, parse_half_space, require_pinned
+
+
+class _Facts(Struct):
+    fps: Annotated[float, Meta(gt=0)]
+    views: tuple[str, ...]
+    train_views: tuple[str, ...]
+    heldout_views: tuple[str, ...]
+    # The first frame and the first unseen one.
+    train_frames: tuple[Annotated[int, Meta(ge=0, le=0)], Annotated[int, Meta(ge=2, le=1 << 31)]]
+    name: str = ""
 
 
 class ObjectData:
@@ -53,7 +63,7 @@ class ObjectData:
             sequences: only so many sequences, or only those of these names; all when None.
             scene: PLY of the rest scene; ``root/scene.ply`` when None.
             masks: npz of its masks; beside the PLY when None.
-            selections: what replaces its masks, see :func:`gausim.data.scenes.select_masks`.
+            selections: what replaces its masks, see :func:`gausim.data.objects.select_masks`.
 
         Raises:
             DataError: ``dataset.json`` is missing or a field of it is wrong.
@@ -61,12 +71,10 @@ class ObjectData:
         self.root = Path(root)
         path = self.root / "dataset.json"
         self.facts = read_json(path)
-        self.name = str(self.facts.get("name", self.root.name))
-        self.fps = positive_field(self.facts, "fps", str(path))
-        self.views = _names(self.facts, "views", path)
-        self.train_views = _names(self.facts, "train_views", path)
-        self.heldout_views = _names(self.facts, "heldout_views", path)
-        self.train_frames = _frame_range(self.facts, path)
+        found = checked(self.facts, _Facts, str(path), "Correct the field.")
+        self.name, self.fps = found.name or self.root.name, found.fps
+        self.views, self.train_views, self.heldout_views = found.views, found.train_views, found.heldout_views
+        self.train_frames = range(*found.train_frames)
         self._check_views(path)
         self.scene_path = Path(scene) if scene is not None else self.root / "scene.ply"
         self.masks_path = Path(masks) if masks is not None else None
@@ -120,7 +128,7 @@ class ObjectData:
     def diagonal(self) -> float | None:
         """Bounding-box diagonal of the true object [scene units], where ``dataset.json`` states it."""
         value = self.facts.get("object_diagonal")
-        return float(value) if isinstance(value, (int, float)) and math.isfinite(value) and value > 0 else None
+        return float(value) if isinstance(value, (int, float)) and value > 0 else None
 
     def scene(self) -> GaussianScene:
         """The rest scene with its masks and the config's selections, named after the object.
@@ -169,16 +177,14 @@ def find_objects(root: Path | str) -> list[Path]:
     return found
 
 
-def _names(facts: dict[str, Any], key: str, path: Path) -> tuple[str, ...]:
-    value = facts.get(key)
-    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-        raise DataError(f"{path}: field '{key}' must be a list of camera names, got {value!r}.")
-    return tuple(value)
+def select_masks(scene: GaussianScene, selections: Mapping[str, Selection | str]) -> GaussianScene:
+    """Replaces masks by selections, e.g. ``{"pinned": "z=0.33"}`` (below that height) or any ``Selection``.
 
-
-def _frame_range(facts: dict[str, Any], path: Path) -> range:
-    value = facts.get("train_frames")
-    numbers = value if isinstance(value, list) and all(type(v) is int for v in value) else []
-    if len(numbers) != 2 or numbers[0] != 0 or numbers[1] < 2:
-        raise DataError(f"{path}: field 'train_frames' must be [0, first unseen frame], e.g. [0, 16], got {value!r}.")
-    return range(*numbers)
+    Raises:
+        ConfigError: a mask that does not exist.
+        SceneError: a selection is malformed or holds no kernel.
+    """
+    unknown = sorted(set(selections) - set(MASK_NAMES))
+    if unknown:
+        raise ConfigError(f"data.selections: no such mask {unknown}; expected some of {MASK_NAMES}.")
+    return apply_masks(scene, **{k: parse_half_space(s) if isinstance(s, str) else s for k, s in selections.items()})

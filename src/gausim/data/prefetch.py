@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import torch
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset
 
 from gausim.core import ConfigError
 
@@ -22,15 +22,8 @@ class PrefetchingLoader(DataLoader):
     and content are those of a loader that does not read ahead.
     """
 
-    def __init__(
-        self,
-        dataset: Dataset,
-        *,
-        batch_sampler: Sampler[list[Any]],
-        collate_fn: Callable[[list[Any]], Any],
-        prefetch: int,
-    ) -> None:
-        """Serves the batches of ``batch_sampler``; ``prefetch`` of them are read ahead, 0 reads each when asked.
+    def __init__(self, dataset: Dataset, *, prefetch: int, **options: Any) -> None:
+        """A ``DataLoader`` with these ``options``; ``prefetch`` batches are read ahead, 0 reads each when asked.
 
         Raises:
             ConfigError: ``prefetch`` is negative.
@@ -38,7 +31,7 @@ class PrefetchingLoader(DataLoader):
         if prefetch < 0:
             raise ConfigError(f"data.prefetch: expected 0 or more batches read ahead, got {prefetch}.")
         # The loader draws a number per epoch; from the global generator, a resumed run would draw another count.
-        super().__init__(dataset, batch_sampler=batch_sampler, collate_fn=collate_fn, generator=torch.Generator())
+        super().__init__(dataset, generator=torch.Generator(), **options)
         self.prefetch = prefetch
         self._open: Generator[Any, None, None] | None = None
 

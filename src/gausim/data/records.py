@@ -23,41 +23,27 @@ STILLS_PER_HELDOUT = 10
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """True motion of P points of one sequence.
+    """True motion of P points of one sequence."""
 
-    Attributes:
-        rest: positions in the rest state [scene units].
-        positions: positions in every frame, frame 0 first [scene units].
-    """
-
-    rest: Float[Tensor, "P 3"]
-    positions: Float[Tensor, "F P 3"]
+    rest: Float[Tensor, "P 3"]  # positions in the rest state [scene units]
+    positions: Float[Tensor, "F P 3"]  # positions in every frame, frame 0 first [scene units]
 
 
 @dataclass(frozen=True, eq=False)
 class Stills:
-    """Posed images of the rest state.
+    """Posed images of the rest state."""
 
-    Attributes:
-        images: straight-alpha RGBA.
-        cameras: one per image.
-        train: indices to reconstruct from.
-        heldout: indices of those left out to measure the reconstruction on, every tenth unless told otherwise.
-    """
-
-    images: UInt8[Tensor, "N H W 4"]
-    cameras: Cameras
-    train: tuple[int, ...]
+    images: UInt8[Tensor, "N H W 4"]  # straight-alpha RGBA
+    cameras: Cameras  # one per image
+    train: tuple[int, ...]  # indices to reconstruct from
+    # indices of those left out to measure the reconstruction on, every tenth unless told otherwise
     heldout: tuple[int, ...]
 
 
 def read_stills(path: Path, *, every: int = STILLS_PER_HELDOUT, opaque: bool = False) -> Stills:
-    """Reads all images named by a ``transforms.json`` of the rest scene, and splits them.
+    """Reads all images named by a ``transforms.json`` of the rest scene; one in ``every`` is not for training.
 
-    Args:
-        path: the file.
-        every: one still in so many is left out of the training ones.
-        opaque: take all of every image, whatever its alpha says; images without alpha will do.
+    ``opaque`` takes all of every image, whatever its alpha says; images without alpha will do.
 
     Raises:
         DataError: an image or pose is unusable.
@@ -119,11 +105,7 @@ class SequenceRecord:
         return self._source.absent()
 
     def ground_truth(self, rest: Float[Tensor, "P 3"] | None) -> GroundTruth | None:
-        """True motion of the object's points, or None where the data set has none (real captures).
-
-        Args:
-            rest: rest positions of the same points, from :meth:`ObjectData.rest_points`.
-        """
+        """True motion of the points with these rest positions, or None where the data set has none (real captures)."""
         path = self.root / "ground_truth.npz"
         if rest is None or not path.is_file():
             return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -22,27 +23,19 @@ FRAMES_AT_A_TIME = 8
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that is wrong.
+    """One thing that is wrong."""
 
-    Attributes:
-        where: file or folder, relative to the object where it lies in it.
-        what: with the remedy.
-    """
-
-    where: str
-    what: str
+    where: str  # file or folder, relative to the object where it lies in it
+    what: str  # with the remedy
 
 
 def verify(root: Path, *, quick: bool = False, scene: bool = True) -> list[Fault]:
-    """Checks one object: facts, sequences with all their images, true motion, stills, scene, hashes of a packed store.
+    """The faults of one object: facts, sequences with all their images, true motion, stills, scene, hashes of a store.
 
     Args:
         root: its directory.
         quick: look at headers and sizes only; no image is read and nothing is hashed.
         scene: check ``scene.ply`` and its masks too.
-
-    Returns:
-        The faults; none of a data set that is as it should be.
     """
     faults = list(_manifest(root, quick=quick))
     try:
@@ -81,7 +74,7 @@ def _sequences(data: ObjectData, *, quick: bool) -> Iterator[Fault]:
             yield Fault(where, f"has {record.count} frames, dataset.json trains on {data.train_frames}.")
         absent = record.absent()
         if absent:
-            first = absent[0].relative_to(folder) if absent[0].is_relative_to(folder) else absent[0]
+            first = Path(os.path.relpath(absent[0], folder)).as_posix()
             yield Fault(
                 where,
                 f"{len(absent)} of its images are missing, though its transforms.json names them (first: {first}). "

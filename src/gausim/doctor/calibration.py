@@ -28,16 +28,16 @@ def find_calibration_faults(evidence: Evidence) -> Iterator[Finding]:
             f"Make one with `gausim reconstruct {evidence.data.root}` (or give --scene FILE.ply) and run this again.",
         )  # fmt: skip
         return
-    fits = [[row[v] for row in evidence.fits] for v in range(len(evidence.views))]
-    raw = {view: float(np.median([fit.overlap for fit in row])) for view, row in zip(evidence.views, fits, strict=True)}
-    missed = [view for view, value in raw.items() if value < _MISSED]
-    if len(missed) > len(evidence.views) / 2:
+    fits = dict(zip(evidence.views, zip(*evidence.fits, strict=True), strict=True))
+    raw = {view: float(np.median([fit.overlap for fit in row])) for view, row in fits.items()}
+    if sum(value < _MISSED for value in raw.values()) > len(raw) / 2:
         yield _convention(evidence, raw)
-        return
-    yield from _moved(evidence, fits)
+    else:
+        yield from _moved(evidence, fits)
+        yield from _shape(fits)
 
 
-def consistent_shift(fits: Sequence[Fit]) -> float:
+def _consistent_shift(fits: Sequence[Fit]) -> float:
     """Median displacement over sequences [reduced pixels]; 0 where it differs from sequence to sequence.
 
     A camera that is not where its file says is off by the same in every sequence; an object that is not at rest in
@@ -51,33 +51,34 @@ def consistent_shift(fits: Sequence[Fit]) -> float:
     return float(np.median(pixels)) if scatter < 0.5 * np.median(pixels) else 0.0
 
 
-def _moved(evidence: Evidence, fits: Sequence[Sequence[Fit]]) -> Iterator[Finding]:
-    longer = max(evidence.first[0].alpha.shape[-2:])
-    off = {view: consistent_shift(row) for view, row in zip(evidence.views, fits, strict=True)}
+def _moved(evidence: Evidence, fits: dict[str, tuple[Fit, ...]]) -> Iterator[Finding]:
+    longer, scale = max(evidence.first[0].alpha.shape[-2:]), evidence.scale
+    off = {view: _consistent_shift(row) for view, row in fits.items()}
     worth = [view for view, pixels in off.items() if pixels > _WORTH * longer]
-    if worth:
-        spoils = max(off[view] for view in worth) > _SPOILS * longer
-        told = "; ".join(_told(view, fits[evidence.views.index(view)], evidence.scale) for view in worth)
-        measured = {view: pixels / evidence.scale for view, pixels in off.items()}
-        if 2 * len(worth) < len(evidence.views):
-            rest = max(pixels for view, pixels in off.items() if view not in worth) / evidence.scale
-            what = (
-                f"{listed(worth)} {'is' if len(worth) == 1 else 'are'} not where the pose says, while the others "
-                f"agree with the rest scene to {max(rest, 0.1):.1f} pixels: {told}."
-            )
-            remedy = (
-                f"Find the pose of {listed(worth)} again (was it moved after the calibration?), or take "
-                f"{'it' if len(worth) == 1 else 'them'} out of dataset.json."
-            )
-        else:
-            what = f"{len(worth)} of {len(evidence.views)} cameras disagree with the rest scene: {told}."
-            remedy = (
-                "Calibrate all cameras together with the stills that the scene was made of (`gausim prepare poses "
-                "--images STILLS --sequences FRAMES`), or make the scene again if it is of another object or world."
-            )
-        sure = "certain" if spoils and min(min(f.aligned for f in r) for r in fits) > _SHAPE else "likely"
-        yield Finding("fault" if spoils else "warning", sure, what, remedy, {"views": worth, "pixels": measured})  # type: ignore[arg-type]
-    yield from _shape(evidence, fits)
+    if not worth:
+        return
+    told = "; ".join(_told(view, fits[view], scale) for view in worth)
+    if 2 * len(worth) < len(off):
+        rest = max(pixels for view, pixels in off.items() if view not in worth) / scale
+        are, them = ("is", "it") if len(worth) == 1 else ("are", "them")
+        what = (
+            f"{listed(worth)} {are} not where the pose says, while the others agree with the rest scene to "
+            f"{max(rest, 0.1):.1f} pixels: {told}."
+        )
+        remedy = (
+            f"Find the pose of {listed(worth)} again (was it moved after the calibration?), or take {them} out of "
+            "dataset.json."
+        )
+    else:
+        what = f"{len(worth)} of {len(off)} cameras disagree with the rest scene: {told}."
+        remedy = (
+            "Calibrate all cameras together with the stills that the scene was made of (`gausim prepare poses "
+            "--images STILLS --sequences FRAMES`), or make the scene again if it is of another object or world."
+        )
+    spoils = max(off[view] for view in worth) > _SPOILS * longer
+    sure = spoils and min(fit.aligned for row in fits.values() for fit in row) > _SHAPE
+    measured = {"views": worth, "pixels": {view: pixels / scale for view, pixels in off.items()}}
+    yield Finding("fault" if spoils else "warning", "certain" if sure else "likely", what, remedy, measured)
 
 
 def _told(view: str, fits: Sequence[Fit], scale: float) -> str:
@@ -93,16 +94,17 @@ def _told(view: str, fits: Sequence[Fit], scale: float) -> str:
     )
 
 
-def _shape(evidence: Evidence, fits: Sequence[Sequence[Fit]]) -> Iterator[Finding]:
-    aligned = [float(np.median([fit.aligned for fit in row])) for row in fits]
-    if float(np.median(aligned)) < _SHAPE:
+def _shape(fits: dict[str, tuple[Fit, ...]]) -> Iterator[Finding]:
+    aligned = {view: float(np.median([fit.aligned for fit in row])) for view, row in fits.items()}
+    usual = float(np.median(list(aligned.values())))
+    if usual < _SHAPE:
         yield Finding(
             "warning", "likely",
-            f"Even at the best shift the rest scene's silhouettes overlap those of frame 0 by {np.median(aligned):.2f} "
-            "only: parts are missing in the scene, or frame 0 shows another shape.",
+            f"Even at the best shift the rest scene's silhouettes overlap those of frame 0 by {usual:.2f} only: parts "
+            "are missing in the scene, or frame 0 shows another shape.",
             "Look at views.png (--out DIR). Reconstruct the scene again, or check the masks and that sequences begin "
             "at rest.",
-            {"aligned": dict(zip(evidence.views, aligned, strict=True))},
+            {"aligned": aligned},
         )  # fmt: skip
 
 
@@ -111,20 +113,21 @@ def _convention(evidence: Evidence, raw: dict[str, float]) -> Finding:
     item = evidence.first[0]
     readings = try_readings(evidence.scene, item.alpha[0] / np.float32(255), item.cameras)
     best, now = readings[0], float(np.mean(list(raw.values())))
-    measured = {"overlap": raw, "readings": {r.name: r.overlap for r in readings}}
-    start = f"The cameras do not see the rest scene where frame 0 shows the object (mean overlap {now:.2f})."
-    if best.overlap > max(_FITS, now + 0.2):
-        return Finding(
-            "fault", "certain",
-            f"{start} The silhouettes would fit ({best.overlap:.2f}) if transforms.json held {best.name}.",
-            f"In every sequences/*/transforms.json {best.remedy}.",
-            measured,
-        )  # fmt: skip
+    fits = best.overlap > max(_FITS, now + 0.2)
+    if fits:
+        what = f"The silhouettes would fit ({best.overlap:.2f}) if transforms.json held {best.name}."
+        remedy = f"In every sequences/*/transforms.json {best.remedy}."
+    else:
+        what = (
+            f"No convention that is known to be mixed up would make them fit (best: {best.name}, overlap "
+            f"{best.overlap:.2f})."
+        )
+        remedy = (
+            "Check that scene and sequences are of one object and one world, and that angles in degrees were turned "
+            "into radians; calibrate the cameras again (`gausim prepare poses`)."
+        )
     return Finding(
-        "fault", "likely",
-        f"{start} No convention that is known to be mixed up would make them fit (best: {best.name}, overlap "
-        f"{best.overlap:.2f}).",
-        "Check that scene and sequences are of one object and one world, and that angles in degrees were turned into "
-        "radians; calibrate the cameras again (`gausim prepare poses`).",
-        measured,
+        "fault", "certain" if fits else "likely",
+        f"The cameras do not see the rest scene where frame 0 shows the object (mean overlap {now:.2f}). {what}",
+        remedy, {"overlap": raw, "readings": {r.name: r.overlap for r in readings}},
     )  # fmt: skip

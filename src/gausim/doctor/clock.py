@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,11 +29,21 @@ _UNLIKE = 0.3
 _FEW = 2 * FURTHEST
 
 
+@dataclass(frozen=True, eq=False)
+class _Series:
+    """How one sequence moves over time in each view."""
+
+    name: str
+    energy: np.ndarray  # (F - 1, V), see motion_energy
+    middles: np.ndarray  # (F, V, 2) of the masks [reduced pixels]
+    seen: np.ndarray  # (V, 2, 3) change of each picture by a change in space at the object [reduced pixels per unit]
+
+
 def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
     """Correlates every camera's motion energy over time with that of the others, and the middles of the masks."""
     items = [item for item in evidence.watched if len(item.alpha) >= _FEW]
-    energies = [motion_energy(item) for item in items]
-    if not energies or len(evidence.views) < 2 or max(float(e.max()) for e in energies) == 0:
+    series = [_Series(i.name, motion_energy(i), _middles(i), _jacobians(evidence, i.cameras)) for i in items]
+    if not series or len(evidence.views) < 2 or max(float(s.energy.max()) for s in series) == 0:
         return
     if evidence.fits is not None and np.median([[f.overlap for f in row] for row in evidence.fits]) < _SOMEWHERE:
         yield Finding(
@@ -40,7 +51,7 @@ def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
             "Mend the calibration and run this again.",
         )  # fmt: skip
         return
-    lags, unsure, guessed = _lags(evidence, items, energies, _REACHED, _GAIN)
+    lags, unsure, guessed = _lags(series, _REACHED, _GAIN)
     for view in (evidence.views[v] for v in sorted(unsure)):
         yield Finding(
             "note", "possible",
@@ -48,12 +59,11 @@ def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
             "Compare it by eye in motion.png (--out DIR).", {"view": view},
         )  # fmt: skip
     if any(lags.values()):
-        yield from _told(evidence, lags, guessed, [item.name for item in items])
+        yield from _told(evidence, lags, guessed, [s.name for s in series])
         return
-    for item, energy in zip(items, energies, strict=True):
-        alone, _, guessed = _lags(evidence, [item], [energy], _REACHED_ALONE, _GAIN_ALONE)
-        if any(alone.values()):
-            yield from _told(evidence, alone, guessed, [item.name])
+    for one in series:
+        lags, _, guessed = _lags([one], _REACHED_ALONE, _GAIN_ALONE)
+        yield from _told(evidence, lags, guessed, [one.name])
 
 
 def motion_energy(item: Watched) -> np.ndarray:
@@ -67,36 +77,31 @@ def motion_energy(item: Watched) -> np.ndarray:
     return change
 
 
-def correlations(energies: Sequence[np.ndarray], view: int, lags: dict[int, int]) -> np.ndarray:
+def _energy_correlation(series: Sequence[_Series], view: int, lags: dict[int, int]) -> np.ndarray:
     """Correlation of a view's energy with the mean of the others', by lag from -FURTHEST to FURTHEST (late: positive).
 
-    Args:
-        energies: (F - 1, V) of each sequence.
-        view: which.
-        lags: by how much views are late, as far as known.
+    ``lags`` is by how much views are late, as far as known.
     """
     found = np.zeros(2 * FURTHEST + 1)
-    for energy in energies:
+    for energy in (s.energy for s in series):
         z = (energy - energy.mean(0)) / (energy.std(0) + 1e-12)
-        others = np.mean([np.roll(z[:, v], -lags.get(v, 0)) for v in range(z.shape[1]) if v != view], axis=0)
-        found += _by_lag(z[:, view, None], others[:, None]) / len(energies)
+        others = np.mean([np.roll(z[:, v], -lags[v]) for v in lags if v != view], axis=0)
+        found += _by_lag(z[:, view, None], others[:, None]) / len(series)
     return found
 
 
-def agreement(evidence: Evidence, items: Sequence[Watched], view: int, lags: dict[int, int]) -> np.ndarray:
-    """Correlation of the way of a mask's middle with the one that follows from the other views, by lag.
+def _path_correlation(series: Sequence[_Series], view: int, lags: dict[int, int]) -> np.ndarray:
+    """Correlation of the path of a mask's middle with the one that follows from the other views, by lag.
 
-    The middle's way in each picture is a linear picture of one way in space, whose three coordinates the other views
-    give (least squares).
+    The path in each picture is a linear picture of one path in space, whose three coordinates the other views give
+    (least squares).
     """
     found = np.zeros(2 * FURTHEST + 1)
-    for item in items:
-        seen = _jacobians(evidence, item.cameras)
-        ways = _middles(item)
-        others = [v for v in range(len(seen)) if v != view]
-        moved = np.concatenate([np.roll(ways[:, v], -lags.get(v, 0), axis=0) for v in others], axis=1)
-        in_space = moved @ np.linalg.pinv(np.concatenate([seen[v] for v in others])).T
-        found += _by_lag(ways[:, view], in_space @ seen[view].T) / len(items)
+    for s in series:
+        others = [v for v in lags if v != view]
+        moved = np.concatenate([np.roll(s.middles[:, v], -lags[v], axis=0) for v in others], axis=1)
+        in_space = moved @ np.linalg.pinv(np.concatenate([s.seen[v] for v in others])).T
+        found += _by_lag(s.middles[:, view], in_space @ s.seen[view].T) / len(series)
     return found
 
 
@@ -124,33 +129,27 @@ def _middles(item: Watched) -> np.ndarray:
 
 
 def _jacobians(evidence: Evidence, cameras: Cameras) -> np.ndarray:
-    """Change of the picture by a change in space at the object, (V, 2, 3) [reduced pixels per scene unit]."""
     middle = view_directions(evidence)[1]
-    rotations = cameras.viewmats[:, :3, :3].double().numpy()
+    rotations, lenses = cameras.viewmats[:, :3, :3].double().numpy(), cameras.Ks[:, :2, :2].double().numpy()
     x, y, z = (rotations @ middle + cameras.viewmats[:, :3, 3].double().numpy()).T
     z = np.where(np.abs(z) > 1e-6, z, 1e-6)
-    fx, fy = cameras.Ks[:, 0, 0].double().numpy(), cameras.Ks[:, 1, 1].double().numpy()
-    zero = np.zeros_like(z)
-    projection = np.stack(
-        (np.stack((fx / z, zero, -fx * x / z**2), -1), np.stack((zero, fy / z, -fy * y / z**2), -1)), 1
-    )
-    return projection @ rotations
+    one, zero = np.ones_like(z), np.zeros_like(z)
+    projection = np.stack((np.stack((one, zero, -x / z), -1), np.stack((zero, one, -y / z), -1)), 1) / z[:, None, None]
+    return lenses @ projection @ rotations
 
 
-def _lags(
-    evidence: Evidence, items: Sequence[Watched], energies: Sequence[np.ndarray], reached: float, gain: float
-) -> tuple[dict[int, int], set[int], set[int]]:
+def _lags(series: Sequence[_Series], reached: float, gain: float) -> tuple[dict[int, int], set[int], set[int]]:
     """By how many frames each view is late, which cannot be told, and which rest on energy alone.
 
     The view that gains most by a shift is shifted first, then the next.
     """
-    views = energies[0].shape[1]
+    views = series[0].energy.shape[1]
     lags: dict[int, int] = dict.fromkeys(range(views), 0)
     settled: set[int] = set()
     unsure: set[int] = set()
     guessed: set[int] = set()
     while len(settled) < views - (views == 2):
-        scores = {v: _score(evidence, items, energies, v, lags) for v in range(views) if v not in settled}
+        scores = {v: _score(series, v, lags) for v in range(views) if v not in settled}
         gains = {v: float(c.max() - c[FURTHEST]) for v, (c, _) in scores.items() if c.max() >= reached}
         best = max(gains, key=lambda v: gains[v], default=None)
         if best is None or gains[best] < gain:
@@ -162,17 +161,14 @@ def _lags(
             guessed |= set() if telling else {best}
         else:
             unsure.add(best)
-    unlike = {v for v in range(views) if v not in settled and correlations(energies, v, lags).max() < _UNLIKE}
+    unlike = {v for v in range(views) if v not in settled and _energy_correlation(series, v, lags).max() < _UNLIKE}
     return lags, unsure | unlike, guessed
 
 
-def _score(
-    evidence: Evidence, items: Sequence[Watched], energies: Sequence[np.ndarray], view: int, lags: dict[int, int]
-) -> tuple[np.ndarray, bool]:
+def _score(series: Sequence[_Series], view: int, lags: dict[int, int]) -> tuple[np.ndarray, bool]:
     """Correlation of a view with the others by lag, and whether the middles of the masks are in it."""
-    energy = correlations(energies, view, lags)
-    middles = agreement(evidence, items, view, lags)
-    return ((energy + middles) / 2, True) if middles.max() >= _TELLING else (energy, False)
+    energy, path = _energy_correlation(series, view, lags), _path_correlation(series, view, lags)
+    return ((energy + path) / 2, True) if path.max() >= _TELLING else (energy, False)
 
 
 def _told(evidence: Evidence, lags: dict[int, int], guessed: set[int], sequences: list[str]) -> Iterator[Finding]:

@@ -24,30 +24,20 @@ _AXES = torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
 
 @dataclass(frozen=True)
 class Reading:
-    """The calibration as another convention reads it.
+    """The calibration as another convention reads it."""
 
-    Attributes:
-        name: what the file would hold then.
-        remedy: what to change.
-        overlap: mean intersection over union of the silhouettes over the views.
-    """
-
-    name: str
-    remedy: str
-    overlap: float
+    name: str  # what the file would hold then
+    remedy: str  # what to change
+    overlap: float  # mean intersection over union of the silhouettes over the views
 
 
 def try_readings(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], cameras: Cameras) -> list[Reading]:
-    """Reads the cameras in every way that is known to happen, the best fit first.
-
-    Args:
-        scene: at rest.
-        masks: of frame 0, 0 to 1.
-        cameras: as the file states them.
-    """
+    """Reads the cameras of a file in every way that is known to happen; the best fit to the masks of frame 0 first."""
+    # The matrices as the file has them: camera to world, OpenGL axes, as it was read.
+    stored = torch.linalg.inv(cameras.viewmats.double()) * _AXES
     readings = []
     for name, remedy, change in _POSES:
-        viewmats = torch.stack([change(pose) for pose in _stored(cameras)]).float()
+        viewmats = torch.stack([change(pose) for pose in stored]).float()
         readings.append(Reading(name, remedy, _fit(scene, masks, replace(cameras, viewmats=viewmats))))
     readings.append(_another_lens(scene, masks, cameras))
     return sorted(readings, key=lambda reading: -reading.overlap)
@@ -56,11 +46,6 @@ def try_readings(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], camera
 def _fit(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], cameras: Cameras) -> float:
     drawn = draw_silhouettes(scene, cameras).alpha
     return float(np.mean([overlap(mask, alpha) for mask, alpha in zip(masks, drawn, strict=True)]))
-
-
-def _stored(cameras: Cameras) -> Float[Tensor, "V 4 4"]:
-    """The matrices as the file has them: camera to world, OpenGL axes, as it was read."""
-    return torch.linalg.inv(cameras.viewmats.double()) * _AXES
 
 
 def _read(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
@@ -75,15 +60,13 @@ def _transposed(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
 
 def _world(quarter: int) -> Callable[[Tensor], Tensor]:
     """The world turned about x by a quarter, forwards or backwards."""
-    turn = torch.eye(4, dtype=torch.float64)
-    turn[1:3, 1:3] = torch.tensor([[0.0, -quarter], [quarter, 0.0]], dtype=torch.float64)
+    turn = torch.tensor([[1, 0, 0, 0], [0, 0, -quarter, 0], [0, quarter, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
     return lambda pose: _read(turn @ pose)
 
 
 def _unit(factor: float) -> Callable[[Tensor], Tensor]:
-    corner = torch.ones(4, 4, dtype=torch.float64)
-    corner[:3, 3] = factor
-    return lambda pose: _read(pose * corner)
+    scale = torch.tensor([1, 1, 1, factor], dtype=torch.float64)
+    return lambda pose: _read(torch.cat((pose[:3] * scale, pose[3:])))
 
 
 _POSES: list[tuple[str, str, Callable[[Tensor], Tensor]]] = [

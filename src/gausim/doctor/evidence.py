@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from rich.console import Console
+from rich.progress import track
 
 from gausim.core import Cameras, GaussianScene
 from gausim.data.objects import ObjectData
@@ -23,25 +26,17 @@ WATCHED_FRAMES, FRAMES_AT_A_TIME = 64, 8
 # Pictures are reduced to this length of their longer side [pixels].
 LONGEST = 192
 
-# What a progress bar shows: step, how much of it is done, how much there is.
-Tick = Callable[[str, int, int], None]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
 class Watched:
-    """Consecutive frames of one sequence from frame 0 on, reduced.
+    """Consecutive frames of one sequence from frame 0 on, reduced."""
 
-    Attributes:
-        name: of the sequence.
-        cameras: of the reduced pictures.
-        rgb: over black.
-        alpha: foreground.
-    """
-
-    name: str
-    cameras: Cameras
-    rgb: UInt8[np.ndarray, "F V h w 3"]
-    alpha: UInt8[np.ndarray, "F V h w"]
+    name: str  # of the sequence
+    cameras: Cameras  # of the reduced pictures
+    rgb: UInt8[np.ndarray, "F V h w 3"]  # over black
+    alpha: UInt8[np.ndarray, "F V h w"]  # foreground
 
     @cached_property
     def gray(self) -> Float[np.ndarray, "F V h w"]:
@@ -51,23 +46,14 @@ class Watched:
 
 @dataclass(eq=False)
 class Evidence:
-    """What is known of one object; :func:`gather` reads it.
+    """What is known of one object; :func:`gather` reads it."""
 
-    Attributes:
-        data: its facts.
-        sequences: how many there are.
-        scene: the rest scene, pinned or not; None where there is none yet.
-        scale: length of a pixel of the pictures over one of the reduced pictures, at most 1.
-        watched: sequences whose motion is watched.
-        first: frame 0 of sequences, these and more.
-    """
-
-    data: ObjectData
-    sequences: int
-    scene: GaussianScene | None
-    scale: float
-    watched: tuple[Watched, ...]
-    first: tuple[Watched, ...]
+    data: ObjectData  # its facts
+    sequences: int  # how many there are
+    scene: GaussianScene | None  # the rest scene, pinned or not; None where there is none yet
+    scale: float  # length of a pixel of the pictures over one of the reduced pictures, at most 1
+    watched: tuple[Watched, ...]  # sequences whose motion is watched
+    first: tuple[Watched, ...]  # frame 0 of sequences, these and more
 
     @property
     def views(self) -> tuple[str, ...]:
@@ -79,11 +65,11 @@ class Evidence:
         """The rest scene as the cameras of each of :attr:`first` draw it; None without a scene."""
         if self.scene is None:
             return None
-        drawn: list[tuple[Cameras, Silhouettes]] = []
+        drawn: list[Silhouettes] = []
         for item in self.first:
-            if not any(same_cameras(known, item.cameras) for known, _ in drawn):
-                drawn.append((item.cameras, draw_silhouettes(self.scene, item.cameras)))
-        return tuple(next(s for known, s in drawn if same_cameras(known, i.cameras)) for i in self.first)
+            same = next((i for i in range(len(drawn)) if same_cameras(self.first[i].cameras, item.cameras)), None)
+            drawn.append(draw_silhouettes(self.scene, item.cameras) if same is None else drawn[same])
+        return tuple(drawn)
 
     @cached_property
     def fits(self) -> tuple[tuple[Fit, ...], ...] | None:
@@ -104,13 +90,14 @@ def same_cameras(a: Cameras, b: Cameras) -> bool:
     return bool(torch.equal(a.viewmats, b.viewmats) and torch.equal(a.Ks, b.Ks))
 
 
-def gather(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Evidence:
-    """Reads and reduces what the checks need.
+def with_bar(items: Sequence[T], step: str) -> Iterable[T]:
+    """The items; a bar shows how many were taken, where standard error is a terminal."""
+    console = Console(stderr=True)
+    return track(items, step, console=console, transient=True, disable=not console.is_terminal)
 
-    Args:
-        data: the object.
-        scene: its rest scene, where there is one.
-        tick: is told how far it is.
+
+def gather(data: ObjectData, scene: GaussianScene | None) -> Evidence:
+    """Reads and reduces what the checks need.
 
     Raises:
         DataError: an image is missing or malformed.
@@ -119,15 +106,13 @@ def gather(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Evidenc
     watched_names, first_names = _spread(names, WATCHED_SEQUENCES), _spread(names, FIRST_FRAMES)
     watched, first, scale = [], [], 1.0
     chosen = [name for name in names if name in watched_names or name in first_names]
-    for number, name in enumerate(chosen):
-        tick("frames", number, len(chosen))
+    for name in with_bar(chosen, "frames"):
         # Not one of data.sequences: these keep all pictures that were ever decoded.
         record = SequenceRecord(data.root / "sequences" / name, views=data.views, fps=data.fps)
         frames = min(record.count, WATCHED_FRAMES) if name in watched_names else 1
         item, scale = _reduced(record, frames), _factor(record.cameras)
         watched += [item] if name in watched_names else []
         first.append(Watched(item.name, item.cameras, item.rgb[:1], item.alpha[:1]))
-    tick("frames", len(chosen), len(chosen))
     return Evidence(data, len(names), scene, scale, tuple(watched), tuple(first))
 
 

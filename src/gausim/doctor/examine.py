@@ -17,7 +17,7 @@ from gausim.doctor.coverage import (
     find_pins,
     find_tiny,
 )
-from gausim.doctor.evidence import Evidence, Tick, gather
+from gausim.doctor.evidence import Evidence, gather, with_bar
 from gausim.doctor.finding import SEVERITIES, Check, Finding
 from gausim.doctor.masks import find_mask_faults
 from gausim.doctor.motion import find_odd_motion, find_unrest
@@ -36,17 +36,11 @@ CHECKS = (
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """What was found in one object.
+    """What was found in one object."""
 
-    Attributes:
-        findings: faults first.
-        left_out: checks that another check's fault made useless, with that check.
-        evidence: what was looked at; None where it could not be read.
-    """
-
-    findings: tuple[Finding, ...]
-    left_out: dict[str, str]
-    evidence: Evidence | None
+    findings: tuple[Finding, ...]  # faults first
+    left_out: dict[str, str]  # checks that another check's fault made useless, with that check
+    evidence: Evidence | None  # what was looked at; None where it could not be read
 
     @property
     def ruinous(self) -> bool:
@@ -59,24 +53,17 @@ class Examination:
         return replace(self, findings=tuple(f for f in self.findings if f.severity != "note"))
 
 
-def examine(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Examination:
-    """Looks at some frames of an object and at its rest scene.
-
-    Args:
-        data: the object, whose files are in order (:func:`gausim.data.verify.verify`).
-        scene: its rest scene, pinned or not; None where there is none yet.
-        tick: is told (step, how much is done, of how much).
-    """
+def examine(data: ObjectData, scene: GaussianScene | None) -> Examination:
+    """Looks at some frames of an object, whose files are in order, and at its rest scene, pinned or not."""
     try:
-        evidence = gather(data, scene, tick)
+        evidence = gather(data, scene)
     except DataError as error:
         remedy = "Mend this file; `gausim verify` without --quick finds all others that cannot be read."
         return Examination((Finding("fault", "certain", str(error), remedy, check="files"),), {}, None)
     findings: list[Finding] = []
     spoilt: set[str] = set()
     left_out: dict[str, str] = {}
-    for number, check in enumerate(CHECKS):
-        tick("checks", number, len(CHECKS))
+    for check in with_bar(CHECKS, "checks"):
         blocking = next((name for name in check.needs if name in spoilt), None)
         if blocking is not None:
             left_out[check.name] = blocking
@@ -85,7 +72,6 @@ def examine(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Examin
         findings += found
         if any(finding.severity == "fault" for finding in found):
             spoilt.add(check.name)
-    tick("checks", len(CHECKS), len(CHECKS))
     findings = _without_consequences(findings)
     ordered = sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
     return Examination(tuple(ordered), left_out, evidence)
@@ -94,5 +80,4 @@ def examine(data: ObjectData, scene: GaussianScene | None, tick: Tick) -> Examin
 def _without_consequences(findings: list[Finding]) -> list[Finding]:
     """Leaves out that a camera is off the rest scene where its frame 0 is a later one, which says all."""
     early = {f.measured["view"] for f in findings if f.check == "clock" and f.severity != "note"}
-    return [f for f in findings if f.check != "calibration" or not f.measured.get("views")
-            or not set(f.measured["views"]) <= early]  # fmt: skip
+    return [f for f in findings if f.check != "calibration" or not {*f.measured.get("views", "-")} <= early]

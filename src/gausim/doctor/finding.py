@@ -16,38 +16,24 @@ SEVERITIES: tuple[Severity, ...] = ("fault", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found.
+    """One thing that was found."""
 
-    Attributes:
-        severity: "fault" where it would ruin a training, "warning" where it costs quality, "note" otherwise.
-        sureness: how sure it is.
-        what: what is wrong, in a sentence that names cameras, sequences and files.
-        remedy: what to do.
-        measured: the numbers behind it, for programs.
-        check: the check that found it, which :func:`gausim.doctor.examine.examine` fills in.
-    """
-
-    severity: Severity
-    sureness: Sureness
-    what: str
-    remedy: str
-    measured: Mapping[str, Any] = field(default_factory=dict)
-    check: str = ""
+    severity: Severity  # "fault" where it would ruin a training, "warning" where it costs quality, "note" otherwise
+    sureness: Sureness  # how sure it is
+    what: str  # what is wrong, in a sentence that names cameras, sequences and files
+    remedy: str  # what to do
+    measured: Mapping[str, Any] = field(default_factory=dict)  # the numbers behind it, for programs
+    check: str = ""  # the check that found it, which :func:`gausim.doctor.examine.examine` fills in
 
 
 @dataclass(frozen=True)
 class Check:
-    """One examination.
+    """One examination."""
 
-    Attributes:
-        name: what it examines.
-        finders: look for one kind of fault each; all have this signature.
-        needs: checks whose faults would make this one see ghosts; it is left out after such a fault.
-    """
-
-    name: str
+    name: str  # what it examines
+    # look for one kind of fault each; all have this signature
     finders: tuple[Callable[[Evidence], Iterator[Finding]], ...]
-    needs: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()  # checks whose faults would make this one see ghosts; it is left out after such a fault
 
 
 def listed(names: list[str]) -> str:

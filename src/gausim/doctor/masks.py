@@ -26,8 +26,8 @@ _MANY = 0.1
 
 def find_mask_faults(evidence: Evidence) -> Iterator[Finding]:
     """Compares alpha with what a mask of one object looks like."""
-    around = {view: [_border(item.alpha[0, v]) for item in evidence.first] for v, view in enumerate(evidence.views)}
-    full = [view for view, fractions in around.items() if np.median(fractions) > _AROUND]
+    rims = {view: [_rim(item.alpha[0, v]) > 127 for item in evidence.first] for v, view in enumerate(evidence.views)}
+    full = [view for view, found in rims.items() if np.median([rim.mean() for rim in found]) > _AROUND]
     if full:
         yield _inverted_or_absent(evidence, full)
         return
@@ -36,10 +36,9 @@ def find_mask_faults(evidence: Evidence) -> Iterator[Finding]:
     yield from _blinking(evidence)
 
 
-def _border(alpha: np.ndarray) -> float:
-    """Fraction of the picture's border that is foreground."""
-    rim = np.concatenate((alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]))
-    return float((rim > 127).mean())
+def _rim(picture: np.ndarray) -> np.ndarray:
+    """The pixels along the picture's border."""
+    return np.concatenate((picture[0], picture[-1], picture[:, 0], picture[:, -1]))
 
 
 def _inverted_or_absent(evidence: Evidence, views: list[str]) -> Finding:
@@ -71,9 +70,9 @@ def _inverted_or_absent(evidence: Evidence, views: list[str]) -> Finding:
 
 
 def _not_cut_out(evidence: Evidence, views: list[str], index: list[int]) -> Finding:
-    rims = [np.concatenate((p[0], p[-1], p[:, 0], p[:, -1])) for i in evidence.first for p in i.rgb[0, index]]
-    spread = float(np.median([rim.astype(np.float32).std(0).max() for rim in rims]))
-    hue = float(np.median([np.ptp(rim.astype(np.float32).mean(0)) for rim in rims]))
+    rims = [_rim(p).astype(np.float32) for i in evidence.first for p in i.rgb[0, index]]
+    spread = float(np.median([rim.std(0).max() for rim in rims]))
+    hue = float(np.median([np.ptp(rim.mean(0)) for rim in rims]))
     looks = "uniform" if spread < _UNIFORM else "not uniform"
     backend = "chroma" if spread < _UNIFORM and hue > _COLOURED else "background, --backend onnx or --backend sam2"
     return Finding(

@@ -113,37 +113,30 @@ def _first_overlaps(evidence: Evidence) -> dict[str, float]:
     The worse of the two, each as a median over the cameras. The scene counts relative to the sequence that fits it
     best, so that a coarse scene or a camera that was moved is no fault of a sequence.
     """
-    found = {}
     cameras = evidence.first[0].cameras
     alike = [item for item in evidence.first if same_cameras(item.cameras, cameras)]
     usual = np.median([item.alpha[0] for item in alike], axis=0).astype(np.float32) / 255
-    best = max((float(np.median([fit.aligned for fit in row])) for row in evidence.fits or ()), default=1.0)
+    aligned = [float(np.median([fit.aligned for fit in row])) for row in evidence.fits or ()]
+    best, found = max(aligned, default=0.0), {}
     for s, item in enumerate(evidence.first):
         values = [1.0]
         if item in alike:
-            values.append(float(np.median([overlap(a / np.float32(255), b) for a, b in zip(item.alpha[0], usual,
-                                                                                           strict=True)])))  # fmt: skip
-        if evidence.fits is not None and best > _AT_REST / 2:  # less is a matter of the calibration
-            values.append(float(np.median([fit.aligned for fit in evidence.fits[s]])) / max(best, 1e-6))
+            masks = item.alpha[0] / np.float32(255)
+            values.append(float(np.median([overlap(a, b) for a, b in zip(masks, usual, strict=True)])))
+        if best > _AT_REST / 2:  # less is a matter of the calibration
+            values.append(aligned[s] / best)
         found[item.name] = min(values)
     return found
 
 
 @dataclass(frozen=True, eq=False)
 class Swing:
-    """How the object swings, as far as pictures tell.
+    """How the object swings, as far as pictures tell."""
 
-    Attributes:
-        frequency: of the spectrum [Hz].
-        power: of it, 1 at its peak.
-        dominant: where the power peaks [Hz].
-        cycles: of it within the frames that were watched; of a single one nothing can be told.
-    """
-
-    frequency: np.ndarray
-    power: np.ndarray
-    dominant: float
-    cycles: float
+    frequency: np.ndarray  # of the spectrum [Hz]
+    power: np.ndarray  # of it, 1 at its peak
+    dominant: float  # where the power peaks [Hz]
+    cycles: float  # of it within the frames that were watched; of a single one nothing can be told
 
 
 def swing(evidence: Evidence) -> Swing:

@@ -8,6 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from jinja2 import Environment, StrictUndefined
 
 from gausim.doctor.examine import Examination
@@ -47,20 +48,15 @@ def summary_line(found: Examination) -> str:
 
 
 def plain_findings(found: Examination) -> dict[str, Any]:
-    """Findings and what was left out as plain data, for JSON."""
-    return {
-        "findings": [{**vars(finding), "measured": _plain(finding.measured)} for finding in found.findings],
-        "left_out": found.left_out,
-    }
+    """Findings and what was left out as plain data, for JSON, which has null for what is not finite."""
+    findings = msgspec.json.encode([vars(finding) for finding in found.findings], enc_hook=float)
+    return {"findings": msgspec.json.decode(findings), "left_out": found.left_out}
 
 
 def write_page(path: Path, found: Examination, pictures: Sequence[tuple[str, str]]) -> None:
-    """Writes the page; names are escaped, and its policy forbids the browser to load anything from elsewhere.
+    """Writes the HTML page beside the pictures, of which it is given file names and captions.
 
-    Args:
-        path: HTML to write, beside the pictures.
-        found: the findings.
-        pictures: file name and caption of each.
+    Names are escaped, and its policy forbids the browser to load anything from elsewhere.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     template = environment.from_string(files("gausim.doctor").joinpath("page.html").read_text(encoding="utf-8"))
@@ -73,15 +69,3 @@ def write_page(path: Path, found: Examination, pictures: Sequence[tuple[str, str
         pictures=pictures,
     )
     path.write_text(text, encoding="utf-8")
-
-
-def _plain(value: Any) -> Any:
-    """Numbers that JSON knows: what is not finite becomes null."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, (bool, int, str)):
-        return value
-    number = float(value)
-    return number if abs(number) < float("inf") else None

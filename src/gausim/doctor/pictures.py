@@ -6,13 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from gausim.doctor.clock import motion_energy
 from gausim.doctor.coverage import view_directions
-from gausim.doctor.evidence import Evidence, Tick
+from gausim.doctor.evidence import Evidence, with_bar
 from gausim.doctor.motion import swing
 from gausim.report.pictures.figures import METHOD_COLORS, save_figure
 
@@ -23,17 +22,8 @@ _BEHIND = 90
 _OUTLINE = "#f0962a"
 
 
-def draw_pictures(evidence: Evidence, out: Path, tick: Tick) -> list[tuple[str, str]]:
-    """Writes all pictures into a folder.
-
-    Args:
-        evidence: what was looked at.
-        out: the folder.
-        tick: is told how far it is.
-
-    Returns:
-        Name and caption of each.
-    """
+def draw_pictures(evidence: Evidence, out: Path) -> list[tuple[str, str]]:
+    """Writes all pictures into a folder; returns name and caption of each."""
     drawn: list[tuple[str, str, Callable[[Evidence], Figure]]] = [
         ("views.png", "Frame 0 of the first sequence in every view; orange: outline of the rest scene, drawn by the "
          "camera that the file states. Both must lie on each other.", _views),
@@ -43,14 +33,12 @@ def draw_pictures(evidence: Evidence, out: Path, tick: Tick) -> list[tuple[str, 
          "rate.", _spectrum),
         ("coverage.png", "Cameras seen from above. Orange: training views, blue: held-out ones.", _coverage),
     ]  # fmt: skip
-    for number, (name, _, figure) in enumerate(drawn):
-        tick("pictures", number, len(drawn))
+    for name, _, figure in with_bar(drawn, "pictures"):
         finished = figure(evidence)
         for text in finished.findobj(Text):  # a dollar sign in a name would start a formula
             assert isinstance(text, Text)
             text.set_parse_math(False)
         save_figure(finished, out / name)
-    tick("pictures", len(drawn), len(drawn))
     return [(name, caption) for name, caption, _ in drawn]
 
 
@@ -119,20 +107,15 @@ def _coverage(evidence: Evidence) -> Figure:
         axes.scatter(means[:, first], means[:, second], s=1, color="#999999")
     axes.plot(middle[first], middle[second], "+", color="#555555")
     for v, view in enumerate(evidence.views):
-        _camera(axes, centers[v, [first, second]], forward[v, [first, second]], view,
-                trained=view in evidence.data.train_views)  # fmt: skip
+        (x, y), ahead = centers[v, [first, second]], forward[v, [first, second]]
+        color = METHOD_COLORS[0 if view in evidence.data.train_views else 1]
+        tip = (x, y) + 0.35 * ahead * np.hypot(x, y)
+        axes.plot(x, y, "o", color=color)
+        axes.annotate("", xy=tuple(tip), xytext=(x, y), arrowprops={"arrowstyle": "->", "color": color})
+        axes.annotate(view, xy=(x, y), xytext=(6, 6), textcoords="offset points", fontsize=8, color=color)
     axes.set(aspect="equal", xlabel=f"{'xyz'[first]} [scene units]", ylabel=f"{'xyz'[second]} [scene units]")
     axes.set_title(f"from {'+' if ups[up] > 0 else '-'}{'xyz'[up]}", fontsize=9)
     axes.margins(0.15)
     if (ups[up] > 0) == (up == 1):  # two axes in their order are seen from the other side
         axes.invert_yaxis()
     return figure
-
-
-def _camera(axes: Axes, center: np.ndarray, direction: np.ndarray, name: str, *, trained: bool) -> None:
-    color = METHOD_COLORS[0] if trained else METHOD_COLORS[1]
-    x, y = (float(value) for value in center)
-    u, v = (float(value) for value in center + 0.35 * direction * np.linalg.norm(center))
-    axes.plot(x, y, "o", color=color)
-    axes.annotate("", xy=(u, v), xytext=(x, y), arrowprops={"arrowstyle": "->", "color": color})
-    axes.annotate(name, xy=(x, y), xytext=(6, 6), textcoords="offset points", fontsize=8, color=color)

@@ -20,36 +20,23 @@ _SMOOTHING, _STEPS, _PRECISION = 5, 100, 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Silhouettes:
-    """The rest scene's foreground in V views.
+    """The rest scene's foreground in V views."""
 
-    Attributes:
-        alpha: coverage, 0 to 1.
-        rgb: colours over black, 0 to 1.
-    """
-
-    alpha: Float[np.ndarray, "V h w"]
-    rgb: Float[np.ndarray, "V h w 3"]
+    alpha: Float[np.ndarray, "V h w"]  # coverage, 0 to 1
+    rgb: Float[np.ndarray, "V h w 3"]  # colours over black, 0 to 1
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How a drawn silhouette lies on that of a picture.
+    """How a drawn silhouette lies on that of a picture."""
 
-    Attributes:
-        overlap: intersection over union as it is.
-        aligned: the same after the best shift and turn in the picture.
-        shift: at the middle of the mask, right and down [reduced pixels]; NaN where nothing is drawn.
-        turn: in the picture [degrees].
-        pixels: root mean square of the displacement over the mask [reduced pixels]; infinite where nothing is drawn.
-        degrees: turn of the camera that would explain it.
-    """
-
-    overlap: float
-    aligned: float
-    shift: tuple[float, float]
-    turn: float
+    overlap: float  # intersection over union as it is
+    aligned: float  # the same after the best shift and turn in the picture
+    shift: tuple[float, float]  # at the middle of the mask, right and down [reduced pixels]; NaN where nothing is drawn
+    turn: float  # in the picture [degrees]
+    # root mean square of the displacement over the mask [reduced pixels]; infinite where nothing is drawn
     pixels: float
-    degrees: float
+    degrees: float  # turn of the camera that would explain it
 
 
 def draw_silhouettes(scene: GaussianScene, cameras: Cameras) -> Silhouettes:
@@ -70,10 +57,7 @@ def overlap(a: Float[np.ndarray, "*shape"], b: Float[np.ndarray, "*shape"]) -> f
 def fit_silhouette(mask: Float[np.ndarray, "h w"], drawn: Float[np.ndarray, "h w"], focal: float) -> Fit:
     """Finds the shift and turn in the picture that lay a drawn silhouette on a mask (enhanced correlation).
 
-    Args:
-        mask: of the picture, 0 to 1.
-        drawn: silhouette of the rest scene, 0 to 1.
-        focal: focal length [pixels of both].
+    Both are 0 to 1; ``focal`` is the focal length [pixels of both].
     """
     raw = overlap(mask, drawn)
     if mask.sum() < 1 or drawn.sum() < 1:

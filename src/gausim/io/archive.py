@@ -57,20 +57,13 @@ def files_below(root: Path) -> list[Path]:
 
 
 def pack(target: Path, files: Mapping[str, Path]) -> int:
-    """Writes files into a tar archive, whole or not at all; the same files give the same bytes.
+    """Writes files, by their names in it, into a tar archive, whole or not at all; the same files give the same bytes.
 
     Owners, times and permissions are left out, and nothing is compressed: images and weights hardly shrink, and the
     bytes that a compressor writes depend on its version.
 
-    Args:
-        target: the archive.
-        files: the file of every name in the archive, with ``/`` between folders.
-
     Returns:
         The bytes of all files together, which :func:`unpack` asks for.
-
-    Raises:
-        OSError: a file cannot be read or the archive not be written.
     """
     total = 0
     with replacing(target) as temporary, tarfile.open(temporary, "w", format=tarfile.PAX_FORMAT) as tar:
@@ -88,13 +81,8 @@ def unpack(archive: Path, folder: Path, *, most_bytes: int, advance: Callable[[i
     """Unpacks a tar (also compressed) or zip archive into a new folder; its files and folders only, nothing else.
 
     Nothing in the archive decides where or how anything is written: a path that leaves the folder, a link, a device, a
-    name that is there twice, and more bytes than were announced are refused; then the folder is removed again.
-
-    Args:
-        archive: the archive.
-        folder: where; it is made.
-        most_bytes: what all files together may hold [bytes].
-        advance: told the bytes that were written.
+    name that is there twice, and more than ``most_bytes`` in all files are refused; then the folder is removed again.
+    ``advance`` is told the bytes that were written.
 
     Raises:
         FetchError: the archive holds one of these, or is damaged.
@@ -137,7 +125,7 @@ def _members(archive: Path) -> Iterator[_Member]:
     with archive.open("rb") as file:
         # By its first bytes: a tar that ends with an .npz would pass for a zip, which is known by its end.
         is_zip = file.read(4) in _ZIP_BEGINNINGS
-    yield from _of_zip(archive) if is_zip else _of_tar(archive)
+    return _of_zip(archive) if is_zip else _of_tar(archive)
 
 
 def _of_tar(archive: Path) -> Iterator[_Member]:

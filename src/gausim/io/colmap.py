@@ -1,41 +1,54 @@
-"""COLMAP sparse models: cameras with their lenses, poses of the images, points. Errors name the file and the field."""
+"""COLMAP sparse models, binary or text: cameras with their lenses, poses of the images, points.
+
+pycolmap does not replace this reader: of files that were cut off it reads some as if they were whole, and it allocates
+whatever a count in a file claims. Here a count is compared with the bytes that are left before anything is allocated.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import struct
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gausim.core.errors import DataError
-from gausim.io.colmap_files import CameraRow, ImageRow, PointTable, read_cameras, read_images, read_points
 
+T = TypeVar("T")
+# COLMAP's camera models: number in binary files, name in text files, count of parameters.
+MODELS: dict[int, tuple[str, int]] = {
+    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12),
+}  # fmt: skip
+PARAMETERS = dict(MODELS.values())
 # Models with two focal lengths; the others have one for both axes.
 _TWO_FOCAL = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE")
-PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+_PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 # Larger numbers are damage: they would overflow float32 somewhere down the line.
 _LARGEST = 1e12
 _LARGEST_SIDE = 1 << 20
 # COLMAP writes unit quaternions with all digits; by hand some have six.
 _UNIT_TOLERANCE = 1e-2
+# What the binary format writes where a keypoint shows no point.
+_NO_POINT = (1 << 64) - 1
+_CAMERA, _IMAGE, _POINT, _COUNT = (struct.Struct(f) for f in ("<IiQQ", "<I7dI", "<Q3d3BdQ", "<Q"))
+_KEYPOINT, _FLOAT = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")]), np.dtype("<f8")
+_TRACK_BYTES = 8
+_POINT_COLUMNS = 8
 
 
 @dataclass(frozen=True, eq=False)
 class ColmapCamera:
-    """One camera.
+    """One camera."""
 
-    Attributes:
-        model: a name of :data:`gausim.io.colmap_files.PARAMETERS`.
-        width: of its images [pixels].
-        height: of its images [pixels].
-        params: (p,) float64, in COLMAP's order: focal lengths and centre [pixels], then the lens's coefficients.
-    """
-
-    model: str
-    width: int
-    height: int
+    model: str  # a name of :data:`PARAMETERS`
+    width: int  # of its images [pixels]
+    height: int  # of its images [pixels]
+    # (p,) float64, in COLMAP's order: focal lengths and centre [pixels], then the lens's coefficients
     params: np.ndarray
 
     @property
@@ -48,7 +61,7 @@ class ColmapCamera:
     @property
     def distorted(self) -> bool:
         """Whether straight lines are bent: neither a pinhole model nor one whose coefficients are all zero."""
-        if self.model in PINHOLES:
+        if self.model in _PINHOLES:
             return False
         # Fisheye models and the field-of-view model bend with coefficients of zero, too.
         bent = "FISHEYE" in self.model or self.model == "FOV"
@@ -72,38 +85,34 @@ class ColmapCamera:
 
 @dataclass(frozen=True, eq=False)
 class ColmapImage:
-    """One registered image.
+    """One registered image."""
 
-    Attributes:
-        name: its path within the folder of images.
-        camera: key of the model's cameras.
-        viewmat: (4, 4) float64 world to camera, OpenCV axes.
-        xy: (m, 2) float64 keypoints that show a point [pixels].
-        point_ids: (m,) int64 the points they show.
-    """
+    name: str  # its path within the folder of images
+    camera: int  # key of the model's cameras
+    viewmat: np.ndarray  # (4, 4) float64 world to camera, OpenCV axes
+    xy: np.ndarray  # (m, 2) float64 keypoints that show a point [pixels]
+    point_ids: np.ndarray  # (m,) int64 the points they show
 
-    name: str
-    camera: int
-    viewmat: np.ndarray
-    xy: np.ndarray
-    point_ids: np.ndarray
+
+@dataclass(frozen=True, eq=False)
+class PointTable:
+    """All of ``points3D``: ids (P,) int64, xyz (P, 3) and error (P,) float64, rgb (P, 3) uint8, tracks (P,) int64."""
+
+    ids: np.ndarray
+    xyz: np.ndarray
+    rgb: np.ndarray
+    error: np.ndarray
+    tracks: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """A sparse model.
+    """A sparse model."""
 
-    Attributes:
-        path: the folder it was read from.
-        cameras: by their number.
-        images: in the order of their names.
-        points: what was triangulated; an empty table where there is no file of points.
-    """
-
-    path: Path
-    cameras: dict[int, ColmapCamera]
-    images: tuple[ColmapImage, ...]
-    points: PointTable
+    path: Path  # the folder it was read from
+    cameras: dict[int, ColmapCamera]  # by their number
+    images: tuple[ColmapImage, ...]  # in the order of their names
+    points: PointTable  # what was triangulated; an empty table where there is no file of points
 
 
 def find_colmap(folder: Path) -> Path:
@@ -142,20 +151,20 @@ def read_colmap(folder: Path | str) -> ColmapModel:
     folder = Path(folder)
     files = colmap_files(folder)
     cameras: dict[int, ColmapCamera] = {}
-    for row in read_cameras(files["cameras"]):
-        _unique(files["cameras"], row.where, row.number, cameras)
-        cameras[row.number] = _camera(files["cameras"], row)
-    images: dict[int | str, ColmapImage] = {}
-    for entry in read_images(files["images"]):
-        image = _image(files["images"], entry, cameras)
-        for key in (entry.number, entry.name):
-            _unique(files["images"], entry.where, key, images)
-            images[key] = image
+    for where, number, camera in _rows_of(files["cameras"], _cameras_binary, _cameras_text):
+        _check_unique(where, number, cameras)
+        cameras[number] = _checked_camera(where, camera)
+    images: dict[str, ColmapImage] = {}
+    numbers: set[int] = set()
+    for where, number, pose, image in _rows_of(files["images"], _images_binary, _images_text):
+        _check_unique(where, number, numbers)
+        _check_unique(where, image.name, images)
+        numbers.add(number)
+        images[image.name] = _checked_image(where, pose, image, cameras)
     if not images:
         raise DataError(f"{files['images']}: holds no image. Expected the registered images of a model.")
     points = _points(files["points3D"]) if "points3D" in files else no_points()
-    named = sorted(key for key in images if isinstance(key, str))
-    return ColmapModel(folder, cameras, tuple(images[name] for name in named), points)
+    return ColmapModel(folder, cameras, tuple(images[name] for name in sorted(images)), points)
 
 
 def no_points() -> PointTable:
@@ -164,47 +173,52 @@ def no_points() -> PointTable:
     return PointTable(empty, np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0), empty)
 
 
-def _camera(path: Path, row: CameraRow) -> ColmapCamera:
-    where = f"{path}: {row.where}"
-    if not (0 < row.width <= _LARGEST_SIDE and 0 < row.height <= _LARGEST_SIDE):
-        size = f"{row.width} x {row.height}"
+def _rows_of(path: Path, binary: Callable[[Path], Iterator[T]], text: Callable[[Path], Iterator[T]]) -> Iterator[T]:
+    return binary(path) if path.suffix == ".bin" else text(path)
+
+
+def _checked_camera(where: str, camera: ColmapCamera) -> ColmapCamera:
+    if not (0 < camera.width <= _LARGEST_SIDE and 0 < camera.height <= _LARGEST_SIDE):
+        size = f"{camera.width} x {camera.height}"
         raise DataError(f"{where}: fields 'width', 'height' are {size}, expected 1 to {_LARGEST_SIDE} pixels.")
-    _check_finite(f"{where}: field 'params'", row.params)
-    camera = ColmapCamera(row.model, row.width, row.height, row.params)
+    _check_finite(f"{where}: field 'params'", camera.params)
     if min(camera.intrinsics[:2]) <= 0:
         raise DataError(f"{where}: field 'params': focal lengths must be positive, got {camera.intrinsics[:2]}.")
     return camera
 
 
-def _image(path: Path, row: ImageRow, cameras: dict[int, ColmapCamera]) -> ColmapImage:
-    where, place = f"{path}: {row.where}", PurePosixPath(row.name)
-    if not row.name.isprintable() or not place.name or place.is_absolute() or ".." in place.parts:
-        raise DataError(f"{where}: field 'name' must be a path inside the folder of images, got {row.name!r:.80}.")
-    if row.camera not in cameras:
-        raise DataError(f"{where}: field 'camera_id' is {row.camera}, the cameras are {sorted(cameras)[:20]}.")
-    quaternion, translation = row.pose[:4], row.pose[4:]
-    for field, values in (
-        ("field 'quaternion'", quaternion),
-        ("field 'translation'", translation),
-        ("keypoints", row.xy),
-    ):
-        _check_finite(f"{where}: {field}", values)
+def _checked_image(where: str, pose: np.ndarray, image: ColmapImage, cameras: dict[int, ColmapCamera]) -> ColmapImage:
+    place = PurePosixPath(image.name)
+    if not image.name.isprintable() or not place.name or place.is_absolute() or ".." in place.parts:
+        raise DataError(f"{where}: field 'name' must be a path inside the folder of images, got {image.name!r:.80}.")
+    if image.camera not in cameras:
+        raise DataError(f"{where}: field 'camera_id' is {image.camera}, the cameras are {sorted(cameras)[:20]}.")
+    quaternion, translation = pose[:4], pose[4:]
+    _check_finite(f"{where}: field 'quaternion'", quaternion)
+    _check_finite(f"{where}: field 'translation'", translation)
+    _check_finite(f"{where}: keypoints", image.xy)
     length = float(np.linalg.norm(quaternion))
     if abs(length - 1) > _UNIT_TOLERANCE:
         raise DataError(f"{where}: field 'quaternion' has length {length:.4g}, expected 1. Export the model again.")
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix(), translation
-    return ColmapImage(row.name, row.camera, viewmat, row.xy, row.point_ids)
+    image.viewmat[:3, :3] = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+    image.viewmat[:3, 3] = translation
+    return image
 
 
 def _points(path: Path) -> PointTable:
-    table = read_points(path)
-    for field in ("xyz", "error"):
-        _check_finite(f"{path}: field '{field}'", getattr(table, field))
-    ids, counts = np.unique(table.ids, return_counts=True)
-    if len(ids) < len(table.ids):
-        raise DataError(f"{path}: field 'id' {ids[counts > 1][0]} stands twice. Export the model again.")
-    return table
+    rows = list(_rows_of(path, _points_binary, _points_text))
+    table = np.array([row for row, _ in rows]).reshape(-1, _POINT_COLUMNS)
+    xyz, rgb, error = table[:, 1:4], table[:, 4:7], table[:, 7]
+    # Comparisons with NaN are false, so it is refused too.
+    if not ((rgb >= 0) & (rgb <= 255) & (rgb == np.floor(rgb))).all():
+        raise DataError(f"{path}: field 'rgb' must hold whole numbers from 0 to 255. Export the model again.")
+    _check_finite(f"{path}: field 'xyz'", xyz)
+    _check_finite(f"{path}: field 'error'", error)
+    ids = _ids(path, table[:, 0])
+    known, counts = np.unique(ids, return_counts=True)
+    if len(known) < len(ids):
+        raise DataError(f"{path}: field 'id' {known[counts > 1][0]} stands twice. Export the model again.")
+    return PointTable(ids, xyz, rgb.astype(np.uint8), error, np.array([track for _, track in rows], np.int64))
 
 
 def _check_finite(where: str, values: np.ndarray) -> None:
@@ -218,6 +232,169 @@ def _check_finite(where: str, values: np.ndarray) -> None:
         )
 
 
-def _unique(path: Path, where: str, value: int | str, known: Collection[int | str]) -> None:
+def _check_unique(where: str, value: int | str, known: Collection[int | str]) -> None:
     if value in known:
-        raise DataError(f"{path}: {where}: '{value}' stands twice. Export the model again.")
+        raise DataError(f"{where}: '{value}' stands twice. Export the model again.")
+
+
+class _Binary:
+    """A binary file that is read forward, with an error where it ends too early."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.at, self.data = path, 0, _contents(path)
+
+    def need(self, count: int, where: str) -> int:
+        """Goes on by ``count`` bytes; returns where they begin."""
+        left = len(self.data) - self.at
+        if count > left:
+            raise DataError(
+                f"{where}: expected {count} more bytes, the file has {left}. It is truncated or its counts are wrong; "
+                "copy or export the model again."
+            )
+        self.at += count
+        return self.at - count
+
+    def take(self, layout: struct.Struct, where: str) -> tuple:
+        return layout.unpack_from(self.data, self.need(layout.size, where))
+
+    def table(self, dtype: np.dtype, count: int, where: str) -> np.ndarray:
+        return np.frombuffer(self.data, dtype, count, self.need(count * dtype.itemsize, where))
+
+    def name(self, where: str) -> str:
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise DataError(f"{where}: field 'name' has no end. The file is truncated; export it again.")
+        return _decoded(self.data[self.need(end + 1 - self.at, where) : end], f"{where}: field 'name'")
+
+    def records(self) -> Iterator[str]:
+        """What messages call each record of the file, which holds nothing after them."""
+        (count,) = self.take(_COUNT, f"{self.path}: number of {self.path.stem}")
+        for i in range(count):
+            yield f"{self.path}: {self.path.stem}[{i}]"
+        if self.at < len(self.data):
+            left = len(self.data) - self.at
+            raise DataError(f"{self.path}: {left} bytes follow the last record. Its counts are wrong; export it again.")
+
+
+# Of each camera where it stands, its number and what it is; of each image its pose (w x y z and translation) besides.
+_CameraRow = tuple[str, int, ColmapCamera]
+_ImageRow = tuple[str, int, np.ndarray, ColmapImage]
+
+
+def _cameras_binary(path: Path) -> Iterator[_CameraRow]:
+    file = _Binary(path)
+    for where in file.records():
+        number, model, width, height = file.take(_CAMERA, where)
+        name, count = MODELS.get(model) or _unknown_model(where, str(model))
+        params = file.table(_FLOAT, count, f"{where}: field 'params' of {name}").copy()
+        yield where, number, ColmapCamera(name, width, height, params)
+
+
+def _cameras_text(path: Path) -> Iterator[_CameraRow]:
+    for where, words in _lines(path):
+        if not words:
+            continue
+        model = words[1] if len(words) > 1 else ""
+        expected = 4 + (PARAMETERS.get(model) or _unknown_model(where, model)[1])
+        if len(words) != expected:
+            raise DataError(f"{where}: expected {expected} words for {model}, got {len(words)}.")
+        number, width, height = (_whole(where, words[i]) for i in (0, 2, 3))
+        yield where, number, ColmapCamera(model, width, height, _numbers(where, words[4:]))
+
+
+def _unknown_model(where: str, model: str) -> tuple[str, int]:
+    known = ", ".join(PARAMETERS)
+    raise DataError(f"{where}: field 'model' is {model!r:.40}, expected one of {known}. Undistort the model.")
+
+
+def _images_binary(path: Path) -> Iterator[_ImageRow]:
+    file = _Binary(path)
+    for where in file.records():
+        number, *pose, camera = file.take(_IMAGE, where)
+        name = file.name(where)
+        where = f"{where} '{name}'"
+        (count,) = file.take(_COUNT, where)
+        keypoints = file.table(_KEYPOINT, count, f"{where}: keypoints")
+        seen = keypoints[keypoints["point"] != _NO_POINT]
+        xy = np.stack((seen["x"], seen["y"]), 1)
+        yield where, number, np.array(pose), ColmapImage(name, camera, np.eye(4), xy, _ids(path, seen["point"]))
+
+
+def _images_text(path: Path) -> Iterator[_ImageRow]:
+    lines = _lines(path)
+    for where, words in lines:
+        if not words:
+            continue
+        if len(words) < 10:
+            raise DataError(f"{where}: expected ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {len(words)} words.")
+        number, camera = (_whole(where, words[i]) for i in (0, 8))
+        pose, name = _numbers(where, words[1:8]), " ".join(words[9:])
+        # Its keypoints stand on the next line, which may be empty, or missing at the end of the file.
+        below, keypoints = next(lines, (where, []))
+        if len(keypoints) % 3:
+            raise DataError(f"{below}: keypoints: expected triples X Y POINT3D_ID, got {len(keypoints)} words.")
+        table = _numbers(below, keypoints).reshape(-1, 3)
+        seen = table[table[:, 2] != -1]
+        image = ColmapImage(name, camera, np.eye(4), seen[:, :2].copy(), _ids(path, seen[:, 2]))
+        yield f"{where} '{name}'", number, pose, image
+
+
+def _points_binary(path: Path) -> Iterator[tuple[tuple, int]]:
+    file = _Binary(path)
+    for where in file.records():
+        *row, track = file.take(_POINT, where)
+        file.need(track * _TRACK_BYTES, f"{where}: field 'track'")
+        yield tuple(row), track
+
+
+def _points_text(path: Path) -> Iterator[tuple[np.ndarray, int]]:
+    for where, words in _lines(path):
+        track, odd = divmod(len(words) - _POINT_COLUMNS, 2)
+        if words and (track < 0 or odd):
+            raise DataError(f"{where}: expected ID X Y Z R G B ERROR and pairs of a track, got {len(words)} words.")
+        if words:
+            yield _numbers(where, words)[:_POINT_COLUMNS], track
+
+
+def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
+    """Place and words of every line that is no comment; empty ones too, they mean something in ``images.txt``."""
+    for number, raw in enumerate(_contents(path).split(b"\n"), 1):
+        where = f"{path}: line {number}"
+        line = _decoded(raw, where).strip()
+        if not line.startswith("#"):
+            yield where, line.split()
+
+
+def _contents(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror}). Expected a file of a COLMAP model.") from error
+
+
+def _decoded(raw: bytes, where: str) -> str:
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{where}: is no UTF-8 text ({error.reason}). Export the model again.") from error
+
+
+def _whole(where: str, word: str) -> int:
+    # ASCII digits only: int() also takes underscores and other alphabets' digits.
+    if not (word.isascii() and word.isdigit()) or len(word) > 18:
+        raise DataError(f"{where}: expected a whole number, got {word!r:.40}.")
+    return int(word)
+
+
+def _numbers(where: str, words: list[str]) -> np.ndarray:
+    try:
+        return np.array(words, np.float64)
+    except ValueError as error:
+        raise DataError(f"{where}: expected a number ({error!s:.80}).") from None
+
+
+def _ids(path: Path, values: np.ndarray) -> np.ndarray:
+    """Ids (n,) as int64, after checking that they are such: whole, not negative, below 2^53."""
+    if not ((values == np.floor(values)) & (values >= 0) & (values < 1 << 53)).all():
+        raise DataError(f"{path}: a point's id is no whole number from 0 to 2^53. Export the model again.")
+    return values.astype(np.int64)

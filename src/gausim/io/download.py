@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import http.client
 import re
+import ssl
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from io import BufferedIOBase
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -20,7 +20,8 @@ ATTEMPTS, PAUSE = 5, 1.0  # connections; seconds before the second, doubled befo
 _TIMEOUT = 30.0  # seconds without a byte
 _CHUNK = 1 << 18
 _RANGE = re.compile(r"bytes (\d+)-\d+/(\d+|\*)")
-_BROKEN = (urllib.error.URLError, http.client.HTTPException, ConnectionError, TimeoutError)
+# What goes wrong on the way, as against on our disk.
+_BROKEN = (urllib.error.URLError, http.client.HTTPException, ConnectionError, TimeoutError, ssl.SSLError)
 
 
 def is_url(address: str) -> bool:
@@ -35,12 +36,11 @@ def read_text(address: str, *, most_bytes: int) -> str:
         FetchError: it cannot be had, is longer, or is not UTF-8.
     """
     try:
-        with _opened(address, 0) as (stream, _, _):
-            data = b""
-            while chunk := _read(stream, most_bytes + 1 - len(data)):
-                data += chunk
-    except _Broken as broken:
-        raise FetchError(_unreadable(address, broken.reason)) from broken
+        stream, _, _ = _opened(address, 0)
+        with stream:
+            data = stream.read(most_bytes + 1)
+    except _BROKEN as error:
+        raise _unreadable(address, error) from error
     if len(data) > most_bytes:
         raise FetchError(f"{address}: expected at most {most_bytes} bytes, found more. Check the address.")
     try:
@@ -60,7 +60,6 @@ def continue_download(address: str, part: Path, *, size: int, advance: Callable[
 
     Raises:
         FetchError: the address cannot be reached or has a file of another size.
-        OSError: the disk refuses.
     """
     tries = 0
     while (have := _length(part)) != size:
@@ -73,69 +72,47 @@ def continue_download(address: str, part: Path, *, size: int, advance: Callable[
         tries += 1
         final = isinstance(broken, urllib.error.HTTPError) and broken.code < 500 and broken.code not in (408, 416, 429)
         if final or not is_url(address) or tries == ATTEMPTS:
-            raise FetchError(_unreadable(address, broken, kept=_length(part))) from broken
+            raise _unreadable(address, broken, kept=_length(part)) from broken
         time.sleep(PAUSE * 2 ** (tries - 1))
     advance(size)
 
 
 def _append(address: str, part: Path, have: int, size: int, advance: Callable[[int], None]) -> Exception | None:
     """Adds what one connection brings; returns what broke it off."""
+    other = "It is another file: tell whoever keeps the registry."
     try:
-        with _opened(address, have) as (stream, start, total):
+        stream, start, total = _opened(address, have)
+        with stream:
             if total not in (None, size):
-                raise FetchError(f"{address}: expected {size} bytes, as the registry says, found {total}. {_OTHER}")
+                raise FetchError(f"{address}: expected {size} bytes, as the registry says, found {total}. {other}")
             with part.open("r+b" if start else "wb") as file:
                 file.seek(start)
-                while chunk := _read(stream, size + 1 - file.tell()):
+                while chunk := stream.read(min(_CHUNK, size + 1 - file.tell())):
                     file.write(chunk)
                     advance(file.tell())
-                if file.tell() > size:
-                    part.unlink()
-                    raise FetchError(f"{address}: expected {size} bytes, as the registry says, found more. {_OTHER}")
                 done = file.tell()
-    except _Broken as broken:
-        if isinstance(broken.reason, urllib.error.HTTPError):
-            broken.reason.close()
-            if broken.reason.code == 416:  # it has no bytes from there on: begin anew
+    except _BROKEN as error:
+        if isinstance(error, urllib.error.HTTPError):
+            error.close()
+            if error.code == 416:  # it has no bytes from there on: begin anew
                 part.unlink(missing_ok=True)
-        return broken.reason
+        return error
+    if done > size:
+        part.unlink()
+        raise FetchError(f"{address}: expected {size} bytes, as the registry says, found more. {other}")
     return None if done == size else ConnectionError(f"the connection ended after {done} of {size} bytes")
 
 
-_OTHER = "It is another file: tell whoever keeps the registry."
-
-
-class _Broken(Exception):
-    """What went wrong on the way, as against on our disk."""
-
-    def __init__(self, reason: Exception) -> None:
-        super().__init__(str(reason))
-        self.reason = reason
-
-
-def _read(stream: BufferedIOBase, room: int) -> bytes:
-    try:
-        return stream.read(min(_CHUNK, room)) if room > 0 else b""
-    except (*_BROKEN, OSError) as error:
-        raise _Broken(error) from error
-
-
-@contextmanager
-def _opened(address: str, offset: int) -> Iterator[tuple[BufferedIOBase, int, int | None]]:
+def _opened(address: str, offset: int) -> tuple[BufferedIOBase, int, int | None]:
     """A stream from ``offset`` on, or from where the server begins; where that is; the file's size if it is said."""
+    if is_url(address):
+        return _web(address, offset)
     try:
-        stream, start, total = _web(address, offset) if is_url(address) else _file(address, offset)
-    except (*_BROKEN, OSError) as error:
-        raise _Broken(error) from error
-    with stream:
-        yield stream, start, total
-
-
-def _file(address: str, offset: int) -> tuple[BufferedIOBase, int, int]:
-    path = Path(address)
-    stream = path.open("rb")
-    stream.seek(offset)
-    return stream, offset, path.stat().st_size
+        stream = Path(address).open("rb")
+        stream.seek(offset)
+        return stream, offset, Path(address).stat().st_size
+    except OSError as error:  # of what is brought, as against of our disk
+        raise urllib.error.URLError(error) from error
 
 
 def _web(address: str, offset: int) -> tuple[BufferedIOBase, int, int | None]:
@@ -157,29 +134,17 @@ def _length(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 
-def _unreadable(address: str, error: Exception, *, kept: int = 0) -> str:
-    stays = f" The {kept} bytes that came are kept." if kept else ""
-    return f"{address}: cannot be read ({_told(error)}).{stays} {_remedy(address, error)}"
-
-
-def _told(error: BaseException) -> str:
-    """An error of the network in few words."""
-    if isinstance(error, urllib.error.HTTPError):
-        return f"HTTP {error.code}, {error.reason}"
-    if isinstance(error, urllib.error.URLError):
-        return str(error.reason)
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return str(error) or type(error).__name__
-
-
-def _remedy(address: str, error: BaseException) -> str:
-    """What to do about it."""
+def _unreadable(address: str, error: Exception, *, kept: int = 0) -> FetchError:
+    status = error.code if isinstance(error, urllib.error.HTTPError) else None
+    said = str(getattr(error, "reason", error)) or type(error).__name__
     if not is_url(address):
-        return "Check that the file is there."
-    if isinstance(error, urllib.error.HTTPError) and error.code < 500:
-        return "Check the address, or tell whoever keeps the registry."
-    return (
-        "Check the connection (and HTTPS_PROXY, where there is a proxy) and give the same command again, or give a "
-        "copy with --mirror DIR."
-    )
+        remedy = "Check that the file is there."
+    elif status is not None and status < 500:
+        remedy = "Check the address, or tell whoever keeps the registry."
+    else:
+        remedy = (
+            "Check the connection (and HTTPS_PROXY, where there is a proxy) and give the same command again, or give a "
+            "copy with --mirror DIR."
+        )
+    stays = f" The {kept} bytes that came are kept." if kept else ""
+    return FetchError(f"{address}: cannot be read ({f'HTTP {status}, ' if status else ''}{said}).{stays} {remedy}")

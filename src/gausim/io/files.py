@@ -19,15 +19,12 @@ def replacing(path: Path, *, previous: Path | None = None, typed: bool = False) 
     """A temporary file that takes the name ``path`` when the block ends without an error.
 
     A crash at any moment leaves the old content or the new one, never a mixture: the temporary file lies in the same
-    directory and reaches the disk before it takes the name; the directory's entry is flushed too.
+    directory, which is made, and reaches the disk before it takes the name; the directory's entry is flushed too.
 
     Args:
-        path: the file; its directory is made.
+        path: the file.
         previous: where a file that ``path`` names already is kept; None replaces it.
         typed: the temporary name has the same ending, for writers that go by it.
-
-    Raises:
-        OSError: the disk refuses; the old file stays.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp{path.suffix if typed else ''}")
@@ -48,14 +45,7 @@ def write_durably(
 ) -> None:
     """Writes a file so that it is there whole or as it was, see :func:`replacing`.
 
-    Args:
-        path: the file.
-        data: its content.
-        check: raises if what was written is not good; called with the temporary file.
-        previous: where a file that ``path`` names already is kept; None replaces it.
-
-    Raises:
-        OSError: the disk refuses; the old file stays.
+    ``check`` is called with the temporary file and raises if what was written is not good.
     """
     with replacing(path, previous=previous) as temporary:
         temporary.write_bytes(data)
@@ -73,21 +63,15 @@ def write_json(path: Path, data: Any) -> None:
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file's content in hexadecimal.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """SHA-256 of a file's content in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def remove_leftovers(folder: Path, *, deep: bool = False) -> None:
-    """Removes the temporary files of processes that were killed while writing. Call it as the only writer.
+    """Removes the temporary files of processes that were killed while writing, those in folders below (``deep``) too.
 
-    Args:
-        folder: where.
-        deep: in the folders below too.
+    Call it as the only writer.
     """
     for path in folder.rglob(".*.tmp*") if deep else folder.glob(".*.tmp*"):
         if _LEFTOVER.fullmatch(path.name):

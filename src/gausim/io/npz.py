@@ -18,11 +18,7 @@ _MOST_PACKED = 1100
 
 
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of an npz file, in this machine's byte order.
-
-    Args:
-        path: the file.
-        names: only these, where they are there; all when None.
+    """The arrays of an npz file, or those of these names that are there, in this machine's byte order.
 
     Raises:
         ValueError: it is missing, no npz, damaged, or holds anything but plain arrays; says why, not which file.

@@ -7,42 +7,61 @@ they are needed; nothing is decoded.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 import torch
 from jaxtyping import UInt8
+from msgspec import Meta, Struct
 from torch import Tensor
 
 from gausim.core import Cameras, DataError
-from gausim.io.transforms import positive_field, read_json
+from gausim.io.files import replacing, write_durably
+from gausim.io.plain_json import checked
+from gausim.io.transforms import read_json
 
-SCHEMA = 1
 HEADER, PIXELS = "frames.json", "frames.bin"
-# Of a header; sequences beyond these sizes are a broken file rather than a film.
-MOST_FRAMES, MOST_PIXELS = 1_000_000, 1 << 16
+# Sequences beyond these sizes are a broken file rather than a film.
+_Count = Annotated[int, Meta(ge=1, le=1_000_000)]
+_Side = Annotated[int, Meta(ge=1, le=1 << 16)]
+_Natural = Annotated[int, Meta(ge=0, le=1 << 62)]
+_Row = tuple[float, float, float]
+_LongRow = tuple[float, float, float, float]
+
+
+class _View(Struct):
+    name: str
+    crop: tuple[_Natural, _Natural, _Natural, _Natural]  # left, top, width, height
+    offset: _Natural
+    viewmat: tuple[_LongRow, _LongRow, _LongRow, _LongRow]
+    K: tuple[_Row, _Row, _Row]
+
+
+class _Header(Struct):
+    schema: Literal[1]
+    frames: _Count
+    width: _Side
+    height: _Side
+    fps: Annotated[float, Meta(gt=0)]
+    bytes: _Natural
+    sha256: Annotated[str, Meta(min_length=64, max_length=64)]
+    views: Annotated[list[_View], Meta(min_length=1)]
 
 
 @dataclass(frozen=True)
 class Crop:
-    """The part of a view that is stored.
+    """The part of a view that is stored."""
 
-    Attributes:
-        left: first column [pixels].
-        top: first row [pixels].
-        width: of the part; 0 where the view never shows any foreground.
-        height: of the part.
-        offset: of its first byte in ``frames.bin``.
-    """
-
-    left: int
-    top: int
-    width: int
-    height: int
-    offset: int
+    left: int  # first column [pixels]
+    top: int  # first row [pixels]
+    width: int  # of the part; 0 where the view never shows any foreground
+    height: int  # of the part
+    offset: int  # of its first byte in ``frames.bin``
 
     @property
     def frame_bytes(self) -> int:
@@ -52,25 +71,15 @@ class Crop:
 
 @dataclass(frozen=True, eq=False)
 class PackedFrames:
-    """A sequence's header.
+    """A sequence's header."""
 
-    Attributes:
-        folder: where both files lie.
-        count: number of frames.
-        fps: frames per second.
-        cameras: one per view.
-        crops: one per view.
-        size: of ``frames.bin`` [bytes].
-        sha256: of ``frames.bin``.
-    """
-
-    folder: Path
-    count: int
-    fps: float
-    cameras: Cameras
-    crops: tuple[Crop, ...]
-    size: int
-    sha256: str
+    folder: Path  # where both files lie
+    count: int  # number of frames
+    fps: float  # frames per second
+    cameras: Cameras  # one per view
+    crops: tuple[Crop, ...]  # one per view
+    size: int  # of ``frames.bin`` [bytes]
+    sha256: str  # of ``frames.bin``
 
     def read(self, frames: range, columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:
         """Whole images of consecutive frames of these views, transparent black outside the crops.
@@ -102,67 +111,78 @@ def read_packed(folder: Path) -> PackedFrames:
     Raises:
         DataError: a file is missing or a field is wrong; names both.
     """
-    path = folder / HEADER
-    data = read_json(path)
-    if data.get("schema") != SCHEMA:
-        raise DataError(f"{path}: schema is {data.get('schema')!r}, expected {SCHEMA}. Pack the sequence again.")
-    count = _integer(data, "frames", path, 1, MOST_FRAMES)
-    width, height = (_integer(data, key, path, 1, MOST_PIXELS) for key in ("width", "height"))
-    fps, size = positive_field(data, "fps", str(path)), _integer(data, "bytes", path, 0, 1 << 62)
-    content = data.get("sha256")
-    if not isinstance(content, str) or len(content) != 64:
-        raise DataError(f"{path}: field 'sha256' must be 64 hexadecimal digits, got {content!r}.")
-    views = data.get("views")
-    if not isinstance(views, list) or not views or not all(isinstance(v, dict) for v in views):
-        raise DataError(f"{path}: field 'views' must be a non-empty list of objects.")
-    crops = tuple(_crop(view, f"{path}: views[{i}]", (width, height), count, size) for i, view in enumerate(views))
-    cameras = _cameras(views, path, width, height)
-    pixels = folder / PIXELS
-    if not pixels.is_file() or pixels.stat().st_size != size:
-        found = f"{pixels.stat().st_size} bytes" if pixels.is_file() else "no such file"
-        raise DataError(f"{pixels}: expected {size} bytes as {HEADER} says, got {found}. Pack the sequence again.")
-    return PackedFrames(folder, count, fps, cameras, crops, size, content)
+    path, pixels, remedy = folder / HEADER, folder / PIXELS, "Pack the sequence again."
+    found = checked(read_json(path), _Header, str(path), remedy)
+    names, crops = tuple(view.name for view in found.views), []
+    if len(set(names)) != len(names):
+        raise DataError(f"{path}: field 'name' of the views must be different texts, got {names}. {remedy}")
+    for view in found.views:
+        crops.append(crop := Crop(*view.crop, view.offset))
+        if crop.left + crop.width > found.width or crop.top + crop.height > found.height:
+            raise DataError(f"{path}: '{view.name}': field 'crop' {view.crop} leaves the image. {remedy}")
+        if crop.offset + found.frames * crop.frame_bytes > found.bytes:
+            raise DataError(
+                f"{path}: '{view.name}': its frames from 'offset' on leave the {found.bytes} bytes. {remedy}"
+            )
+        if min(view.K[0][0], view.K[1][1]) <= 0 or view.K[2] != (0, 0, 1):
+            raise DataError(f"{path}: '{view.name}': field 'K' must have positive focal lengths and end in 0 0 1.")
+    size = pixels.stat().st_size if pixels.is_file() else None
+    if size != found.bytes:
+        raise DataError(f"{pixels}: expected {found.bytes} bytes as {HEADER} says, got {size or 'none'}. {remedy}")
+    viewmats, lenses = (torch.tensor([getattr(view, key) for view in found.views]) for key in ("viewmat", "K"))
+    cameras = Cameras(viewmats, lenses, found.width, found.height, names).validated(str(path))
+    return PackedFrames(folder, found.frames, found.fps, cameras, tuple(crops), found.bytes, found.sha256)
 
 
-def _integer(data: dict[str, Any], key: str, where: Path | str, low: int, high: int) -> int:
-    value = data.get(key)
-    if type(value) is not int or not low <= value <= high:
-        raise DataError(f"{where}: field '{key}' must be an integer from {low} to {high}, got {value!r}.")
-    return value
+def write_packed(
+    folder: Path, cameras: Cameras, views: Iterable[UInt8[np.ndarray, "F H W 4"]], fps: float, *, margin: int
+) -> None:
+    """Writes one sequence; ``frames.json``, which makes it one, comes last and whole.
+
+    The views are the straight-alpha RGBA of each camera, asked for one by one; ``margin`` is how many transparent
+    pixels are kept around what the foreground ever touches.
+
+    Raises:
+        DataError: a view has another size than its camera or another number of frames than the first.
+    """
+    crops: list[Crop] = []
+    digest, offset, count = hashlib.sha256(), 0, 0
+    with replacing(folder / PIXELS) as temporary, temporary.open("wb") as file:
+        for number, pixels in enumerate(views):
+            count = count or len(pixels)
+            expected = (count, cameras.height, cameras.width, 4)
+            if number >= len(cameras.names) or pixels.shape != expected:
+                raise DataError(f"{folder}: view {number}: expected frames of shape {expected}, got {pixels.shape}.")
+            crop = bounding_crop(pixels[..., 3], margin, offset)
+            for frame in pixels[:, crop.top : crop.top + crop.height, crop.left : crop.left + crop.width]:
+                content = frame.tobytes()
+                file.write(content)
+                digest.update(content)
+            crops.append(crop)
+            offset += count * crop.frame_bytes
+    text = header(cameras, crops, count=count, fps=fps, size=offset, sha256=digest.hexdigest())
+    write_durably(folder / HEADER, text)
 
 
-def _crop(view: dict[str, Any], where: str, size: tuple[int, int], count: int, total: int) -> Crop:
-    box = view.get("crop")
-    if not isinstance(box, list) or len(box) != 4 or not all(type(x) is int and x >= 0 for x in box):
-        raise DataError(f"{where}: field 'crop' must be four integers (left, top, width, height), got {box!r}.")
-    left, top, width, height = box
-    crop = Crop(left, top, width, height, _integer(view, "offset", where, 0, total))
-    if crop.left + crop.width > size[0] or crop.top + crop.height > size[1]:
-        raise DataError(f"{where}: field 'crop' {box} leaves the image of {size[0]}x{size[1]}.")
-    if crop.offset + count * crop.frame_bytes > total:
-        raise DataError(
-            f"{where}: {count} frames of {crop.frame_bytes} bytes from {crop.offset} on leave the {total} bytes that "
-            "field 'bytes' states."
+def bounding_crop(alpha: UInt8[np.ndarray, "F H W"], margin: int, offset: int) -> Crop:
+    """The smallest box around all pixels with alpha > 0 in any of the frames, and ``margin`` pixels more."""
+    touched = np.asarray(np.any(alpha > 0, axis=0))
+    if not touched.any():
+        return Crop(0, 0, 0, 0, offset)
+    rows, columns = np.flatnonzero(touched.any(axis=1)), np.flatnonzero(touched.any(axis=0))
+    top, left = max(0, int(rows[0]) - margin), max(0, int(columns[0]) - margin)
+    bottom = min(touched.shape[0], int(rows[-1]) + 1 + margin)
+    right = min(touched.shape[1], int(columns[-1]) + 1 + margin)
+    return Crop(left, top, right - left, bottom - top, offset)
+
+
+def header(cameras: Cameras, crops: Sequence[Crop], *, count: int, fps: float, size: int, sha256: str) -> bytes:
+    """The content of ``frames.json``."""
+    views = [
+        _View(name, (crop.left, crop.top, crop.width, crop.height), crop.offset, viewmat, k)
+        for name, crop, viewmat, k in zip(
+            cameras.names, crops, cameras.viewmats.tolist(), cameras.Ks.tolist(), strict=True
         )
-    return crop
-
-
-def _cameras(views: list[dict[str, Any]], path: Path, width: int, height: int) -> Cameras:
-    names = [view.get("name") for view in views]
-    if not all(isinstance(name, str) for name in names) or len(set(names)) != len(names):
-        raise DataError(f"{path}: field 'name' of the views must be different texts, got {names}.")
-    stacked = [torch.stack([_matrix(view, key, side, f"{path}: views[{i}]") for i, view in enumerate(views)])
-               for key, side in (("viewmat", 4), ("K", 3))]  # fmt: skip
-    return Cameras(stacked[0], stacked[1], width, height, tuple(map(str, names))).validated(str(path))
-
-
-def _matrix(view: dict[str, Any], key: str, side: int, where: str) -> Tensor:
-    try:
-        found = torch.tensor(view.get(key), dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError):
-        found = torch.empty(0)
-    if found.shape != (side, side) or not torch.isfinite(found).all():
-        raise DataError(f"{where}: field '{key}' must be a finite {side} x {side} matrix.")
-    if key == "K" and (found.diag().min() <= 0 or found[2].tolist() != [0, 0, 1]):
-        raise DataError(f"{where}: field 'K' must have positive focal lengths and end in 0 0 1.")
-    return found.float()
+    ]
+    facts = _Header(1, count, cameras.width, cameras.height, fps, size, sha256, views)
+    return msgspec.json.format(msgspec.json.encode(facts), indent=1) + b"\n"

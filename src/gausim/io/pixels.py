@@ -16,12 +16,7 @@ _EXIF = 0x8769
 
 
 def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
-    """Pixels of an image as ``cv2.imread`` gives them (BGR, rows first); None where it cannot be decoded.
-
-    Args:
-        path: the file.
-        flags: of ``cv2.imread``.
-    """
+    """Pixels of an image as ``cv2.imread`` gives them (BGR, rows first); None where it cannot be decoded."""
     if read_header(path) is None:
         return None
     try:
@@ -32,19 +27,12 @@ def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What an image file states before its pixels.
+    """What an image file states before its pixels."""
 
-    Attributes:
-        width: as stored [pixels].
-        height: as stored [pixels].
-        mode: Pillow's name of the channels, e.g. ``RGBA``.
-        exif: camera's facts by tag, those of the sub-directory included.
-    """
-
-    width: int
-    height: int
-    mode: str
-    exif: Mapping[int, Any]
+    width: int  # as stored [pixels]
+    height: int  # as stored [pixels]
+    mode: str  # Pillow's name of the channels, e.g. ``RGBA``
+    exif: Mapping[int, Any]  # camera's facts by tag, those of the sub-directory included
 
 
 def read_header(path: Path) -> ImageHeader | None:

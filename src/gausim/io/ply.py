@@ -39,12 +39,12 @@ _HEADER_LIMIT = 1 << 16
 
 @dataclass(frozen=True)
 class _Header:
-    """What a PLY header declares about its vertices, and where their data starts [bytes]."""
+    """What a PLY header declares about its vertices."""
 
     encoding: str
     count: int
     dtype: np.dtype
-    offset: int
+    offset: int  # where their data starts [bytes]
     only_element: bool
 
 
@@ -97,20 +97,13 @@ def load_points(path: Path | str) -> np.ndarray:
     """
     path = Path(path)
     table = _read_vertices(path)
-    missing = [n for n in _POSITION if n not in (table.dtype.names or ())]
-    if missing:
-        raise SceneError(f"{path}: property '{missing[0]}' is missing. Expected points with x, y and z.")
+    if not set(_POSITION) <= set(table.dtype.names or ()):
+        raise SceneError(f"{path}: a property x, y or z is missing. Expected points.")
     return _columns(path, table, list(_POSITION))
 
 
 def save_scene(scene: GaussianScene, path: Path | str, *, masks: bool = True) -> None:
-    """Writes the scene as little-endian float32 PLY in INRIA order, and its masks next to it; replaces atomically.
-
-    Args:
-        scene: what to write.
-        path: the PLY file.
-        masks: write ``<stem>.masks.npz``, too.
-    """
+    """Writes the scene as little-endian float32 PLY in INRIA order, and its masks next to it; replaces atomically."""
     path = Path(path)
     rest_count = 3 * (scene.sh.shape[1] - 1)
     names = [*_POSITION, "nx", "ny", "nz", *_COLOR, *(f"f_rest_{i}" for i in range(rest_count)), *_SHAPE]
@@ -129,14 +122,9 @@ def save_scene(scene: GaussianScene, path: Path | str, *, masks: bool = True) ->
 
 def save_masks(scene: GaussianScene, path: Path | str) -> None:
     """Writes simulated, pinned, foreground (bool) and volume_scale as npz without pickles; replaces atomically."""
+    masks = {name: getattr(scene, name).cpu().numpy() for name in MASK_NAMES}
     with replacing(Path(path)) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(
-            file,
-            volume_scale=np.float64(scene.volume_scale),
-            simulated=scene.simulated.cpu().numpy(),
-            pinned=scene.pinned.cpu().numpy(),
-            foreground=scene.foreground.cpu().numpy(),
-        )
+        np.savez_compressed(file, volume_scale=np.float64(scene.volume_scale), **masks)
 
 
 def load_masks(scene: GaussianScene, path: Path | str) -> GaussianScene:
@@ -227,20 +215,17 @@ def _read_vertices(path: Path) -> np.ndarray:
 
 
 def _read_text(path: Path, header: _Header) -> np.ndarray:
-    lines = path.read_bytes()[header.offset :].decode("ascii", errors="replace").split("\n")
-    rows = [line.split() for line in lines if line.strip()][: header.count]
     names = header.dtype.names or ()
-    wrong = next((i for i, row in enumerate(rows) if len(row) != len(names)), None)
-    if len(rows) < header.count or wrong is not None:
-        found = f"{len(rows)} lines" if wrong is None else f"{len(rows[wrong])} numbers at vertex {wrong}"
-        raise SceneError(
-            f"{path}: element 'vertex' declares {header.count} vertices of {len(names)} numbers, but the file holds "
-            f"{found}. It is truncated; copy or export it again."
-        )
+    wanted = f"{path}: element 'vertex' declares {header.count} vertices of {len(names)} numbers"
+    lines = [line for line in path.read_bytes()[header.offset :].split(b"\n") if line.strip()][: header.count]
+    if len(lines) < header.count:
+        raise SceneError(f"{wanted}, but the file holds {len(lines)} lines. It is truncated; copy or export it again.")
     try:
-        values = np.array(rows, np.float64)
+        values = np.array([line.split() for line in lines], np.float64)
     except ValueError as error:
-        raise SceneError(f"{path}: element 'vertex': expected numbers ({error!s:.80}). Export it again.") from error
+        raise SceneError(f"{wanted}, but not every line holds so many ({error!s:.80}). Export it again.") from error
+    if values.shape[1] != len(names):
+        raise SceneError(f"{wanted}, but the lines hold {values.shape[1]}. Export it again.")
     return values.view([(name, np.float64) for name in names])[:, 0]
 
 
@@ -275,19 +260,14 @@ def _parse_header(path: Path, lines: list[list[str]], offset: int) -> _Header:
         found = ", ".join(e[0] for e in elements) or "none"
         raise SceneError(f"{path}: first element must be 'vertex', got {found}. Expected a 3DGS scene.")
     _, count, properties = elements[0]
-    dtype = _vertex_dtype(path, properties, _BYTE_ORDER[encoding])
-    return _Header(encoding, count, dtype, offset, len(elements) == 1)
-
-
-def _vertex_dtype(path: Path, properties: list[list[str]], order: str) -> np.dtype:
-    fields: list[tuple[str, str]] = []
-    for words in properties:
-        if len(words) != 2 or words[0] not in _TYPES:
+    fields: dict[str, str] = {}
+    for *kind, name in properties:
+        if len(kind) != 1 or kind[0] not in _TYPES:
             raise SceneError(
-                f"{path}: property '{words[-1]}' of element 'vertex' has type '{' '.join(words[:-1])}'; "
-                f"expected one of {', '.join(_TYPES)}. Export the file as a 3DGS scene."
+                f"{path}: property '{name}' of element 'vertex' has type '{' '.join(kind)}'; expected one of "
+                f"{', '.join(_TYPES)}. Export the file as a 3DGS scene."
             )
-        if words[1] in [n for n, _ in fields]:
-            raise SceneError(f"{path}: property '{words[1]}' of element 'vertex' is declared twice. Export it again.")
-        fields.append((words[1], order + _TYPES[words[0]]))
-    return np.dtype(fields)
+        if name in fields:
+            raise SceneError(f"{path}: property '{name}' of element 'vertex' is declared twice. Export it again.")
+        fields[name] = _BYTE_ORDER[encoding] + _TYPES[kind[0]]
+    return _Header(encoding, count, np.dtype(list(fields.items())), offset, len(elements) == 1)

@@ -16,20 +16,14 @@ _NAME = re.compile(r"(?P<stem>.+)_(?P<number>\d{4,6})\.ply")
 
 
 def save_ply_sequence(folder: Path | str, name: str, frames: Iterable[GaussianScene], fps: float) -> list[Path]:
-    """Writes one PLY per frame, NAME_0001.ply first, with NAME.masks.npz and NAME.json (frames per second) beside.
-
-    Args:
-        folder: is created; may hold no other frames of this name.
-        name: of the sequence.
-        frames: the deformed scenes; masks are taken from the first.
-        fps: frames per second.
+    """Writes one PLY per frame, NAME_0001.ply first, with NAME.masks.npz (of the first) and NAME.json (fps) beside.
 
     Raises:
         DataError: there are frames of this name already, or none to write.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    there = [path.name for _, path in _numbered(folder) if _stem(path) == name]
+    there = [path.name for _, stem, path in _numbered(folder) if stem == name]
     if there:
         raise DataError(f"{folder}: holds '{there[0]}' already. Choose another folder or name, or delete its frames.")
     written = []
@@ -47,12 +41,8 @@ def save_ply_sequence(folder: Path | str, name: str, frames: Iterable[GaussianSc
 def load_ply_sequence(folder: Path | str, *, fps: float | None = None) -> tuple[Iterator[GaussianScene], int, float]:
     """Reads numbered PLY files, one at a time as they are asked for.
 
-    Args:
-        folder: with the files of one sequence.
-        fps: frames per second where no NAME.json says them.
-
     Returns:
-        The scenes in the order of their numbers, how many there are, and frames per second.
+        The scenes in the order of their numbers, how many there are, and frames per second (``fps`` or NAME.json).
 
     Raises:
         DataError: there are no such files, those of several sequences, a number is missing, or the frame rate is
@@ -61,17 +51,20 @@ def load_ply_sequence(folder: Path | str, *, fps: float | None = None) -> tuple[
     """
     folder = Path(folder)
     found = _numbered(folder)
-    stems = sorted({_stem(path) for _, path in found})
+    stems = sorted({stem for _, stem, _ in found})
     if len(stems) != 1:
         what = f"frames of several sequences: {stems[:5]}" if stems else "no files NAME_0001.ply, NAME_0002.ply, ..."
         raise DataError(f"{folder}: has {what}; expected those of one sequence.")
-    numbers = [number for number, _ in found]
+    numbers = [number for number, _, _ in found]
     if numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         missing = sorted(set(range(numbers[0], numbers[-1])) - set(numbers))
         what = f"number {missing[0]} is missing" if missing else "a number stands there twice"
         raise DataError(f"{folder}: {what}. Complete the sequence.")
-    rate = _rate(folder / f"{stems[0]}.json", fps)
-    return _scenes([path for _, path in found], folder / f"{stems[0]}.masks.npz"), len(found), rate
+    path = folder / f"{stems[0]}.json"
+    if fps is None and not path.is_file():
+        raise DataError(f"{path}: no such file, so the frame rate is unknown. State it (--fps).")
+    rate = positive_field(read_json(path) if fps is None else {"fps": fps}, "fps", str(path))
+    return _scenes([path for *_, path in found], folder / f"{stems[0]}.masks.npz"), len(found), rate
 
 
 def _scenes(paths: list[Path], masks: Path) -> Iterator[GaussianScene]:
@@ -84,19 +77,8 @@ def _scenes(paths: list[Path], masks: Path) -> Iterator[GaussianScene]:
         yield scene
 
 
-def _numbered(folder: Path) -> list[tuple[int, Path]]:
+def _numbered(folder: Path) -> list[tuple[int, str, Path]]:
     if not folder.is_dir():
         raise DataError(f"{folder}: no such folder. Expected one with NAME_0001.ply, NAME_0002.ply, ...")
     matches = [(match, path) for path in folder.iterdir() if (match := _NAME.fullmatch(path.name))]
-    return sorted((int(match["number"]), path) for match, path in matches)
-
-
-def _stem(path: Path) -> str:
-    match = _NAME.fullmatch(path.name)
-    return match["stem"] if match else ""
-
-
-def _rate(path: Path, fps: float | None) -> float:
-    if fps is None and not path.is_file():
-        raise DataError(f"{path}: no such file, so the frame rate is unknown. State it (--fps).")
-    return positive_field(read_json(path) if fps is None else {"fps": fps}, "fps", str(path))
+    return sorted((int(match["number"]), match["stem"], path) for match, path in matches)

@@ -14,23 +14,16 @@ from gausim.core import DataError, Trajectory
 from gausim.io.files import write_durably
 
 FORMAT = "gausim.trajectory/1"
-_TENSORS = ("positions", "gradients", "rotations", "unit_of_kernel", "fps")
-_ATTRIBUTES = {"gradients": "deformation_gradients"}  # names in the file that differ from those of Trajectory
+# Names in the file, and those of Trajectory.
+_TENSORS = {"positions": "positions", "gradients": "deformation_gradients", "rotations": "rotations",
+            "unit_of_kernel": "unit_of_kernel"}  # fmt: skip
 
 
 def save_trajectory(path: Path | str, trajectory: Trajectory, *, facts: Mapping[str, str] | None = None) -> None:
-    """Writes a trajectory; replaces the file atomically.
-
-    Args:
-        path: the safetensors file.
-        trajectory: what to write.
-        facts: texts for the header, e.g. object and sequence.
-    """
-    path = Path(path)
-    found = {name: getattr(trajectory, _ATTRIBUTES.get(name, name)) for name in _TENSORS[:-1]}
-    tensors = {name: value.detach().cpu().contiguous() for name, value in found.items()}
+    """Writes a trajectory, with ``facts`` (e.g. object and sequence) in its header; replaces the file atomically."""
+    tensors = {name: getattr(trajectory, key).detach().cpu().contiguous() for name, key in _TENSORS.items()}
     tensors["fps"] = torch.tensor(trajectory.fps, dtype=torch.float64)
-    write_durably(path, save(tensors, metadata={**(facts or {}), "format": FORMAT}))
+    write_durably(Path(path), save(tensors, metadata={**(facts or {}), "format": FORMAT}))
 
 
 def load_trajectory(path: Path | str) -> Trajectory:
@@ -43,18 +36,18 @@ def load_trajectory(path: Path | str) -> Trajectory:
     try:
         with safe_open(str(path), framework="pt") as file:
             found, metadata = set(file.keys()), file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in _TENSORS if name in found}
+            tensors = {name: file.get_tensor(name) for name in (*_TENSORS, "fps") if name in found}
     except FileNotFoundError:
         raise DataError(f"{path}: no such file. Write one with `gausim simulate RUN`.") from None
     except (OSError, SafetensorError) as error:
         raise DataError(f"{path}: cannot be read as safetensors ({error}). Copy or export it again.") from error
     if metadata.get("format") != FORMAT:
         raise DataError(f"{path}: header 'format' is {metadata.get('format')!r}, expected {FORMAT!r}.")
-    missing = [name for name in _TENSORS if name not in found]
+    missing = [name for name in (*_TENSORS, "fps") if name not in found]
     if missing:
         raise DataError(f"{path}: tensor '{missing[0]}' is missing; it has {sorted(found)}. Export it again.")
     _check(path, tensors)
-    return Trajectory(**{_ATTRIBUTES.get(n, n): tensors[n] for n in _TENSORS[:-1]}, fps=float(tensors["fps"]))
+    return Trajectory(**{key: tensors[name] for name, key in _TENSORS.items()}, fps=float(tensors["fps"]))
 
 
 def _check(path: Path, tensors: dict[str, Tensor]) -> None:
@@ -71,7 +64,7 @@ def _check(path: Path, tensors: dict[str, Tensor]) -> None:
         actual = tuple(tensors[name].shape)
         if actual != tuple(shape):
             raise DataError(f"{path}: tensor '{name}' has shape {actual}, expected {tuple(shape)}. Export it again.")
-    for name in (*_TENSORS[:3], "fps"):
+    for name in ("positions", "gradients", "rotations", "fps"):
         if not tensors[name].is_floating_point() or not torch.isfinite(tensors[name]).all():
             raise DataError(f"{path}: tensor '{name}' holds values that are no finite numbers. Simulate it again.")
     index = tensors["unit_of_kernel"]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -19,43 +20,30 @@ from gausim.io.plain_json import parse_json
 # Camera models without distortion, or whose distortion is checked to be zero.
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
-# OpenGL looks along -z with y up, OpenCV along +z with y down.
 _LONGEST_NAME = 255
+_Row = tuple[float, float, float, float]
+# OpenGL looks along -z with y up, OpenCV along +z with y down.
 OPENGL_TO_OPENCV = (1.0, -1.0, -1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class PosedFrame:
-    """One entry of ``frames``.
+    """One entry of ``frames``."""
 
-    Attributes:
-        path: image file.
-        camera: name of the camera; the image's folder where the entry names none.
-        frame: frame number within its sequence; None for a still.
-        heldout: the entry is marked as never to be trained on.
-    """
-
-    path: Path
-    camera: str
-    frame: int | None
-    heldout: bool
+    path: Path  # image file
+    camera: str  # name of the camera; the image's folder where the entry names none
+    frame: int | None  # frame number within its sequence; None for a still
+    heldout: bool  # the entry is marked as never to be trained on
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImages:
-    """A whole ``transforms.json``.
+    """A whole ``transforms.json``."""
 
-    Attributes:
-        path: the file it was read from.
-        frames: its N entries.
-        cameras: their N cameras, in the same order.
-        fps: frames per second, where the file says so.
-    """
-
-    path: Path
-    frames: tuple[PosedFrame, ...]
-    cameras: Cameras
-    fps: float | None
+    path: Path  # the file it was read from
+    frames: tuple[PosedFrame, ...]  # its N entries
+    cameras: Cameras  # their N cameras, in the same order
+    fps: float | None  # frames per second, where the file says so
 
 
 def read_transforms(path: Path) -> PosedImages:
@@ -84,7 +72,7 @@ def read_transforms(path: Path) -> PosedImages:
         viewmats.append(viewmat_of(entry, field))
         intrinsics.append(_intrinsics(fields, here, field))
     assert size is not None
-    names = tuple(_name(f) for f in frames)
+    names = tuple(f"{f.path.parent.name}/{f.path.name}" for f in frames)
     cameras = Cameras(torch.stack(viewmats), torch.stack(intrinsics), size[0], size[1], names).validated(str(path))
     fps = number_field(data, "fps", str(path)) if "fps" in data else None
     return PosedImages(path, tuple(frames), cameras, fps)
@@ -167,10 +155,6 @@ def _frame(folder: Path, entry: dict[str, Any], field: str) -> PosedFrame:
     return PosedFrame(path, str(entry.get("camera", path.parent.name)), number, bool(entry.get("heldout", False)))
 
 
-def _name(frame: PosedFrame) -> str:
-    return f"{frame.path.parent.name}/{frame.path.name}"
-
-
 def _size(fields: dict[str, Any], image: Path, field: str, *, fallback: tuple[int, int] | None) -> tuple[int, int]:
     if "w" in fields or "h" in fields:
         size = int(number_field(fields, "w", field)), int(number_field(fields, "h", field))
@@ -193,14 +177,14 @@ def viewmat_of(entry: dict[str, Any], field: str) -> Float[Tensor, "4 4"]:
     """
     if "transform_matrix" not in entry:
         raise DataError(f"{field}: field 'transform_matrix' is missing (camera to world, 4 x 4, OpenGL axes).")
+    wrong = f"{field}: field 'transform_matrix' must be a finite 4 x 4 matrix that ends in 0 0 0 1."
     try:
-        pose = torch.tensor(entry["transform_matrix"], dtype=torch.float64)
-    except (TypeError, ValueError):
-        pose = torch.empty(0)
-    last_row = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=torch.float64)
-    if pose.shape != (4, 4) or not torch.isfinite(pose).all() or not torch.allclose(pose[3], last_row, atol=1e-6):
-        raise DataError(f"{field}: field 'transform_matrix' must be a finite 4 x 4 matrix that ends in 0 0 0 1.")
-    pose = pose * torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
+        rows = msgspec.convert(entry["transform_matrix"], tuple[_Row, _Row, _Row, _Row])
+    except msgspec.ValidationError as error:
+        raise DataError(wrong) from error
+    if max(abs(a - b) for a, b in zip(rows[3], (0, 0, 0, 1), strict=True)) > 1e-6:
+        raise DataError(wrong)
+    pose = torch.tensor(rows, dtype=torch.float64) * torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
     # The transpose is the inverse of a rotation, and unlike a general inverse it keeps whatever is wrong with the
     # matrix visible to Cameras.validated (a singular pose must reach that message, not a linear-algebra error).
     rotation = pose[:3, :3].T
@@ -220,12 +204,7 @@ def _intrinsics(fields: dict[str, Any], size: tuple[int, int], field: str) -> Fl
 
 
 def pinhole_of(fields: dict[str, Any], size: tuple[int, int], field: str) -> Float[Tensor, "3 3"]:
-    """K [pixels] of an entry with its file's global fields, whatever its lens does besides.
-
-    Args:
-        fields: of the entry and the file.
-        size: (width, height) of the image [pixels].
-        field: what messages call the entry.
+    """K [pixels] of an image of ``size`` (width, height) by the fields of its entry and file, whatever its lens does.
 
     Raises:
         DataError: no focal length is given, or a number is malformed or impossible.
@@ -243,9 +222,8 @@ def pinhole_of(fields: dict[str, Any], size: tuple[int, int], field: str) -> Flo
         fl_x = size[0] / (2 * math.tan(angle / 2))
     else:
         raise DataError(f"{field}: neither field 'fl_x' [pixels] nor 'camera_angle_x' [radian] is there.")
-    fl_y = number_field(fields, "fl_y", field) if "fl_y" in fields else fl_x
+    usual = {"fl_y": fl_x, "cx": size[0] / 2, "cy": size[1] / 2}
+    fl_y, cx, cy = (number_field({**usual, **fields}, key, field) for key in usual)
     if fl_x <= 0 or fl_y <= 0:
         raise DataError(f"{field}: focal lengths must be positive, got fl_x {fl_x:g}, fl_y {fl_y:g}.")
-    cx = number_field(fields, "cx", field) if "cx" in fields else size[0] / 2
-    cy = number_field(fields, "cy", field) if "cy" in fields else size[1] / 2
     return torch.tensor([[fl_x, 0.0, cx], [0.0, fl_y, cy], [0.0, 0.0, 1.0]])

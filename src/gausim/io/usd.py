@@ -9,7 +9,6 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,25 +27,15 @@ _EDGE = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class UsdClip:
-    """Moving Gaussians of a file, read frame by frame.
+    """Moving Gaussians of a file, read frame by frame."""
 
-    Attributes:
-        path: the file.
-        fps: frames per second.
-        frames: their number.
-        up: vertical axis, ``y`` or ``z``.
-        stage: the open stage.
-        splats: its ParticleField3DGaussianSplat.
-        times: time code of every frame.
-    """
-
-    path: Path
-    fps: float
-    frames: int
-    up: str
-    stage: Any
-    splats: Any
-    times: tuple[float, ...]
+    path: Path  # the file
+    fps: float  # frames per second
+    frames: int  # their number
+    up: str  # vertical axis, ``y`` or ``z``
+    stage: Any  # the open stage
+    splats: Any  # its ParticleField3DGaussianSplat
+    times: tuple[float, ...]  # time code of every frame
 
     def scenes(self) -> Iterator[GaussianScene]:
         """The frames, one at a time; masks are the defaults (all simulated, none pinned).
@@ -70,8 +59,8 @@ def save_usd(path: Path | str, frames: Iterable[GaussianScene], fps: float, *, u
 
     Args:
         path: the file: .usd and .usdc are binary, .usda is text.
-        frames: deformed scenes of equal size.
-        fps: frames per second; frame n has time code n.
+        frames: deformed scenes of equal size; frame n has time code n.
+        fps: frames per second.
         up: vertical axis, ``y`` or ``z``.
 
     Raises:
@@ -110,7 +99,7 @@ def load_usd(path: Path | str) -> UsdClip:
     try:
         layer = pxr.Sdf.Layer.OpenAsAnonymous(str(path))
     except pxr.Tf.ErrorException as error:
-        raise DataError(f"{path}: cannot be read as USD ({_first_line(error)}). Export it again.") from error
+        raise DataError(f"{path}: cannot be read as USD ({str(error).strip()[-200:]}). Export it again.") from error
     if layer is None:
         raise DataError(f"{path}: cannot be read as USD. Export it again.")
     # Nothing that a file names is opened: it could be any file of this machine.
@@ -150,7 +139,8 @@ def _write(pxr: Any, stage: Any, frames: Iterable[GaussianScene], path: Path) ->
         time, means, lengths = count - 1, _numpy(scene.means), _numpy(scene.log_scales.exp())
         quats = _numpy(scene.quats / scene.quats.norm(dim=-1, keepdim=True))
         positions.Set(vt.Vec3fArray.FromNumpy(means), time)
-        orientations.Set(_quaternions(pxr, quats), time)
+        # Vt stores the imaginary parts first.
+        orientations.Set(vt.QuatfArray.FromNumpy(np.ascontiguousarray(quats[:, [1, 2, 3, 0]])), time)
         scales.Set(vt.Vec3fArray.FromNumpy(lengths), time)
         reach = 3 * lengths.max(-1, keepdims=True)
         box = np.stack([(means - reach).min(0), (means + reach).max(0)]).astype(np.float32)
@@ -184,7 +174,6 @@ def _scene(clip: UsdClip, time: float, source: str) -> GaussianScene:
     return GaussianScene.create(
         means=torch.from_numpy(means),
         log_scales=torch.from_numpy(scales).log(),
-        # Vt stores the imaginary parts first.
         quats=torch.from_numpy(np.ascontiguousarray(quats[:, [3, 0, 1, 2]])),
         opacity_logits=torch.from_numpy(np.log(logits / (1 - logits)).astype(np.float32)),
         sh=torch.from_numpy(held.reshape(count, basis, 3)),
@@ -210,24 +199,16 @@ def _array(attribute: Any, time: float, source: str, *, width: int, count: int |
     return numbers.astype(np.float32)
 
 
-def _quaternions(pxr: Any, wxyz: np.ndarray) -> Any:
-    return pxr.Vt.QuatfArray.FromNumpy(np.ascontiguousarray(wxyz[:, [1, 2, 3, 0]]))
-
-
 def _numpy(value: torch.Tensor) -> np.ndarray:
     return np.ascontiguousarray(value.detach().cpu().float().numpy())
 
 
-def _first_line(error: BaseException) -> str:
-    return str(error).strip().splitlines()[-1][:200] if str(error).strip() else type(error).__name__
-
-
 def _pxr() -> Any:
     try:
-        from pxr import Sdf, Tf, Usd, UsdGeom, UsdVol, Vt
+        import pxr
+        from pxr import Sdf, Tf, Usd, UsdGeom, UsdVol, Vt  # noqa: F401
     except ImportError as error:
         raise ConfigError("OpenUSD is not installed. Install it with `pip install gausim[usd]`.") from error
     if not hasattr(UsdVol, "ParticleField3DGaussianSplat"):
         raise ConfigError("usd-core: expected 26.3 or newer, which knows Gaussians. `pip install -U usd-core`.")
-
-    return SimpleNamespace(Sdf=Sdf, Tf=Tf, Usd=Usd, UsdGeom=UsdGeom, UsdVol=UsdVol, Vt=Vt)
+    return pxr

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -21,13 +23,8 @@ FINE, SMALL = 16, 21
 def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float, *, quality: int = FINE) -> int:
     """Writes (H, W, 3) uint8 RGB frames as MP4 (H.264), one at a time as they come; returns their number.
 
-    Odd sizes grow by one repeated row or column, because the chroma planes have half the size.
-
-    Args:
-        path: the file, with suffix .mp4.
-        frames: at least one frame, all of one size.
-        fps: frames per second.
-        quality: constant rate factor.
+    Odd sizes grow by one repeated row or column, because the chroma planes have half the size. ``quality`` is the
+    constant rate factor.
 
     Raises:
         DataError: no frames, frames of different size or type, or the encoder fails.
@@ -57,20 +54,26 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float, *, q
     return count
 
 
+@contextmanager
+def _opened(path: Path | str) -> Iterator[Any]:
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise DataError(f"{path}: holds no video stream.")
+            yield container
+    except (FFmpegError, OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be decoded as video ({error}). Check the file.") from error
+
+
 def read_video(path: Path | str) -> Iterator[np.ndarray]:
     """Decodes the first video stream, one (H, W, 3) uint8 RGB frame at a time.
 
     Raises:
         DataError: the file is missing, holds no video or cannot be decoded.
     """
-    try:
-        with av.open(str(path)) as container:
-            if not container.streams.video:
-                raise DataError(f"{path}: holds no video stream.")
-            for frame in container.decode(video=0):
-                yield frame.to_ndarray(format="rgb24")
-    except (FFmpegError, OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be decoded as video ({error}). Check the file.") from error
+    with _opened(path) as container:
+        for frame in container.decode(video=0):
+            yield frame.to_ndarray(format="rgb24")
 
 
 def video_rate(path: Path | str) -> float:
@@ -79,13 +82,10 @@ def video_rate(path: Path | str) -> float:
     Raises:
         DataError: the file is missing, holds no video or cannot be read.
     """
-    try:
-        with av.open(str(path)) as container:
-            rate = container.streams.video[0].average_rate if container.streams.video else None
-    except (FFmpegError, OSError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as video ({error}). Check the file.") from error
+    with _opened(path) as container:
+        rate = container.streams.video[0].average_rate
     if not rate:
-        raise DataError(f"{path}: holds no video stream with a frame rate.")
+        raise DataError(f"{path}: its video stream states no frame rate.")
     return float(rate)
 
 
