@@ -8,8 +8,7 @@ import types
 import pytest
 import torch
 
-from gausim.benchmark import Options, Row, medians, peak_saved_bytes, peaks
-from gausim.benchmark.harness import spent_in
+from gausim.benchmark.harness import Options, Row, medians, peak_saved_bytes, spent_in
 from gausim.cli import benchmark
 from gausim.core import ConfigError
 
@@ -21,6 +20,9 @@ def test_candidates_are_called_in_turn_and_warm_up_is_not_timed() -> None:
     result = medians({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, QUICK, warmup=2)
     assert calls == ["a", "b"] * 5
     assert set(result) == {"a", "b"} and all(value >= 0 for value in result.values())
+    calls.clear()
+    medians({"c": lambda: calls.append("c") or time.sleep(0.01)}, QUICK, at_least=0.035)
+    assert 1 + 3 * 2 <= len(calls) <= 1 + 3 * 3  # three in a row, after one that warms up
 
 
 def test_peak_counts_what_is_held_at_one_time() -> None:
@@ -48,11 +50,6 @@ def test_time_is_told_by_part_and_functions_are_themselves_again() -> None:
     assert seconds["sleep"] >= 0.02 > seconds["options"] > 0 and Options.__init__ is own
 
 
-def test_peaks_are_rates_of_a_real_machine() -> None:
-    found = peaks(QUICK)
-    assert 1e8 < found.fma < 1e13 and 1e8 < found.gemm < 1e13 and 1e8 < found.copy < 1e13
-
-
 @pytest.mark.parametrize(
     ("value", "unit", "shown"),
     [(0.00123, "s", ("1.23", "ms")), (2.5e9, "FLOP/s", ("2.5", "GFLOP/s")), (41.26, "x", ("41.3", "x")),
@@ -68,7 +65,7 @@ def test_json_is_one_object_on_stdout(monkeypatch: pytest.MonkeyPatch, capsys: p
     monkeypatch.setitem(sys.modules, case.__name__, case)
     assert benchmark.main(["cluster", "--json", "--quick"]) == 0
     document = json.loads(capsys.readouterr().out)
-    assert set(document) == {"machine", "rows"} and "processor" in document["machine"]
+    assert set(document) == {"machine", "rows"} and "GFLOP/s" in document["machine"]["peaks"]
     assert document["rows"][1] == {
         "case": "2k kernels", "metric": "ratio", "value": 3.0, "unit": "x", "reference": "scipy"
     }  # fmt: skip
