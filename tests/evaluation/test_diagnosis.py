@@ -13,7 +13,7 @@ import torch
 
 from gausim.metrics.level_error import level_error
 from gausim.report.gather.diagnosis import read_diagnosis
-from gausim.report.pictures.diagnosis import diagnosis_figure, diagnosis_plot
+from gausim.report.pictures.motion import diagnosis_figure, diagnosis_plot
 from gausim.results.curves import TRUTH
 from gausim.results.diagnosis import Diagnosis
 

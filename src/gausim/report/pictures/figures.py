@@ -48,14 +48,13 @@ def error_plot(
     every = [(curves, row) for _, members in rows for curves, row in members]
     if any(ERROR_3D in curves.values.get(row, {}) for curves, row in every):
         panels.insert(0, (ERROR_3D, "points"))
-    figure = Figure(figsize=(4.4 * len(panels), 3.4), dpi=_DPI, layout="constrained")
-    for axes, panel in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
+    figure, places = made_figure(1, len(panels), (4.4 * len(panels), 3.4), title)
+    for axes, panel in zip(places, panels, strict=True):
         _error_panel(axes, rows, panel, sequence)
         axes.set(xlim=(0, max(first.facts.frames) - 1))
         axes.axvspan(-0.5, first.facts.first_unseen - 0.5, color=SEEN_SHADE, zorder=0, label="seen in training")
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)), fontsize=7)
-    figure.suptitle(title, fontsize=10)
     return figure
 
 
@@ -114,8 +113,8 @@ def slices_plot(
     """
     rows, wide = len(columns[0][1]), len(columns) > 1
     size = (5.2 * len(columns) if wide else 7.0, 1.5 * rows + 0.6 if wide else 2.6 * rows)
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-    grid = figure.subplots(rows, len(columns), squeeze=False)
+    figure, places = made_figure(rows, len(columns), size)
+    grid = places.reshape(rows, len(columns))
     lines = [moving_line(films[0][1]) for _, films in columns]
     for column, (panels, (title, films), line) in enumerate(zip(grid.T, columns, lines, strict=True)):
         for axes, (label, frames) in zip(panels, films, strict=True):
@@ -168,8 +167,8 @@ def panels_plot(
     """
     height, width = next(image.shape[:2] for _, images in rows for image in images if image is not None)
     size = (1.25 * len(heads), 1.25 * height / width * len(rows) + (0.6 if title else 0.3))
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-    grid = figure.subplots(len(rows), len(heads), squeeze=False)
+    figure, places = made_figure(len(rows), len(heads), size, title)
+    grid = places.reshape(len(rows), len(heads))
     for panels, (label, images) in zip(grid, rows, strict=True):
         for axes, image in zip(panels, images, strict=True):
             axes.set(xticks=[], yticks=[])
@@ -178,8 +177,6 @@ def panels_plot(
         panels[0].set_ylabel(label, fontsize=8)
     for axes, (head, foreseen) in zip(grid[0], heads, strict=True):
         axes.set_title(head, fontsize=7, color="#c2410c" if foreseen else "black")
-    if title:
-        figure.suptitle(title, fontsize=10)
     return figure
 
 
@@ -208,15 +205,21 @@ def contact_sheet(
 def picture_grid(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, *, title: str, columns: int) -> None:
     """Labelled (H, W, 3) uint8 pictures in rows of ``columns``, as PNG."""
     ratio, rows = images[0].shape[0] / images[0].shape[1], -(-len(images) // columns)
-    figure = Figure(figsize=(3.2 * columns, (3.2 * ratio + 0.3) * rows + 0.3), dpi=_DPI, layout="constrained")
-    places = figure.subplots(rows, columns, squeeze=False).ravel()
+    figure, places = made_figure(rows, columns, (3.2 * columns, (3.2 * ratio + 0.3) * rows + 0.3), title)
     for axes in places:
         axes.set_axis_off()
     for axes, image, label in zip(places, images, labels, strict=False):  # the last row may have places left
         axes.imshow(image)
         axes.set_title(label, fontsize=8)
-    figure.suptitle(title, fontsize=10)
     save_figure(figure, path)
+
+
+def made_figure(rows: int, columns: int, size: tuple[float, float], title: str = "") -> tuple[Figure, np.ndarray]:
+    """A figure of this size [inches] with its axes, row by row."""
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    if title:
+        figure.suptitle(title, fontsize=10)
+    return figure, figure.subplots(rows, columns, squeeze=False).ravel()
 
 
 def save_figure(figure: Figure, path: Path) -> None:

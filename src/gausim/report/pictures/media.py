@@ -18,9 +18,9 @@ from gausim.core import GausSimError
 from gausim.io.video import SMALL, write_video
 from gausim.report.gather.diagnosis import read_diagnosis
 from gausim.report.gather.study import Group, Study
-from gausim.report.pictures.diagnosis import diagnosis_plot
 from gausim.report.pictures.figures import contact_frames, error_plot, panels_plot, slices_plot
 from gausim.report.pictures.frames import Timeline, brighten, label_bar, light_gain, timeline_bar
+from gausim.report.pictures.motion import diagnosis_plot
 from gausim.results.curves import POINT_ARRAYS, STATIC, ObjectCurves, load_curves
 from gausim.results.pictures import Pictures, kept_pictures
 
