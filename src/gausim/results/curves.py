@@ -7,11 +7,11 @@ Energies of frame t belong to the step from t-1 to t and exist for the row ``tru
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from gausim.core import RunError
@@ -101,7 +101,7 @@ def save_curves(path: Path, objects: list[ObjectCurves]) -> None:
     """Writes all objects' arrays and facts into one npz (the facts as JSON text; nothing is pickled)."""
     arrays: dict[str, Any] = {}
     for curves in objects:
-        arrays[f"{curves.facts.name}/{_FACTS}"] = np.array(json.dumps(asdict(curves.facts)))
+        arrays[f"{curves.facts.name}/{_FACTS}"] = np.array(msgspec.json.encode(curves.facts).decode())
         for row, metrics in curves.values.items():
             for metric, values in metrics.items():
                 arrays[f"{curves.facts.name}/{row}/{metric}"] = values
@@ -116,9 +116,10 @@ def load_curves(path: Path) -> list[ObjectCurves]:
     """
     try:
         arrays = read_npz(path)
-    except ValueError as error:
+        texts = {n.rsplit("/", 1)[0]: str(array) for n, array in arrays.items() if n.endswith(f"/{_FACTS}")}
+        objects = {name: msgspec.json.decode(text, type=ObjectFacts) for name, text in texts.items()}
+    except (ValueError, msgspec.MsgspecError) as error:
         raise RunError(f"{path}: cannot be read ({error}). Write it with `gausim evaluate RUN`.") from error
-    objects = {n.rsplit("/", 1)[0]: _facts(str(a)) for n, a in arrays.items() if n.endswith(f"/{_FACTS}")}
     if not objects:
         raise RunError(f"{path}: holds no array '*/{_FACTS}'; expected a metrics.npz of `gausim evaluate RUN`.")
     found = {name: ObjectCurves(facts) for name, facts in objects.items()}
@@ -127,10 +128,3 @@ def load_curves(path: Path) -> list[ObjectCurves]:
         if owner in found and metric:
             found[owner].values.setdefault(row, {})[metric] = array
     return list(found.values())
-
-
-def _facts(text: str) -> ObjectFacts:
-    data: dict[str, Any] = json.loads(text)
-    metrics = tuple(ImageMetricInfo(**m) for m in data.pop("metrics"))
-    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
-    return ObjectFacts(**fields, metrics=metrics)

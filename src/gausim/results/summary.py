@@ -65,14 +65,29 @@ _POINT_METRICS = {
 }
 
 
+class _Metric(msgspec.Struct):
+    label: str
+    scale: float
+    unit: str
+    higher_is_better: bool | None
+
+
+class _Contrast(msgspec.Struct):
+    mean_color: tuple[float, float, float]
+    norm: float
+    max_l2: float
+
+
 class _Object(msgspec.Struct):
     """What tables are made from; files of earlier versions have no more."""
 
     sequences: list[str]
     splits: dict[str, tuple[int, int]]
-    metrics: dict[str, Any]
+    metrics: dict[str, _Metric]
     rows: dict[str, dict[str, dict[str, dict[str, dict[str, float | None]]]]]
     methods: list[str]
+    contrast: _Contrast | None = None
+    absent: dict[str, str] = {}
 
 
 class _Summary(msgspec.Struct):

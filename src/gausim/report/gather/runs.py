@@ -8,6 +8,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -32,25 +33,15 @@ FAILURE, BROKEN = "failed", "broken files"
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """One run directory.
-
-    Attributes:
-        path: the directory.
-        name: its path below the searched directory.
-        status: one of the constants of this module.
-        detail: what more is known of the status, for people.
-        config: its configuration; empty where it is unreadable.
-        choices: Hydra's choice of every config group, where known.
-        summary: the content of ``evaluation/metrics.json``; None without one.
-    """
+    """One run directory."""
 
     path: Path
-    name: str
-    status: str
-    detail: str
-    config: dict[str, Any] = field(default_factory=dict, repr=False)
-    choices: dict[str, str] = field(default_factory=dict, repr=False)
-    summary: dict[str, Any] | None = field(default=None, repr=False)
+    name: str  # its path below the searched directory
+    status: str  # one of the constants above
+    detail: str  # what more is known of the status, for people
+    config: dict[str, Any] = field(default_factory=dict, repr=False)  # empty where it is unreadable
+    choices: dict[str, str] = field(default_factory=dict, repr=False)  # Hydra's, of every config group
+    summary: dict[str, Any] | None = field(default=None, repr=False)  # content of evaluation/metrics.json
 
     @property
     def seed(self) -> Any:
@@ -58,10 +49,19 @@ class RunRecord:
         return self.config.get("seed", "?")
 
     @property
+    def objects(self) -> dict[str, dict[str, Any]]:
+        """What its evaluation has of every object."""
+        return (self.summary or {}).get("objects", {})
+
+    @cached_property
     def settings(self) -> dict[str, str]:
         """Dotted keys and values of what is computed, seeds aside."""
-        flat = dict(flatten(self.config))
-        return {k: v for k, v in flat.items() if not any(k == f or k.startswith(f"{f}.") for f in _FREE)}
+        return self.settings_besides(())
+
+    def settings_besides(self, keys: tuple[str, ...]) -> dict[str, str]:
+        """The settings but those of the groups ``keys``."""
+        flat = flatten(self.config)
+        return {k: v for k, v in flat if not any(k == f or k.startswith(f"{f}.") for f in (*_FREE, *keys))}
 
     @property
     def config_hash(self) -> str:
@@ -92,12 +92,11 @@ class RunRecord:
     @property
     def data_hashes(self) -> dict[str, tuple[str, str]]:
         """First digits of the hashes of every object's scene and manifest; ``?`` where they were not recorded."""
-        found = {}
-        for name, entry in (self.summary or {}).get("objects", {}).items():
-            both = (dig(entry, "sources", key, "sha256") for key in ("scene", "manifest"))
-            scene, manifest = (digest[:_DIGITS] if isinstance(digest, str) else "?" for digest in both)
-            found[name] = scene, manifest
-        return found
+
+        def digits(entry: dict[str, Any], key: str) -> str:
+            return (dig(entry, "sources", key, "sha256") or "?")[:_DIGITS]
+
+        return {name: (digits(entry, "scene"), digits(entry, "manifest")) for name, entry in self.objects.items()}
 
     @property
     def is_from_unfinished(self) -> bool:

@@ -21,13 +21,7 @@ _REFERENCE_COLORS = ("#555555", "#999999", "#bbbbbb")
 
 
 def error_figure(curves: ObjectCurves, path: Path, *, sequence: str | None = None) -> None:
-    """Errors over time of every row: 3D where truth exists, then l2 in the training and held-out views.
-
-    Args:
-        curves: the evaluated object.
-        path: PNG to write.
-        sequence: one sequence; mean over all, with a band of one standard deviation for the methods, when None.
-    """
+    """Writes the errors over time of one sequence, or their mean over all sequences."""
     facts = curves.facts
     title = f"{facts.name}, {sequence or f'mean over {len(facts.sequences)} sequences'}"
     save_figure(error_plot([(row, [(curves, row)]) for row in curves.rows], title=title, sequence=sequence), path)
@@ -36,10 +30,11 @@ def error_figure(curves: ObjectCurves, path: Path, *, sequence: str | None = Non
 def error_plot(
     rows: Sequence[tuple[str, Sequence[tuple[ObjectCurves, str]]]], *, title: str = "", sequence: str | None = None
 ) -> Figure:
-    """The same of rows that may come from several evaluations.
+    """Errors over time of every row: 3D where truth exists, then l2 in the training and held-out views.
 
     Args:
-        rows: label, and the evaluations (seeds) with the name of their row; mean and band are over all of them.
+        rows: label, and the evaluations (seeds) with the name of their row; the mean and, for methods, a band of one
+            standard deviation are over all of them.
         title: heading.
         sequence: one sequence; all when None.
     """
@@ -135,12 +130,7 @@ def slice_figure(
 ) -> tuple[str, int]:
     """Writes space-time slices of truth (without it, of the prediction alone) above prediction; returns their line.
 
-    Args:
-        truth: (F, H, W, 3) uint8, of any length; without it the prediction chooses the line.
-        prediction: (F, H, W, 3) uint8.
-        path: PNG to write.
-        title: sequence and view.
-        first_unseen: first frame that training did not see.
+    Films are (F, H, W, 3) uint8, of any length; a mark stands before ``first_unseen``.
     """
     films = [] if truth is None else [("ground truth", truth)]
     figure, lines = slices_plot([(title, [*films, ("prediction", prediction)])], first_unseen)
@@ -158,13 +148,7 @@ def contact_frames(frames: int, first_unseen: int, count: int = 8) -> list[int]:
 def panels_plot(
     rows: Sequence[tuple[str, Sequence[np.ndarray | None]]], heads: Sequence[tuple[str, bool]], *, title: str = ""
 ) -> Figure:
-    """Pictures in rows and columns.
-
-    Args:
-        rows: label, and (H, W, 3) uint8 pictures; a place of None stays empty.
-        heads: of the columns, and whether they are foreseen, which an orange heading tells.
-        title: heading.
-    """
+    """Labelled rows of (H, W, 3) uint8 pictures (None: an empty place); heads of foreseen columns are orange."""
     height, width = next(image.shape[:2] for _, images in rows for image in images if image is not None)
     size = (1.25 * len(heads), 1.25 * height / width * len(rows) + (0.6 if title else 0.3))
     figure, places = made_figure(len(rows), len(heads), size, title)
@@ -185,12 +169,7 @@ def contact_sheet(
 ) -> None:
     """Chosen frames of truth, prediction and error under one another; foreseen frames carry an orange number.
 
-    Args:
-        truth: (F, H, W, 3) uint8, or None; frames beyond its end stay empty.
-        prediction: (F, H, W, 3) uint8.
-        path: PNG to write.
-        title: sequence and view.
-        first_unseen: first frame that training did not see.
+    Films are (F, H, W, 3) uint8; frames beyond the end of the truth stay empty.
     """
     chosen = contact_frames(len(prediction), first_unseen)
     rows: list[tuple[str, list[np.ndarray | None]]] = [("prediction", [prediction[f] for f in chosen])]
