@@ -10,7 +10,7 @@ from gausim.cli.benchmark import simulator_of
 QUICK = Options(torch.device("cpu"), quick=True, rounds=1)
 
 
-@pytest.mark.parametrize("memory", [0, 1 << 40])
+@pytest.mark.parametrize("memory", [1 << 40, pytest.param(0, marks=pytest.mark.slow)])
 def test_every_figure_of_the_step_is_reported(memory: int, monkeypatch, capsys) -> None:
     torch.manual_seed(0)
     monkeypatch.setattr(step, "_available_memory", lambda device: memory)

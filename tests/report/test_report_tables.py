@@ -128,15 +128,6 @@ def test_a_metric_that_old_evaluations_lack_is_not_called_no_weights(sweep):
     assert texts(found["efficiency"])["gausim"][0] == "not measured"
 
 
-def test_the_ablation_table_has_variations_as_columns(sweep):
-    sheet = sheets(sweep)["ablation_toy_bunny_gausim"]
-    assert sheet.columns == (("gausim", ("full", "w/o mass", "w/o momentum", "w/o hierarchy")),)
-    rows = texts(sheet)
-    assert rows["l2: Seen"] == ["2.20 ± 1.10", "3.00 ± 1.50", "unfinished", "failed"]
-    assert rows["l2: Unseen 34, against full"] == ["–", "+36.4 %", "–", "–"]
-    assert rows["3D error: Seen"][0] == "0.22 ± 0.11" and "motion energy, 3D: Unseen 44" in rows
-
-
 def test_the_efficiency_table(sweep):
     rows = texts(sheets(sweep)["efficiency"])
     assert rows["gausim"] == [

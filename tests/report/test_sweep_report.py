@@ -61,6 +61,7 @@ def test_the_ablation_table_pools_seeds_and_shows_what_is_missing(sweep: Path) -
     assert shown["w/o hierarchy"].text == "failed" and shown["w/o hierarchy"].missing
     assert shown["layers=4"].text == "not evaluated"
     assert [name for name, e in shown.items() if e.best] == ["w/o momentum"]
+    assert "motion energy, 3D: Unseen 44" in {line.label for line in ablations.lines}
     change = next(line for line in ablations.lines if line.label == "l2: Unseen 34, against full")
     # 17 against 12, each with a deviation of 1 over three seeds: 5 / sqrt(2 / 3).
     assert change.entries[columns["w/o mass"]].text == "+41.7 %"

@@ -51,12 +51,13 @@ def _clusters(count: int, options: Options) -> list[Row]:
         linkage = time.perf_counter() - start
     rows = []
     for name, found in labels.items():
-        case = f"{name}, {count} kernels"
-        clusters = int(found.max()) + 1
-        rows.append(Row(case, "time", times[name], "s"))
-        rows.append(Row(case, "throughput", count / times[name], "kernels/s"))
-        rows.append(Row(case, "clusters", clusters, "1"))
-        rows.append(Row(case, "widest cluster", _widest(points, found) / DIAMETER, "x", "the bound"))
+        case, clusters = f"{name}, {count} kernels", int(found.max()) + 1
+        rows += [
+            Row(case, "time", times[name], "s"),
+            Row(case, "throughput", count / times[name], "kernels/s"),
+            Row(case, "clusters", clusters, "1"),
+            Row(case, "widest cluster", _widest(points, found) / DIAMETER, "x", "the bound"),
+        ]
         if reference is not None:
             text = "complete linkage (scipy)"
             rows.append(Row(case, "clusters ratio", clusters / reference, "x", text))

@@ -24,38 +24,23 @@ from gausim.kernels.operations import plain_forms
 
 @dataclass(frozen=True)
 class Row:
-    """One measured figure.
+    """One measured figure."""
 
-    Attributes:
-        case: what was run, with its sizes.
-        metric: what was measured of it.
-        value: the figure.
-        unit: its unit; ``x`` for a ratio, ``1`` for a fraction.
-        reference: what a ratio or fraction compares with, in words; None for a plain figure.
-    """
-
-    case: str
-    metric: str
+    case: str  # what was run, with its sizes
+    metric: str  # what was measured of it
     value: float
-    unit: str
-    reference: str | None = None
+    unit: str  # x for a ratio, 1 for a fraction
+    reference: str | None = None  # what a ratio or fraction compares with, in words
 
 
 @dataclass(frozen=True)
 class Options:
-    """How a benchmark is run.
-
-    Attributes:
-        device: where.
-        threads: of torch and of the renderer, unless a case is about threads.
-        quick: tiny sizes that take seconds; to see that the command works, not to quote.
-        rounds: timed calls of each candidate; the median is reported.
-    """
+    """How a benchmark is run."""
 
     device: torch.device
-    threads: int = 1
-    quick: bool = False
-    rounds: int = 7
+    threads: int = 1  # of torch and of the renderer, unless a case is about threads
+    quick: bool = False  # tiny sizes that take seconds; to see that the command works, not to quote
+    rounds: int = 7  # timed calls of each candidate; the median is reported
 
 
 def seconds_of(call: Callable[[], object], device: torch.device, repeats: int = 1) -> float:

@@ -28,17 +28,11 @@ TRIES = 7
 
 @dataclass(frozen=True)
 class Peaks:
-    """Best rates of one thread count on one device.
+    """Best rates of one thread count on one device."""
 
-    Attributes:
-        fma: float32 fused multiply-adds in registers [FLOP/s], one CPU thread; 0 on a GPU, where nothing compares.
-        gemm: float32 matrix product [FLOP/s].
-        copy: bytes read plus bytes written by a large copy [B/s].
-    """
-
-    fma: float
-    gemm: float
-    copy: float
+    fma: float  # float32 fused multiply-adds in registers [FLOP/s], one CPU thread; 0 on a GPU, where nothing compares
+    gemm: float  # float32 matrix product [FLOP/s]
+    copy: float  # bytes read plus bytes written by a copy much larger than the caches [B/s]
 
 
 def _make_fma_loop():
@@ -72,27 +66,17 @@ def fma_peak(threads: int = 1) -> float:
     return 2.0 * LANES * ROUNDS * threads / best
 
 
-def gemm_peak(options: Options) -> float:
-    """Square float32 matrix product [FLOP/s]."""
-    size = GEMM_SIZE[options.quick] * (8 if options.device.type == "cuda" else 1)
-    a, b = (torch.randn(size, size, device=options.device) for _ in range(2))
-    out = torch.empty_like(a)
-    return 2.0 * size**3 / medians({"gemm": lambda: torch.mm(a, b, out=out)}, options)["gemm"]
-
-
-def copy_peak(options: Options) -> float:
-    """A copy much larger than the caches, bytes read plus bytes written [B/s]."""
-    source = torch.zeros(COPY_BYTES // 4, device=options.device)
-    target = torch.empty_like(source)
-    return 2.0 * COPY_BYTES / medians({"copy": lambda: target.copy_(source)}, options)["copy"]
-
-
 @functools.cache
 def peaks(options: Options) -> Peaks:
     """The three rates, measured once per process and set of options."""
+    size = GEMM_SIZE[options.quick] * (8 if options.device.type == "cuda" else 1)
+    a, b, out = torch.randn(3, size, size, device=options.device)
+    source, target = torch.zeros(2, COPY_BYTES // 4, device=options.device)
     with torch_threads(options.threads):
+        calls = {"gemm": lambda: torch.mm(a, b, out=out), "copy": lambda: target.copy_(source)}
+        times = medians(calls, options)
         fma = fma_peak() if options.device.type == "cpu" else 0.0
-        return Peaks(fma, gemm_peak(options), copy_peak(options))
+    return Peaks(fma, 2.0 * size**3 / times["gemm"], 2.0 * COPY_BYTES / times["copy"])
 
 
 def processor() -> str:

@@ -20,8 +20,8 @@ HELP = "Measure the speed of rendering, stepping, training and clustering as rat
 CASES = {
     "render": "the CPU renderer against plain torch and the peak of the processor, threads, views, compilation",
     "network": "the graph network against the textbook form: time, memory, fraction of the matrix-product peak",
-    "step": "one predicted frame at the paper's size, with and without hierarchy, part by part",
-    "train": "whole optimiser steps, part by part; KEY=VALUE chooses the experiment as in `gausim train`",
+    "step": "one predicted frame at the paper's size, with and without hierarchy; neural steps against elastic ones",
+    "train": "whole optimiser steps, part by part, against elastic ones; KEY=VALUE as in `gausim train`",
     "data": "packed frames against decoding PNG; opening and streaming a set of the paper's size",
     "interact": "an object that is pushed about: simulated frames per second, from the force to the browser's bytes",
     "cluster": "clusters of bounded diameter, against scipy",

@@ -41,50 +41,29 @@ class ImageMetricInfo:
 
 @dataclass(frozen=True)
 class ObjectFacts:
-    """What was evaluated.
+    """What was evaluated."""
 
-    Attributes:
-        name: the object.
-        fps: frames per second.
-        sequences: names of the S sequences.
-        frames: number of frames of each.
-        views: names of the V evaluated views.
-        train_views: those of them that training saw.
-        first_unseen: first frame that training did not see.
-        methods: rows that are predictions of a method (the others are references).
-        metrics: the image metrics.
-        mean_color: mean colour of the true foreground in [0, 1].
-        max_l2: largest per-pixel colour distance of any prediction of the first method.
-    """
-
-    name: str
+    name: str  # of the object
     fps: float
     sequences: tuple[str, ...]
-    frames: tuple[int, ...]
+    frames: tuple[int, ...]  # number of frames of each sequence
     views: tuple[str, ...]
-    train_views: tuple[str, ...]
-    first_unseen: int
-    methods: tuple[str, ...]
+    train_views: tuple[str, ...]  # those of the views that training saw
+    first_unseen: int  # first frame that training did not see
+    methods: tuple[str, ...]  # rows that are predictions of a method (the others are references)
     metrics: tuple[ImageMetricInfo, ...]
-    mean_color: tuple[float, float, float]
-    max_l2: float
+    mean_color: tuple[float, float, float]  # of the true foreground, in [0, 1]
+    max_l2: float  # largest per-pixel colour distance of any prediction of the first method
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectCurves:
-    """Facts and arrays of one object: ``values[row][metric]``, see the module's text for shapes.
-
-    Attributes:
-        facts: what was evaluated.
-        values: the arrays.
-        record: plain data that goes into the summary as it is (``efficiency``, ``sources``, ``absent``).
-        pictures: of one sequence; they have a file of their own.
-    """
+    """Facts and arrays of one object: ``values[row][metric]``, see the module's text for shapes."""
 
     facts: ObjectFacts
     values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    record: dict[str, Any] = field(default_factory=dict)
-    pictures: Pictures | None = None
+    record: dict[str, Any] = field(default_factory=dict)  # goes into the summary as it is (efficiency, sources, ...)
+    pictures: Pictures | None = None  # of one sequence; they have a file of their own
 
     @property
     def rows(self) -> list[str]:

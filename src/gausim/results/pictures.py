@@ -28,30 +28,18 @@ class _Facts:
     object: str
     sequence: str
     fps: float
-    first_unseen: int
-    views: tuple[str, ...]
-    heldout_views: tuple[str, ...]
+    first_unseen: int  # first frame that training did not see
+    views: tuple[str, ...]  # names of the V cameras
+    heldout_views: tuple[str, ...]  # those of them that training never saw
 
 
 @dataclass(frozen=True, eq=False)
 class Pictures(_Facts):
-    """Pictures of one sequence of one object.
+    """Pictures of one sequence of one object."""
 
-    Attributes:
-        object: its name.
-        sequence: the sequence's name.
-        fps: frames per second.
-        first_unseen: first frame that training did not see.
-        views: names of the V cameras.
-        heldout_views: those of them that training never saw.
-        truth: recorded frames, RGB premultiplied with alpha.
-        predictions: the same of every method.
-        background: what the cameras saw behind the object; None where the recording does not show it.
-    """
-
-    truth: UInt8[np.ndarray, "F V h w 4"]
-    predictions: dict[str, np.ndarray] = field(default_factory=dict)
-    background: UInt8[np.ndarray, "V h w 3"] | None = None
+    truth: UInt8[np.ndarray, "F V h w 4"]  # recorded frames, RGB premultiplied with alpha
+    predictions: dict[str, np.ndarray] = field(default_factory=dict)  # the same of every method
+    background: UInt8[np.ndarray, "V h w 3"] | None = None  # what the cameras saw behind the object, where known
 
     def over_background(self, frames: UInt8[np.ndarray, "F V h w 4"]) -> UInt8[np.ndarray, "F V h w 3"]:
         """Frames over the recorded background, or over plain grey."""
