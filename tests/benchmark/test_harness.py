@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib
 import json
 import sys
 import time
@@ -8,6 +9,7 @@ import types
 import pytest
 import torch
 
+from gausim.benchmark import data
 from gausim.benchmark.harness import Options, Row, medians, peak_saved_bytes, spent_in
 from gausim.cli import benchmark
 from gausim.core import ConfigError
@@ -63,7 +65,7 @@ def test_json_is_one_object_on_stdout(monkeypatch: pytest.MonkeyPatch, capsys: p
     case = types.ModuleType("gausim.benchmark.cluster")
     case.run = lambda options: [Row("2k kernels", "time", 0.5, "s"), Row("2k kernels", "ratio", 3.0, "x", "scipy")]
     monkeypatch.setitem(sys.modules, case.__name__, case)
-    assert benchmark.main(["cluster", "--json", "--quick"]) == 0
+    assert benchmark.main(["cluster", "--json", "--quick", "--rounds", "1"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert set(document) == {"machine", "rows"} and "GFLOP/s" in document["machine"]["peaks"]
     assert document["rows"][1] == {
@@ -76,3 +78,13 @@ def test_a_missing_device_is_refused(device: str, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ConfigError, match="--device"):
         benchmark.main(["cluster", "--quick", "--device", device])
+
+
+def test_packed_frames_are_compared_with_images() -> None:
+    found = {(row.metric, row.unit): row.value for row in data.run(QUICK)}
+    assert found["packed", "x"] == pytest.approx(found["packed", "images/s"] / found["image files", "images/s"])
+    assert 0 < found["stored", "1"] < 0.5 and found["opening", "s"] > 0
+
+
+def test_the_command_has_every_case() -> None:
+    assert all(callable(importlib.import_module(f"gausim.benchmark.{name}").run) for name in benchmark.CASES)

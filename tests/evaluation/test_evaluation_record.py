@@ -114,14 +114,6 @@ def test_the_first_sequence_warms_up(monkeypatch):
 
 
 @pytest.mark.skipif(not cost._RESET.exists() or torch.cuda.is_available(), reason="needs Linux's /proc, without CUDA")
-def test_memory_that_a_prediction_takes_is_seen():
-    meter = CostMeter()
-    meter.predict(lambda: np.ones(30_000_000).sum(), 1)  # 240 MB, let go at once
-    memory = meter.summary()["memory"]
-    assert 200e6 < memory["added_bytes"] < 400e6 and memory["peak_bytes"] > memory["added_bytes"]
-
-
-@pytest.mark.skipif(not cost._RESET.exists() or torch.cuda.is_available(), reason="needs Linux's /proc, without CUDA")
 def test_memory_that_was_freed_before_hides_nothing():
     def blocks(count: int) -> float:
         return float(sum(x.sum() for x in [np.ones(125_000) for _ in range(count)]))  # 1 MB each
@@ -132,6 +124,7 @@ def test_memory_that_was_freed_before_hides_nothing():
     for count in (150, 60, 80):
         meter.predict(lambda count=count: blocks(count), 1)
     memory = meter.summary()["memory"]
+    assert memory["peak_bytes"] > memory["first_added_bytes"]
     assert 130e6 < memory["first_added_bytes"] < 200e6 and 65e6 < memory["added_bytes"] < 110e6
 
 
