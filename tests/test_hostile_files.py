@@ -45,9 +45,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "trajectory": ("trajectory.safetensors", load_trajectory),
     "lpips": ("lpips.safetensors", LPIPS),
     "lpips, jax": ("alexnet.ckpt", convert),
-    "lpips, npz": ("w.npz", convert),
-    "lpips, torchvision": ("alexnet.pth", lambda path: convert(path, path)),
-    "lpips, wheel": ("lpips.whl", lambda path: convert(path, path)),
+    "lpips, wheel": ("lpips.whl", convert),
 }
 
 

@@ -16,10 +16,3 @@ def test_every_size_reports_its_bound_its_count_and_its_speed() -> None:
         assert 0 < found[case, "clusters"] < count
         assert found[f"ball, {count} kernels", "widest cluster"] <= 1 + 1e-9
     assert len(found) == len(rows)
-
-
-def test_the_shell_is_thin_and_has_diagonal_one() -> None:
-    points = cluster._shell(4_000)
-    assert abs(float((points.amax(0) - points.amin(0)).norm()) - 1) < 1e-6
-    distance = torch.cdist(points, points).fill_diagonal_(1.0).amin(1)
-    assert float(distance.mean()) < 0.5 * 4_000 ** (-1 / 3)  # far denser than a filled volume

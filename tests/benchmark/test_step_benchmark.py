@@ -10,30 +10,28 @@ from gausim.cli.benchmark import simulator_of
 QUICK = Options(torch.device("cpu"), quick=True, rounds=1)
 
 
-@pytest.mark.slow
-def test_every_figure_of_the_step_is_reported() -> None:
+@pytest.mark.parametrize("memory", [1 << 40, pytest.param(0, marks=pytest.mark.slow)])
+def test_every_figure_of_the_step_is_reported(memory: int, monkeypatch, capsys) -> None:
     torch.manual_seed(0)
+    monkeypatch.setattr(step, "_available_memory", lambda device: memory)
+    monkeypatch.setattr(step, "QUICK", step.Size(120, (24, 4), 2, 100, (20, 4), 2, step.QUICK.network))
     rows = step.run(QUICK, simulator_of)
     found = {(row.case, row.metric): row.value for row in rows}
     assert len(found) == len(rows)
     paper, flat, training = list(dict.fromkeys(row.case for row in rows))
-    assert paper.startswith("step, 400 kernels") and flat.endswith("no hierarchy") and "2 x 300 kernels" in training
-    for case in (paper, training):
-        for metric in ("forward", "forward + backward"):
+    assert paper.startswith("step, 120 kernels") and flat.endswith("no hierarchy") and "2 x 100 kernels" in training
+    for metric in ("forward", "forward + backward"):
+        for case in (paper, training):
             assert found[case, metric] > 0 and found[case, f"{metric}, outside the network"] < 1
+        speed = found[training, f"{metric}, throughput"]
+        assert speed == pytest.approx(2 * 2 * 1e3 / found[training, metric])
+        assert all(found[training, f"{metric}, throughput / {other}"] > 0 for other in ("elastic", "plain"))
     assert found[flat, "edges"] > found[paper, "edges"] > 0
-    for metric in ("forward", "forward + backward", "kept for the backward pass"):
-        assert found[flat, f"{metric} / with hierarchy"] > 0
+    said = capsys.readouterr().err
+    for metric in ("forward + backward", "kept for the backward pass"):
+        assert ((flat, f"{metric} / with hierarchy") in found) == bool(memory) == ("no backward pass" not in said)
     parts = [metric for case, metric in found if case == paper and metric.startswith("forward, ")]
     assert len(parts) == 9 and all(found[paper, metric] > 0 for metric in parts[1:])
-
-
-def test_no_backward_pass_where_memory_would_not_do(monkeypatch, capsys) -> None:
-    monkeypatch.setattr(step, "_available_memory", lambda device: 0)
-    rows = step.run(QUICK, simulator_of)
-    assert "has no backward pass" in capsys.readouterr().err
-    flat = [row.metric for row in rows if row.case.endswith("no hierarchy")]
-    assert flat == ["edges", "forward", "forward / with hierarchy"]
 
 
 def test_levels_are_found_that_have_the_units_wanted() -> None:

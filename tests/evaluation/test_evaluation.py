@@ -10,13 +10,24 @@ from helpers import toy_object
 from gausim.baselines.static import StaticDynamics
 from gausim.core import DataError, RunError, SimState, Trajectory
 from gausim.data.objects import ObjectData
+from gausim.evaluation import evaluation
 from gausim.evaluation.evaluation import evaluate_object, write_evaluation
 from gausim.render.reference import ReferenceRenderer
 from gausim.results.curves import load_curves
 from gausim.results.summary import load_summary, summarise
+from gausim.runs import cost
 from gausim.training.supervision.points import attach_points
 
 LINEAR = "linear AR(2) on true states, 8 modes"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def without_what_takes_long():
+    """FLIP takes half of an evaluation, and collecting garbage before the memory is counted most of a prediction."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluation, "flip_is_installed", lambda: False)
+        patch.setattr(cost, "_begin", lambda cuda: None)
+        yield
 
 
 @pytest.fixture(scope="module")

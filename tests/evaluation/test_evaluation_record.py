@@ -18,6 +18,7 @@ import gausim
 from gausim.compose.predict import RunObject, TrainedPrediction
 from gausim.core import Rendered
 from gausim.data.objects import ObjectData
+from gausim.evaluation import evaluation
 from gausim.evaluation.evaluation import absent_metrics, default_metrics, evaluate_object, write_evaluation
 from gausim.evaluation.recorder import PictureRecorder
 from gausim.metrics import flip
@@ -46,7 +47,8 @@ class Oracle:
         return self.toy.truth(record.name)
 
 
-def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path):
+def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "flip_is_installed", lambda: False)  # it takes half of the time
     methods = {"oracle": Oracle(toy), "bare": lambda record: toy.truth(record.name)}
     curves = evaluate_object(ObjectData(toy.root), toy.scene, methods, ReferenceRenderer())
     summary = write_evaluation(tmp_path, [curves], {"name": "toy"})
@@ -63,11 +65,7 @@ def test_an_evaluation_says_what_it_cost_and_where_it_comes_from(toy, tmp_path):
     assert (pictures.sequence, pictures.views, pictures.heldout_views) == ("seq_000", toy_object.VIEWS, ("cam_2",))
     difference = pictures.truth.astype(int) - pictures.predictions["oracle"]
     assert pictures.truth.shape == (20, 3, 32, 32, 4) and np.abs(difference).max() <= 2
-    assert (
-        pictures.background is None
-        and "flip" in {**entry["metrics"], **entry["absent"]}
-        and "lpips" not in entry["metrics"]
-    )
+    assert pictures.background is None and entry["absent"] == {"flip": "no package", "lpips": "no weights"}
 
 
 def test_lpips_is_measured_where_its_weights_are(monkeypatch, tmp_path):
@@ -96,6 +94,7 @@ def test_levels_of_a_trained_prediction(toy):
 
 
 def test_the_first_sequence_warms_up(monkeypatch):
+    monkeypatch.setattr(cost, "_begin", lambda cuda: None)
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
     meter = CostMeter()
@@ -115,14 +114,6 @@ def test_the_first_sequence_warms_up(monkeypatch):
 
 
 @pytest.mark.skipif(not cost._RESET.exists() or torch.cuda.is_available(), reason="needs Linux's /proc, without CUDA")
-def test_memory_that_a_prediction_takes_is_seen():
-    meter = CostMeter()
-    meter.predict(lambda: np.ones(30_000_000).sum(), 1)  # 240 MB, let go at once
-    memory = meter.summary()["memory"]
-    assert 200e6 < memory["added_bytes"] < 400e6 and memory["peak_bytes"] > memory["added_bytes"]
-
-
-@pytest.mark.skipif(not cost._RESET.exists() or torch.cuda.is_available(), reason="needs Linux's /proc, without CUDA")
 def test_memory_that_was_freed_before_hides_nothing():
     def blocks(count: int) -> float:
         return float(sum(x.sum() for x in [np.ones(125_000) for _ in range(count)]))  # 1 MB each
@@ -133,6 +124,7 @@ def test_memory_that_was_freed_before_hides_nothing():
     for count in (150, 60, 80):
         meter.predict(lambda count=count: blocks(count), 1)
     memory = meter.summary()["memory"]
+    assert memory["peak_bytes"] > memory["first_added_bytes"]
     assert 130e6 < memory["first_added_bytes"] < 200e6 and 65e6 < memory["added_bytes"] < 110e6
 
 

@@ -33,9 +33,8 @@ def test_without_a_network_it_is_that_of_the_template_s_matrices() -> None:
     assert stability.largest_eigenvalue(model, 0) == pytest.approx(expected, abs=1e-4)
 
 
-@pytest.mark.parametrize("output_scale", [0.05, 0.3])
-def test_it_is_the_growth_of_a_small_motion(output_scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = _model(output_scale=output_scale, anchor=True).train()
+def test_it_is_the_growth_of_a_small_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = _model(output_scale=0.3, anchor=True).train()
     batch = model.batch([0])
     with torch.no_grad():
         model.step(batch, SimState(batch.rest, batch.rest))  # gathers statistics of the inputs

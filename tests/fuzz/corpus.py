@@ -251,6 +251,9 @@ def _settings(folder: Path) -> Iterator[Reader]:
     run = place / "config.yaml"
     run.write_text("name: demo\nseed: 0\nmodel:\n  simulator: {_target_: gausim.X, layers: 2}\n  list: [1, 2.5]\n")
     yield Reader("run's configuration", run, "text", lambda p: str(RunDirectory(p.parent).config()))
+    rows = {"ours": {"seen": {"train": {"psnr": {"mean": 30.5, "ratio": None}}}}}
+    metrics = {"psnr": {"label": "PSNR", "scale": 1.0, "unit": "dB", "higher_is_better": True}}
+    toy = {"sequences": ["a"], "splits": {"seen": [0, 2]}, "metrics": metrics, "rows": rows, "methods": ["ours"]}
     summary = place / "metrics.json"
-    summary.write_text(json.dumps({"objects": {"toy": {"psnr": {"seen": 30.5}}}, "schema": SCHEMA}))
+    summary.write_text(json.dumps({"objects": {"toy": toy}, "run": {}, "schema": SCHEMA}))
     yield Reader("summary", summary, "json", lambda p: str(load_summary(p)), 2)

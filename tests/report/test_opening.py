@@ -228,6 +228,7 @@ def test_hostile_names_stay_text_on_the_first_screen(tmp_path: Path):
     summary["objects"][name]["heldout_views"] = [EVIL]
     (run / "evaluation" / "metrics.json").write_text(json.dumps(summary))
     write_run(tmp_path / "b", config(name=EVIL, conserve_mass=False), model=EVIL)
-    write_report([tmp_path], tmp_path / "report")
+    write_report([tmp_path], tmp_path / "report", title=EVIL)
     page = (tmp_path / "report" / "report.html").read_text()
     assert "<script" not in page and first_screen(page).count("&lt;script&gt;") >= 4 and "<video" in page
+    assert "<script>" not in (tmp_path / "report" / "report.md").read_text().replace("\\<script\\>", "")

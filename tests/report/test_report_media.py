@@ -81,11 +81,6 @@ def test_runs_without_pictures_leave_the_others_theirs(tmp_path):
     assert any("gausim w/o mass:" in n and "metrics.npz" in n for n in notes)
 
 
-def test_nothing_measured_nothing_shown(tmp_path):
-    write_run(tmp_path / "a", config())
-    assert object_figures(make_study(find_runs([tmp_path])), "toy") == ([], [])
-
-
 def test_a_name_with_a_formula_is_drawn_as_it_is(tmp_path):
     evaluate(write_run(tmp_path / "a", config(name="x"), model="$\\frac{$"), make_curves(1.0))
     assert len(figures(tmp_path)[0]) == 4

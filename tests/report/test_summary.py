@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gausim.core import RunError
-from gausim.results.curves import ImageMetricInfo, ObjectCurves, ObjectFacts, load_curves, save_curves
+from gausim.results.curves import ImageMetricInfo, ObjectCurves, ObjectFacts, load_curves
 from gausim.results.summary import frame_splits, load_summary, summarise, write_summary
 from gausim.results.table import LEGEND, markdown, object_tables
 
@@ -101,10 +101,6 @@ def test_still_truth_has_no_ratio_and_the_file_stays_valid_json(tmp_path):
     assert "NaN" not in (tmp_path / "metrics.json").read_text()
 
 
-def test_contrast_norm():
-    assert summarise(curves())["contrast"] == {"mean_color": [0.3, 0.0, 0.4], "norm": pytest.approx(0.5), "max_l2": 0.9}
-
-
 def test_files_that_are_not_ours_are_refused(tmp_path):
     path = tmp_path / "metrics.json"
     with pytest.raises(RunError, match="no such file"):
@@ -120,16 +116,6 @@ def test_files_that_are_not_ours_are_refused(tmp_path):
     np.savez(tmp_path / "metrics.npz", a=np.zeros(3))
     with pytest.raises(RunError, match="holds no array"):
         load_curves(tmp_path / "metrics.npz")
-
-
-def test_curves_round_trip(tmp_path):
-    original = curves()
-    save_curves(tmp_path / "metrics.npz", [original])
-    (loaded,) = load_curves(tmp_path / "metrics.npz")
-    assert loaded.facts == original.facts and list(loaded.values) == list(original.values)
-    assert np.array_equal(
-        loaded.values["ours"]["point_energy"], original.values["ours"]["point_energy"], equal_nan=True
-    )
 
 
 def test_tables_hold_the_numbers(tmp_path):

@@ -6,13 +6,14 @@ The large set is written as sparse files: its bytes are read as any others, but 
 from __future__ import annotations
 
 import tempfile
-import time
+from functools import partial
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 import torch
 
-from gausim.benchmark.harness import Options, Row, medians, peak_resident, process_memory
+from gausim.benchmark.harness import Options, Row, medians, peak_resident, process_memory, seconds_of
 from gausim.core import Cameras
 from gausim.data.frames import ImageSource, PackedSource
 from gausim.data.images import write_rgba
@@ -79,14 +80,15 @@ def _large(folder: Path, options: Options) -> list[Row]:
             file.truncate(total)
         text = header(cameras, crops, count=frames, fps=FPS, size=total, sha256="0" * 64)
         (place / HEADER).write_bytes(text)
-    start = time.perf_counter()
-    sources = [PackedSource(place, cameras.names, FPS) for place in sorted(folder.iterdir())]
-    opened, resident, spent = time.perf_counter() - start, [], []
+    sources: list[PackedSource] = []
+    opened = seconds_of(
+        lambda: sources.extend(PackedSource(place, cameras.names, FPS) for place in sorted(folder.iterdir())),
+        options.device,
+    )
+    resident, spent = [], []
     for _ in range(EPOCHS):
-        start = time.perf_counter()
-        for source in sources:
-            source.read(range(FRAMES), list(range(min(VIEWS, views))))
-        spent.append((time.perf_counter() - start) / sequences)
+        read = [partial(source.read, range(FRAMES), list(range(min(VIEWS, views)))) for source in sources]
+        spent.append(fmean(seconds_of(call, options.device) for call in read))
         resident.append(process_memory("VmRSS") or peak_resident())
     case = f"{sequences} sequences x {frames} frames x {views} views of {width} x {height}"
     return [

@@ -9,49 +9,30 @@ import json
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 
 import torch
 
-from gausim.benchmark.harness import peak_resident
-from gausim.benchmark.splats import deformed, splats
+from gausim.benchmark.harness import peak_resident, seconds_of
+from gausim.benchmark.splats import deformed, gradients, splats
 from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import deformed_appearance
 
 
 def measure(count: int, size: int) -> dict[str, float]:
-    """Seconds of the first forward and backward pass, and of a second one, and bytes of resident memory.
+    """Seconds of the first forward and backward pass and bytes of resident memory.
 
     ``renderer`` and ``appearance`` are first calls of the renderer and of the colours and covariances of deformed
     kernels, each with its backward pass; imports are over by then.
     """
     torch.set_num_threads(1)
-    x = torch.ones(2, requires_grad=True)
+    x, cpu = torch.ones(2, requires_grad=True), torch.device("cpu")
     torch.autograd.grad([2 * x], [x], [torch.ones(2)])  # torch imports more when it first differentiates anything
-    scene, renderer = splats(count, size, size), CpuRenderer(threads=1)
-    weights, imported = scene.weights(), peak_resident()
-    found = {"renderer": _seconds(lambda: scene.both(renderer, weights))}
-    found["again"] = _seconds(lambda: scene.both(renderer, weights))
-    found["memory"], found["imports"] = float(peak_resident()), float(imported)
-    found["appearance"] = _seconds(lambda: _appearance(count))
-    return found
-
-
-def _appearance(count: int) -> None:
-    state = deformed(count, 1, 1, 1)
-    positions, deformation_gradients, rotations = leaves = [value.requires_grad_() for value in state[:3]]
-    look, unit = state.look, state.unit_of_kernel
-    outputs = deformed_appearance(
-        positions, deformation_gradients, rotations, unit, look.covars, look.sh, state.centers
-    )
-    torch.autograd.grad(outputs, leaves, [torch.ones_like(output) for output in outputs])
-
-
-def _seconds(call: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    call()
-    return time.perf_counter() - start
+    scene, renderer, state = splats(count, size, size), CpuRenderer(threads=1), deformed(count, 1, 1, 1)
+    weights, imported = scene.weights(), float(peak_resident())
+    seconds = seconds_of(lambda: scene.both(renderer, weights), cpu)
+    memory = float(peak_resident())
+    appearance = seconds_of(lambda: gradients(deformed_appearance, state), cpu)
+    return {"renderer": seconds, "memory": memory, "imports": imported, "appearance": appearance}
 
 
 def in_fresh_process(count: int, size: int, cache: str) -> dict[str, float]:

@@ -7,6 +7,8 @@ import resource
 import statistics
 import sys
 import time
+import weakref
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -17,45 +19,41 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
+from gausim.kernels.operations import plain_forms
+
 
 @dataclass(frozen=True)
 class Row:
-    """One measured figure.
+    """One measured figure."""
 
-    Attributes:
-        case: what was run, with its sizes.
-        metric: what was measured of it.
-        value: the figure.
-        unit: its unit; ``x`` for a ratio, ``1`` for a fraction.
-        reference: what a ratio or fraction compares with, in words; None for a plain figure.
-    """
-
-    case: str
-    metric: str
+    case: str  # what was run, with its sizes
+    metric: str  # what was measured of it
     value: float
-    unit: str
-    reference: str | None = None
+    unit: str  # x for a ratio, 1 for a fraction
+    reference: str | None = None  # what a ratio or fraction compares with, in words
 
 
 @dataclass(frozen=True)
 class Options:
-    """How a benchmark is run.
-
-    Attributes:
-        device: where.
-        threads: of torch and of the renderer, unless a case is about threads.
-        quick: tiny sizes that take seconds; to see that the command works, not to quote.
-        rounds: timed calls of each candidate; the median is reported.
-    """
+    """How a benchmark is run."""
 
     device: torch.device
-    threads: int = 1
-    quick: bool = False
-    rounds: int = 7
+    threads: int = 1  # of torch and of the renderer, unless a case is about threads
+    quick: bool = False  # tiny sizes that take seconds; to see that the command works, not to quote
+    rounds: int = 7  # timed calls of each candidate; the median is reported
 
 
-def synchronise(device: torch.device) -> None:
-    """Waits for the device, so that a clock read afterwards counts its work."""
+def seconds_of(call: Callable[[], object], device: torch.device, repeats: int = 1) -> float:
+    """Wall time of one call, its work on the device included; the mean of some calls in a row [s]."""
+    _synchronise(device)
+    start = time.perf_counter()
+    for _ in range(repeats):
+        call()
+    _synchronise(device)
+    return (time.perf_counter() - start) / repeats
+
+
+def _synchronise(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
@@ -66,6 +64,7 @@ def medians(
     *,
     rounds: int | None = None,
     warmup: int = 1,
+    at_least: float = 0.0,
 ) -> dict[str, float]:
     """Median wall time of each candidate [s].
 
@@ -77,53 +76,57 @@ def medians(
         options: the device to wait for and the number of rounds.
         rounds: timed calls of each; ``options.rounds`` when None.
         warmup: calls of each that are not timed.
+        at_least: a shorter call is repeated until about so much time has gone, as the last of the warm-up took [s].
     """
     times: dict[str, list[float]] = {name: [] for name in candidates}
+    repeats = dict.fromkeys(candidates, 1)
     for number in range(warmup + (rounds or options.rounds)):
         for name, call in candidates.items():
-            synchronise(options.device)
-            start = time.perf_counter()
-            call()
-            synchronise(options.device)
-            if number >= warmup:
-                times[name].append(time.perf_counter() - start)
+            seconds = seconds_of(call, options.device, repeats[name])
+            if number < warmup:
+                repeats[name] = max(1, int(at_least / seconds))
+            else:
+                times[name].append(seconds)
     return {name: statistics.median(values) for name, values in times.items()}
 
 
+def plainly(call: Callable[[], object], names: Sequence[str] | None = None) -> Callable[[], None]:
+    """The call with these operations in their plain form, with all of them when None."""
+
+    def plain() -> None:
+        with plain_forms(names):
+            call()
+
+    return plain
+
+
 class _Kept:
-    """A tensor that the graph holds; says so when the graph lets go of it."""
+    """A tensor that the graph holds."""
 
-    def __init__(self, tensor: Tensor, ledger: _Ledger) -> None:
+    def __init__(self, tensor: Tensor) -> None:
         # Detached: an operation that saves its own result would hold itself for ever.
-        self.tensor, self._ledger = tensor.detach(), ledger
-        storage = tensor.untyped_storage()
-        self._key = storage.data_ptr()
-        ledger.add(self._key, storage.nbytes())
-
-    def __del__(self) -> None:
-        self._ledger.drop(self._key)
+        self.tensor = tensor.detach()
 
 
 class _Ledger:
-    """Bytes of the distinct storages that are held, and the most there were at one time."""
+    """Bytes of the distinct storages that the graph holds, and the most there were at one time."""
 
     def __init__(self) -> None:
         self.now = self.peak = 0
-        self._held: dict[int, list[int]] = {}
+        self._held: Counter[tuple[int, int]] = Counter()
 
-    def add(self, key: int, size: int) -> None:
-        entry = self._held.setdefault(key, [0, size])
-        if entry[0] == 0:
-            self.now += size
-            self.peak = max(self.peak, self.now)
-        entry[0] += 1
+    def keep(self, tensor: Tensor) -> _Kept:
+        kept, storage = _Kept(tensor), tensor.untyped_storage()
+        key = storage.data_ptr(), storage.nbytes()
+        self._count(key, 1)
+        weakref.finalize(kept, self._count, key, -1)
+        return kept
 
-    def drop(self, key: int) -> None:
-        entry = self._held[key]
-        entry[0] -= 1
-        if entry[0] == 0:
-            self.now -= entry[1]
-            del self._held[key]
+    def _count(self, key: tuple[int, int], change: int) -> None:
+        before = self._held[key]
+        self._held[key] += change
+        self.now += key[1] * (bool(self._held[key]) - bool(before))
+        self.peak = max(self.peak, self.now)
 
 
 def peak_saved_bytes(call: Callable[[], object]) -> int:
@@ -133,7 +136,7 @@ def peak_saved_bytes(call: Callable[[], object]) -> int:
     inputs that the graph keeps are counted too: they stand on both sides of a ratio.
     """
     ledger = _Ledger()
-    with torch.autograd.graph.saved_tensors_hooks(lambda tensor: _Kept(tensor, ledger), lambda kept: kept.tensor):
+    with torch.autograd.graph.saved_tensors_hooks(ledger.keep, lambda kept: kept.tensor):
         call()
     return ledger.peak
 
@@ -164,12 +167,9 @@ def spent_in(parts: Mapping[str, Sequence[tuple[Any, str]]], device: torch.devic
     def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(function)
         def call(*args: Any, **options: Any) -> Any:
-            synchronise(device)
-            start = time.perf_counter()
-            result = function(*args, **options)
-            synchronise(device)
-            seconds[name] += time.perf_counter() - start
-            return result
+            results: list[Any] = []
+            seconds[name] += seconds_of(lambda: results.append(function(*args, **options)), device)
+            return results[0]
 
         return call
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from gausim.benchmark.harness import Options, Row, medians, spent_in, torch_threads
 from gausim.benchmark.step import Build, cloud, parts
-from gausim.core import GaussianScene, SimState
+from gausim.core import SimState
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.selections import Ball
 from gausim.interaction.session import Force, MadeWith
@@ -22,7 +22,6 @@ GROUPS = {
     "network": ("network",),
     "propagation": ("template", "recursion and kernels"),
 }
-SH_DEGREE_3 = 16
 
 
 def run(options: Options, build: Build) -> list[Row]:
@@ -31,18 +30,8 @@ def run(options: Options, build: Build) -> list[Row]:
         return [row for count in SIZES[options.quick] for row in _frame(count, options, build)]
 
 
-def _scene(count: int) -> GaussianScene:
-    """A scene with spherical harmonics of degree 3."""
-    scene = cloud(count, f"cloud{count}")
-    colors = 0.2 * torch.randn(count, SH_DEGREE_3, 3, generator=torch.Generator().manual_seed(0))
-    return GaussianScene.create(
-        means=scene.means, log_scales=scene.log_scales, quats=scene.quats, opacity_logits=scene.opacity_logits,
-        sh=colors, pinned=scene.pinned, name=scene.name,
-    )  # fmt: skip
-
-
 def _frame(count: int, options: Options, build: Build) -> list[Row]:
-    scene = _scene(count)
+    scene = cloud(count, f"cloud{count}", degree=3)
     model = build("gausim", scene).eval().to(options.device)
     scene = scene.to(options.device)
     initial, dynamics = SimState(scene.means, scene.means), SceneDynamics(model)
@@ -55,11 +44,10 @@ def _frame(count: int, options: Options, build: Build) -> list[Row]:
     eye, speed = torch.tensor([0.0, -3.0, 0.5]), torch.zeros(count)
     live.step()
 
-    def paint() -> tuple[Tensor, Tensor]:
-        covars, rgb, _ = painter(live.frame, live.unit_of_kernel, speed, VIEW, eye)
-        return covars, rgb
+    def paint() -> tuple[Tensor, Tensor, object]:
+        return painter(live.frame, live.unit_of_kernel, speed, VIEW, eye)
 
-    covars, rgb = paint()
+    covars, rgb, _ = paint()
     rounds = max(options.rounds, 15)
     times = medians(
         {

@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -21,16 +21,8 @@ NODE_FEATURES, EDGE_FEATURES, OUTPUTS = 40, 20, 11
 NAIVE = "the textbook form in fp32"
 
 
-@dataclass(frozen=True)
-class Size:
-    """Of the graph and the network; the default is the fine level of the paper's scene with up to 16 + 16 neighbours.
-
-    Attributes:
-        nodes: number of nodes.
-        edges: number of edges.
-        layers: message-passing layers.
-        hidden: width of the network.
-    """
+class Size(NamedTuple):
+    """Of the graph and the network; by default the fine level of the paper's scene with up to 16 + 16 neighbours."""
 
     nodes: int = 1203
     edges: int = 30_000
@@ -58,27 +50,23 @@ def run(options: Options) -> list[Row]:
         both = medians({n: functools.partial(_gradients, call, parameters[n]) for n, call in calls.items()}, options)
         kept = {name: float(peak_saved_bytes(call)) for name, call in calls.items() if not name.startswith("compiled")}
         gemm = peaks(options).gemm
-    case = f"network {size.nodes} nodes, {size.edges} edges, {size.layers} x {size.hidden}"
-    flops = useful_flops(networks["split fp32"], size.nodes, size.edges)
-    rows = [row for name in calls for row in _times(f"{case}, {name}", name, forward, both, flops, gemm)]
-    for name, value in kept.items():
-        rows.append(Row(f"{case}, {name}", "kept for the backward pass", value / 2**20, "MiB"))
-        if name != "naive":
-            rows.append(Row(f"{case}, {name}", "kept for the backward pass / naive", value / kept["naive"], "x", NAIVE))
-    return rows
-
-
-def _times(
-    case: str, name: str, forward: dict[str, float], both: dict[str, float], flops: tuple[float, float], gemm: float
-) -> list[Row]:
+    work = useful_flops(networks["split fp32"], size.nodes, size.edges)
     rows = []
-    for metric, times, work in (("forward", forward, flops[0]), ("forward + backward", both, sum(flops))):
-        rows.append(Row(case, metric, 1e3 * times[name], "ms"))
-        if name == "naive":
-            continue
-        rows.append(Row(case, f"{metric} / naive", times[name] / times["naive"], "x", NAIVE))
-        if "checkpointed" not in name:
-            rows.append(Row(case, f"{metric}, useful FLOP/s", work / times[name] / gemm, "1", "fp32 GEMM peak"))
+    for name in calls:
+        case = f"network {size.nodes} nodes, {size.edges} edges, {size.layers} x {size.hidden}, {name}"
+        for metric, values, scale, unit, flops in (
+            ("forward", forward, 1e3, "ms", work[0]),
+            ("forward + backward", both, 1e3, "ms", sum(work)),
+            ("kept for the backward pass", kept, 2**-20, "MiB", None),
+        ):
+            if name not in values:
+                continue
+            rows.append(Row(case, metric, scale * values[name], unit))
+            if name != "naive":
+                rows.append(Row(case, f"{metric} / naive", values[name] / values["naive"], "x", NAIVE))
+            if flops and name != "naive" and "checkpointed" not in name:
+                speed = flops / values[name] / gemm
+                rows.append(Row(case, f"{metric}, useful FLOP/s", speed, "1", "fp32 GEMM peak"))
     return rows
 
 

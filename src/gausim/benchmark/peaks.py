@@ -1,18 +1,21 @@
-"""What the machine can do at best, measured in the same run: what every fraction of a peak is of."""
+"""The machine, and what it can do at best, measured in the same run: what every fraction of a peak is of."""
 
 # Annotations would be checked by beartype in the tests, around a function that numba has to compile.
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
 from __future__ import annotations
 
 import functools
-import time
+import os
+import platform
 from dataclasses import dataclass
+from pathlib import Path
 
 import numba
 import numpy as np
 import torch
 
-from gausim.benchmark.harness import Options, medians, torch_threads
+from gausim import __version__
+from gausim.benchmark.harness import Options, medians, seconds_of, torch_threads
 from gausim.kernels.pool import WorkerPool
 
 # Independent accumulators: enough vectors of any width to hide the latency of a fused multiply-add.
@@ -25,24 +28,17 @@ TRIES = 7
 
 @dataclass(frozen=True)
 class Peaks:
-    """Best rates of one thread count on one device.
+    """Best rates of one thread count on one device."""
 
-    Attributes:
-        fma: float32 fused multiply-adds in registers [FLOP/s], one CPU thread; 0 on a GPU, where nothing compares.
-        gemm: float32 matrix product [FLOP/s].
-        copy: bytes read plus bytes written by a large copy [B/s].
-    """
-
-    fma: float
-    gemm: float
-    copy: float
+    fma: float  # float32 fused multiply-adds in registers [FLOP/s], one CPU thread; 0 on a GPU, where nothing compares
+    gemm: float  # float32 matrix product [FLOP/s]
+    copy: float  # bytes read plus bytes written by a copy much larger than the caches [B/s]
 
 
 def _make_fma_loop():
     @numba.njit(nogil=True, fastmath=True, error_model="numpy", cache=True)
     def loop(values, scale, shift, rounds):
-        # A local array of known length stays in vector registers.
-        a = np.empty(LANES, np.float32)
+        a = np.empty(LANES, np.float32)  # a local array of known length stays in vector registers
         for i in range(LANES):
             a[i] = values[i]
         for _ in range(rounds):
@@ -65,32 +61,46 @@ def fma_peak(threads: int = 1) -> float:
         _fma_loop(np.ones(LANES, np.float32), scale, shift, rounds)
 
     loop(1)
-    best, pool = float("inf"), WorkerPool(threads)
-    for _ in range(TRIES):
-        start = time.perf_counter()
-        pool.run(loop, [ROUNDS] * threads)
-        best = min(best, time.perf_counter() - start)
+    pool, cpu = WorkerPool(threads), torch.device("cpu")
+    best = min(seconds_of(lambda: pool.run(loop, [ROUNDS] * threads), cpu) for _ in range(TRIES))
     return 2.0 * LANES * ROUNDS * threads / best
-
-
-def gemm_peak(options: Options) -> float:
-    """Square float32 matrix product [FLOP/s]."""
-    size = GEMM_SIZE[options.quick] * (8 if options.device.type == "cuda" else 1)
-    a, b = (torch.randn(size, size, device=options.device) for _ in range(2))
-    out = torch.empty_like(a)
-    return 2.0 * size**3 / medians({"gemm": lambda: torch.mm(a, b, out=out)}, options)["gemm"]
-
-
-def copy_peak(options: Options) -> float:
-    """A copy much larger than the caches, bytes read plus bytes written [B/s]."""
-    source = torch.zeros(COPY_BYTES // 4, device=options.device)
-    target = torch.empty_like(source)
-    return 2.0 * COPY_BYTES / medians({"copy": lambda: target.copy_(source)}, options)["copy"]
 
 
 @functools.cache
 def peaks(options: Options) -> Peaks:
     """The three rates, measured once per process and set of options."""
+    size = GEMM_SIZE[options.quick] * (8 if options.device.type == "cuda" else 1)
+    a, b, out = torch.randn(3, size, size, device=options.device)
+    source, target = torch.zeros(2, COPY_BYTES // 4, device=options.device)
     with torch_threads(options.threads):
+        calls = {"gemm": lambda: torch.mm(a, b, out=out), "copy": lambda: target.copy_(source)}
+        times = medians(calls, options)
         fma = fma_peak() if options.device.type == "cpu" else 0.0
-        return Peaks(fma, gemm_peak(options), copy_peak(options))
+    return Peaks(fma, 2.0 * size**3 / times["gemm"], 2.0 * COPY_BYTES / times["copy"])
+
+
+def processor() -> str:
+    """The processor's name, as the system gives it."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(named, platform.processor() or platform.machine())
+
+
+def machine(options: Options) -> dict[str, str]:
+    """What figures were measured on: processor, device, software and the peaks measured now."""
+    best = peaks(options)
+    rates = [f"fused multiply-add {best.fma / 1e9:.0f} GFLOP/s"] if best.fma else []
+    rates += [f"matrix product {best.gemm / 1e9:.0f} GFLOP/s", f"copy {best.copy / 1e9:.1f} GB/s"]
+    described = {
+        "processor": f"{processor()}, {os.cpu_count()} logical cores, {torch.backends.cpu.get_cpu_capability()}",
+        "system": f"{platform.system()} {platform.machine()}",
+        "software": f"gausim {__version__}, Python {platform.python_version()}, torch {torch.__version__}, "
+        f"numba {numba.__version__}",
+        "threads": str(options.threads),
+        "peaks": ", ".join(rates),
+        "sizes": "quick (not to be quoted)" if options.quick else "full",
+    }
+    if options.device.type == "cuda":
+        described["device"] = torch.cuda.get_device_name(options.device)
+    return described

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import GaussianScene, Rendered, Renderer
@@ -88,19 +89,11 @@ def splats(count: int, width: int, height: int, views: int = 1) -> Splats:
     )
 
 
-class Deformed(NamedTuple):
-    """One deformed state of a scene and four cameras: what colours and covariances are made of."""
+def deformed(count: int, units: int, views: int, degree: int) -> tuple[Tensor, ...]:
+    """What the appearance of random kernels with deformation gradients near one is computed from.
 
-    positions: Float[Tensor, "1 K 3"]
-    deformation_gradients: Float[Tensor, "1 N 3 3"]
-    rotations: Float[Tensor, "1 N 3 3"]
-    unit_of_kernel: Int[Tensor, " K"]
-    look: SceneAppearance
-    centers: Float[Tensor, "V 3"]
-
-
-def deformed(count: int, units: int, views: int, degree: int) -> Deformed:
-    """Random kernels, deformation gradients near one and colours of spherical harmonics of that degree."""
+    The arguments of :func:`gausim.render.draw.deformed_appearance`; colours are spherical harmonics of that degree.
+    """
     g = torch.Generator().manual_seed(0)
     deformation_gradients = torch.eye(3) + 0.1 * torch.randn(1, units, 3, 3, generator=g)
     scene = GaussianScene.create(
@@ -112,7 +105,21 @@ def deformed(count: int, units: int, views: int, degree: int) -> Deformed:
     )
     look, centers = SceneAppearance.of(scene), torch.randn(views, 3, generator=g)
     centers = DISTANCE * torch.nn.functional.normalize(centers, dim=-1)
-    unit = torch.randint(0, units, (count,), generator=g)
-    return Deformed(
-        scene.means[None], deformation_gradients, polar_rotation(deformation_gradients), unit, look, centers
-    )
+    unit, rotations = torch.randint(0, units, (count,), generator=g), polar_rotation(deformation_gradients)
+    return scene.means[None], deformation_gradients, rotations, unit, look.covars, look.sh, centers
+
+
+Form = Callable[..., tuple[Tensor, ...]]
+
+
+@torch.no_grad()
+def without_graph(form: Form, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """What a form computes of a deformed state."""
+    return form(*state)
+
+
+def gradients(form: Form, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """Gradients of all that a form computes with respect to positions, deformation gradients and rotations."""
+    leaves = [value.detach().requires_grad_() for value in state[:3]]
+    outputs = form(*leaves, *state[3:])
+    return torch.autograd.grad(outputs, leaves, [torch.ones_like(output) for output in outputs])

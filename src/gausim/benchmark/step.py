@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from gausim.benchmark.harness import Options, Row, medians, peak_saved_bytes, process_memory, spent_in, torch_threads
+from gausim.benchmark.harness import (
+    Options,
+    Row,
+    medians,
+    peak_saved_bytes,
+    plainly,
+    process_memory,
+    spent_in,
+    torch_threads,
+)
 from gausim.core import GaussianScene, SimState
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import build_hierarchy
@@ -29,36 +38,25 @@ EDGE_LENGTHS, KERNEL_LEVEL = (2.0, 0.4), "hierarchy.levels=[{diameter:0.0,edge_l
 # Calls of what takes long; its first call is not timed either.
 LONG_ROUNDS = 2
 PAPER_RATIO = "with hierarchy, same run (the paper: 2.8 in time, 1.7 in memory, rendering included)"
+# What the neural simulator's speed is compared with.
+ELASTIC, PLAIN = "model=gausim_elastic, same run", "the same steps by the plain forms of all operations"
 
-
-class Build(Protocol):
-    """Makes simulators; given by the command, which knows the configurations."""
-
-    def __call__(self, preset: str, scene: GaussianScene, *settings: str) -> GausSim:
-        """The untrained simulator of ``conf/model/PRESET.yaml`` for a scene; settings are KEY=VALUE of it."""
+# Makes the untrained simulator of ``conf/model/PRESET.yaml`` for a scene: build(preset, scene, *settings), settings
+# KEY=VALUE of it. Given by the command, which knows the configurations.
+Build = Callable[..., GausSim]
 
 
 @dataclass(frozen=True)
 class Size:
-    """How large the cases are; the defaults are the paper's scene and a training batch of the bunny.
-
-    Attributes:
-        kernels: of the paper's scene.
-        units: its systems of levels 1 and 2.
-        batch: sequences of the training batch.
-        bunny: kernels of its scene.
-        bunny_units: and systems of levels 1 and 2.
-        steps: predicted frames of the training batch.
-        network: settings of the network.
-    """
+    """How large the cases are; the defaults are the paper's scene and a training batch of the bunny."""
 
     kernels: int = 23_422
-    units: tuple[int, int] = (1_203, 11)
-    batch: int = 4
+    units: tuple[int, int] = (1_203, 11)  # of levels 1 and 2
+    batch: int = 4  # sequences of the training batch
     bunny: int = 1_999
     bunny_units: tuple[int, int] = (144, 15)
-    steps: int = 15
-    network: tuple[str, ...] = ()
+    steps: int = 15  # predicted frames of the training batch
+    network: tuple[str, ...] = ()  # settings
 
 
 QUICK = Size(400, (40, 6), 2, 300, (30, 5), 2, ("network.hidden=16", "network.layers=2"))
@@ -71,8 +69,11 @@ def run(options: Options, build: Build) -> list[Row]:
         return [*_paper(size, options, build), *_training(size, options, build)]
 
 
-def cloud(count: int, name: str) -> GaussianScene:
-    """Kernels spread evenly through an ellipsoid with axes 0.8, 0.6 and 1, the lowest twentieth pinned."""
+def cloud(count: int, name: str, *, degree: int = 1) -> GaussianScene:
+    """Kernels spread evenly through an ellipsoid with axes 0.8, 0.6 and 1, the lowest twentieth pinned.
+
+    Their colours are spherical harmonics of this degree.
+    """
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(count, 3, generator=generator)
     x = x / x.norm(dim=1, keepdim=True) * torch.rand(count, 1, generator=generator) ** (1 / 3)
@@ -82,8 +83,7 @@ def cloud(count: int, name: str) -> GaussianScene:
         log_scales=torch.full((count, 3), -4.0),
         quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
         opacity_logits=torch.zeros(count),
-        sh=torch.zeros(count, 4, 3),
-        simulated=torch.ones(count, dtype=torch.bool),
+        sh=0.2 * torch.randn(count, (degree + 1) ** 2, 3, generator=generator),
         pinned=means[:, 2] < means[:, 2].quantile(0.05),
         name=name,
     )
@@ -122,9 +122,9 @@ def parts(template: PreparedTemplate) -> Mapping[str, Sequence[tuple[Any, str]]]
 
 
 def _paper(size: Size, options: Options, build: Build) -> list[Row]:
+    """The paper's scene, with its hierarchy and with every kernel predicted."""
     scene = cloud(size.kernels, "paper")
-    model = build("gausim_paper", scene, levels_of(scene, size.units), *size.network)
-    bound = Bound(model, 1, options)
+    bound = Bound(build("gausim_paper", scene, levels_of(scene, size.units), *size.network), 1, options)
     case = f"step, {size.kernels} kernels, {bound.units} units"
     forward = medians({"step": bound.forward, "network": bound.network_forward}, options)
     both = medians({"step": bound.both, "network": bound.network_both}, options)
@@ -132,45 +132,45 @@ def _paper(size: Size, options: Options, build: Build) -> list[Row]:
     rows = [Row(case, "edges", float(bound.edges), "1"), *_outside(case, "forward", forward)]
     rows += [*_outside(case, "forward + backward", both), Row(case, "kept for the backward pass", kept / 2**20, "MiB")]
     rows += [Row(case, f"forward, {name}", 1e3 * t, "ms") for name, t in bound.parts(options).items()]
+
     flat = Bound(build("gausim_paper", scene, KERNEL_LEVEL, *size.network), 1, options)
-    return rows + _flat(flat, bound, forward["step"], both["step"], kept, size, options)
+    case, rounds = f"step, {size.kernels} kernels, no hierarchy", min(options.rounds, LONG_ROUNDS)
 
-
-def _flat(
-    flat: Bound, bound: Bound, forward: float, both: float, kept: float, size: Size, options: Options
-) -> list[Row]:
-    """The same scene with every kernel predicted."""
-    case = f"step, {size.kernels} kernels, no hierarchy"
-    rounds = min(options.rounds, LONG_ROUNDS)
-
-    def row(metric: str, value: float, unit: str, reference: float) -> list[Row]:
-        factor = 1e3 if unit == "ms" else 2**-20
+    def beside(metric: str, value: float, unit: str, reference: float) -> list[Row]:
         ratio = Row(case, f"{metric} / with hierarchy", value / reference, "x", PAPER_RATIO)
-        return [Row(case, metric, factor * value, unit), ratio]
+        return [Row(case, metric, value * (1e3 if unit == "ms" else 2**-20), unit), ratio]
 
-    rows = [Row(case, "edges", float(flat.edges), "1")]
-    rows += row("forward", medians({"": flat.forward}, options, rounds=rounds)[""], "ms", forward)
+    rows.append(Row(case, "edges", float(flat.edges), "1"))
+    rows += beside("forward", medians({"": flat.forward}, options, rounds=rounds)[""], "ms", forward["step"])
     needed = 1.5 * kept * flat.edges / bound.edges
     if needed > _available_memory(options.device):
         print(f"step: about {needed / 2**30:.0f} GiB are not free, so {case} has no backward pass.", file=sys.stderr)
         return rows
-    rows += row("forward + backward", medians({"": flat.both}, options, rounds=rounds)[""], "ms", both)
-    return rows + row("kept for the backward pass", float(peak_saved_bytes(flat.differentiable)), "MiB", kept)
+    rows += beside("forward + backward", medians({"": flat.both}, options, rounds=rounds)[""], "ms", both["step"])
+    return rows + beside("kept for the backward pass", float(peak_saved_bytes(flat.differentiable)), "MiB", kept)
 
 
 def _training(size: Size, options: Options, build: Build) -> list[Row]:
-    """All steps of a training batch of the default model."""
+    """All steps of a training batch of the neural simulator, beside the elastic one and its own plain forms."""
     scene = cloud(size.bunny, "bunny")
-    model = build("gausim", scene, levels_of(scene, size.bunny_units), *size.network)
-    bound = Bound(model, size.batch, options, steps=size.steps)
+    levels = levels_of(scene, size.bunny_units)
+    bound, elastic = (
+        Bound(build(preset, scene, levels, *size.network), size.batch, options, steps=size.steps)
+        for preset in ("gausim", "gausim_elastic")
+    )
     case = f"{size.steps} steps, {size.batch} x {size.bunny} kernels, {bound.units} units"
     rows = [Row(case, "edges", float(bound.edges), "1")]
-    for metric, call, alone in (
-        ("forward", bound.forward, bound.network_forward),
-        ("forward + backward", bound.both, bound.network_both),
+    for metric, call, alone, other in (
+        ("forward", bound.forward, bound.network_forward, elastic.forward),
+        ("forward + backward", bound.both, bound.network_both, elastic.both),
     ):
-        times = medians({"step": call, "network": alone}, options)
+        times = medians({"step": call, "network": alone, "elastic": other, "plain": plainly(call)}, options)
         rows += _outside(case, metric, {**times, "network": size.steps * times["network"]})
+        rows += [
+            Row(case, f"{metric}, throughput", size.steps * size.batch / times["step"], "sequence-steps/s"),
+            Row(case, f"{metric}, throughput / elastic", times["elastic"] / times["step"], "x", ELASTIC),
+            Row(case, f"{metric}, throughput / plain", times["plain"] / times["step"], "x", PLAIN),
+        ]
     return [*rows, Row(case, "kept for the backward pass", peak_saved_bytes(bound.differentiable) / 2**20, "MiB")]
 
 

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import torch
 from torch.optim import Optimizer
 
-from gausim.benchmark.harness import Options, Row, medians, peak_resident, peak_saved_bytes, spent_in, torch_threads
+from gausim.benchmark.harness import (
+    Options,
+    Row,
+    medians,
+    peak_resident,
+    peak_saved_bytes,
+    plainly,
+    spent_in,
+    torch_threads,
+)
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
-from gausim.kernels.operations import OPERATIONS, plain_forms
+from gausim.kernels.operations import OPERATIONS
 from gausim.training.module import GausSimModule
 from gausim.training.supervision.comparison import Comparison
 
-# Timed steps of plain torch, which takes long.
-REFERENCE_ROUNDS = 2
+# Sequences of an optimiser step, at most as many as there are; timed steps of plain torch, which takes long.
+SEQUENCES, REFERENCE_ROUNDS = 4, 2
 
 
 @dataclass
@@ -30,9 +38,9 @@ class _Case:
     optimizer: Optimizer
 
     @staticmethod
-    def of(module: GausSimModule, datamodule: ReadyDataModule, options: Options, sequences: int, steps: int) -> _Case:
+    def of(module: GausSimModule, datamodule: ReadyDataModule, options: Options, steps: int) -> _Case:
         index = datamodule.index
-        chosen = range(min(sequences, len(index)))
+        chosen = range(min(SEQUENCES, len(index)))
         views = [index.objects[index.entries[i][0]].train_views for i in chosen]
         samples = [index.sample(i, range(steps + 1), v).to(options.device) for i, v in zip(chosen, views, strict=True)]
         module.to(options.device)
@@ -62,61 +70,53 @@ class _Case:
 
 
 def run(
-    options: Options,
-    module: GausSimModule,
-    datamodule: ReadyDataModule,
-    *,
-    sequences: int = 4,
-    steps: int | None = None,
+    options: Options, module: GausSimModule, datamodule: ReadyDataModule, others: Mapping[str, GausSimModule]
 ) -> list[Row]:
     """Times optimiser steps and their parts, and counts what the graph holds.
 
     Args:
-        options: how.
+        options: how; a quick run predicts three frames, another one as many as the curriculum's last.
         module: what is trained; its weights do not change, its running statistics do.
         datamodule: where sequences come from.
-        sequences: per optimiser step, at most as many as there are.
-        steps: predicted frames T; the curriculum's largest when None (three in a quick run).
+        others: modules of the same data whose speed is compared, by the setting that chooses them.
     """
     datamodule.setup("fit")
-    length = steps or (min(3, datamodule.curriculum.t_max) if options.quick else datamodule.curriculum.t_max)
+    t_max = datamodule.curriculum.t_max
+    length = min(3, t_max) if options.quick else t_max
     with torch_threads(options.threads):
-        case = _Case.of(module, datamodule, options, sequences, length)
+        case = _Case.of(module, datamodule, options, length)
         cameras = case.samples[0].cameras
         name = (
             f"{case.samples[0].object_name}: {len(case.samples)} sequences x {len(cameras.names)} views x "
             f"{cameras.width}x{cameras.height}, T={case.steps}"
         )
-        return [*_speed(name, case, options), *_memory(name, case, options)]
+        rivals = {setting: _Case.of(other, datamodule, options, length) for setting, other in others.items()}
+        return [*_speed(name, case, rivals, options), *_memory(name, case, options)]
 
 
-def _speed(name: str, case: _Case, options: Options) -> list[Row]:
+def _speed(name: str, case: _Case, rivals: Mapping[str, _Case], options: Options) -> list[Row]:
     times = medians({"without": case.step, "with": lambda: case.step(static=True)}, options)
     static = case.module.objective.static_chance(case.steps) * max(0.0, times["with"] - times["without"])
     whole = times["without"] + static
     parts = _parts(case, options)
     parts["static loss (by its fraction of the batches)"] = static
     parts["rest"] = whole - sum(parts.values())
-    rounds = min(REFERENCE_ROUNDS, options.rounds)
-    forms: dict[str, Callable[[], object]] = {form: partial(_plain, case, [form]) for form in OPERATIONS}
-    plain = medians(
-        {"own": case.step, "plain": partial(_plain, case, list(OPERATIONS)), **forms}, options, rounds=rounds
-    )
-    reference = "the same step with every operation but the renderer as plain torch"
-    one, own = "its fast form against the plain", plain["own"] + static
+    compared: dict[str, Callable[[], object]] = {form: plainly(case.step, [form]) for form in OPERATIONS}
+    compared |= {"own": case.step, "plain": plainly(case.step)}
+    compared |= {setting: rival.step for setting, rival in rivals.items()}
+    found = medians(compared, options, rounds=min(REFERENCE_ROUNDS, options.rounds))
+    own = found["own"] + static
+    plain = "the same step with every operation but the renderer as plain torch"
     return [
         Row(name, "throughput", case.steps * len(case.samples) / whole, "sequence-steps/s"),
+        *(Row(name, f"throughput / {setting}", found[setting] / found["own"], "x", "same run, without the static loss")
+          for setting in rivals),
+        Row(name, "throughput / plain", (found["plain"] + static) / own, "x", plain),
         Row(name, "optimiser step", 1e3 * whole, "ms"),
         *(Row(name, part, seconds / whole, "1", "of the optimiser step") for part, seconds in parts.items()),
-        *(Row(name, f"speed-up by {form}", (plain[form] + static) / own, "x", one) for form in forms),
-        Row(name, "speed-up", (plain["plain"] + static) / own, "x", reference),
-    ]
-
-
-def _plain(case: _Case, names: Sequence[str]) -> None:
-    """A step with these operations in their plain form."""
-    with plain_forms(names):
-        case.step()
+        *(Row(name, f"speed-up by {form}", (found[form] + static) / own, "x", "its fast form against the plain")
+          for form in OPERATIONS),
+    ]  # fmt: skip
 
 
 def _parts(case: _Case, options: Options) -> dict[str, float]:

@@ -18,13 +18,14 @@ if TYPE_CHECKING:
 CASES = {
     "render": "the CPU renderer against plain torch and the peak of the processor, threads, views, compilation",
     "network": "the graph network against the textbook form: time, memory, fraction of the matrix-product peak",
-    "step": "one predicted frame at the paper's size, with and without hierarchy, part by part",
-    "train": "whole optimiser steps, part by part; KEY=VALUE chooses the experiment as in `gausim train`",
+    "step": "one predicted frame at the paper's size, with and without hierarchy; neural steps against elastic ones",
+    "train": "whole optimiser steps, part by part, against elastic ones; KEY=VALUE as in `gausim train`",
     "data": "packed frames against decoding PNG; opening and streaming a set of the paper's size",
     "interact": "an object that is pushed about: simulated frames per second, from the force to the browser's bytes",
     "cluster": "clusters of bounded diameter, against scipy",
 }
-DEFAULT_OVERRIDES = ("experiment=demo",)
+DEFAULT_OVERRIDES = ("experiment=demo", "model=gausim")
+RIVAL = "model=gausim_elastic"  # what the speed of training is compared with
 
 
 def main(argv: list[str]) -> int:
@@ -33,7 +34,7 @@ def main(argv: list[str]) -> int:
     import torch
 
     from gausim.benchmark.harness import Options, torch_threads
-    from gausim.benchmark.machine import machine
+    from gausim.benchmark.peaks import machine
 
     options = Options(_device(arguments.device), arguments.threads, arguments.quick, arguments.rounds)
     torch.manual_seed(0)
@@ -97,14 +98,18 @@ def _run(name: str, options: Options, overrides: list[str], *, optional: bool) -
     from gausim.compose.config import compose
     from gausim.core.errors import DataError
 
+    overrides = overrides or list(DEFAULT_OVERRIDES)
+    config = compose("train", overrides)
+    rival = compose("train", [*(word for word in overrides if not word.startswith(("model=", "model."))), RIVAL])
     try:
-        module, datamodule = build(compose("train", overrides or list(DEFAULT_OVERRIDES)))
+        module, datamodule = build(config)
+        others = {} if config.model == rival.model else {RIVAL: build(rival)[0]}
     except DataError as error:
         if not optional:
             raise
         print(f"train left out: {error}", file=sys.stderr)
         return []
-    return list(case.run(options, module, datamodule))
+    return list(case.run(options, module, datamodule, others))
 
 
 def simulator_of(preset: str, scene: GaussianScene, *settings: str) -> GausSim:

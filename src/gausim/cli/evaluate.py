@@ -32,8 +32,8 @@ def main(argv: list[str]) -> int:
     from gausim.compose.data_paths import data_option
     from gausim.compose.predict import state_of
     from gausim.evaluation.evaluation import write_evaluation
-    from gausim.report.pictures.diagnosis import diagnosis_figure
     from gausim.report.pictures.figures import error_figure
+    from gausim.report.pictures.motion import diagnosis_figure
 
     run = load_run(arguments.run, data=data_option(arguments.data))
     facts = {"name": run.config.get("name"), "seed": run.config.get("seed"), "views": arguments.views, **state_of(run)}
@@ -104,7 +104,7 @@ def _evaluate(run: LoadedRun, arguments: argparse.Namespace) -> list[ObjectCurve
 def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list[str]:
     """Writes what long rollouts of each object's first sequence tell; returns the names of the files."""
     from gausim.compose.predict import endurance, run_objects
-    from gausim.report.pictures.endurance import endurance_figure
+    from gausim.report.pictures.motion import endurance_figure
 
     found = {item.data.name: endurance(run, item, arguments.endurance) for item in run_objects(run, arguments.object)}
     (folder / "endurance.json").write_text(json.dumps(found, indent=1) + "\n")

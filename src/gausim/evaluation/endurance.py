@@ -21,24 +21,14 @@ PUSH_EVERY, PUSH_FRAMES, PUSH_REACH, PUSH_SHIFT = 24, 3, 0.15, 0.002
 
 @dataclass(frozen=True, eq=False)
 class RandomPushes:
-    """Pushes at random places in random directions, the same for the same seed.
+    """Pushes at random places in random directions, the same for the same seed."""
 
-    Attributes:
-        rest: rest positions [scene units].
-        mass: of the kernels.
-        free: which of them can be pushed.
-        diagonal: of the scene [scene units].
-        fps: frames per second.
-        frames: pushes begin before this frame.
-        seed: of places and directions.
-    """
-
-    rest: Float[Tensor, "K 3"]
+    rest: Float[Tensor, "K 3"]  # rest positions [scene units]
     mass: Float[Tensor, " K"]
-    free: Bool[Tensor, " K"]
-    diagonal: float
+    free: Bool[Tensor, " K"]  # which kernels can be pushed
+    diagonal: float  # of the scene [scene units]
     fps: float
-    frames: int
+    frames: int  # pushes begin before this frame
     seed: int = 0
 
     def __call__(self, step: int) -> Float[Tensor, "K 3"] | None:

@@ -169,13 +169,7 @@ def _linear_references(data: ObjectData) -> dict[str, LinearAR2]:
 class _ObjectMeasure:
     """Measures one object's sequences; keeps what is summed over all of them (mean colour, largest l2, costs)."""
 
-    def __init__(
-        self,
-        data: ObjectData,
-        scene: GaussianScene,
-        renderer: Renderer,
-        views: Sequence[str] | None,
-    ) -> None:
+    def __init__(self, data: ObjectData, scene: GaussianScene, renderer: Renderer, views: Sequence[str] | None) -> None:
         self.data, self.scene, self.renderer = data, scene, renderer
         self.views = list(data.views if views is None else views)
         side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
@@ -253,7 +247,10 @@ class _ObjectMeasure:
             target, alpha = composite(recorded)
             target, mask = target.to(rest), (alpha > 0).to(rest.device)
             self._count_color(target, mask)
-            images_of = {name: self._timed(name, t, frames, cameras) for name, t in trajectories.items()}
+            images_of = {
+                name: self._costs[name].draw(partial(self._draw, t, frames, cameras), mask.shape[:2].numel())
+                for name, t in trajectories.items()
+            }
             if pictures is not None:
                 pictures.add(recorded, images_of)
             drawn = {name: images.rgb for name, images in images_of.items()} | {STATIC: rest.expand_as(target)}
@@ -268,11 +265,6 @@ class _ObjectMeasure:
                 parts.setdefault(name, {}).setdefault(IMAGE_ENERGY, []).append(_energy(images, before.get(name)))
                 before[name] = images[-1:]
         return {row: {m: torch.cat(v).cpu().numpy() for m, v in ms.items()} for row, ms in parts.items()}
-
-    def _timed(self, name: str, trajectory: Trajectory, frames: range, cameras: Cameras) -> Rendered:
-        return self._costs[name].draw(
-            partial(self._draw, trajectory, frames, cameras), len(frames) * len(cameras.viewmats)
-        )
 
     def _draw(self, trajectory: Trajectory, frames: range, cameras: Cameras) -> Rendered:
         """Foreground on black; colours beyond [0, 1] are cut, as in every image file."""

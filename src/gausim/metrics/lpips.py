@@ -11,13 +11,12 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
 from gausim.core import ConfigError, DataError
-from gausim.metrics.image import ImageMetric
+from gausim.metrics.image import ImageMetric, Images, Mask, PerImage
 
 WEIGHTS_VARIABLE = "GAUSIM_LPIPS_WEIGHTS"
 NO_WEIGHTS = "no weights"
@@ -98,12 +97,7 @@ class LPIPS(ImageMetric):
         check_weights(arrays, str(path))
         self._weights = {name: arrays[name].float() for name in expected_shapes()}
 
-    def per_image(
-        self,
-        prediction: Float[Tensor, "B H W 3"],
-        target: Float[Tensor, "B H W 3"],
-        mask: Bool[Tensor, "B H W"],
-    ) -> Float[Tensor, " B"]:
+    def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
         """LPIPS of every image.
 
         Raises:
@@ -120,7 +114,7 @@ class LPIPS(ImageMetric):
         return total
 
 
-def _features(images: Float[Tensor, "B H W 3"], weights: Mapping[str, Tensor]) -> list[Tensor]:
+def _features(images: Images, weights: Mapping[str, Tensor]) -> list[Tensor]:
     shift, scale = (images.new_tensor(v)[:, None, None] for v in (_SHIFT, _SCALE))
     x, found = (2 * images.permute(0, 3, 1, 2) - 1 - shift) / scale, []
     for i, (stride, padding) in enumerate(zip(_STRIDES, _PADDING, strict=True)):

@@ -23,29 +23,17 @@ _HEADLINES = {"points": "error_3d", "heldout": "l2", "train": "l2"}
 
 @dataclass(frozen=True)
 class CardFacts:
-    """What a card says beyond the run's own records.
+    """What a card says beyond the run's own records."""
 
-    Attributes:
-        command: how the run's directory is written in commands.
-        about: what its model's preset says of itself; empty where it is unknown.
-        data: content of ``dataset.json`` by object; None where the data set is not on this machine.
-        base: what its configuration is compared with, in words.
-        differences: key, value of the run and value of that base.
-        overrides: what it was started with, paths of that machine left out.
-        finished: content of ``FINISHED``; empty for an unfinished run.
-        endurance: content of ``evaluation/endurance.json``; empty where long rollouts were not measured.
-        licence: of the weights; None where nobody has said it.
-    """
-
-    command: str
-    about: str = ""
-    data: Mapping[str, Mapping[str, Any]] | None = None
-    base: str = ""
-    differences: Sequence[tuple[str, str, str]] = ()
-    overrides: Sequence[str] = ()
-    finished: Mapping[str, Any] = field(default_factory=dict)
-    endurance: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    licence: str | None = None
+    command: str  # how the run's directory is written in commands
+    about: str = ""  # what its model's preset says of itself
+    data: Mapping[str, Mapping[str, Any]] | None = None  # dataset.json by object, where the data set is here
+    base: str = ""  # what its configuration is compared with, in words
+    differences: Sequence[tuple[str, str, str]] = ()  # key, value of the run and value of that base
+    overrides: Sequence[str] = ()  # what it was started with, paths of that machine left out
+    finished: Mapping[str, Any] = field(default_factory=dict)  # content of FINISHED
+    endurance: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # content of endurance.json
+    licence: str | None = None  # of the weights
 
 
 def card(run: RunRecord, facts: CardFacts) -> str:
@@ -54,7 +42,7 @@ def card(run: RunRecord, facts: CardFacts) -> str:
         loader=PackageLoader("gausim.report"), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
     environment.filters["cell"] = lambda text: text.replace("|", "\\|")
-    objects = _objects(run)
+    objects = run.objects
     data, trainer = run.config.get("data", {}), run.config.get("trainer", {})
     costs = {name: dig(entry, "efficiency", _method(entry)) for name, entry in objects.items()}
     first = next(iter(objects.values()), None)
@@ -92,10 +80,6 @@ def _hashed(entry: dict[str, Any]) -> list[dict[str, Any]]:
     return [file for file in found if dig(file, "sha256")]
 
 
-def _objects(run: RunRecord) -> dict[str, Any]:
-    return {} if run.summary is None else run.summary["objects"]
-
-
 def _front_matter(run: RunRecord, facts: CardFacts) -> str:
     results = [
         {
@@ -103,7 +87,7 @@ def _front_matter(run: RunRecord, facts: CardFacts) -> str:
             "dataset": {"type": name, "name": name},
             "metrics": metrics,
         }
-        for name, entry in _objects(run).items()
+        for name, entry in run.objects.items()
         if (metrics := list(_headline_metrics(entry)))
     ]
     head: dict[str, Any] = {"license": facts.licence.lower()} if facts.licence else {}

@@ -7,7 +7,6 @@ import io
 from collections.abc import Iterator
 
 from gausim.report.gather.study import Group, Study, cell
-from gausim.report.tables.sheets import metric_info
 
 CSV_HEAD = (
     "row", "kind", "object", "split", "first_frame", "end_frame", "views", "metric", "mean", "std_sequences",
@@ -32,31 +31,26 @@ def _lines(study: Study, group: Group, name: str, row: str) -> Iterator[dict[str
     is_method = row == group.method
     line: dict[str, object] = {
         "row": group.label if is_method else f"{row} (with {group.label})",
-        "kind": "method" if is_method else "reference",
-        "object": name,
-        **_sources(group, name),
-    }
-    entries = [e["rows"].get(row) for _, e in group.entries(name)]
+        "kind": "method" if is_method else "reference", "object": name, **_sources(group, name),
+    }  # fmt: skip
+    entries = group.entries(name)
     if not entries:
         yield line | {"status": cell(group, name, "seen", "train", "l2").status}
-        return
     splits = study.splits(name)
     places = dict.fromkeys(
-        (split, views, metric)
-        for found in entries if isinstance(found, dict)
-        for split, by_views in found.items() if split in splits and isinstance(by_views, dict)
-        for views, cells in by_views.items() if isinstance(cells, dict)
-        for metric in cells
+        (split, views, metric) for _, entry in entries for split, by_views in entry["rows"].get(row, {}).items()
+        for views, cells in by_views.items() for metric in cells if split in splits
     )  # fmt: skip
     for split, views, metric in places:
-        c, info = cell(group, name, split, views, metric, row=row), metric_info(study, metric) or {}
-        where = {"split": split, "first_frame": splits[split][0], "end_frame": splits[split][1], "views": views}
-        figures: dict[str, object] = {"status": c.status, "metric": metric}
-        figures |= {key: info.get(key, "") for key in ("scale", "unit")}
+        c, info = cell(group, name, split, views, metric, row=row), study.info(metric) or {}
+        start, end = splits[split]
+        line |= {"split": split, "first_frame": start, "end_frame": end, "views": views, "metric": metric}
+        line |= {"status": c.status, "scale": info.get("scale", ""), "unit": info.get("unit", "")}
+        figures: dict[str, object] = {}
         if c.value is not None:
-            figures |= {"mean": c.value.mean, "std_sequences": c.value.std, "std_seeds": c.value.seed_std}
+            figures = {"mean": c.value.mean, "std_sequences": c.value.std, "std_seeds": c.value.seed_std}
             figures["seeds"] = c.value.seeds
-        yield line | where | figures
+        yield line | figures
 
 
 def _sources(group: Group, name: str) -> dict[str, str]:

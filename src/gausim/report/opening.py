@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Any
 
 from gausim.core import RunError
 from gausim.metrics.lpips import HOW_TO_GET_WEIGHTS, NO_WEIGHTS
-from gausim.report.gather.runs import FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord, dig
-from gausim.report.gather.study import Cell, Group, Study, cell, pooled
+from gausim.report.gather.runs import BROKEN, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord, dig
+from gausim.report.gather.study import Group, Study, cell, pooled
 from gausim.report.pictures.film import Film, make_film
 from gausim.report.tables.sheets import NOTHING
 from gausim.report.tables.verdict import outcome, sentences
@@ -36,33 +37,19 @@ _COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """The first screen of one run and object.
+    """The first screen of one run and object."""
 
-    Attributes:
-        label: what it is chosen by.
-        name: of the object.
-        title: heading: the object and the row.
-        row: label of its row.
-        seed: which of several seeds; empty for one.
-        run: the run of the video.
-        sentences: three, over all seeds of the row.
-        table: the one table.
-        film: the video; None without one.
-        problem: why there is none, and what to do.
-        unfinished: whether the figures are of a checkpoint in the middle of training.
-    """
-
-    label: str
-    name: str
-    title: str
-    row: str
-    seed: str
-    run: RunRecord
-    sentences: tuple[str, str, str]
+    label: str  # what it is chosen by
+    name: str  # of the object
+    title: str  # heading: the object and the row
+    row: str  # label of its row
+    seed: str  # which of several seeds; empty for one
+    run: RunRecord  # of the video
+    sentences: tuple[str, str, str]  # over all seeds of the row
     table: Table
     film: Film | None
-    problem: str
-    unfinished: bool
+    problem: str  # why there is no video, and what to do
+    unfinished: bool  # whether the figures are of a checkpoint in the middle of training
 
 
 def make_openings(study: Study, *, pictures: bool = True) -> tuple[list[Opening], int]:
@@ -85,30 +72,26 @@ def _ranked(study: Study, name: str) -> list[tuple[str, Group, RunRecord]]:
     """The evaluated runs about an object, the best seed of every row first, by their errors."""
     found: list[tuple[int, float, Group, RunRecord]] = []
     for group in study.groups:
-        seeds = sorted(
-            ((outcome([entry], group.method).merit, run) for run, entry in group.entries(name)), key=lambda s: s[0]
-        )
-        found += [(place, merit, group, run) for place, (merit, run) in enumerate(seeds)]
+        seeds = [(outcome([entry], group.method).merit, run) for run, entry in group.entries(name)]
+        ranks = enumerate(sorted(seeds, key=lambda seed: seed[0]))
+        found += [(place, merit, group, run) for place, (merit, run) in ranks]
     return [(name, group, run) for _, _, group, run in sorted(found, key=lambda item: item[:2])]
 
 
 def unanswered(study: Study) -> list[str]:
     """For every run without figures, the command that leads to them; in words, backquotes about the command."""
-    return [_remedy(run) for run in study.runs if run.summary is None]
-
-
-def _remedy(run: RunRecord) -> str:
-    path = shlex.quote(str(run.path))
-    if run.status == NOT_EVALUATED:
-        return f"{run.name} is trained and not evaluated: `gausim evaluate {path}` measures it."
-    if run.status == UNFINISHED:
-        return (
-            f"{run.name} is not finished ({run.detail}): give its `gausim train` command again, or measure what there "
-            f"is with `gausim evaluate {path}`."
-        )
-    if run.status == FAILURE:
-        return f"{run.name} failed ({run.detail}): mend the cause and give its `gausim train` command again."
-    return f"{run.name} has {run.status}: {run.detail}"
+    remedies = {
+        NOT_EVALUATED: "{name} is trained and not evaluated: `gausim evaluate {path}` measures it.",
+        UNFINISHED: "{name} is not finished ({detail}): give its `gausim train` command again, or measure what there "
+        "is with `gausim evaluate {path}`.",
+        FAILURE: "{name} failed ({detail}): mend the cause and give its `gausim train` command again.",
+        BROKEN: "{name} has broken files: {detail}",
+    }
+    return [
+        remedies[run.status].format(name=run.name, detail=run.detail, path=shlex.quote(str(run.path)))
+        for run in study.runs
+        if run.summary is None
+    ]
 
 
 def _opening(study: Study, name: str, group: Group, run: RunRecord, *, pictures: bool) -> Opening:
@@ -161,11 +144,9 @@ def _comparison(study: Study, rivals: list[Group], name: str) -> Table:
     splits = study.splits(name)
     split = "unseen" if "unseen" in splits else "seen"
 
-    def merit(group: Group) -> float:
-        entries = [entry for _, entry in group.entries(name)]
-        return outcome(entries, group.method).merit if entries else math.inf
-
-    ordered = sorted(rivals, key=merit)
+    entries = {g.label: [entry for _, entry in g.entries(name)] for g in rivals}
+    merits = {g.label: outcome(entries[g.label], g.method).merit if entries[g.label] else math.inf for g in rivals}
+    ordered = sorted(rivals, key=lambda g: merits[g.label])
     shown = ordered[: MOST_ROWS - 1]
     views = "heldout" if any(_rows(g, name, split, "")[1:] for g in shown) else "train"
     rows = [_row(g, name, split, views, g.label) for g in shown]
@@ -176,7 +157,7 @@ def _comparison(study: Study, rivals: list[Group], name: str) -> Table:
     return _tidy(["method"], rows, caption)
 
 
-def _span(split: tuple[int, int]) -> str:
+def _span(split: Sequence[int]) -> str:
     return f"{split[0]}–{split[1] - 1}"
 
 
@@ -191,27 +172,18 @@ def _rows(group: Group, name: str, split: str, label: str, *, row: str | None = 
 
 
 def _row(group: Group, name: str, split: str, views: str, label: str, *, row: str | None = None) -> list[str]:
+    def ratio(entry: dict[str, Any]) -> Any:
+        return {"mean": dig(entry["rows"], row or group.method, split, "points", ERROR_3D, "ratio")}
+
     texts = []
     for metric, own, _, digits in _COLUMNS:
         if metric == ERROR_3D:
-            found = _ratio(group, name, split, row)
+            found = pooled(group, name, ratio, metric)
         else:
             found = cell(group, name, split, own or views, metric, row=row)
-        texts.append(_text(found, digits, spread=row is None))
+        value, text = found.value, found.status or NOTHING
+        texts.append(plus_minus(value.mean, None if row else value.seed_std, digits=digits) if value else text)
     return [label, *texts]
-
-
-def _ratio(group: Group, name: str, split: str, row: str | None) -> Cell:
-    def find(entry: dict[str, Any]) -> Any:
-        return {"mean": dig(entry["rows"], row or group.method, split, "points", ERROR_3D, "ratio")}
-
-    return pooled(group, name, find, ERROR_3D)
-
-
-def _text(found: Cell, digits: int, *, spread: bool) -> str:
-    if found.value is None:
-        return found.status or NOTHING
-    return plus_minus(found.value.mean, found.value.seed_std if spread else None, digits=digits)
 
 
 def _is_figure(text: str) -> bool:

@@ -32,27 +32,16 @@ _ANGLES = {
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """What a report says.
-
-    Attributes:
-        title: heading.
-        study: what the report is about.
-        sheets: tables.
-        sources: where their numbers link to.
-        openings: first screens, of which one is shown at a time.
-        left: number of first screens that were left out.
-        exhibits: pictures and videos by object.
-        notes: what a reader must know.
-    """
+    """What a report says."""
 
     title: str
     study: Study
     sheets: Sequence[Sheet]
-    sources: Sources
-    openings: Sequence[Opening]
-    left: int = 0
-    exhibits: Sequence[tuple[str, list[Exhibit]]] = ()
-    notes: Sequence[str] = ()
+    sources: Sources  # where their numbers link to
+    openings: Sequence[Opening]  # first screens, of which one is shown at a time
+    left: int = 0  # number of first screens that were left out
+    exhibits: Sequence[tuple[str, list[Exhibit]]] = ()  # pictures and videos by object
+    notes: Sequence[str] = ()  # what a reader must know
 
 
 def html_page(content: Content) -> str:

@@ -21,17 +21,11 @@ PAGE, MARKDOWN, LATEX, NUMBERS = "report.html", "report.md", "tables.tex", "numb
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """A report that was written.
-
-    Attributes:
-        study: what it is about.
-        openings: first screens, the best run's first; none where nothing was evaluated.
-        files: the page first.
-    """
+    """A report that was written."""
 
     study: Study
-    openings: list[Opening]
-    files: list[Path]
+    openings: list[Opening]  # the best run's first; none where nothing was evaluated
+    files: list[Path]  # the page first
 
 
 def write_report(
@@ -40,7 +34,7 @@ def write_report(
     *,
     title: str = "Report",
     pictures: bool = True,
-    say: Callable[[str], None] | None = None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Report:
     """Writes the report of all runs at or below ``roots`` into ``out``.
 
@@ -51,9 +45,6 @@ def write_report(
         pictures: whether the page has figures and videos.
         say: told what is being drawn.
 
-    Returns:
-        What the report is about, what it begins with, and the files.
-
     Raises:
         RunError: a root is no directory, or there is no run.
     """
@@ -61,14 +52,13 @@ def write_report(
     study = make_study(runs)
     sheets = make_sheets(study)
     sources = Sources(runs, sheets, out)
-    if say is not None and pictures:
+    if pictures:
         say("videos of the runs")
     openings, left = make_openings(study, pictures=pictures)
     exhibits: list[tuple[str, list[Exhibit]]] = []
     notes = list(study.notes)
     for name in study.objects if pictures else ():
-        if say is not None:
-            say(f"pictures of {name}")
+        say(f"pictures of {name}")
         figures, problems = object_figures(study, name)
         exhibits.append((name, figures))
         notes += [f"{name}: {problem}" for problem in dict.fromkeys(problems)]

@@ -7,11 +7,11 @@ Energies of frame t belong to the step from t-1 to t and exist for the row ``tru
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from gausim.core import RunError
@@ -41,50 +41,29 @@ class ImageMetricInfo:
 
 @dataclass(frozen=True)
 class ObjectFacts:
-    """What was evaluated.
+    """What was evaluated."""
 
-    Attributes:
-        name: the object.
-        fps: frames per second.
-        sequences: names of the S sequences.
-        frames: number of frames of each.
-        views: names of the V evaluated views.
-        train_views: those of them that training saw.
-        first_unseen: first frame that training did not see.
-        methods: rows that are predictions of a method (the others are references).
-        metrics: the image metrics.
-        mean_color: mean colour of the true foreground in [0, 1].
-        max_l2: largest per-pixel colour distance of any prediction of the first method.
-    """
-
-    name: str
+    name: str  # of the object
     fps: float
     sequences: tuple[str, ...]
-    frames: tuple[int, ...]
+    frames: tuple[int, ...]  # number of frames of each sequence
     views: tuple[str, ...]
-    train_views: tuple[str, ...]
-    first_unseen: int
-    methods: tuple[str, ...]
+    train_views: tuple[str, ...]  # those of the views that training saw
+    first_unseen: int  # first frame that training did not see
+    methods: tuple[str, ...]  # rows that are predictions of a method (the others are references)
     metrics: tuple[ImageMetricInfo, ...]
-    mean_color: tuple[float, float, float]
-    max_l2: float
+    mean_color: tuple[float, float, float]  # of the true foreground, in [0, 1]
+    max_l2: float  # largest per-pixel colour distance of any prediction of the first method
 
 
 @dataclass(frozen=True, eq=False)
 class ObjectCurves:
-    """Facts and arrays of one object: ``values[row][metric]``, see the module's text for shapes.
-
-    Attributes:
-        facts: what was evaluated.
-        values: the arrays.
-        record: plain data that goes into the summary as it is (``efficiency``, ``sources``, ``absent``).
-        pictures: of one sequence; they have a file of their own.
-    """
+    """Facts and arrays of one object: ``values[row][metric]``, see the module's text for shapes."""
 
     facts: ObjectFacts
     values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    record: dict[str, Any] = field(default_factory=dict)
-    pictures: Pictures | None = None
+    record: dict[str, Any] = field(default_factory=dict)  # goes into the summary as it is (efficiency, sources, ...)
+    pictures: Pictures | None = None  # of one sequence; they have a file of their own
 
     @property
     def rows(self) -> list[str]:
@@ -101,7 +80,7 @@ def save_curves(path: Path, objects: list[ObjectCurves]) -> None:
     """Writes all objects' arrays and facts into one npz (the facts as JSON text; nothing is pickled)."""
     arrays: dict[str, Any] = {}
     for curves in objects:
-        arrays[f"{curves.facts.name}/{_FACTS}"] = np.array(json.dumps(asdict(curves.facts)))
+        arrays[f"{curves.facts.name}/{_FACTS}"] = np.array(msgspec.json.encode(curves.facts).decode())
         for row, metrics in curves.values.items():
             for metric, values in metrics.items():
                 arrays[f"{curves.facts.name}/{row}/{metric}"] = values
@@ -116,9 +95,10 @@ def load_curves(path: Path) -> list[ObjectCurves]:
     """
     try:
         arrays = read_npz(path)
-    except ValueError as error:
+        texts = {n.rsplit("/", 1)[0]: str(array) for n, array in arrays.items() if n.endswith(f"/{_FACTS}")}
+        objects = {name: msgspec.json.decode(text, type=ObjectFacts) for name, text in texts.items()}
+    except (ValueError, msgspec.MsgspecError) as error:
         raise RunError(f"{path}: cannot be read ({error}). Write it with `gausim evaluate RUN`.") from error
-    objects = {n.rsplit("/", 1)[0]: _facts(str(a)) for n, a in arrays.items() if n.endswith(f"/{_FACTS}")}
     if not objects:
         raise RunError(f"{path}: holds no array '*/{_FACTS}'; expected a metrics.npz of `gausim evaluate RUN`.")
     found = {name: ObjectCurves(facts) for name, facts in objects.items()}
@@ -127,10 +107,3 @@ def load_curves(path: Path) -> list[ObjectCurves]:
         if owner in found and metric:
             found[owner].values.setdefault(row, {})[metric] = array
     return list(found.values())
-
-
-def _facts(text: str) -> ObjectFacts:
-    data: dict[str, Any] = json.loads(text)
-    metrics = tuple(ImageMetricInfo(**m) for m in data.pop("metrics"))
-    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in data.items()}
-    return ObjectFacts(**fields, metrics=metrics)

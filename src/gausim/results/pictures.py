@@ -8,10 +8,11 @@ shows one. Numbers are never computed from them.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from jaxtyping import UInt8
 
@@ -20,34 +21,25 @@ from gausim.io.npz import read_npz
 
 # What stands behind an object whose recording has no background of its own.
 PLAIN = (46, 48, 52)
-_FACTS = ("object", "sequence", "fps", "first_unseen", "views", "heldout_views")
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
-    """Pictures of one sequence of one object.
-
-    Attributes:
-        object: its name.
-        sequence: the sequence's name.
-        fps: frames per second.
-        first_unseen: first frame that training did not see.
-        views: names of the V cameras.
-        heldout_views: those of them that training never saw.
-        truth: recorded frames, RGB premultiplied with alpha.
-        predictions: the same of every method.
-        background: what the cameras saw behind the object; None where the recording does not show it.
-    """
-
+class _Facts:
     object: str
     sequence: str
     fps: float
-    first_unseen: int
-    views: tuple[str, ...]
-    heldout_views: tuple[str, ...]
-    truth: UInt8[np.ndarray, "F V h w 4"]
-    predictions: dict[str, np.ndarray] = field(default_factory=dict)
-    background: UInt8[np.ndarray, "V h w 3"] | None = None
+    first_unseen: int  # first frame that training did not see
+    views: tuple[str, ...]  # names of the V cameras
+    heldout_views: tuple[str, ...]  # those of them that training never saw
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures(_Facts):
+    """Pictures of one sequence of one object."""
+
+    truth: UInt8[np.ndarray, "F V h w 4"]  # recorded frames, RGB premultiplied with alpha
+    predictions: dict[str, np.ndarray] = field(default_factory=dict)  # the same of every method
+    background: UInt8[np.ndarray, "V h w 3"] | None = None  # what the cameras saw behind the object, where known
 
     def over_background(self, frames: UInt8[np.ndarray, "F V h w 4"]) -> UInt8[np.ndarray, "F V h w 3"]:
         """Frames over the recorded background, or over plain grey."""
@@ -60,7 +52,7 @@ def save_pictures(path: Path, pictures: list[Pictures]) -> None:
     """Writes the pictures of all objects into one npz without pickles."""
     arrays: dict[str, Any] = {}
     for item in pictures:
-        facts = {key: getattr(item, key) for key in _FACTS}
+        facts = {fact.name: getattr(item, fact.name) for fact in fields(_Facts)}
         arrays |= {f"{item.object}/facts": np.array(json.dumps(facts)), f"{item.object}/truth": item.truth}
         arrays |= {f"{item.object}/prediction/{name}": frames for name, frames in item.predictions.items()}
         if item.background is not None:
@@ -78,7 +70,7 @@ def load_pictures(path: Path) -> list[Pictures]:
         arrays = read_npz(path)
         names = [name.removesuffix("/facts") for name in arrays if name.endswith("/facts")]
         return [_pictures(name, arrays) for name in names]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, msgspec.MsgspecError) as error:
         raise RunError(f"{path}: cannot be read ({error}). Write it with `gausim evaluate RUN`.") from error
 
 
@@ -97,10 +89,10 @@ def kept_pictures(run: Path, name: str) -> list[Pictures]:
 
 
 def _pictures(name: str, arrays: dict[str, np.ndarray]) -> Pictures:
-    facts = json.loads(str(arrays[f"{name}/facts"]))
+    facts = msgspec.json.decode(str(arrays[f"{name}/facts"]), type=_Facts)
     prefix, truth = f"{name}/prediction/", arrays[f"{name}/truth"]
     predictions = {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
-    frames, views = len(truth), len(facts["views"])
+    frames, views = len(truth), len(facts.views)
     background = arrays.get(f"{name}/background")
     for array in (truth, *predictions.values()):
         if array.dtype != np.uint8 or array.ndim != 5 or array.shape != (frames, views, *truth.shape[2:4], 4):
@@ -109,14 +101,4 @@ def _pictures(name: str, arrays: dict[str, np.ndarray]) -> Pictures:
         raise ValueError("there are no pictures")
     if background is not None and (background.dtype != np.uint8 or background.shape != (*truth.shape[1:4], 3)):
         raise ValueError(f"the background has shape {background.shape}, expected {(*truth.shape[1:4], 3)}")
-    return Pictures(
-        object=str(facts["object"]),
-        sequence=str(facts["sequence"]),
-        fps=float(facts["fps"]),
-        first_unseen=int(facts["first_unseen"]),
-        views=tuple(facts["views"]),
-        heldout_views=tuple(facts["heldout_views"]),
-        truth=truth,
-        predictions=predictions,
-        background=background,
-    )
+    return Pictures(**vars(facts), truth=truth, predictions=predictions, background=background)

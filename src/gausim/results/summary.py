@@ -45,6 +45,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from gausim.core import RunError
@@ -62,6 +63,36 @@ _POINT_METRICS = {
     ERROR_3D: {"label": "3D error", "scale": 1.0, "unit": "% of diagonal", "higher_is_better": False},
     MOTION_ENERGY: {"label": "motion energy", "scale": 1.0, "unit": "", "higher_is_better": None},
 }
+
+
+class _Metric(msgspec.Struct):
+    label: str
+    scale: float
+    unit: str
+    higher_is_better: bool | None
+
+
+class _Contrast(msgspec.Struct):
+    mean_color: tuple[float, float, float]
+    norm: float
+    max_l2: float
+
+
+class _Object(msgspec.Struct):
+    """What tables are made from; files of earlier versions have no more."""
+
+    sequences: list[str]
+    splits: dict[str, tuple[int, int]]
+    metrics: dict[str, _Metric]
+    rows: dict[str, dict[str, dict[str, dict[str, dict[str, float | None]]]]]
+    methods: list[str]
+    contrast: _Contrast | None = None
+    absent: dict[str, str] = {}
+
+
+class _Summary(msgspec.Struct):
+    run: dict[str, Any]
+    objects: dict[str, _Object]
 
 
 def frame_splits(frames: int, first_unseen: int) -> dict[str, tuple[int, int]]:
@@ -186,7 +217,7 @@ def load_summary(path: Path) -> dict[str, Any]:
     """Reads a ``metrics.json``.
 
     Raises:
-        RunError: it is missing, no JSON or of another schema.
+        RunError: it is missing, no JSON, of another schema, or a field that tables need is missing or of another type.
     """
     try:
         summary = parse_json(path.read_bytes())
@@ -197,4 +228,8 @@ def load_summary(path: Path) -> dict[str, Any]:
     found = summary.get("schema") if isinstance(summary, dict) else None
     if found != SCHEMA:
         raise RunError(f"{path}: field 'schema' is {found!r}, expected {SCHEMA!r}. Run `gausim evaluate RUN` again.")
-    return summary
+    try:
+        msgspec.convert(summary, _Summary)
+    except msgspec.ValidationError as error:
+        raise RunError(f"{path}: {error}. Run `gausim evaluate RUN` again.") from error
+    return dict(summary)

@@ -2,116 +2,88 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from gausim.report.gather.study import number
+from gausim.report.gather.runs import dig
 from gausim.results.curves import TRUTH
 
+Number = float | None
 
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """How one row moves.
+
+class Motion(msgspec.Struct):
+    """How one row moves; None where a figure is not defined, and no phase, cosine or levels where there are none.
 
     Attributes:
         spectrum: power per frequency.
-        frequencies: of each principal motion [Hz]; NaN where unknown.
-        dampings: fraction of critical; NaN where it does not oscillate.
-        phase_error: per frame [degrees]; empty for the truth.
-        cosine: of the first velocity to the true one; NaN for the truth.
-        levels: error over the static prediction's of the units of each level, the small ones first; empty where there
-            is no hierarchy.
+        frequencies: of each principal motion [Hz].
+        dampings: fraction of critical.
+        phase_error: per frame [degrees].
+        velocity_cosine: of the first velocity to the true one.
+        level_errors: over the static prediction's, of the units of each level of a hierarchy, the small ones first.
     """
 
-    spectrum: np.ndarray
-    frequencies: np.ndarray
-    dampings: np.ndarray
-    phase_error: np.ndarray
-    cosine: float
-    levels: np.ndarray
-
-    @property
-    def small(self) -> float:
-        """Error of the smallest units; NaN without a hierarchy."""
-        return float(self.levels[0]) if len(self.levels) else float("nan")
-
-    @property
-    def large(self) -> float:
-        """Error of the largest units; NaN without a hierarchy."""
-        return float(self.levels[-1]) if len(self.levels) else float("nan")
+    spectrum: list[float]
+    frequencies: list[Number]
+    dampings: list[Number]
+    phase_error: list[Number] = []
+    velocity_cosine: Number = None
+    level_errors: list[Number] = []
 
 
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
+class Diagnosis(msgspec.Struct):
     """What is known of the motions of one object.
 
     Attributes:
-        fraction: of the squared displacement in each principal motion.
+        share: of the squared displacement in each principal motion.
         frequency: of the spectra [Hz].
-        first_unseen: first frame that training did not see.
         rows: the truth and the predictions.
+        first_unseen: first frame that training did not see.
     """
 
-    fraction: np.ndarray
-    frequency: np.ndarray
-    first_unseen: int
-    rows: Mapping[str, Motion]
+    share: list[float]
+    frequency: list[float]
+    rows: dict[str, Motion]
+    first_unseen: int = 0
 
     def frequency_error(self, row: str) -> float:
-        """Mean over principal motions, weighted by :attr:`fraction`, of the relative error of the frequency."""
-        found, true = self.rows[row].frequencies, self.rows[TRUTH].frequencies
+        """Mean over principal motions, weighted by :attr:`share`, of the relative error of the frequency."""
+        found, true = (numbers(self.rows[r].frequencies) for r in (row, TRUTH))
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._mean(np.where(true > 0, np.abs(found / true - 1), np.nan))
 
     def damping_ratio(self, row: str) -> float:
         """Predicted over true damping, both as weighted means over the principal motions that oscillate in both."""
-        found, true = self.rows[row].dampings, self.rows[TRUTH].dampings
-        both = np.isfinite(found) & np.isfinite(true)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return float(self._mean(np.where(both, found, np.nan)) / self._mean(np.where(both, true, np.nan)))
+        both = np.stack([numbers(self.rows[r].dampings) for r in (row, TRUTH)])
+        found, true = np.where(np.isfinite(both).all(0), both, np.nan)
+        return self._mean(found) / (self._mean(true) or float("nan"))
 
     def phase(self, row: str, *, seen: bool) -> float:
         """Mean phase error of the seen or the unseen frames [degrees]."""
-        values = self.rows[row].phase_error
-        return _nanmean(values[: self.first_unseen] if seen else values[self.first_unseen :])
+        values = numbers(self.rows[row].phase_error)
+        part = values[: self.first_unseen] if seen else values[self.first_unseen :]
+        return float(part[np.isfinite(part)].mean()) if np.isfinite(part).any() else float("nan")
 
     def _mean(self, values: np.ndarray) -> float:
-        known = np.isfinite(values)
-        total = float(self.fraction[known].sum())
-        return float((self.fraction[known] * values[known]).sum() / total) if total > 0 else float("nan")
+        known, share = np.isfinite(values), numbers(self.share)
+        return float(np.average(values[known], weights=share[known])) if share[known].any() else float("nan")
 
 
 def read_diagnosis(entry: Mapping[str, Any]) -> Diagnosis | None:
     """The diagnosis of an object's entry in metrics.json; None where there is none that makes sense."""
-    found, splits = entry.get("diagnosis"), entry.get("splits")
-    if not isinstance(found, dict) or not isinstance(found.get("rows"), dict) or not isinstance(splits, dict):
+    try:
+        found = msgspec.convert(entry.get("diagnosis"), Diagnosis)
+        found.first_unseen = msgspec.convert(dig(entry, "splits", "seen"), tuple[int, int])[1]
+    except msgspec.ValidationError:
         return None
-    fraction, frequency, seen = _numbers(found.get("share")), _numbers(found.get("frequency")), splits.get("seen")
-    rows = {str(k): _motion(v, len(fraction), len(frequency)) for k, v in found["rows"].items() if isinstance(v, dict)}
-    known = {name: motion for name, motion in rows.items() if motion is not None}
-    if TRUTH not in known or not isinstance(seen, list) or len(seen) != 2 or not isinstance(seen[1], int):
-        return None
-    return Diagnosis(fraction, frequency, seen[1], known)
+    size = len(found.frequency), len(found.share), len(found.share)
+    sizes = {(len(m.spectrum), len(m.frequencies), len(m.dampings)) for m in found.rows.values()}
+    return found if TRUTH in found.rows and sizes == {size} and all(size) else None
 
 
-def _motion(row: Mapping[str, Any], motions: int, bins: int) -> Motion | None:
-    power, frequencies, dampings = (_numbers(row.get(key)) for key in ("spectrum", "frequencies", "dampings"))
-    if not bins or not motions or (len(power), len(frequencies), len(dampings)) != (bins, motions, motions):
-        return None
-    (cosine,) = _numbers([row.get("velocity_cosine")])
-    phase = _numbers(row.get("phase_error"))
-    levels = _numbers(row.get("level_errors"))
-    return Motion(power, frequencies, dampings, phase, float(cosine), levels)
-
-
-def _numbers(values: Any) -> np.ndarray:
-    found = [number(v) for v in values] if isinstance(values, list) else []
-    return np.array([np.nan if v is None else v for v in found], float)
-
-
-def _nanmean(values: np.ndarray) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else float("nan")
+def numbers(values: Sequence[Number]) -> np.ndarray:
+    """The figures as an array, NaN where one is not defined."""
+    return np.array(values, float)

@@ -8,6 +8,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,7 @@ _KEYS_OF_A_RUN = {"model", "data", "seed"}
 # Keys that do not change what is computed, or that only tell seeds apart.
 _FREE = ("paths", "logger", "callbacks", "sweep", "task_name", "evaluate", "seed", "data.seed", "trainer")
 _DIGITS = 12  # of hashes and commits
-# A refusal instead of a hang on a file that no run writes.
-_LARGEST_CONFIG = 1 << 20
+_HYDRA = ".hydra"  # Hydra's own folder, also of a job that never came to a run of its own
 
 EVALUATED, NOT_EVALUATED, UNFINISHED = "evaluated", "not evaluated", "unfinished"
 FAILURE, BROKEN = "failed", "broken files"
@@ -33,25 +33,15 @@ FAILURE, BROKEN = "failed", "broken files"
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """One run directory.
-
-    Attributes:
-        path: the directory.
-        name: its path below the searched directory.
-        status: one of the constants of this module.
-        detail: what more is known of the status, for people.
-        config: its configuration; empty where it is unreadable.
-        choices: Hydra's choice of every config group, where known.
-        summary: the content of ``evaluation/metrics.json``; None without one.
-    """
+    """One run directory."""
 
     path: Path
-    name: str
-    status: str
-    detail: str
-    config: dict[str, Any] = field(default_factory=dict, repr=False)
-    choices: dict[str, str] = field(default_factory=dict, repr=False)
-    summary: dict[str, Any] | None = field(default=None, repr=False)
+    name: str  # its path below the searched directory
+    status: str  # one of the constants above
+    detail: str  # what more is known of the status, for people
+    config: dict[str, Any] = field(default_factory=dict, repr=False)  # empty where it is unreadable
+    choices: dict[str, str] = field(default_factory=dict, repr=False)  # Hydra's, of every config group
+    summary: dict[str, Any] | None = field(default=None, repr=False)  # content of evaluation/metrics.json
 
     @property
     def seed(self) -> Any:
@@ -59,10 +49,19 @@ class RunRecord:
         return self.config.get("seed", "?")
 
     @property
+    def objects(self) -> dict[str, dict[str, Any]]:
+        """What its evaluation has of every object."""
+        return (self.summary or {}).get("objects", {})
+
+    @cached_property
     def settings(self) -> dict[str, str]:
         """Dotted keys and values of what is computed, seeds aside."""
-        flat = dict(flatten(self.config))
-        return {k: v for k, v in flat.items() if not any(k == f or k.startswith(f"{f}.") for f in _FREE)}
+        return self.settings_besides(())
+
+    def settings_besides(self, keys: tuple[str, ...]) -> dict[str, str]:
+        """The settings but those of the groups ``keys``."""
+        flat = flatten(self.config)
+        return {k: v for k, v in flat if not any(k == f or k.startswith(f"{f}.") for f in (*_FREE, *keys))}
 
     @property
     def config_hash(self) -> str:
@@ -93,12 +92,11 @@ class RunRecord:
     @property
     def data_hashes(self) -> dict[str, tuple[str, str]]:
         """First digits of the hashes of every object's scene and manifest; ``?`` where they were not recorded."""
-        found = {}
-        for name, entry in (self.summary or {}).get("objects", {}).items():
-            both = (dig(entry, "sources", key, "sha256") for key in ("scene", "manifest"))
-            scene, manifest = (digest[:_DIGITS] if isinstance(digest, str) else "?" for digest in both)
-            found[name] = scene, manifest
-        return found
+
+        def digits(entry: dict[str, Any], key: str) -> str:
+            return (dig(entry, "sources", key, "sha256") or "?")[:_DIGITS]
+
+        return {name: (digits(entry, "scene"), digits(entry, "manifest")) for name, entry in self.objects.items()}
 
     @property
     def is_from_unfinished(self) -> bool:
@@ -157,7 +155,7 @@ def _run_folders(root: Path, skip: Path | None) -> Iterator[Path]:
         if CONFIG in files and _is_run(folder):
             folders.clear()
             alive.append(folder)
-        elif (folder / ".hydra" / CONFIG).is_file():
+        elif (folder / _HYDRA / CONFIG).is_file():
             dead.append(folder)
     dead = [d for d in dead if not any(a.is_relative_to(d) for a in alive)]
     yield from sorted(alive + dead)
@@ -174,17 +172,11 @@ def _yaml(path: Path) -> dict[str, Any]:
     """A mapping from a YAML file, with the safe loader: no tag builds an object.
 
     Raises:
-        RunError: the file is missing, too large, no YAML or no mapping.
+        RunError: the file is missing, no YAML or no mapping.
     """
     try:
-        if path.stat().st_size > _LARGEST_CONFIG:
-            raise RunError(f"{path}: has more than {_LARGEST_CONFIG} bytes; no configuration is that long.")
-        text = path.read_text()
-        # Aliases let a short file stand for a huge one; what a run writes has none.
-        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text, Loader=yaml.SafeLoader)):
-            raise RunError(f"{path}: has YAML aliases, which no run writes.")
-        loaded = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
+        loaded = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise RunError(f"{path}: cannot be read as YAML ({type(error).__name__}).") from error
     if not isinstance(loaded, dict):
         raise RunError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
@@ -193,39 +185,38 @@ def _yaml(path: Path) -> dict[str, Any]:
 
 def _read_run(folder: Path, name: str) -> RunRecord:
     choices = _choices(folder)
-    own = folder / CONFIG if (folder / CONFIG).is_file() else folder / ".hydra" / CONFIG
+    is_run = (folder / CONFIG).is_file()
+    path = (folder if is_run else folder / _HYDRA) / CONFIG
     try:
-        config = with_present_names(_yaml(own))
+        config = with_present_names(_yaml(path))
     except RunError as error:
         return RunRecord(folder, name, BROKEN, str(error), choices=choices)
     except (IndexError, TypeError, ValueError) as error:
-        return RunRecord(folder, name, BROKEN, f"{own}: its levels cannot be read ({error}).", choices=choices)
+        return RunRecord(folder, name, BROKEN, f"{path}: its levels cannot be read ({error}).", choices=choices)
     metrics = folder / EVALUATION
     if metrics.is_file():
         try:
-            summary = check_summary(load_summary(metrics), metrics)
-        except (RunError, OSError, UnicodeDecodeError) as error:
+            summary = load_summary(metrics)
+        except (RunError, OSError) as error:
             return RunRecord(folder, name, BROKEN, str(error), config, choices)
         unfinished = summary["run"].get("finished") is False
-        detail = f"measured before it was finished, {progress(folder)}" if unfinished else ""
+        detail = f"measured before it was finished, {_progress(folder)}" if unfinished else ""
         return RunRecord(folder, name, EVALUATED, detail, config, choices, summary)
-    return RunRecord(folder, name, *_state(folder, own), config, choices)
+    return RunRecord(folder, name, *_state(folder, is_run), config, choices)
 
 
-def _state(folder: Path, config: Path) -> tuple[str, str]:
+def _state(folder: Path, is_run: bool) -> tuple[str, str]:
     if (folder / FAILED).is_file():
-        with (folder / FAILED).open("rb") as file:  # a long traceback may stand above the line that matters
-            file.seek(max(0, (folder / FAILED).stat().st_size - 4000))
-            lines = file.read().decode(errors="replace").strip().splitlines()
+        lines = (folder / FAILED).read_text(errors="replace").strip().splitlines()
         return FAILURE, lines[-1] if lines else ""
     if (folder / FINISHED).is_file():
         return NOT_EVALUATED, f"gausim evaluate {folder}"
-    if config.parent.name == ".hydra":
+    if not is_run:
         return FAILURE, "ended before training began"
-    return UNFINISHED, f"killed, or still running: {progress(folder)}"
+    return UNFINISHED, f"killed, or still running: {_progress(folder)}"
 
 
-def progress(folder: Path) -> str:
+def _progress(folder: Path) -> str:
     """How far a run's own table of epochs goes."""
     try:
         with (folder / EPOCHS).open(newline="", errors="replace") as file:
@@ -237,35 +228,7 @@ def progress(folder: Path) -> str:
 
 def _choices(folder: Path) -> dict[str, str]:
     try:
-        node: Any = _yaml(folder / ".hydra" / "hydra.yaml")
+        node = dig(_yaml(folder / _HYDRA / "hydra.yaml"), "hydra", "runtime", "choices")
     except RunError:
         return {}
-    node = dig(node, "hydra", "runtime", "choices")
     return {str(k): str(v) for k, v in node.items()} if isinstance(node, dict) else {}
-
-
-def check_summary(summary: dict[str, Any], path: Path) -> dict[str, Any]:
-    """The summary, if it has the shape that tables are made from.
-
-    Raises:
-        RunError: a field is missing or of another type.
-    """
-    shapes: dict[str, type] = {"sequences": list, "splits": dict, "metrics": dict, "rows": dict, "methods": list}
-    objects = summary.get("objects")
-    problem = None
-    if not isinstance(objects, dict) or not isinstance(summary.get("run"), dict):
-        problem = "'objects' and 'run'"
-    else:
-        for name, entry in objects.items():
-            wrong = [k for k, t in shapes.items() if not isinstance(entry, dict) or not isinstance(entry.get(k), t)]
-            if not wrong and not all(_is_range(split) for split in entry["splits"].values()):
-                wrong = ["splits"]
-            if wrong:
-                problem = f"'objects.{name}.{wrong[0]}'"
-    if problem:
-        raise RunError(f"{path}: field {problem} is missing or of another type. Run `gausim evaluate RUN` again.")
-    return summary
-
-
-def _is_range(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2 and all(type(v) is int for v in value)

@@ -32,18 +32,11 @@ About = dict[tuple[str, ...], tuple[RunRecord, ...]]
 
 @dataclass(frozen=True)
 class Value:
-    """A figure of a row: over sequences, and over seeds where there are several.
+    """A figure of a row: over sequences, and over seeds where there are several."""
 
-    Attributes:
-        mean: of all seeds' means over sequences.
-        std: standard deviation over sequences (over seeds: root of the mean square); None where there is none.
-        seed_std: standard deviation of the seeds' means (n - 1); None for one seed.
-        seeds: how many.
-    """
-
-    mean: float
-    std: float | None
-    seed_std: float | None
+    mean: float  # of all seeds' means over sequences
+    std: float | None  # standard deviation over sequences (over seeds: root of the mean square)
+    seed_std: float | None  # standard deviation of the seeds' means (n - 1); None for one seed
     seeds: int
 
 
@@ -60,20 +53,14 @@ class Cell:
 class Group:
     """Runs of one configuration and one method of their summaries; they differ by their seeds.
 
-    Attributes:
-        label: name of the row.
-        family: the model's name, without what was varied.
-        variation: what was varied, ``full`` for nothing.
-        method: row of the summaries.
-        about: the runs, evaluated ones or not, by the objects that they are about. A network per object, each of the
-            same configuration, is one group; so is one network of several objects.
+    A network per object, each of the same configuration, is one group; so is one network of several objects.
     """
 
-    label: str
-    family: str
-    variation: str
-    method: str
-    about: About
+    label: str  # name of the row
+    family: str  # the model's name, without what was varied
+    variation: str  # what was varied
+    method: str  # row of the summaries
+    about: About  # the runs, evaluated ones or not
 
     @property
     def runs(self) -> tuple[RunRecord, ...]:
@@ -105,40 +92,27 @@ class Group:
 
     def entries(self, name: str) -> list[tuple[RunRecord, dict[str, Any]]]:
         """Evaluated runs and their entries of an object."""
-        return [(r, r.summary["objects"][name]) for r in self.of(name) if r.summary and name in r.summary["objects"]]
+        return [(r, r.objects[name]) for r in self.of(name) if name in r.objects]
 
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Everything that a report is about.
-
-    Attributes:
-        runs: all runs.
-        groups: rows of the tables.
-        objects: columns, those with numbers first.
-        notes: what a reader must know to trust the tables.
-    """
+    """Everything that a report is about."""
 
     runs: tuple[RunRecord, ...]
-    groups: tuple[Group, ...]
-    objects: tuple[str, ...]
-    notes: tuple[str, ...]
+    groups: tuple[Group, ...]  # rows of the tables
+    objects: tuple[str, ...]  # columns, those with numbers first
+    notes: tuple[str, ...]  # what a reader must know to trust the tables
 
-    def splits(self, name: str) -> dict[str, tuple[int, int]]:
+    def splits(self, name: str) -> dict[str, Sequence[int]]:
         """Ranges of frames of an object, as its first evaluated run has them."""
-        for group in self.groups:
-            for _, entry in group.entries(name):
-                return {key: (split[0], split[1]) for key, split in entry["splits"].items()}
-        return {}
+        entries = (entry for group in self.groups for _, entry in group.entries(name))
+        return dict(next(entries, {"splits": {}})["splits"])
 
     def info(self, metric: str) -> dict[str, Any] | None:
         """How a metric is printed; None where no run has it."""
-        for group in self.groups:
-            for run in group.evaluated:
-                for entry in (run.summary or {})["objects"].values():
-                    if isinstance(entry["metrics"].get(metric), dict):
-                        return entry["metrics"][metric]
-        return None
+        entries = (entry for group in self.groups for run in group.evaluated for entry in run.objects.values())
+        return next((entry["metrics"][metric] for entry in entries if metric in entry["metrics"]), None)
 
 
 def make_study(runs: Sequence[RunRecord]) -> Study:
@@ -159,7 +133,7 @@ def make_study(runs: Sequence[RunRecord]) -> Study:
     families = list(dict.fromkeys(g.family for g in groups))
     groups.sort(key=lambda g: (families.index(g.family), _place(g.variation)))
     # Dictionaries keep the order and drop what comes twice.
-    known = dict.fromkeys(o for g in groups for run in g.evaluated for o in (run.summary or {})["objects"])
+    known = dict.fromkeys(o for g in groups for run in g.evaluated for o in run.objects)
     every = known | dict.fromkeys(o for g in groups for o in g.objects)
     return Study(tuple(runs), tuple(groups), tuple(every), tuple(_notes(groups)))
 
@@ -180,15 +154,9 @@ def _rows(members: Sequence[tuple[RunRecord, ...]], runs: Sequence[RunRecord]) -
 
 def _continues(row: About, names: tuple[str, ...], run: RunRecord) -> bool:
     """Whether a run on one object belongs to a row of single objects: another object, the same settings besides."""
-    if names in row or any(len(other) > 1 for other in row):
-        return False
     first = next(iter(row.values()))[0]
-    return bool(run.config) and bool(first.config) and _without_data(first) == _without_data(run)
-
-
-def _without_data(run: RunRecord) -> dict[str, str]:
-    """The settings that do not say which object it is."""
-    return {k: v for k, v in run.settings.items() if not any(k == d or k.startswith(f"{d}.") for d in _WHICH_OBJECT)}
+    settings, own = (r.settings_besides(_WHICH_OBJECT) for r in (first, run))
+    return names not in row and all(len(other) == 1 for other in row) and bool(run.config) and settings == own
 
 
 def _place(variation: str) -> list[int]:
@@ -199,9 +167,7 @@ def _place(variation: str) -> list[int]:
 
 def _methods(same: Sequence[RunRecord]) -> list[tuple[str | None, str]]:
     """Methods of the summaries: (what is added to the label, row); usually one and nothing."""
-    rows = dict.fromkeys(
-        str(m) for r in same if r.summary for entry in r.summary["objects"].values() for m in entry["methods"]
-    )
+    rows = dict.fromkeys(m for r in same for entry in r.objects.values() for m in entry["methods"])
     return [(None, next(iter(rows), ""))] if len(rows) < 2 else [(m, m) for m in rows]
 
 
@@ -209,8 +175,8 @@ def _objects(same: Sequence[RunRecord], runs: Sequence[RunRecord]) -> tuple[str,
     """What the runs are about: from their summaries, else from a run on the same data, else the data's directory."""
     for pool in (same, [r for r in runs if _data(r) == _data(same[0])]):
         for run in pool:
-            if run.summary is not None:
-                return tuple(run.summary["objects"])
+            if run.objects:
+                return tuple(run.objects)
     names, root = _data(same[0])
     if isinstance(names, list) and names:
         return tuple(str(n) for n in names)
@@ -228,28 +194,22 @@ _SWITCHES = ("no_mass", "no_momentum", "no_hierarchy")  # ablations that are tol
 
 def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
     """(label, family, variation) from what the configuration computes, not from what it is called."""
-    model = run.config.get("model")
-    simulator = model.get("simulator", {}) if isinstance(model, dict) else {}
-    simulator = simulator if isinstance(simulator, dict) else {}
+    simulator = dig(run.config, "model", "simulator")
     family = run.choices.get("model") or str(run.config.get("name") or run.name)
-    varied = ["jointly"] if objects > 1 else []
-    if simulator.get("conserve_mass") is False:
-        varied.append("w/o mass")
-    if simulator.get("conserve_momentum") is False:
-        varied.append("w/o momentum")
-    hierarchy = simulator.get("hierarchy")
-    levels = hierarchy.get("levels") if isinstance(hierarchy, dict) else None
-    alone = levels[0] if isinstance(levels, list) and len(levels) == 1 else None
-    if isinstance(alone, dict) and alone.get("diameter") == 0:
-        varied.append("w/o hierarchy")
-    ablation = run.config.get("ablation")
-    name = ablation.get("name") if isinstance(ablation, dict) else None
-    parts = [part for part in str(name or "none").split("+") if part not in ("none", "full", "joint")]
-    if varied not in ([], ["jointly"]):  # what is switched off has been named; of a list, the others have not
-        parts = [part for part in parts if part not in _SWITCHES] if "+" in str(name) else []
-    varied += parts
+    levels = dig(simulator, "hierarchy", "levels")
+    is_flat = isinstance(levels, list) and len(levels) == 1 and dig(levels[0], "diameter") == 0
+    off = [word for word, is_off in (
+        ("w/o mass", dig(simulator, "conserve_mass") is False),
+        ("w/o momentum", dig(simulator, "conserve_momentum") is False),
+        ("w/o hierarchy", is_flat),
+    ) if is_off]  # fmt: skip
+    name = str(dig(run.config, "ablation", "name") or "none")
+    parts = [part for part in name.split("+") if part not in ("none", "full", "joint")]
+    if off:  # what is switched off has been named; of a list, the others have not
+        parts = [part for part in parts if part not in _SWITCHES] if "+" in name else []
+    varied = [*(["jointly"] if objects > 1 else []), *off, *parts]
     variation = ", ".join(varied) or FULL
-    return (family if not varied else f"{family} {variation}"), family, variation
+    return (f"{family} {variation}" if varied else family), family, variation
 
 
 def _distinct(labels: list[tuple[str, str, str]], members: Sequence[About]) -> list[tuple[str, str, str]]:
@@ -334,21 +294,8 @@ def _notes(groups: Sequence[Group]) -> list[str]:
 
 
 def cell(group: Group, name: str, split: str, views: str, metric: str, *, row: str | None = None) -> Cell:
-    """A figure of a group on an object, pooled over its seeds.
-
-    Args:
-        group: the row.
-        name: the object.
-        split: range of frames.
-        views: ``train``, ``heldout`` or ``points``.
-        metric: its key.
-        row: another row of the same summaries (a reference); the group's own method when None.
-    """
-
-    def find(entry: dict[str, Any]) -> Any:
-        return dig(entry["rows"], row or group.method, split, views, metric)
-
-    return pooled(group, name, find, metric)
+    """A figure of a group on an object, pooled over its seeds: of its method, or of a reference ``row``."""
+    return pooled(group, name, lambda entry: dig(entry["rows"], row or group.method, split, views, metric), metric)
 
 
 def pooled(group: Group, name: str, find: Callable[[dict[str, Any]], Any], metric: str) -> Cell:
@@ -363,12 +310,11 @@ def pooled(group: Group, name: str, find: Callable[[dict[str, Any]], Any], metri
     found = [(run, find(entry)) for run, entry in entries]
     # Sequences at rest spoil a mean of ratios; the pooled ratio is what tables show of the energy.
     key = "pooled" if metric == MOTION_ENERGY else "mean"
-    numbers = [(run, number(dig(c, key)), number(dig(c, "std"))) for run, c in found]
+    numbers = [(run, dig(c, key), dig(c, "std")) for run, c in found]
     valid = [(run, mean, std) for run, mean, std in numbers if mean is not None]
     if not valid:
         absent = [dig(entry, "absent", metric) for _, entry in entries]
-        reason = next((a for a in absent if isinstance(a, str)), NOT_MEASURED)
-        return Cell(None, reason, tuple(run for run, _ in entries))
+        return Cell(None, next(filter(None, absent), NOT_MEASURED), tuple(run for run, _ in entries))
     means = [mean for _, mean, _ in valid]
     stds = [std for _, _, std in valid if std is not None]
     std = math.sqrt(sum(s * s for s in stds) / len(stds)) if stds and metric != MOTION_ENERGY else None

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from gausim.io.files import replacing
@@ -43,7 +42,6 @@ def draw_clusters(
         flip: draw the vertical axis downwards (scenes whose up is negative).
     """
     figure = Figure(figsize=(4.2 * len(labels), 8.4), layout="constrained")
-    FigureCanvasAgg(figure)
     figure.suptitle(title)
     panels = figure.subplots(2, len(labels), squeeze=False)
     area = min(POINT_AREA, max(0.3, POINT_AREA * 1e3 / len(means)))

@@ -21,13 +21,7 @@ _REFERENCE_COLORS = ("#555555", "#999999", "#bbbbbb")
 
 
 def error_figure(curves: ObjectCurves, path: Path, *, sequence: str | None = None) -> None:
-    """Errors over time of every row: 3D where truth exists, then l2 in the training and held-out views.
-
-    Args:
-        curves: the evaluated object.
-        path: PNG to write.
-        sequence: one sequence; mean over all, with a band of one standard deviation for the methods, when None.
-    """
+    """Writes the errors over time of one sequence, or their mean over all sequences."""
     facts = curves.facts
     title = f"{facts.name}, {sequence or f'mean over {len(facts.sequences)} sequences'}"
     save_figure(error_plot([(row, [(curves, row)]) for row in curves.rows], title=title, sequence=sequence), path)
@@ -36,10 +30,11 @@ def error_figure(curves: ObjectCurves, path: Path, *, sequence: str | None = Non
 def error_plot(
     rows: Sequence[tuple[str, Sequence[tuple[ObjectCurves, str]]]], *, title: str = "", sequence: str | None = None
 ) -> Figure:
-    """The same of rows that may come from several evaluations.
+    """Errors over time of every row: 3D where truth exists, then l2 in the training and held-out views.
 
     Args:
-        rows: label, and the evaluations (seeds) with the name of their row; mean and band are over all of them.
+        rows: label, and the evaluations (seeds) with the name of their row; the mean and, for methods, a band of one
+            standard deviation are over all of them.
         title: heading.
         sequence: one sequence; all when None.
     """
@@ -48,14 +43,13 @@ def error_plot(
     every = [(curves, row) for _, members in rows for curves, row in members]
     if any(ERROR_3D in curves.values.get(row, {}) for curves, row in every):
         panels.insert(0, (ERROR_3D, "points"))
-    figure = Figure(figsize=(4.4 * len(panels), 3.4), dpi=_DPI, layout="constrained")
-    for axes, panel in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
+    figure, places = made_figure(1, len(panels), (4.4 * len(panels), 3.4), title)
+    for axes, panel in zip(places, panels, strict=True):
         _error_panel(axes, rows, panel, sequence)
         axes.set(xlim=(0, max(first.facts.frames) - 1))
         axes.axvspan(-0.5, first.facts.first_unseen - 0.5, color=SEEN_SHADE, zorder=0, label="seen in training")
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=min(5, len(labels)), fontsize=7)
-    figure.suptitle(title, fontsize=10)
     return figure
 
 
@@ -114,8 +108,8 @@ def slices_plot(
     """
     rows, wide = len(columns[0][1]), len(columns) > 1
     size = (5.2 * len(columns) if wide else 7.0, 1.5 * rows + 0.6 if wide else 2.6 * rows)
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-    grid = figure.subplots(rows, len(columns), squeeze=False)
+    figure, places = made_figure(rows, len(columns), size)
+    grid = places.reshape(rows, len(columns))
     lines = [moving_line(films[0][1]) for _, films in columns]
     for column, (panels, (title, films), line) in enumerate(zip(grid.T, columns, lines, strict=True)):
         for axes, (label, frames) in zip(panels, films, strict=True):
@@ -136,12 +130,7 @@ def slice_figure(
 ) -> tuple[str, int]:
     """Writes space-time slices of truth (without it, of the prediction alone) above prediction; returns their line.
 
-    Args:
-        truth: (F, H, W, 3) uint8, of any length; without it the prediction chooses the line.
-        prediction: (F, H, W, 3) uint8.
-        path: PNG to write.
-        title: sequence and view.
-        first_unseen: first frame that training did not see.
+    Films are (F, H, W, 3) uint8, of any length; a mark stands before ``first_unseen``.
     """
     films = [] if truth is None else [("ground truth", truth)]
     figure, lines = slices_plot([(title, [*films, ("prediction", prediction)])], first_unseen)
@@ -159,17 +148,11 @@ def contact_frames(frames: int, first_unseen: int, count: int = 8) -> list[int]:
 def panels_plot(
     rows: Sequence[tuple[str, Sequence[np.ndarray | None]]], heads: Sequence[tuple[str, bool]], *, title: str = ""
 ) -> Figure:
-    """Pictures in rows and columns.
-
-    Args:
-        rows: label, and (H, W, 3) uint8 pictures; a place of None stays empty.
-        heads: of the columns, and whether they are foreseen, which an orange heading tells.
-        title: heading.
-    """
+    """Labelled rows of (H, W, 3) uint8 pictures (None: an empty place); heads of foreseen columns are orange."""
     height, width = next(image.shape[:2] for _, images in rows for image in images if image is not None)
     size = (1.25 * len(heads), 1.25 * height / width * len(rows) + (0.6 if title else 0.3))
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
-    grid = figure.subplots(len(rows), len(heads), squeeze=False)
+    figure, places = made_figure(len(rows), len(heads), size, title)
+    grid = places.reshape(len(rows), len(heads))
     for panels, (label, images) in zip(grid, rows, strict=True):
         for axes, image in zip(panels, images, strict=True):
             axes.set(xticks=[], yticks=[])
@@ -178,8 +161,6 @@ def panels_plot(
         panels[0].set_ylabel(label, fontsize=8)
     for axes, (head, foreseen) in zip(grid[0], heads, strict=True):
         axes.set_title(head, fontsize=7, color="#c2410c" if foreseen else "black")
-    if title:
-        figure.suptitle(title, fontsize=10)
     return figure
 
 
@@ -188,12 +169,7 @@ def contact_sheet(
 ) -> None:
     """Chosen frames of truth, prediction and error under one another; foreseen frames carry an orange number.
 
-    Args:
-        truth: (F, H, W, 3) uint8, or None; frames beyond its end stay empty.
-        prediction: (F, H, W, 3) uint8.
-        path: PNG to write.
-        title: sequence and view.
-        first_unseen: first frame that training did not see.
+    Films are (F, H, W, 3) uint8; frames beyond the end of the truth stay empty.
     """
     chosen = contact_frames(len(prediction), first_unseen)
     rows: list[tuple[str, list[np.ndarray | None]]] = [("prediction", [prediction[f] for f in chosen])]
@@ -208,15 +184,21 @@ def contact_sheet(
 def picture_grid(images: Sequence[np.ndarray], labels: Sequence[str], path: Path, *, title: str, columns: int) -> None:
     """Labelled (H, W, 3) uint8 pictures in rows of ``columns``, as PNG."""
     ratio, rows = images[0].shape[0] / images[0].shape[1], -(-len(images) // columns)
-    figure = Figure(figsize=(3.2 * columns, (3.2 * ratio + 0.3) * rows + 0.3), dpi=_DPI, layout="constrained")
-    places = figure.subplots(rows, columns, squeeze=False).ravel()
+    figure, places = made_figure(rows, columns, (3.2 * columns, (3.2 * ratio + 0.3) * rows + 0.3), title)
     for axes in places:
         axes.set_axis_off()
     for axes, image, label in zip(places, images, labels, strict=False):  # the last row may have places left
         axes.imshow(image)
         axes.set_title(label, fontsize=8)
-    figure.suptitle(title, fontsize=10)
     save_figure(figure, path)
+
+
+def made_figure(rows: int, columns: int, size: tuple[float, float], title: str = "") -> tuple[Figure, np.ndarray]:
+    """A figure of this size [inches] with its axes, row by row."""
+    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    if title:
+        figure.suptitle(title, fontsize=10)
+    return figure, figure.subplots(rows, columns, squeeze=False).ravel()
 
 
 def save_figure(figure: Figure, path: Path) -> None:

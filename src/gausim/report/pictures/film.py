@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -22,28 +22,16 @@ _WIDEST, _HIGHEST, _SHORT = 352, 400, 4.0
 
 @dataclass(frozen=True)
 class Film:
-    """A video of truth, prediction and error side by side.
-
-    Attributes:
-        uri: the MP4 as a data URI.
-        poster: its picture before it plays, a data URI.
-        width: of the video [pixels].
-        caption: what it shows.
-    """
+    """A video of truth, prediction and error side by side: data URIs of the MP4 and of its picture before it plays."""
 
     uri: str
     poster: str
-    width: int
+    width: int  # [pixels]
     caption: str
 
 
 def make_film(run: RunRecord, name: str, method: str) -> Film:
-    """The video of an evaluated run, in the first view never trained on, else in the first view.
-
-    Args:
-        run: the run.
-        name: the object.
-        method: row of the evaluation.
+    """The video of an evaluated run and object, in the first view never trained on, else in the first view.
 
     Raises:
         RunError: the evaluation kept no pictures of this object and method, or they cannot be read.
@@ -55,33 +43,20 @@ def make_film(run: RunRecord, name: str, method: str) -> Film:
             f"{shlex.quote(str(run.path))}`."
         )
     view = next((i for i, v in enumerate(found.views) if v in found.heldout_views), 0)
-    seen_by = _one_view(found, view)
-    gain, slow = light_gain(seen_by.truth), 2 if len(found.truth) < _SHORT * found.fps else 1
-    frames = list(_frames(seen_by, method, gain))
+    gain, slow = light_gain(found.truth[:, view]), 2 if len(found.truth) < _SHORT * found.fps else 1
+    frames = list(_frames(found, method, view, gain))
     poster = frames[min(found.first_unseen, len(frames) - 1)]
     uri = video_uri(frames, found.fps / slow)
-    return Film(uri, _jpeg(poster), poster.shape[1], _caption(seen_by, gain, slow))
+    return Film(uri, _jpeg(poster), poster.shape[1], _caption(found, found.views[view], gain, slow))
 
 
-def _one_view(pictures: Pictures, view: int) -> Pictures:
-    one = slice(view, view + 1)
-    background = None if pictures.background is None else pictures.background[one]
-    predictions = {name: frames[:, one] for name, frames in pictures.predictions.items()}
-    return replace(
-        pictures,
-        views=pictures.views[one],
-        truth=pictures.truth[:, one],
-        predictions=predictions,
-        background=background,
-    )
-
-
-def _frames(pictures: Pictures, method: str, gain: float) -> Iterator[np.ndarray]:
+def _frames(pictures: Pictures, method: str, view: int, gain: float) -> Iterator[np.ndarray]:
     height, width = pictures.truth.shape[2:4]
     zoom = min(_WIDEST / width, _HIGHEST / height)
     # The encoder takes even sizes.
     size = 2 * max(1, round(width * zoom / 2)), 2 * max(1, round(height * zoom / 2))
-    truth, predicted = (pictures.over_background(f)[:, 0] for f in (pictures.truth, pictures.predictions[method]))
+    both = pictures.truth, pictures.predictions[method]
+    truth, predicted = (pictures.over_background(frames)[:, view] for frames in both)
     timeline = Timeline(len(truth), pictures.first_unseen)
     for number, (true, ours) in enumerate(zip(truth, predicted, strict=True)):
         panels = (brighten(true, gain), brighten(ours, gain), error_colors(true, ours))
@@ -89,8 +64,7 @@ def _frames(pictures: Pictures, method: str, gain: float) -> Iterator[np.ndarray
         yield np.concatenate((picture, time_line(number, timeline, picture.shape[1])))
 
 
-def _caption(pictures: Pictures, gain: float, slow: int) -> str:
-    (view,) = pictures.views
+def _caption(pictures: Pictures, view: str, gain: float, slow: int) -> str:
     kind = "never trained on" if view in pictures.heldout_views else "a training view; the evaluation has no other"
     speed = ", at half speed" if slow > 1 else ""
     bright = f", brightened {gain:g}×" if gain != 1 else ""

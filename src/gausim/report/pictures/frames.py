@@ -53,18 +53,14 @@ def video_frame(
     """
     missing = np.full_like(prediction, _PAPER[0])
     error = missing if truth is None else error_colors(truth, prediction)
+    panels = [missing if truth is None else truth, prediction, error]
     zoom = max(1.0, height / prediction.shape[0])
-    panels = [_enlarge(p, zoom) for p in (missing if truth is None else truth, prediction, error)]
+    if zoom > 1:
+        panels = [cv2.resize(p, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC) for p in panels]
     labels = ["ground truth" if truth is not None else "no ground truth", "prediction", f"error 0..{ERROR_RANGE:g}"]
     labelled = [np.concatenate((label_bar(text, p.shape[1]), p)) for text, p in zip(labels, panels, strict=True)]
     picture = np.concatenate(labelled, axis=1)
     return np.concatenate((picture, timeline_bar(frame, timeline, title, picture.shape[1])))
-
-
-def _enlarge(image: np.ndarray, zoom: float) -> np.ndarray:
-    if zoom == 1:
-        return image
-    return cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_CUBIC)
 
 
 def label_bar(text: str, width: int) -> np.ndarray:

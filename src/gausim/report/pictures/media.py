@@ -18,10 +18,10 @@ from gausim.core import GausSimError
 from gausim.io.video import SMALL, write_video
 from gausim.report.gather.diagnosis import read_diagnosis
 from gausim.report.gather.study import Group, Study
-from gausim.report.pictures.diagnosis import diagnosis_plot
 from gausim.report.pictures.figures import contact_frames, error_plot, panels_plot, slices_plot
 from gausim.report.pictures.frames import Timeline, brighten, label_bar, light_gain, timeline_bar
-from gausim.results.curves import POINT_ARRAYS, STATIC, ObjectCurves, load_curves
+from gausim.report.pictures.motion import diagnosis_plot
+from gausim.results.curves import STATIC, ObjectCurves, load_curves
 from gausim.results.pictures import Pictures, kept_pictures
 
 TRUTH = "ground truth"
@@ -43,17 +43,11 @@ class Exhibit:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Pictures of one sequence: (name, frames over the background) with the truth first.
+    """Pictures of one sequence, the truth first."""
 
-    Attributes:
-        pictures: what they were made from (cameras, border of the seen frames).
-        columns: names and (F, V, h, w, 3) frames, brightened.
-        note: what was done to them, for captions.
-    """
-
-    pictures: Pictures
-    columns: list[tuple[str, np.ndarray]]
-    note: str
+    pictures: Pictures  # what they were made from (cameras, border of the seen frames)
+    columns: list[tuple[str, np.ndarray]]  # names and (F, V, h, w, 3) frames over the background, brightened
+    note: str  # what was done to them, for captions
 
 
 def object_figures(study: Study, name: str) -> tuple[list[Exhibit], list[str]]:
@@ -92,25 +86,12 @@ def _curves(study: Study, name: str, problems: list[str]) -> list[tuple[Group, l
         seeds = []
         for run, _ in group.entries(name):
             try:
-                seeds += [
-                    _checked(c) for c in load_curves(run.path / "evaluation" / "metrics.npz") if c.facts.name == name
-                ]
-            except (GausSimError, ValueError, TypeError, KeyError) as error:
+                seeds += [c for c in load_curves(run.path / "evaluation" / "metrics.npz") if c.facts.name == name]
+            except GausSimError as error:
                 problems.append(f"{group.label}: {error}")
         if seeds:
             found.append((group, seeds))
     return found
-
-
-def _checked(curves: ObjectCurves) -> ObjectCurves:
-    """The curves, if their arrays have the axes that plots need."""
-    sequences, views = len(curves.facts.sequences), len(curves.facts.views)
-    for row, metrics in curves.values.items():
-        for metric, values in metrics.items():
-            axes = (sequences, -1) if metric in POINT_ARRAYS else (sequences, -1, views)
-            if values.ndim != len(axes) or any(a not in (-1, n) for a, n in zip(axes, values.shape, strict=True)):
-                raise ValueError(f"metrics.npz: {row}/{metric} has shape {values.shape}, expected {axes}")
-    return curves
 
 
 def _error_curves(name: str, curves: Sequence[tuple[Group, list[ObjectCurves]]]) -> Exhibit:
@@ -149,12 +130,11 @@ def _lit(members: Sequence[tuple[str, Pictures, np.ndarray]]) -> Shown:
     gain = light_gain(first.truth)
     columns = [(TRUTH, first.truth), *((label, frames) for label, _, frames in members)]
     shown = [(label, brighten(first.over_background(frames), gain)) for label, frames in columns]
-    behind = "over plain grey (the recording keeps no background)" if first.background is None else (
-        "over the original background"
-    )  # fmt: skip
-    note = (
-        f"{first.sequence}; composited {behind}, brightened {gain:g}×, made smaller: for the eye, no number uses this."
-    )
+    behind = "the original background"
+    if first.background is None:
+        behind = "plain grey (the recording keeps no background)"
+    made = f"composited over {behind}, brightened {gain:g}×, made smaller"
+    note = f"{first.sequence}; {made}: for the eye, no number uses this."
     return Shown(first, shown, note)
 
 

@@ -46,13 +46,14 @@ _CAPTION = (
 
 
 def _entries(found: Sequence[tuple[RunRecord, Diagnosis]], row: str) -> tuple[Entry, ...]:
+    motions = [d.rows[row] for _, d in found]
     columns = (
-        ([d.rows[row].cosine for _, d in found], "{:.2f}"),
+        ([m.velocity_cosine for m in motions], "{:.2f}"),
         ([100 * d.frequency_error(row) for _, d in found], "{:.1f} %"),
         ([d.damping_ratio(row) for _, d in found], "{:.2f}"),
         ([d.phase(row, seen=True) for _, d in found], "{:.0f}°"),
         ([d.phase(row, seen=False) for _, d in found], "{:.0f}°"),
-        ([d.rows[row].large for _, d in found], "{:.2f}"),
-        ([d.rows[row].small for _, d in found], "{:.2f}"),
+        ([m.level_errors[-1] for m in motions if m.level_errors], "{:.2f}"),
+        ([m.level_errors[0] for m in motions if m.level_errors], "{:.2f}"),
     )
     return tuple(seeds_entry(values, form, runs=tuple(run for run, _ in found)) for values, form in columns)

@@ -7,7 +7,7 @@ from statistics import fmean
 from typing import Any
 
 from gausim.report.gather import paper
-from gausim.report.gather.runs import dig
+from gausim.report.gather.runs import RunRecord, dig
 from gausim.report.gather.study import FULL, NOT_MEASURED, Cell, Group, Study, cell, number
 from gausim.report.tables.diagnosis import diagnosis_sheets
 from gausim.report.tables.sheets import (
@@ -24,7 +24,6 @@ from gausim.report.tables.sheets import (
     Sheet,
     best_of,
     entry,
-    metric_info,
     metric_sheet,
     plain,
     seeds_entry,
@@ -55,14 +54,11 @@ def ablation_sheets(study: Study) -> list[Sheet]:
     """One table per object and model that was run in several variations; columns are variations, as in the paper."""
     sheets = []
     for name in study.objects:
-        families: dict[str, list[Group]] = {}
-        for group in study.groups:
-            if name in group.objects:
-                families.setdefault(group.family, []).append(group)
-        for family, groups in families.items():
+        about = [group for group in study.groups if name in group.objects]
+        for family in dict.fromkeys(group.family for group in about):
+            groups = sorted((g for g in about if g.family == family), key=lambda g: g.variation != FULL)
             if len(groups) > 1 and study.splits(name):
-                ordered = sorted(groups, key=lambda g: g.variation != FULL)
-                sheets.append(_ablation(study, name, family, ordered))
+                sheets.append(_ablation(study, name, family, groups))
     return sheets
 
 
@@ -70,7 +66,7 @@ def _ablation(study: Study, name: str, family: str, groups: Sequence[Group]) -> 
     lines: list[Line] = []
     splits = [s for s in SPLITS if s in study.splits(name)]
     for metric, views in _ABLATED:
-        info = metric_info(study, metric)
+        info = study.info(metric)
         if info is None:
             continue
         for split in splits:
@@ -96,17 +92,15 @@ def _ablation(study: Study, name: str, family: str, groups: Sequence[Group]) -> 
 
 def _against_full(cells: Sequence[Cell], title: str) -> Line:
     """Relative change of the error against the first column."""
-    full = cells[0].value
-    entries = [plain("")]
+    full, entries = cells[0].value, [plain("")]
     for c in cells[1:]:
         if full is None or c.value is None or not full.mean:
             entries.append(plain(""))
             continue
-        change = c.value.mean - full.mean
-        spread = None
+        change, extra = c.value.mean - full.mean, ""
         if full.seed_std is not None and c.value.seed_std is not None:
             spread = (full.seed_std**2 / full.seeds + c.value.seed_std**2 / c.value.seeds) ** 0.5
-        extra = f"{change / spread:+.1f} σ" if spread else ""
+            extra = f"{change / spread:+.1f} σ" if spread else ""
         entries.append(Entry(f"{100 * change / full.mean:+.1f} %", extra, runs=cells[0].runs + c.runs))
     return Line(f"l2: {title}, against full", METHOD, tuple(entries))
 
@@ -153,7 +147,7 @@ def efficiency_sheet(study: Study) -> Sheet:
 def _costs(group: Group, name: str) -> tuple[Entry, ...]:
     """What a group's predictions and trainings cost on an object, in the columns of ``_COSTS``."""
     entries = group.entries(name)
-    found = [(r, cost) for r, e in entries if isinstance(cost := dig(e, "efficiency", group.method), dict)]
+    found = [(r, cost) for r, e in entries if (cost := dig(e, "efficiency", group.method))]
     if not found:
         states = sorted({r.status for r in group.of(name) if r.summary is None})
         missing = Entry(states[0] if states else NOT_MEASURED, missing=True, runs=group.of(name))
@@ -207,7 +201,7 @@ _CONTRAST = ("mean foreground colour", "its norm", "largest l2 of a pixel")
 def contrast_sheet(study: Study) -> Sheet:
     """The paper's table of colour contrast, which explains absolute differences between objects."""
     own = [_contrast(study, name) for name in study.objects]
-    theirs = [tuple(map(plain, _printed(paper.CONTRAST.get(paper.paper_object(name) or "")))) for name in study.objects]
+    theirs = [_printed(paper.CONTRAST.get(paper.paper_object(name) or "")) for name in study.objects]
     lines = [Line(_CONTRAST[i], METHOD, tuple(column[i] for column in own)) for i in range(3)]
     if any(not e.missing for column in theirs for e in column):
         lines += [Line(f"{_CONTRAST[i]} (paper)", PAPER, tuple(column[i] for column in theirs)) for i in range(3)]
@@ -221,18 +215,14 @@ def contrast_sheet(study: Study) -> Sheet:
 def _contrast(study: Study, name: str) -> tuple[Entry, ...]:
     """The contrast of an object, as the first run has it that recorded one."""
     for run, found in (item for group in study.groups for item in group.entries(name)):
-        color = dig(found, "contrast", "mean_color")
-        values = [number(value) for value in color] if isinstance(color, list) else []
-        norm, largest = (number(dig(found, "contrast", key)) for key in ("norm", "max_l2"))
-        known = [value for value in (*values, norm, largest) if value is not None]
-        if len(known) == 5:
-            red, green, blue, norm, largest = known
-            return tuple(plain(text, runs=(run,)) for text in _printed(((red, green, blue), norm, largest)))
-    return tuple(map(plain, _printed(None)))
+        if contrast := found.get("contrast"):
+            return _printed((contrast["mean_color"], contrast["norm"], contrast["max_l2"]), run)
+    return _printed(None)
 
 
-def _printed(contrast: tuple[tuple[float, float, float], float, float] | None) -> tuple[str, str, str]:
+def _printed(contrast: tuple[Sequence[float], float, float] | None, *runs: RunRecord) -> tuple[Entry, ...]:
     if contrast is None:
-        return "", "", ""
+        return (plain(""),) * 3
     color, norm, largest = contrast
-    return f"({', '.join(f'{c:.2f}' for c in color)})", f"{norm:.2f}", f"{largest:.2f}"
+    texts = f"({', '.join(f'{c:.2f}' for c in color)})", f"{norm:.2f}", f"{largest:.2f}"
+    return tuple(plain(text, runs=runs) for text in texts)

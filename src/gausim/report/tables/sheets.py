@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +13,7 @@ from typing import Any
 from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.report.gather import paper
 from gausim.report.gather.runs import RunRecord, dig
-from gausim.report.gather.study import NOT_MEASURED, Cell, Group, Study, cell, deviation, number, pooled, says
+from gausim.report.gather.study import NOT_MEASURED, Cell, Group, Study, cell, deviation, pooled, says
 from gausim.results.curves import ERROR_3D
 from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import NO_FORESIGHT, plus_minus, spread
@@ -21,28 +22,19 @@ METHOD, REFERENCE, PAPER = "method", "reference", "paper"
 # The splits of the paper; `unseen_all` exists where recordings go on beyond frame 49.
 SPLITS = ("seen", "unseen", "unseen_all")
 VIEWS = {"train": "training cameras", "heldout": "cameras never trained on", "points": "3D, true points"}
+_IMAGES = ("l2", "ssim", "lpips", "psnr", "flip")
 # (metric, views) of the tables, the paper's three first. A table that no run has anything for is left out.
 TABLES = (
-    ("l2", "train"),
-    ("ssim", "train"),
-    ("lpips", "train"),
-    ("psnr", "train"),
-    ("flip", "train"),
-    (ERROR_3D, "points"),
-    (MOTION_ENERGY, "points"),
-    (MOTION_ENERGY, "train"),
-    ("l2", "heldout"),
-    ("ssim", "heldout"),
-    ("lpips", "heldout"),
-    ("psnr", "heldout"),
-    ("flip", "heldout"),
-)
+    *((metric, "train") for metric in _IMAGES),
+    (ERROR_3D, "points"), (MOTION_ENERGY, "points"), (MOTION_ENERGY, "train"),
+    *((metric, "heldout") for metric in _IMAGES),
+)  # fmt: skip
 # What tables belong to, in the order of a page.
 ABLATIONS, MOTION = "Ablations", "3D error and motion"
 TRAINING_VIEWS, NEW_VIEWS = "Images in the training views", "Images in views never trained on"
 COST, CONTRAST = "Time and memory", "Colour contrast"
 SECTIONS = (ABLATIONS, MOTION, TRAINING_VIEWS, NEW_VIEWS, COST, CONTRAST)
-# How metrics are named and printed that no run has.
+# LPIPS has a table of the paper's figures even where nobody measured it.
 _LPIPS = {"label": "LPIPS", "scale": 100.0, "unit": "1e-2", "higher_is_better": False}
 NOTHING = "–"
 FLOOR = "reconstruction (floor)"
@@ -51,21 +43,13 @@ OLD_EVALUATION = "Not measured: by an evaluation of an earlier version; call `ga
 
 @dataclass(frozen=True)
 class Entry:
-    """One place of a table.
+    """One place of a table."""
 
-    Attributes:
-        text: the number, or why there is none.
-        extra: what stands small behind it (spread over seeds).
-        best: to be printed bold.
-        missing: ``text`` is no number.
-        runs: what it was computed from.
-    """
-
-    text: str
-    extra: str = ""
-    best: bool = False
-    missing: bool = False
-    runs: tuple[RunRecord, ...] = ()
+    text: str  # the number, or why there is none
+    extra: str = ""  # what stands small behind it (spread over seeds)
+    best: bool = False  # to be printed bold
+    missing: bool = False  # the text is no number
+    runs: tuple[RunRecord, ...] = ()  # what it was computed from
 
 
 @dataclass(frozen=True)
@@ -84,25 +68,15 @@ class Line:
 
 @dataclass(frozen=True)
 class Sheet:
-    """One table.
+    """One table."""
 
-    Attributes:
-        key: short name for files and anchors.
-        section: what it belongs to, of ``SECTIONS``.
-        title: heading.
-        caption: how to read it.
-        columns: groups of columns: (heading, headings of its columns).
-        lines: the rows.
-        stub: heading of the labels.
-    """
-
-    key: str
-    section: str
+    key: str  # short name for files and anchors
+    section: str  # what it belongs to, of SECTIONS
     title: str
-    caption: str
-    columns: tuple[tuple[str, tuple[str, ...]], ...]
+    caption: str  # how to read it
+    columns: tuple[tuple[str, tuple[str, ...]], ...]  # groups of columns: heading, headings of its columns
     lines: tuple[Line, ...]
-    stub: str = ""
+    stub: str = ""  # heading of the labels
 
     @property
     def label(self) -> str:
@@ -120,37 +94,20 @@ class Sheet:
         return [f"{group} {sub}".strip() for group, subs in self.columns for sub in subs]
 
 
-def metric_info(study: Study, metric: str) -> dict[str, Any] | None:
-    """Label, scale, unit and direction of a metric, checked; LPIPS is known even where nobody measured it."""
-    found = study.info(metric) or (_LPIPS if metric == "lpips" else None)
-    if found is None:
-        return None
-    scale = found.get("scale")
-    return {
-        "label": str(found.get("label", metric)),
-        "scale": float(scale) if isinstance(scale, (int, float)) else 1.0,
-        "unit": str(found.get("unit", "")),
-        "higher_is_better": found.get("higher_is_better"),
-    }
-
-
 def split_title(study: Study, name: str, split: str) -> str:
     """Seen, or Unseen and the number of frames, as the paper says it."""
+    if split == "seen":
+        return "Seen"
     start, stop = study.splits(name)[split]
-    return "Seen" if split == "seen" else f"Unseen {stop - start}"
-
-
-def _columns(study: Study) -> list[tuple[str, list[str]]]:
-    """Objects and the splits that each has."""
-    return [(name, [s for s in SPLITS if s in study.splits(name)] or ["seen"]) for name in study.objects]
+    return f"Unseen {stop - start}"
 
 
 def metric_sheet(study: Study, metric: str, views: str) -> Sheet | None:
     """Rows methods, columns objects and ranges of frames, as the paper has it; None where nobody has the metric."""
-    info = metric_info(study, metric)
+    info = study.info(metric) or (_LPIPS if metric == "lpips" else None)
     if info is None:
         return None
-    columns = _columns(study)
+    columns = [(name, [s for s in SPLITS if s in study.splits(name)] or ["seen"]) for name in study.objects]
     rows = [[cell(g, name, s, views, metric) for name, splits in columns for s in splits] for g in study.groups]
     if not any(c.value for row in rows for c in row) and (metric, views) != ("lpips", "train"):
         return None
@@ -161,19 +118,12 @@ def metric_sheet(study: Study, metric: str, views: str) -> Sheet | None:
     ]
     lines += _references(study, columns, metric, views, info)
     lines += _paper_lines(columns, metric, views)
-    heads = tuple(
-        (name, tuple(split_title(study, name, s) if study.splits(name) else "Seen" for s in splits))
-        for name, splits in columns
-    )
+    heads = tuple((name, tuple(split_title(study, name, s) for s in splits)) for name, splits in columns)
     title = f"{info['label']}{_unit(info)}, {VIEWS[views]}"
-    caption = " ".join([_caption(metric, views, info, lines), *_blind(study.groups)])
+    blind = [f"{group.label}: {NO_FORESIGHT}" for group in study.groups if NO_FORESIGHT in says(group)]
+    caption = " ".join([_caption(metric, views, info, lines), *blind])
     section = MOTION if metric in (ERROR_3D, MOTION_ENERGY) else NEW_VIEWS if views == "heldout" else TRAINING_VIEWS
     return Sheet(f"{metric}_{views}", section, title, caption, heads, tuple(lines), "method")
-
-
-def _blind(groups: Sequence[Group]) -> list[str]:
-    """A footnote for every row whose unseen frames are no prediction."""
-    return [f"{group.label}: {NO_FORESIGHT}" for group in groups if NO_FORESIGHT in says(group)]
 
 
 def _unit(info: dict[str, Any]) -> str:
@@ -216,16 +166,8 @@ def seeds_entry(
     values: Sequence[float | None], form: str, *, stds: Sequence[float] = (), note: str = "",
     runs: tuple[RunRecord, ...] = (),
 ) -> Entry:  # fmt: skip
-    """The mean of one figure per seed as it is printed, and small behind it how far the seeds differ.
-
-    Args:
-        values: of the seeds, those that are known.
-        form: how a figure is printed, as :meth:`str.format` takes it.
-        stds: deviations over sequences.
-        note: what else stands small.
-        runs: where the values come from.
-    """
-    known = [found for value in values if (found := number(value)) is not None]
+    """The mean of one figure per seed (and of ``stds``), and small behind it how far the seeds differ and ``note``."""
+    known = [value for value in values if value is not None and math.isfinite(value)]
     if not known:
         return Entry(NOTHING, missing=True, runs=runs)
     text = " ± ".join(form.format(fmean(part)) for part in (known, stds) if part)
@@ -263,63 +205,50 @@ def _references(
         for row in e["rows"] if row not in e["methods"]
     )  # fmt: skip
 
-    def of_row(group: Group, name: str, split: str, *, row: str) -> Cell:
-        return cell(group, name, split, views, metric, row=row)
-
-    def of_floor(group: Group, name: str, split: str) -> Cell:
+    def find(group: Group, name: str, split: str, row: str) -> Cell:
+        if row != FLOOR:
+            return cell(group, name, split, views, metric, row=row)
         return pooled(group, name, lambda e: dig(e, "floor", metric), metric) if split == "seen" else Cell(None)
 
-    find = {row: partial(of_row, row=row) for row in rows} | ({FLOOR: of_floor} if views == "train" else {})
-    return [line for label, cells in find.items() for line in _distinct_lines(label, study, columns, cells, info)]
+    lines = []
+    for row in [*rows, *([FLOOR] if views == "train" else [])]:
+        versions = [_versions(study, [partial(find, name=name, split=s, row=row) for s in splits])
+                    for name, splits in columns]  # fmt: skip
+        for place in range(max(map(len, versions), default=0)):
+            entries: list[Entry] = []
+            for (_, splits), version in zip(columns, versions, strict=True):
+                cells = version[place] if place < len(version) else [Cell(None)] * len(splits)
+                entries += [entry(c if c.value else Cell(None), info) for c in cells]
+            lines.append(Line(row if place == 0 else f"{row} [{place + 1}]", REFERENCE, tuple(entries)))
+    return lines
 
 
-def _distinct_lines(
-    label: str,
-    study: Study,
-    columns: Sequence[tuple[str, list[str]]],
-    find: Callable[[Group, str, str], Cell],
-    info: dict[str, Any],
-) -> list[Line]:
-    """One line of a reference, or several where runs were evaluated on other sequences or scenes.
+def _versions(study: Study, finds: Sequence[Callable[[Group], Cell]]) -> list[list[Cell]]:
+    """The cells of a reference on one object: several where runs were evaluated on other sequences or scenes.
 
     References do not depend on seeds: each run speaks for itself, and runs that say the same are named together.
     """
-    versions: list[list[list[Cell]]] = []  # object -> version -> cells of its splits
-    for name, splits in columns:
-        found: dict[tuple[Any, ...], list[Cell]] = {}
-        for single in (one for g in study.groups for one in g.singles()):
-            cells = [find(single, name, split) for split in splits]
-            if any(c.value for c in cells):
-                key = tuple(None if c.value is None else float(f"{c.value.mean:.6g}") for c in cells)
-                known = found.get(key)
-                joined = (
-                    [replace(k, runs=k.runs + c.runs) for k, c in zip(known, cells, strict=True)] if known else cells
-                )
-                found[key] = joined
-        versions.append(list(found.values()))
-    lines = []
-    for place in range(max((len(v) for v in versions), default=0)):
-        entries: list[Entry] = []
-        for (_, splits), version in zip(columns, versions, strict=True):
-            cells = version[place] if place < len(version) else [Cell(None)] * len(splits)
-            entries += [entry(c if c.value else Cell(None), info) for c in cells]
-        lines.append(Line(label if place == 0 else f"{label} [{place + 1}]", REFERENCE, tuple(entries)))
-    return lines
+    found: dict[tuple[Any, ...], list[Cell]] = {}
+    for single in (one for group in study.groups for one in group.singles()):
+        cells = [find(single) for find in finds]
+        if any(c.value for c in cells):
+            key = tuple(None if c.value is None else float(f"{c.value.mean:.6g}") for c in cells)
+            same = found.get(key, [replace(c, runs=()) for c in cells])
+            found[key] = [replace(k, runs=k.runs + c.runs) for k, c in zip(same, cells, strict=True)]
+    return list(found.values())
 
 
 def _paper_lines(columns: Sequence[tuple[str, list[str]]], metric: str, views: str) -> list[Line]:
     table = paper.TABLES.get(metric, {}) if views == "train" else {}
-    if not any(paper.paper_object(name) for name, _ in columns):
-        return []
+    objects = [paper.paper_object(name) for name, _ in columns]
     lines = []
-    for method, figures in table.items():
+    for method, figures in table.items() if any(objects) else ():
         entries = []
-        for name, splits in columns:
-            object_name = paper.paper_object(name)
-            pairs = figures[object_name] if object_name else None
-            late = "unseen_all" if object_name in paper.LATE and "unseen_all" in splits else "unseen"
+        for name, (_, splits) in zip(objects, columns, strict=True):
+            seen, unseen = figures[name] if name else (None, None)
+            late = "unseen_all" if name in paper.LATE and "unseen_all" in splits else "unseen"
             for split in splits:
-                pair = None if pairs is None else {"seen": pairs[0], late: pairs[1]}.get(split)
+                pair = {"seen": seen, late: unseen}.get(split)
                 entries.append(plain(plus_minus(*pair) if pair else ""))
         lines.append(Line(method, PAPER, tuple(entries)))
     return lines

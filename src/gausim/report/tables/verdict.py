@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from typing import Any
 
 from gausim.report.gather.runs import dig
-from gausim.report.gather.study import number
 from gausim.results.curves import ERROR_3D, STATIC
 from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import said
@@ -38,31 +38,18 @@ _EVALUATE = "`gausim evaluate RUN` measures it."
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the sentences are made of; means over seeds, None where a figure is not known.
+    """What the sentences are made of; means over seeds, None where a figure is not known."""
 
-    Attributes:
-        frames: first and last frame that training did not see; None where the recordings end before.
-        measured: what the errors are of: ``points`` (3D) or ``train`` (l2 of the images in the training views).
-        error: error on unseen frames over that of a prediction of no motion.
-        seen_error: the same on the frames that training saw.
-        energy: predicted over true motion energy on unseen frames.
-        psnr: by ``train`` and ``heldout`` views, of unseen frames [dB].
-        still_psnr: the same of a prediction of no motion.
-        heldout_views: names of the views that training never saw.
-        seeds: number of evaluations.
-        repeats: whether the method repeats what it was fitted to instead of foreseeing.
-    """
-
-    frames: tuple[int, int] | None
-    measured: str
-    error: float | None
-    seen_error: float | None
-    energy: float | None
-    psnr: dict[str, float | None]
-    still_psnr: dict[str, float | None]
+    frames: tuple[int, int] | None  # first and last that training did not see; None where the recordings end before
+    measured: str  # what the errors are of: points (3D), or train (l2 of the images in the training views)
+    error: float | None  # on unseen frames, over that of a prediction of no motion
+    seen_error: float | None  # the same on the frames that training saw
+    energy: float | None  # predicted over true motion energy on unseen frames
+    psnr: dict[str, float | None]  # by train and heldout views, of unseen frames [dB]
+    still_psnr: dict[str, float | None]  # the same of a prediction of no motion
     heldout_views: tuple[str, ...]
-    seeds: int
-    repeats: bool
+    seeds: int  # number of evaluations
+    repeats: bool  # whether the method repeats what it was fitted to instead of foreseeing
 
     @property
     def merit(self) -> float:
@@ -72,33 +59,26 @@ class Outcome:
 
 
 def outcome(entries: Sequence[dict[str, Any]], method: str) -> Outcome:
-    """The outcome of a method on one object.
-
-    Args:
-        entries: the object's entries in ``metrics.json``, one per seed; at least one.
-        method: row of their tables.
-    """
+    """The outcome of a method on one object, from the object's entries in ``metrics.json``, one per seed."""
 
     def mean(row: str, split: str, views: str, metric: str, key: str) -> float | None:
-        found = [number(dig(entry["rows"], row, split, views, metric, key)) for entry in entries]
+        found = [dig(entry["rows"], row, split, views, metric, key) for entry in entries]
         known = [value for value in found if value is not None]
-        return sum(known) / len(known) if known else None
+        return fmean(known) if known else None
 
-    splits = entries[0]["splits"]
-    start, end = splits.get("unseen", (0, 0))
-    split = "unseen" if "unseen" in splits else "seen"
+    unseen = entries[0]["splits"].get("unseen")
+    split = "unseen" if unseen else "seen"
     in_3d = [mean(method, part, "points", ERROR_3D, "ratio") for part in ("seen", "unseen")]
     measured, metric = ("points", ERROR_3D) if any(r is not None for r in in_3d) else ("train", "l2")
-    heldout = entries[0].get("heldout_views")
     return Outcome(
-        frames=(start, end - 1) if "unseen" in splits else None,
+        frames=(unseen[0], unseen[1] - 1) if unseen else None,
         measured=measured,
         error=mean(method, "unseen", measured, metric, "ratio"),
         seen_error=mean(method, "seen", measured, metric, "ratio"),
         energy=mean(method, split, measured, MOTION_ENERGY, "pooled"),
         psnr={views: mean(method, split, views, "psnr", "mean") for views in ("train", "heldout")},
         still_psnr={views: mean(STATIC, split, views, "psnr", "mean") for views in ("train", "heldout")},
-        heldout_views=tuple(str(view) for view in heldout) if isinstance(heldout, list) else (),
+        heldout_views=tuple(entries[0].get("heldout_views", ())),
         seeds=len(entries),
         repeats=said(entries[0], method).get("extrapolates") is False,
     )
@@ -153,17 +133,17 @@ def _views(found: Outcome) -> str:
     if new is None and trained is None:
         return f"Nothing says how good its images are (PSNR): {_EVALUATE}"
     if new is None:
+        where = "No view was kept out of training, so nothing tells how it looks from elsewhere"
         if found.heldout_views:
             where = f"Nothing was measured in {_names(found.heldout_views)}, `gausim evaluate RUN` does"
-        else:
-            where = "No view was kept out of training, so nothing tells how it looks from elsewhere"
         return f"{where}; in the training views its images have a PSNR of {trained:.1f} dB{_gain(found, 'train')}."
+    beside = ""
+    if trained is not None:
+        apart = new - trained
+        than = "about as good as" if abs(apart) < _SAME_DB else "better than" if apart > 0 else "worse than"
+        beside = f", {than} in the training views ({trained:.1f} dB)"
     begin = f"In {_names(found.heldout_views)}, its images have a PSNR of {new:.1f} dB"
-    if trained is None:
-        return f"{begin}{_gain(found, 'heldout')}."
-    apart = new - trained
-    than = "about as good as" if abs(apart) < _SAME_DB else "better than" if apart > 0 else "worse than"
-    return f"{begin}, {than} in the training views ({trained:.1f} dB){_gain(found, 'heldout')}."
+    return f"{begin}{beside}{_gain(found, 'heldout')}."
 
 
 def _names(views: Sequence[str]) -> str:

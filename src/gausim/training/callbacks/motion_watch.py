@@ -15,7 +15,7 @@ from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth
 from gausim.metrics.motion import motion_energy
 from gausim.nn.mode import evaluating
-from gausim.report.gather.diagnosis import read_diagnosis
+from gausim.report.gather.diagnosis import numbers, read_diagnosis
 from gausim.results.diagnosis import Diagnosis
 from gausim.runs.names import MOTION
 from gausim.runs.randomness import undisturbed
@@ -135,8 +135,10 @@ def figures(
     row["energy_unseen"] = _ratio(sums["energy"], slice(unseen - 1, None))
     read = read_diagnosis({"diagnosis": diagnosis.summary(), "splits": {"seen": [0, unseen]}})
     if read is not None:
-        row |= {f"error_level_{i}": float(v) for i, v in enumerate(read.rows[METHOD].levels[:LEVELS], 1)}
-        row["velocity_cosine"] = read.rows[METHOD].cosine
+        own = read.rows[METHOD]
+        levels, (cosine,) = (numbers(v) for v in (own.level_errors[:LEVELS], [own.velocity_cosine]))
+        row |= {f"error_level_{i}": float(v) for i, v in enumerate(levels, 1)}
+        row["velocity_cosine"] = float(cosine)
         row["frequency_error"] = read.frequency_error(METHOD)
         row["damping_ratio"] = read.damping_ratio(METHOD)
         row["phase_seen"], row["phase_unseen"] = (read.phase(METHOD, seen=seen) for seen in (True, False))
