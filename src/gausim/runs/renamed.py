@@ -37,6 +37,8 @@ GONE = {
     "make_trainer": ("overwrite",),
     "TrainerSettings": ("overwrite",),
 }
+# Constant is what no schedule means; a run that had the cosine can be evaluated, and not be gone on with.
+SCHEDULES = dict.fromkeys(("ConstantSchedule", "CosineSchedule"))
 UNSUPPORTED = {
     "Objective": ("input_noise",),
     **dict.fromkeys(("PointSupervision", "TrackSupervision", "tracks_or_images"), ("velocity_weight",)),
@@ -104,8 +106,8 @@ def with_present_names(config: Any) -> Any:
     """
     if isinstance(config, dict):
         name = str(config.get("_target_")).rsplit(".", 1)[-1]
-        if name == "ConstantSchedule":  # constant is what no schedule means
-            return None
+        if name in SCHEDULES:
+            return SCHEDULES[name]
         wanted = [k for k in UNSUPPORTED.get(name, ()) if config.get(k)]
         if wanted:
             raise ValueError(f"{wanted[0]} is {config[wanted[0]]!r}, which is no longer supported: train the run again")
