@@ -114,7 +114,8 @@ class WandbLog(WandbLogger):
     def save(self) -> None:
         """Closes the row of the latest step, so that it is kept whatever happens to this process."""
         if self._experiment is not None and self._row_is_open:
-            self._experiment.log({}, commit=True)
+            with undisturbed():
+                self._experiment.log({}, commit=True)
             self._row_is_open = False
 
     def finalize(self, status: str) -> None:
