@@ -29,39 +29,51 @@ def media_at(run: Path, step: int) -> Media:
     return write_media(run, step, [clip], ["object", "l2"], [["toy", "1.5"]])
 
 
-class FakeWandb:
-    """A server whose last step of this run is ``start - 1``, or that does not answer."""
-
-    start, broken = 0, False
-    Error = type("Error", (Exception,), {})
-    plot = SimpleNamespace(line_series=lambda *a, **k: None)
-    Video = Image = Table = staticmethod(lambda *a, **k: None)
-
-    def __init__(self) -> None:
-        self.given: dict[str, Any] = {}
-        self.steps: list[int] = []
+class FakeRun:
+    def __init__(self, given: dict[str, Any], start: int) -> None:
+        self.given, self.starting_step = given, start
+        self.rows: list[tuple[int, dict[str, Any]]] = []
         self.exits: list[int] = []
-
-    def init(self, **given: Any) -> SimpleNamespace:
-        np.random.rand()  # a library may draw; training must not notice
-        if self.broken:
-            raise self.Error("no answer from the server")
-        self.given = given
-        return SimpleNamespace(starting_step=self.start, log=self.log, finish=self.finish, dir=given["dir"])
+        folder = Path(given["dir"]) / "wandb" / f"offline-run-{len(FakeWandb.runs)}-{given['id']}" / "files"
+        folder.mkdir(parents=True)
+        self.dir = str(folder)
 
     def log(self, values: dict[str, Any], step: int | None = None, commit: bool | None = None) -> None:
-        np.random.rand()
-        self.steps += [step] if step is not None else []
+        assert not self.exits, "logged after its end"
+        if values:
+            assert step is not None and (not self.rows or step >= self.rows[-1][0]), "steps must not go back"
+            self.rows.append((step, values))
+        np.random.rand()  # a library may draw; training must not notice
 
     def finish(self, exit_code: int) -> None:
         self.exits.append(exit_code)
 
 
+class FakeWandb:
+    runs: list[FakeRun] = []
+    start, broken = 0, False
+    Error = type("Error", (Exception,), {})
+    plot = SimpleNamespace(line_series=lambda *a, **k: ("plot", a, k))
+
+    @classmethod
+    def init(cls, **given: Any) -> FakeRun:
+        np.random.rand()
+        if cls.broken:
+            raise cls.Error("no answer from the server")
+        cls.runs.append(FakeRun(given, cls.start))
+        return cls.runs[-1]
+
+    Settings = staticmethod(lambda **k: k)
+    Video = staticmethod(lambda path, **k: ("video", path))
+    Image = staticmethod(lambda path: ("image", path))
+    Table = staticmethod(lambda columns, data: ("table", columns, data))
+
+
 @pytest.fixture
-def fake(monkeypatch: pytest.MonkeyPatch) -> FakeWandb:
-    made = FakeWandb()
-    monkeypatch.setitem(sys.modules, "wandb", made)
-    return made
+def fake(monkeypatch: pytest.MonkeyPatch) -> type[FakeWandb]:
+    FakeWandb.runs, FakeWandb.start, FakeWandb.broken = [], 0, False
+    monkeypatch.setitem(sys.modules, "wandb", FakeWandb)
+    return FakeWandb
 
 
 def train_a_part(run: Path, resume_at: int, steps: range, *, offline: bool = True, status: str = "success") -> None:
@@ -79,21 +91,23 @@ def train_a_part(run: Path, resume_at: int, steps: range, *, offline: bool = Tru
     logger.finalize(status)  # Lightning may say so twice
 
 
-def test_an_online_run_is_sent_what_the_server_has_not_and_ended_once(fake: FakeWandb, tmp_path: Path) -> None:
+def test_an_online_run_is_sent_what_the_server_has_not_and_ended_once(fake: type[FakeWandb], tmp_path: Path) -> None:
     WandbLog(tmp_path).finalize("failed")  # nothing was begun, nothing is to be ended
-    assert fake.exits == []
+    assert fake.runs == []
     np.random.seed(1)  # not Python's generator, which the type checker of the tests draws from
     train_a_part(tmp_path, 0, range(1, 7), offline=False, status="failed")
     drawn = np.random.rand()
     np.random.seed(1)
     assert drawn == np.random.rand()
-    assert fake.given["mode"] == "online" and fake.given["resume"] == "allow" and fake.given["reinit"] == "create_new"
-    fake.steps, fake.start = [], 6  # the server has steps up to 5; step 6 was lost, the checkpoint is of step 4
+    fake.start = 6  # the server has steps up to 5; step 6 was lost, the checkpoint is of step 4
     train_a_part(tmp_path, 4, range(5, 8), offline=False)
-    assert fake.steps == [6, 7] and fake.exits == [1, 0]
+    first, second = fake.runs
+    assert second.given["mode"] == "online" and second.given["resume"] == "allow"
+    assert second.given["reinit"] == "create_new" and second.given["id"] == first.given["id"]
+    assert [step for step, _ in second.rows] == [6, 7] and (first.exits, second.exits) == ([1], [0])
 
 
-def test_a_server_that_does_not_answer_is_a_named_error(fake: FakeWandb, tmp_path: Path) -> None:
+def test_a_server_that_does_not_answer_is_a_named_error(fake: type[FakeWandb], tmp_path: Path) -> None:
     fake.broken = True
     with pytest.raises(RunError, match=r"logger\.wandb.*WANDB_API_KEY.*offline=true"):
         WandbLog(tmp_path, offline=False).resume_at(0)
