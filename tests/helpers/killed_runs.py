@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import importlib
 import json
+import multiprocessing
 import os
 import random
 import resource
 import select
 import signal
-import subprocess
 import sys
 import tempfile
 import traceback
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,18 +31,13 @@ from gausim.cli.main import main
 from gausim.training.module import GausSimModule
 
 
-class Started(subprocess.Popen):
-    """Remembers the processes that this one starts: the other ranks of its run."""
-
-    pids: ClassVar[list[int]] = []
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.pids.append(self.pid)
-
-
 def die_at(target: str, match: str, count: int, when: str, rank: int = 0) -> None:
     """Ends a rank by SIGKILL before or after our count-th call of ``target`` with ``match`` in its arguments."""
+
+    def kill() -> None:
+        others = sorted(multiprocessing.active_children(), key=lambda process: process.pid)
+        os.kill(others[rank - 1].pid if rank else os.getpid(), signal.SIGKILL)
+
     home, name = target.rsplit(".", 1)
     try:
         owner: Any = importlib.import_module(home)
@@ -54,10 +49,10 @@ def die_at(target: str, match: str, count: int, when: str, rank: int = 0) -> Non
         nonlocal calls
         calls += match in " ".join(map(str, args)) if match else 1
         if when == "before" and calls == count:
-            os.kill(Started.pids[rank - 1] if rank else os.getpid(), signal.SIGKILL)
+            kill()
         result = original(*args, **kwargs)
         if when == "after" and calls == count:
-            os.kill(Started.pids[rank - 1] if rank else os.getpid(), signal.SIGKILL)
+            kill()
         return result
 
     setattr(owner, name, dying)
@@ -80,7 +75,6 @@ def child(order: dict[str, Any]) -> int:
     if order.get("limit"):
         resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
     draw_from_global_generators()
-    subprocess.Popen = Started  # type: ignore[misc]
     for point in order.get("die") or []:
         die_at(**point)
     try:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -11,11 +14,15 @@ from torch import Tensor, nn
 from gausim.core import GaussianScene, Rendered, SimState
 from gausim.data.dataset import SequenceSample
 from gausim.losses import Objective
+from gausim.models.initial_state import FreeInitialStates
+from gausim.models.template.elastic import ElasticTemplate
+from gausim.render.cpu import CpuRenderer
 from gausim.render.reference import ReferenceRenderer
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from helpers import toy_object
+from helpers.simulators import gausim
 
 
 class Sway(nn.Module):
@@ -103,3 +110,21 @@ def blobs(means: Tensor, covars: Tensor, colors: Tensor, opacities: Tensor, view
     )
     rgb = torch.einsum("bvkh,bvkw,bvkc->bvhwc", rows, columns, weight).tanh()
     return Rendered(rgb, rgb.amax(-1))
+
+
+ELASTIC = partial(ElasticTemplate, modes=6, neighbours=6)
+
+
+def real_module(
+    scene_of_sequence: Sequence[int] = (0,),
+    *,
+    states: Callable[..., nn.Module] = FreeInitialStates,
+    parts: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> GausSimModule:
+    """A small simulator of toy scenes to be trained; ``options`` are the simulator's, ``parts`` the module's."""
+    torch.manual_seed(0)
+    scenes = [toy_object.toy_scene() for _ in range(max(scene_of_sequence) + 1)]
+    model = gausim(scenes, [24.0] * len(scenes), **{"radii": (0.3, 0.7), "hidden": 8, "layers": 1, **options})
+    method = SharedSimulator(model, states(model, scene_of_sequence), scene_of_sequence)
+    return GausSimModule(method=method, **{"renderer": CpuRenderer(threads=1), **(parts or {})})

@@ -28,7 +28,7 @@ OLD = {
         }
     },
     "loss": {"_target_": "gausim.losses.objective.Objective", "input_noise": 0.0, "static_weight": 2.0},
-    "optimizer": {"schedule": {"_target_": "gausim.engine.optim.ConstantSchedule"}},
+    "optimizer": {"schedule": {"_target_": "gausim.engine.optim.CosineSchedule", "warmup": 0.02}},
     "trainer": {"_target_": "gausim.training.trainer.make_trainer", "max_epochs": 3, "devices": 2},
     "callbacks": [{"_target_": "gausim.engine.callbacks.Progress"}, {"_target_": "torch.nn.Module"}],
 }  # fmt: skip

@@ -14,11 +14,12 @@ from gausim.benchmark.train import peak_saved_bytes
 from gausim.core import GaussianScene, Renderer
 from gausim.data.images import composite
 from gausim.losses import ImageLoss
+from gausim.models.hierarchy.batch import Member
 from gausim.render.draw import SceneAppearance, draw
 from gausim.render.reference import ReferenceRenderer
-from gausim.training.rollout import States, ViewGroup
+from gausim.training.rollout import States
 from gausim.training.supervision import comparison as chunked
-from gausim.training.supervision.comparison import Comparison
+from gausim.training.supervision.comparison import Comparison, ViewGroup
 
 blobs = sway.blobs
 SCENES = (0, 1, 0)  # of the three members
@@ -41,7 +42,7 @@ class Case:
             count = self.scenes[i].count
             unit = torch.arange(count) % 2
             rows = slice(kernels, kernels + count), slice(units, units + 2)
-            members.append(SimpleNamespace(scene_id=i, kernels=rows[0], units=rows[1], unit_of_kernel=unit))
+            members.append(Member(i, *rows, unit))
             kernels, units = kernels + count, units + 2
         rest = torch.cat([self.scenes[i].means for i in SCENES]).double()
         self.batch = SimpleNamespace(rest=rest, members=tuple(members))
@@ -85,10 +86,8 @@ def test_chunks_give_what_one_graph_gives(pixels: int, monkeypatch: pytest.Monke
     torch.testing.assert_close(motion, moved.detach(), rtol=1e-12, atol=0)
     assert not motion.requires_grad
     weights = torch.rand(expected.shape, generator=torch.Generator().manual_seed(2)).double()
-    deformation_gradients = torch.autograd.grad(losses, case.states.tensors(), weights)
-    for ours, plain in zip(
-        deformation_gradients, torch.autograd.grad(expected, case.states.tensors(), weights), strict=True
-    ):
+    found, plain_ones = (torch.autograd.grad(x, case.states.tensors(), weights) for x in (losses, expected))
+    for ours, plain in zip(found, plain_ones, strict=True):
         assert float(plain.norm()) > 0
         assert float((ours - plain).norm()) <= 1e-6 * float(plain.norm())
 

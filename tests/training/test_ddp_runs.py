@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -28,6 +29,7 @@ def whole(trainings: Trainings) -> Path:
     return run
 
 
+@pytest.mark.slow
 def test_a_rank_that_is_killed_ends_the_run_and_the_same_command_continues_to_the_same_bits(
     trainings: Trainings, whole: Path
 ) -> None:
@@ -45,7 +47,6 @@ def test_a_rank_that_is_killed_ends_the_run_and_the_same_command_continues_to_th
     assert_same_run(run, whole)
 
 
-@pytest.mark.slow
 def test_two_ranks_learn_what_one_does(trainings: Trainings, whole: Path) -> None:
     status, output = trainings("alone", "trainer=cpu", "data.batch_size=2", "trainer.max_epochs=3")
     assert status == 0, output
@@ -59,16 +60,16 @@ def test_two_ranks_learn_what_one_does(trainings: Trainings, whole: Path) -> Non
 @pytest.mark.parametrize("search", [False, True])
 def test_jobs_of_a_sweep_follow_each_other_with_two_ranks_each(trainings: Trainings, search: bool) -> None:
     settings, name = (*TWO, "trainer.max_epochs=2"), f"swept_{search}"
-    optuna = ("hydra/sweeper=optuna", "hydra.sweeper.n_trials=3", "hydra.sweeper.pruner=null",
+    optuna = ("hydra/sweeper=optuna", "hydra.sweeper.n_trials=2", "hydra.sweeper.pruner=null",
               "optimizer.network_lr=tag(log,interval(1e-4,1e-2))")  # fmt: skip
-    grid = ("optimizer.network_lr=0.001,0.002,0.003",)
+    grid = ("optimizer.network_lr=0.001,0.002",)
     status, output = trainings(name, *settings, *(optuna if search else grid), "-m")
     assert status == 0, output
-    assert output.count("(2 ranks, ") == 3 and "sweep of 3 jobs: 3 trained" in output and "Traceback" not in output
+    assert output.count("(2 ranks, ") == 2 and "sweep of 2 jobs: 2 trained" in output and "Traceback" not in output
     jobs = [marker.parent for marker in (trainings.folder / name).rglob("FINISHED")]
     rates = {yaml.safe_load((job / "config.yaml").read_text())["optimizer"]["network_lr"] for job in jobs}
-    assert len(jobs) == len(rates) == 3
-    for job in jobs[:2]:  # what a run of its own learns with the job's rate: all ranks had it
+    assert len(jobs) == len(rates) == 2
+    for job in jobs:  # what a run of its own learns with the job's rate: all ranks had it
         rate = yaml.safe_load((job / "config.yaml").read_text())["optimizer"]["network_lr"]
         status, output = trainings(f"alone_{job.parent.name[-8:]}", *settings, f"optimizer.network_lr={rate}")
         assert status == 0, output
@@ -81,7 +82,7 @@ def test_two_ranks_killed_at_random_moments(trainings: Trainings) -> None:
     status, output = trainings("ranks_undisturbed", *settings)
     assert status == 0, output
     moments = random.Random(1)
-    for number in range(4):
+    for number in range(2):
         death = killed(STEP, moments.randint(2, 20), rank=number % 2, when=moments.choice(("before", "after")))
         assert trainings("ranks_disturbed", *settings, **death)[0] == (2 if number % 2 else -9)
     status, output = trainings("ranks_disturbed", *settings)
@@ -104,16 +105,9 @@ def test_ranks_that_a_scheduler_has_started_meet_and_train(trainings: Trainings,
         port = str(free.getsockname()[1])
     slurm = {"SLURM_NTASKS": "2", "SLURM_NTASKS_PER_NODE": "2", "SLURM_NNODES": "1", "SLURM_NODEID": "0",
              "SLURM_JOB_NAME": "train", "SLURM_NODELIST": "127.0.0.1", "MASTER_PORT": port}  # fmt: skip
-    ranks = [
-        subprocess.Popen(
-            command,
-            env={**os.environ, **slurm, "SLURM_PROCID": str(rank), "SLURM_LOCALID": str(rank)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for rank in (0, 1)
-    ]
+    environments = [{**os.environ, **slurm, "SLURM_PROCID": n, "SLURM_LOCALID": n} for n in ("0", "1")]
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    ranks = [subprocess.Popen(command, env=env, **pipes) for env in environments]
     outputs = [rank.communicate(timeout=240)[0] for rank in ranks]
     assert [rank.returncode for rank in ranks] == [0, 0], outputs
     assert "2 ranks" in outputs[0] and "epoch 3/3" in outputs[0] and "epoch" not in outputs[1]

@@ -19,7 +19,6 @@ from gausim.training.loggers.media import (
     MediaLog,
     forget_media,
     media_of,
-    safe_name,
     slice_panel,
     write_media,
 )
@@ -87,10 +86,6 @@ def test_media_of_steps_that_are_done_again_go(tmp_path: Path) -> None:
     assert sorted(p.name for p in (tmp_path / "panels").iterdir()) == ["step_000004", "step_000008"]
     media_at(tmp_path, 8)  # written again over what is there
     assert media_of(tmp_path)[-1].names == ["toy_seq_000"]
-
-
-def test_names_become_one_file_name() -> None:
-    assert safe_name("a/b", "seq 1") == "a_b_seq_1" and "/" not in safe_name("../x", "/y")
 
 
 def test_tensorboard_has_video_pictures_errors_table_and_config(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -11,14 +10,15 @@ import torch
 from helpers import sway, toy_object
 from torch import Tensor
 
-from gausim.core import DataError, GaussianScene, Trajectory
+from gausim.core import DataError, GaussianScene, SimState, Trajectory
 from gausim.data.records import GroundTruth
 from gausim.losses import ImageLoss, Objective
 from gausim.metrics import point_error
+from gausim.models.hierarchy.batch import Member
 from gausim.render.reference import ReferenceRenderer
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
-from gausim.training.rollout import States
+from gausim.training.rollout import States, windows
 from gausim.training.supervision.images import Sources
 from gausim.training.supervision.points import PointSupervision, attach_points
 
@@ -41,39 +41,23 @@ def sources(truth: Callable[[int], GroundTruth | None], scenes: Sequence[Gaussia
 def batch(members: int) -> SimpleNamespace:
     """Members of two units each, of which every other kernel belongs to the second."""
     count, unit = SCENE.count, torch.arange(SCENE.count) % 2
-    rows = [
-        SimpleNamespace(
-            scene_id=0,
-            kernels=slice(i * count, (i + 1) * count),
-            units=slice(2 * i, 2 * i + 2),
-            unit_of_kernel=unit,
-        )
-        for i in range(members)
-    ]
-    return SimpleNamespace(rest=SCENE.means.repeat(members, 1), members=tuple(rows))
+    rows = [(slice(i * count, (i + 1) * count), slice(2 * i, 2 * i + 2)) for i in range(members)]
+    return SimpleNamespace(rest=SCENE.means.repeat(members, 1), members=tuple(Member(0, *row, unit) for row in rows))
 
 
 def states(steps: int, members: int) -> States:
     g = torch.Generator().manual_seed(4)
     positions = SCENE.means.repeat(members, 1) + 0.1 * torch.randn(steps, members * SCENE.count, 3, generator=g)
     deformation_gradients = torch.eye(3) + 0.3 * torch.randn(steps, 2 * members, 3, 3, generator=g)
-    return States(
-        positions.requires_grad_(),
-        deformation_gradients.requires_grad_(),
-        torch.eye(3).expand_as(deformation_gradients),
-    )
+    rotations = torch.eye(3).expand_as(deformation_gradients)
+    return States(positions.requires_grad_(), deformation_gradients.requires_grad_(), rotations)
 
 
 def plain(known: GroundTruth, made: States, member: int) -> Tensor:
     """Positions of the points as the evaluation carries them."""
     rows, units = slice(member * SCENE.count, (member + 1) * SCENE.count), slice(2 * member, 2 * member + 2)
-    trajectory = Trajectory(
-        made.positions[:, rows],
-        made.deformation_gradients[:, units],
-        made.rotations[:, units],
-        torch.arange(SCENE.count) % 2,
-        24.0,
-    )
+    parts = made.positions[:, rows], made.deformation_gradients[:, units], made.rotations[:, units]
+    trajectory = Trajectory(*parts, torch.arange(SCENE.count) % 2, 24.0)
     return trajectory.carry(known.rest, attach_points(SCENE, known.rest), SCENE.means)
 
 
@@ -91,12 +75,8 @@ def test_losses_are_squared_distances_in_percent_and_reach_positions_and_gradien
         moved += float((100 * (points.detach() - before.detach()).norm(dim=-1) / SCENE.diagonal).square().mean(1).sum())
     torch.testing.assert_close(losses, torch.stack(expected, 1))
     assert float(motion) == pytest.approx(moved, rel=1e-5)
-    ours = torch.autograd.grad(losses.sum(), [made.positions, made.deformation_gradients])
-    for gradient, other in zip(
-        ours,
-        torch.autograd.grad(torch.stack(expected).sum(), [made.positions, made.deformation_gradients]),
-        strict=True,
-    ):
+    totals, inputs = (losses.sum(), torch.stack(expected).sum()), [made.positions, made.deformation_gradients]
+    for gradient, other in zip(*(torch.autograd.grad(total, inputs) for total in totals), strict=True):
         assert float(other.norm()) > 0
         torch.testing.assert_close(gradient, other)
 
@@ -135,31 +115,23 @@ def test_unknown_motion_is_refused_by_name() -> None:
 
 
 def test_a_module_learns_from_points_and_draws_nothing() -> None:
-    model = sway.Sway([toy_object.toy_scene(), toy_object.toy_scene()])
-    with torch.no_grad():  # a truth that this simulator can follow
-        model.drift[0].fill_(0.02)
-    known = []
-    for _ in range(3):
-        state, frames = SCENE.means, [SCENE.means]
-        before = state
-        for _ in range(3):
-            push = torch.zeros_like(state)
-            push[:, 0] = 0.02 * SCENE.means[:, 2] ** 2
-            state, before = state + 0.5 * (state - before) + push, state
-            frames.append(state)
-        known.append(GroundTruth(SCENE.means, torch.stack(frames)))
+    model = sway.Sway([SCENE])
     with torch.no_grad():
+        model.drift[0].fill_(0.02)
+        whole, state = model.batch([0]), SimState(SCENE.means, SCENE.means)
+        made = [step.positions for _, steps in windows(model, whole, state, 3, 3) for step in steps]
         model.drift[0].zero_()
+    known = GroundTruth(SCENE.means, torch.stack([SCENE.means, *made]))
 
     def refuse(*args: object, **options: object) -> object:
         raise AssertionError("drawn")
 
     module = GausSimModule(
-        method=SharedSimulator(model, sway.Previous(model, (0, 0, 0)), (0, 0, 0)),
+        method=SharedSimulator(model, sway.Previous(model, (0, 0)), (0, 0)),
         renderer=refuse,  # type: ignore[arg-type]
         objective=Objective(static_weight=0.0, momentum_weight=0.0, backprop_steps=0),
-        optimizer=replace(sway.OptimizerSettings(), network_lr=2e-3, scene_lr=2e-3, initial_lr=2e-4),
-        supervision=PointSupervision(sources(lambda number: known[number], model.scenes)),
+        optimizer=sway.OptimizerSettings(network_lr=2e-3, scene_lr=2e-3, initial_lr=2e-4),
+        supervision=PointSupervision(sources(lambda number: known)),
     )
     optimizer, draws = module.configure_optimizers(), torch.Generator().manual_seed(0)
     found = [module.optimise([sample(0), sample(1)], optimizer, draws) for _ in range(30)]
@@ -170,12 +142,8 @@ def test_a_module_learns_from_points_and_draws_nothing() -> None:
 
 def test_energy_of_each_half_counts_by_its_logarithm_in_units_of_the_rest_state() -> None:
     known, made = truth(), states(5, 1)
-    plain_loss, weighted = (
-        PointSupervision(sources(lambda number: known), energy_weight=w).comparison([sample(0, 5)], batch(1))(made, 0)[
-            0
-        ]
-        for w in (0.0, 2.0)
-    )
+    both = (PointSupervision(sources(lambda number: known), energy_weight=w) for w in (0.0, 2.0))
+    plain_loss, weighted = (s.comparison([sample(0, 5)], batch(1))(made, 0)[0] for s in both)
     percent = (100 / SCENE.diagonal) ** 2
     points = torch.cat((known.rest[None], plain(known, made, 0)))
     energy, true = (x.diff(dim=0).square().sum(-1).mean(1) for x in (points, known.positions[:6]))

@@ -17,9 +17,7 @@ from gausim.training.callbacks.progress import EpochSummary
 from gausim.training.callbacks.resume import RunCheckpoint
 from gausim.training.callbacks.time_budget import TimeBudget
 from gausim.training.loggers.files import CsvLog, Resumable, TensorBoardLog
-from gausim.training.loggers.wandb import WandbLog
 from gausim.training.module import GausSimModule
-from gausim.training.table import Table
 
 MODULE = LightningModule()
 
@@ -27,19 +25,6 @@ MODULE = LightningModule()
 def draws() -> list[float]:
     own = [random.random(), random.gauss(0, 1), float(np.random.rand()), float(np.random.randn())]
     return [*own, *torch.rand(2).tolist(), float(torch.randn(()))]
-
-
-def test_rows_done_again_and_torn_ones_are_dropped(tmp_path: Path) -> None:
-    table = Table(tmp_path / "rows.csv", "epoch", ("epoch", "object", "value"))
-    for epoch in (10, 10, 20, 30):
-        table.append({"epoch": epoch, "object": "a", "value": 0.5, "unknown": 5})
-    with (tmp_path / "rows.csv").open("a") as file:
-        file.write("4x,")
-    table.resume_at(20)
-    table.append({"epoch": 30, "object": "b"})
-    assert (tmp_path / "rows.csv").read_text().splitlines() == [
-        "epoch,object,value", "10,a,0.5", "10,a,0.5", "20,a,0.5", "30,b,",
-    ]  # fmt: skip
 
 
 def test_random_generators_go_on_where_they_were(tmp_path: Path) -> None:
@@ -75,18 +60,13 @@ def test_the_log_forgets_later_steps_and_grows(tmp_path: Path) -> None:
     assert isinstance(third, Resumable) and isinstance(TensorBoardLog(tmp_path), Resumable)
 
 
-def test_one_dashboard_id_per_run_directory(tmp_path: Path) -> None:
-    made = [WandbLog(tmp_path / run) for run in ("a", "a", "b")]
-    assert made[0].version == made[1].version == (tmp_path / "a" / "wandb_id").read_text()
-    assert made[2].version != made[0].version
-
-
 def trainer_at(step: int, *, epoch: int = 0, last: bool = False, folder: Path = Path()) -> Any:
     """A trainer as callbacks see it, without the machinery (whose properties cannot be set)."""
-    saved: list[int] = []
+    saved: list[int] = []  # steps; -1 is what the loggers hold
     seen = {
         "global_step": step, "is_last_batch": last, "should_stop": False, "current_epoch": epoch, "max_epochs": 9,
-        "loggers": [], "default_root_dir": str(folder), "strategy": SimpleNamespace(broadcast=lambda x: x),
+        "loggers": [SimpleNamespace(save=lambda: saved.append(-1))], "default_root_dir": str(folder),
+        "strategy": SimpleNamespace(broadcast=lambda x: x),
         "is_global_zero": True, "saved": saved, "save_checkpoint": lambda *_, **__: saved.append(step),
     }  # fmt: skip
     return object.__new__(type("StandIn", (Trainer,), seen))
@@ -107,19 +87,11 @@ def test_saves_come_by_steps_and_by_minutes_within_an_epoch(monkeypatch: pytest.
             found += trainer.saved
         return found
 
-    assert steps_saved(RunCheckpoint()) == [3, 6, 9, 12]  # a minute
+    # What was logged is on the disk before the checkpoint is: a resumed run does not log it again.
+    assert steps_saved(RunCheckpoint()) == [-1, 3, -1, 6, -1, 9, -1, 12]  # a minute
     assert steps_saved(RunCheckpoint(every_minutes=0)) == []
-    assert steps_saved(RunCheckpoint(every_minutes=0, every_steps=5)) == [5, 10]
-    assert steps_saved(RunCheckpoint(every_minutes=0, every_steps=5), last=5) == [6, 11]  # the epoch's end saves that
-
-
-def test_what_was_logged_is_on_the_disk_before_the_checkpoint_is(tmp_path: Path) -> None:
-    trainer, order = trainer_at(4, last=False), []
-    stand_in = type(trainer)
-    stand_in.loggers = [SimpleNamespace(save=lambda: order.append("rows"))]  # type: ignore[attr-defined, misc]
-    stand_in.save_checkpoint = lambda *_, **__: order.append("checkpoint")  # type: ignore[assignment]
-    RunCheckpoint(every_steps=4).on_train_batch_end(trainer, MODULE, None, None, 0)
-    assert order == ["rows", "checkpoint"]
+    assert steps_saved(RunCheckpoint(every_minutes=0, every_steps=5)) == [-1, 5, -1, 10]
+    assert steps_saved(RunCheckpoint(every_minutes=0, every_steps=5), last=5) == [-1, 6, -1, 11]  # its end saves that
 
 
 def test_a_resumed_run_has_the_learning_rate_of_the_time_it_used(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from helpers import toy_object
-from helpers.simulators import gausim
+from helpers import sway
 from helpers.sway import blobs, sample, sway_module
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -17,25 +16,16 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from gausim.benchmark.train import peak_saved_bytes
 from gausim.core import DivergenceError
 from gausim.losses import Objective
-from gausim.models.initial_state import FreeInitialStates
 from gausim.render.reference import ReferenceRenderer
 from gausim.training import step
-from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.supervision import comparison
 
 
 def real_module(objective: Objective) -> GausSimModule:
-    torch.manual_seed(0)
-    model = gausim(
-        [toy_object.toy_scene()], [24.0], radii=(0.3, 0.7), edges="rest", hidden=8, layers=2, output_scale=0.1
-    )
-    return GausSimModule(
-        method=SharedSimulator(model, FreeInitialStates(model, [0]), [0]),
-        renderer=blobs,
-        objective=objective, optimizer=OptimizerSettings(), fraction_every=0,
-    )  # fmt: skip
+    parts = {"renderer": blobs, "objective": objective, "fraction_every": 0}
+    return sway.real_module(edges="rest", layers=2, output_scale=0.1, parts=parts)
 
 
 def optimise(module: GausSimModule, steps: int = 3, times: int = 1) -> dict[str, float]:
@@ -106,36 +96,21 @@ def pair(objective: Objective, drift: float) -> tuple[GausSimModule, GausSimModu
     return made[0], made[1]
 
 
-@pytest.mark.parametrize("backprop_steps", [1, 2, 0])
-@pytest.mark.parametrize(("drift", "lasts"), [(0.02, (6,)), (0.2, (1, 2, 3, 4, 5, 0)), (5.0, (0,))])
-def test_reads_put_off_change_nothing(backprop_steps: int, drift: float, lasts: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(("backprop_steps", "drift"), [(0, 0.02), (1, 0.02), (1, 0.2), (2, 0.2), (0, 5.0), (1, 5.0)])
+def test_reads_put_off_change_nothing(backprop_steps: int, drift: float) -> None:
     now, later = pair(Objective(backprop_steps=backprop_steps, explosion=0.6, static_weight=0.0), drift)
     stats = [optimise(module, steps=6) for module in (now, later)]
-    assert stats[0].keys() == stats[1].keys() and stats[0]["exploded"] == float(lasts != (6,))
+    assert stats[0].keys() == stats[1].keys() and stats[0]["exploded"] == float(drift > 0.1)
+    assert ("loss_image" in stats[0]) == (drift < 1)  # of the middle one a few frames are learned from
     for name, value in stats[0].items():
         assert stats[1][name] == pytest.approx(value, rel=1e-5, abs=1e-12), name
     for name, value in parameters(now).items():
         torch.testing.assert_close(parameters(later)[name], value, rtol=1e-5, atol=1e-8)
 
 
-def test_a_rollout_cut_short_in_the_middle_was_among_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    now, _ = pair(Objective(backprop_steps=1, explosion=0.6, static_weight=0.0), 0.2)
-    lengths = []
-    inner = step.descend
-
-    def counted(learner, losses, *arguments, **options) -> None:
-        lengths.append(len(losses))
-        inner(learner, losses, *arguments, **options)
-
-    monkeypatch.setattr(step, "descend", counted)
-    optimise(now, steps=6)
-    assert 0 < sum(lengths) < 6
-
-
-@pytest.mark.parametrize("poison", [float("nan"), float("inf")])
-def test_positions_that_break_are_named_when_reads_are_put_off(poison: float) -> None:
+def test_positions_that_break_are_named_when_reads_are_put_off() -> None:
     _, later = pair(Objective(static_weight=0.0), 0.0)
-    later.model.poison = poison
+    later.model.poison = float("inf")
     before = parameters(later)
     with pytest.raises(DivergenceError, match=r"predicted step 1 of 3, sequence toy/seq_0: positions"):
         optimise(later)
@@ -176,7 +151,7 @@ def test_one_read_per_optimiser_step(backprop_steps: int, monkeypatch: pytest.Mo
     optimizer, batch = module.configure_optimizers(), [sample(0), sample(1)]
     module.optimise(batch, optimizer, torch.Generator().manual_seed(0))  # cameras and baselines are read once
     draws = torch.Generator().manual_seed(1)
-    monkeypatch.setattr(module, "terms", lambda: ())  # whether to is drawn on the host, and never leaves it
+    monkeypatch.setattr(module.method, "terms", lambda: ())  # whether to is drawn on the host, and never leaves it
     with plain_forms(), watched(monkeypatch) as found:
         module.optimise(batch, optimizer, draws)
     assert found == ["tolist"]

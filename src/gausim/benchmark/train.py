@@ -45,7 +45,7 @@ class _Case:
         samples = [index.sample(i, range(steps + 1), v).to(options.device) for i, v in zip(chosen, views, strict=True)]
         module.to(options.device)
         module.train()
-        module.fraction_every = 0  # the gradients' fractions are measured in every fiftieth step
+        module.measuring = False  # the gradients' fractions are measured in every fiftieth step
         optimizer = module.configure_optimizers()
         for group in optimizer.param_groups:
             group["lr"] = 0.0

@@ -13,9 +13,8 @@ if TYPE_CHECKING:
 
     from gausim.core import FittedMethod
     from gausim.data.datamodule import ReadyDataModule
+    from gausim.models.step.simulator import GausSim
     from gausim.runs.directory import RunDirectory
-    from gausim.training.callbacks.judge import EpochJudge
-    from gausim.training.contracts import Transferable
     from gausim.training.module import GausSimModule
     from gausim.training.ranks.launch import Crew
 
@@ -130,11 +129,11 @@ def _train(cfg: DictConfig, run: RunDirectory) -> float | None:
     from gausim.compose.config import instantiate
     from gausim.training.ranks.launch import Crew
 
-    with run.noting_failure(), Crew(instantiate(cfg.trainer), [sys.executable, "-m", "gausim.cli.rank"]) as crew:
+    with run.noting_failure(), Crew(instantiate(cfg.trainer), follow) as crew:
         if not crew.is_first:  # a scheduler has started it beside the first
             return follow(crew)
         config = _plain(cfg)
-        task = crew.announce(lambda: (config, str(run.path), run.prepare(config, overwrite=cfg.overwrite)))
+        task = crew.ranks.first(lambda: (config, str(run.path), run.prepare(config, overwrite=cfg.overwrite)))
         parts = _parts(cfg, resumed=task[2] is not None)
         crew.start(task)
         return _fit(cfg, run, task[2], parts, crew)
@@ -146,7 +145,8 @@ def follow(crew: Crew) -> float | None:
 
     from gausim.runs.directory import RunDirectory
 
-    config, path, resume = crew.receive()
+    task: Any = crew.ranks.first(lambda: None)
+    config, path, resume = task
     cfg = OmegaConf.create(config)
     return _fit(cfg, RunDirectory(path), resume, _parts(cfg, resumed=resume is not None), crew)
 
@@ -262,9 +262,9 @@ def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None
         raise ConfigError("freeze: a network at random would stay so. Name a trained run (init_from=RUN).")
     if cfg.init_from is not None and not resumed:
         load = load_simulator if cfg.freeze == "model" else load_shared
-        load(cast("Transferable", module.model), cfg.init_from, _plain(cfg)["model"])
+        load(cast("GausSim", module.model), cfg.init_from, _plain(cfg)["model"])
     if cfg.freeze:
-        cast("Transferable", module.model).freeze(scenes=cfg.freeze == "model")
+        cast("GausSim", module.model).freeze(scenes=cfg.freeze == "model")
 
 
 def _take_over_fit(cfg: DictConfig, method: FittedMethod, *, resumed: bool) -> None:

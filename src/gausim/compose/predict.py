@@ -113,10 +113,8 @@ class TrainedPrediction:
     @property
     def units(self) -> tuple[Tensor, ...]:
         """The unit of every kernel at each level, the small ones first; nothing for a model without a hierarchy."""
-        from gausim.training.contracts import Hierarchical
-
-        model = self._run.module.model
-        return tuple(model.units_of_kernels(self._item.scene_id)) if isinstance(model, Hierarchical) else ()
+        units_of_kernels = getattr(self._run.module.model, "units_of_kernels", lambda scene_id: ())
+        return tuple(units_of_kernels(self._item.scene_id))
 
     @property
     def footnotes(self) -> dict[str, Any] | None:

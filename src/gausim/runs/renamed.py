@@ -37,6 +37,8 @@ GONE = {
     "make_trainer": ("overwrite",),
     "TrainerSettings": ("overwrite",),
 }
+# Constant is what no schedule means; a run that had the cosine can be evaluated, and not be gone on with.
+SCHEDULES = ("ConstantSchedule", "CosineSchedule")
 # The same of settings of which one value is left; a false one stands for all that are.
 UNSUPPORTED: dict[str, dict[str, Any]] = {
     "Objective": {"input_noise": None},
@@ -108,7 +110,7 @@ def with_present_names(config: Any) -> Any:
     """
     if isinstance(config, dict):
         name = str(config.get("_target_")).rsplit(".", 1)[-1]
-        if name == "ConstantSchedule":  # constant is what no schedule means
+        if name in SCHEDULES:
             return None
         unsupported = UNSUPPORTED.get(name, {})
         wanted = [k for k, left in unsupported.items() if (config.get(k, left) or None) != left]

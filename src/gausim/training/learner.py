@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import cast
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.optim import Optimizer
 
 from gausim.core import ConfigError, Renderer, SimState, Trajectory
 from gausim.data.dataset import SequenceSample
@@ -25,25 +24,16 @@ from gausim.training.ranks.ranks import Ranks
 from gausim.training.rollout import States, windows
 from gausim.training.supervision.images import ImageSupervision, Supervision
 from gausim.training.terms.free_motion import FreeMotion
-from gausim.training.terms.term import Term
 
 
 class Learner(nn.Module):
     """A method, what is minimised, what predictions are compared with, and what the steps so far have found.
 
     Attributes:
-        method: what is trained.
-        objective: weights of the losses and how far gradients reach.
-        settings: of the optimiser.
-        supervision: what predictions are compared with.
         images: draws predictions, whatever they are compared with.
-        baselines: what the rest state scores.
-        free_motion: the term that a rollout is continued for.
         diagonals: of the scenes [scene units].
-        average: of the weights.
-        ranks: who computes.
-        exchange: makes the parts of the ranks the step of one.
         barren: steps in a row from which nothing was learned.
+        measuring: whether this step measures how much of the network's gradient is of the momentum loss.
         shown: sequences of the last step.
     """
 
@@ -66,7 +56,7 @@ class Learner(nn.Module):
         self.supervision: Supervision = self.images if supervision is None else supervision
         self.baselines = Baselines(self.supervision)
         self.average = WeightAverage(self.settings.ema_decay)
-        self.ranks, self.barren, self.shown = Ranks(), 0, 0
+        self.ranks, self.barren, self.shown, self.measuring = Ranks(), 0, 0, False
         self.exchange = Exchange(self.ranks, method.model)
 
     @property
@@ -83,7 +73,7 @@ class Learner(nn.Module):
         """All parameters by the name that tells how fast they learn."""
         return self.method.groups()
 
-    def make_optimizer(self) -> Optimizer | None:
+    def configure_optimizers(self) -> Any:
         """One optimiser over all groups; None where nothing learns.
 
         Raises:
@@ -102,14 +92,6 @@ class Learner(nn.Module):
         if task.objective is not None:
             self.objective, self.images.loss = task.objective, task.objective.image
         self.settings = task.settings or self.settings
-
-    def terms(self) -> Sequence[Term]:
-        """Terms of the loss beside the rollout's, in the order of their backward passes."""
-        return self.method.terms()
-
-    def measures_fraction(self) -> bool:
-        """Whether this step measures how much of the network's gradient is of the momentum loss."""
-        return False
 
     def accumulate(self, loss: Tensor) -> None:
         """Adds the gradients of a loss; there are none where nothing learns."""

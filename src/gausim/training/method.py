@@ -15,7 +15,7 @@ from gausim.core import ConfigError, SimState, Trajectory
 from gausim.data.dataset import SequenceSample
 from gausim.losses.objective import Objective
 from gausim.models.rollout.dynamics import SceneDynamics
-from gausim.training.contracts import InitialVelocities, Simulator
+from gausim.training.contracts import Simulator
 from gausim.training.optimizers import OptimizerSettings
 from gausim.training.terms.mixing import MixingTerm
 from gausim.training.terms.rest import RestTerm
@@ -26,13 +26,8 @@ from gausim.training.terms.term import Term
 class Moment:
     """Where in a run a step of the optimiser stands.
 
-    Attributes:
-        epoch: epochs done.
-        batch: batches done of the one under way.
-        batches: of an epoch.
-        epochs: of the whole run.
-        least: fraction of the run that counts as done at least, because its time is spent.
-        most: fraction that counts as done at most, because the end of the run has not begun.
+    After ``epoch`` epochs of ``epochs`` and ``batch`` batches of ``batches``; a fraction ``least`` of the run counts as
+    done at least, because its time is spent, and ``most`` at most, because the end of the run has not begun.
     """
 
     epoch: int
@@ -51,13 +46,9 @@ class Moment:
 
 @dataclass(frozen=True)
 class Task:
-    """What the next step of the optimiser is about.
+    """What the next step of the optimiser is about: the rate that is logged, and the objective and settings if new.
 
-    Attributes:
-        rate: the learning rate that is logged.
-        objective: what is minimised from now on; None where it stays.
-        settings: of the optimiser, likewise.
-        is_new: whether the rest state has to be scored anew.
+    ``is_new`` tells that the rest state has to be scored anew.
     """
 
     rate: float
@@ -136,29 +127,21 @@ class Method(ABC):
 
 
 class SharedSimulator(Method):
-    """A simulator of all scenes and a trainable initial state of every sequence: the paper's method."""
+    """A simulator of all scenes and a trainable initial state of every sequence: the paper's method.
+
+    ``initial_states`` (:mod:`gausim.models.initial_state`) have one parameter per training sequence, in their order.
+    """
 
     name, extrapolates = "gausim", True
     initial_states: nn.Module
 
     def __init__(self, model: nn.Module, initial_states: nn.Module, scene_of_sequence: Sequence[int]) -> None:
-        """Keeps its parts.
-
-        Args:
-            model: the simulator (see :class:`gausim.training.contracts.Simulator`).
-            initial_states: one parameter per training sequence, in their order.
-            scene_of_sequence: the scene of each training sequence.
-
-        Raises:
-            ConfigError: the initial states do not fit the sequences.
-        """
         self.model, self.initial_states = model, initial_states
         self.scene_of_sequence = tuple(scene_of_sequence)
         count = len(self.scene_of_sequence)
         if (own := len(list(initial_states.parameters()))) != count:
             raise ConfigError(f"initial states: {own} parameters for {count} sequences; expected one each.")
-        self._simulator = cast(Simulator, model)
-        self._states = cast(InitialVelocities, initial_states)
+        self._simulator, self._states = cast(Simulator, model), cast(Any, initial_states)
 
     def groups(self) -> dict[str, list[nn.Parameter]]:
         """Those of the model, and the initial states."""

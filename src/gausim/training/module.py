@@ -36,16 +36,16 @@ class GausSimModule(Learner, LightningModule):
     """
 
     def __init__(self, *, seed: int = 0, fraction_every: int = 50, **parts: Any) -> None:
-        """Takes everything it works with; it builds nothing.
+        """Takes the ``parts`` of a :class:`~gausim.training.learner.Learner`; it builds nothing.
 
         Args:
             seed: of each step's draws (static loss, free motion), together with its number.
             fraction_every: optimiser steps between measurements of how much of the gradient is of momentum; 0 is never.
-            parts: see :class:`~gausim.training.learner.Learner`.
+            parts: of the learner.
         """
         super().__init__(**parts)
         self.automatic_optimization = False
-        self.seed, self.fraction_every = seed, fraction_every
+        self.seed, self.fraction_every, self.measuring = seed, fraction_every, bool(fraction_every)
         self.summary: dict[str, float] = {}
         self.last_stats: dict[str, float] = {}
         self.time_fraction, self.progress_limit = 0.0, 1.0
@@ -67,10 +67,6 @@ class GausSimModule(Learner, LightningModule):
         """What a reader of the figures must know, in sentences; nothing was spent where nothing learns."""
         return self.method.notes() + (self.cost.notes() if self.method.learns else [])
 
-    def configure_optimizers(self) -> Any:
-        """One optimiser over all groups; None where nothing learns."""
-        return self.make_optimizer()
-
     # ------------------------------------------------------------------------------------------------ one step
 
     def training_step(self, samples: list[SequenceSample], batch_idx: int) -> None:
@@ -80,6 +76,7 @@ class GausSimModule(Learner, LightningModule):
         now = Moment(self.current_epoch, batch_idx, batches, epochs, self.time_fraction, self.progress_limit)
         task = self.method.begin_step(optimizer.optimizer, self.settings, now)
         self.take_up(task)
+        self.measuring = bool(self.fraction_every) and self.global_step % self.fraction_every == 0
         draws = torch.Generator().manual_seed(hash_seed(self.seed, self.global_step))
         stats = self.optimise(samples, optimizer.optimizer, draws, optimizer.step)
         self._record({**stats, "lr": task.rate}, self.shown)
@@ -91,25 +88,8 @@ class GausSimModule(Learner, LightningModule):
         draws: torch.Generator,
         advance: Callable[[], object] | None = None,
     ) -> dict[str, float]:
-        """One step of the optimiser with all losses; works without a trainer, too.
-
-        Args:
-            samples: this rank's part of the batch; it may be empty where there are several.
-            optimizer: from :meth:`configure_optimizers`.
-            draws: random numbers of the step: static loss, free motion.
-            advance: makes the optimiser's step; its own ``step`` when None.
-
-        Returns:
-            What is logged of the step.
-
-        Raises:
-            DivergenceError: a number is not finite; no parameter has moved.
-        """
+        """One step with all losses (:func:`gausim.training.step.optimise`); works without a trainer, too."""
         return step.optimise(self, samples, optimizer, draws, advance or optimizer.step)
-
-    def measures_fraction(self) -> bool:
-        """Every so many steps: what momentum is of the network's gradient."""
-        return bool(self.fraction_every) and self.global_step % self.fraction_every == 0
 
     def accumulate(self, loss: Tensor) -> None:
         """Adds the gradients of a loss, by the trainer where there is one."""

@@ -39,37 +39,12 @@ class HalvingSchedule:
 
 
 @dataclass(frozen=True)
-class CosineSchedule:
-    """A linear start over ``warmup`` of the run, then half a cosine down to ``final``; for runs of known length.
-
-    Attributes:
-        warmup: fraction of the run that the start takes.
-        final: factor at the end of the run.
-    """
-
-    warmup: float = 0.02
-    final: float = 0.05
-
-    def factor(self, epoch: float, epochs: int) -> float:
-        """Between ``final`` and 1 (below that during the start)."""
-        done = min(1.0, epoch / max(1, epochs))
-        if done < self.warmup:
-            return max(0.05, done / self.warmup)
-        fraction = (done - self.warmup) / max(1e-9, 1 - self.warmup)
-        return self.final + (1 - self.final) * 0.5 * (1 + math.cos(math.pi * fraction))
-
-
-@dataclass(frozen=True)
 class StableDecaySchedule:
     """A linear start, constant rates, and a fall along half a cosine over the last part of the run.
 
     What ends a run early moves its last part forward: nothing that was learned before has to be learned again. With
-    ``decay`` 1 there is no such part: the rates fall all along, and the run has the length that it was given.
-
-    Attributes:
-        warmup: epochs that the start takes.
-        decay: fraction of the run over which the rates fall.
-        final: factor at the end of the run.
+    ``decay`` 1 there is no such part: the rates fall all along, and the run has the length that it was given. The start
+    takes ``warmup`` epochs, the fall a fraction ``decay`` of the run, down to the factor ``final``.
     """
 
     warmup: float = 1.0
@@ -114,21 +89,11 @@ class LinearSchedule:
 
 @dataclass(frozen=True)
 class OptimizerSettings:
-    """Who learns how fast.
+    """Who learns how fast; ``conf/optimizer/default.yaml`` and ``conf/base/more.yaml`` say what the settings are.
 
-    Attributes:
-        optimizer: makes the optimiser from parameter groups; Adam when None.
-        network_lr: learning rate of the network.
-        scene_lr: of densities and attributes of a scene.
-        template_lr: of what the model's template learns about a scene; ``scene_lr`` when None.
-        initial_lr: of the initial states [diagonals of the scene's bounding box, or modal amplitudes].
-        schedule: how they change; constant when None.
-        clip_norm: gradients are clipped at this norm; 0 does not clip.
-        clip_per_group: clip network, scenes and initial states each by themselves instead of all together.
-        decay: weight decay by group: of matrices, and of all initial states; decoupled where the optimiser is AdamW.
-            What the data say little about returns to zero, where Adam alone would let it wander.
-        ema_decay: weights of the run are also averaged with this decay per step, and the average is what evaluation
-            loads; 0 does not average.
+    ``decay`` is the weight decay by group, of matrices and of all initial states: what the data say little about
+    returns to zero, where Adam alone would let it wander. Without an ``optimizer`` it is Adam, without a ``schedule``
+    the rates are constant.
     """
 
     optimizer: Callable[..., Optimizer] | None = None
@@ -156,14 +121,9 @@ class OptimizerSettings:
         """The optimiser over the named groups ``network``, ``scene``, ``template`` and ``initial``.
 
         A parameter that is not in a batch has no gradient there, and the optimiser leaves it and its momentum alone.
-
-        Raises:
-            ConfigError: a group for which there is no learning rate.
         """
         template = self.scene_lr if self.template_lr is None else self.template_lr
         rates = dict(zip(GROUPS, (self.network_lr, self.scene_lr, template, self.initial_lr), strict=True))
-        if set(groups) - set(rates):
-            raise ConfigError(f"optimizer: no learning rate for parameter groups {sorted(set(groups) - set(rates))}.")
         made: list[dict[str, Any]] = []
         for name, members in groups.items():
             parts: dict[float, list[Parameter]] = {0.0: []}  # what does not decay comes first

@@ -1,11 +1,11 @@
-"""Rolling a batch forward in stretches that gradients do not leave, and drawing what was predicted."""
+"""Rolling a batch forward in stretches that gradients do not leave."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import cast
 
 import torch
@@ -13,63 +13,23 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as torch_checkpoint
 
-from gausim.core import Cameras, DivergenceError, GaussianScene, Rendered, Renderer, SimState
-from gausim.data.dataset import SampleFacts, SequenceSample
+from gausim.core import DivergenceError, SimState
+from gausim.data.dataset import SampleFacts
 from gausim.nn.normaliser import gathering_nothing, normalisers_of
-from gausim.render.draw import SceneAppearance, draw
 from gausim.training.contracts import SceneBatch, Simulator
 from gausim.training.contracts import Step as PredictedStep
 from gausim.training.ranks.ranks import Ranks, interleave
 
 
-@dataclass(frozen=True, eq=False)
-class ViewGroup:
-    """Sequences of a batch that one call of the renderer can draw together.
-
-    Attributes:
-        scene_id: their scene.
-        members: their places in the batch.
-        cameras: what looks at all of them.
-    """
-
-    scene_id: int
-    members: tuple[int, ...]
-    cameras: Cameras
-
-
-class Views:
-    """Tells which sequences can be drawn together; the cameras of each are fetched from the device once.
-
-    A sequence's cameras stand still, so its number and the names of its views say which they are.
-    """
-
-    def __init__(self) -> None:
-        self._keys: dict[tuple[int, tuple[str, ...]], Hashable] = {}
-
-    def key(self, sample: SequenceSample) -> Hashable:
-        """What must agree for two sequences to be drawn in one call: scene, cameras and image size."""
-        cameras, known = sample.cameras, (sample.sequence_id, sample.cameras.names)
-        if known not in self._keys:
-            numbers = [x.detach().cpu().numpy().tobytes() for x in (cameras.viewmats, cameras.Ks)]
-            self._keys[known] = (sample.scene_id, *numbers, cameras.width, cameras.height)
-        return self._keys[known]
-
-    def groups(self, samples: Sequence[SequenceSample]) -> list[ViewGroup]:
-        """Sorts the sequences of a batch by scene and cameras."""
-        places: dict[Hashable, list[int]] = {}
-        for i, sample in enumerate(samples):
-            places.setdefault(self.key(sample), []).append(i)
-        return [ViewGroup(samples[p[0]].scene_id, tuple(p), samples[p[0]].cameras) for p in places.values()]
-
-
 @dataclass(eq=False)
 class Frame:
-    """One predicted frame without what the model adds to it (see :class:`gausim.training.contracts.Step`)."""
+    """One predicted frame (see :class:`gausim.training.contracts.Step`), and the state to go on from if it is more."""
 
     positions: Tensor
     deformation_gradients: Tensor
     rotations: Tensor
     momentum: Tensor
+    state: SimState | None = None
 
 
 def checkpointed_step(model: Simulator, batch: SceneBatch, state: SimState) -> Frame:
@@ -91,13 +51,7 @@ def checkpointed_step(model: Simulator, batch: SceneBatch, state: SimState) -> F
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """What is drawn: T predicted frames of all members of a batch.
-
-    Attributes:
-        positions: kernel means [scene units].
-        deformation_gradients: accumulated deformation gradients of the units.
-        rotations: their rotations.
-    """
+    """What is drawn: T predicted frames of all members of a batch (see :class:`gausim.training.contracts.Step`)."""
 
     positions: Float[Tensor, "T K 3"]
     deformation_gradients: Float[Tensor, "T N 3 3"]
@@ -106,31 +60,11 @@ class States:
     @staticmethod
     def of(steps: Sequence[PredictedStep]) -> States:
         """Stacks the steps of a stretch."""
-        return States(
-            torch.stack([step.positions for step in steps]),
-            torch.stack([step.deformation_gradients for step in steps]),
-            torch.stack([step.rotations for step in steps]),
-        )
+        return States(*(torch.stack([getattr(step, f.name) for step in steps]) for f in fields(States)))
 
     def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
         """The three of them."""
         return self.positions, self.deformation_gradients, self.rotations
-
-
-class Looks:
-    """The appearance of every scene's foreground, made once and moved to the device on first use."""
-
-    def __init__(self, scenes: Sequence[GaussianScene]) -> None:
-        self._scenes = list(scenes)
-        self._made: dict[int, SceneAppearance] = {}
-
-    def of(self, scene_id: int, like: Tensor) -> SceneAppearance:
-        """The appearance of a scene, on the device and in the type of ``like``."""
-        if scene_id not in self._made:
-            scene = self._scenes[scene_id]
-            self._made[scene_id] = SceneAppearance.of(scene, scene.foreground)
-        self._made[scene_id] = self._made[scene_id].to(like)
-        return self._made[scene_id]
 
 
 def windows(
@@ -160,16 +94,14 @@ def windows(
         made: list[PredictedStep] = []
         prepared = None if checkpoint else model.prepare(batch)
         for _ in range(min(length, steps - start)):
-            if checkpoint:
-                step: PredictedStep = checkpointed_step(model, batch, state)
-            else:
-                step = model.step(batch, state, prepared=prepared)
-            state = following(step, state)
-            made.append(step)
+            made.append(
+                checkpointed_step(model, batch, state) if checkpoint else model.step(batch, state, prepared=prepared)
+            )
+            state = _following(made[-1], state)
         yield start, made
 
 
-def following(step: PredictedStep, state: SimState) -> SimState:
+def _following(step: PredictedStep, state: SimState) -> SimState:
     """The state after a step: the step's own where a model carries more than positions (``step.state``)."""
     own: SimState | None = getattr(step, "state", None)
     return SimState(step.positions, state.positions) if own is None else own
@@ -178,16 +110,8 @@ def following(step: PredictedStep, state: SimState) -> SimState:
 def after(steps: Sequence[PredictedStep], state: SimState) -> SimState:
     """The state behind a stretch that began at ``state``, without history."""
     for step in steps:
-        state = following(step, state)
+        state = _following(step, state)
     return state.detach()
-
-
-def draw_rest(renderer: Renderer, look: SceneAppearance, rest: Float[Tensor, "K 3"], cameras: Cameras) -> Rendered:
-    """The rest state as one drawn state: the static prediction."""
-    identity = torch.eye(3, dtype=rest.dtype, device=rest.device)[None, None]
-    units = torch.zeros(rest.shape[0], dtype=torch.long, device=rest.device)
-    with torch.no_grad():
-        return draw(renderer, look, rest[None], identity, identity, units, cameras)
 
 
 def reach(batch: SceneBatch, diagonals: Sequence[float], positions: Float[Tensor, "T K 3"]) -> Float[Tensor, "T S"]:
@@ -236,12 +160,8 @@ class Explosions:
         """
         self._batch, self._diagonals, self._samples = batch, diagonals, samples
         self._limit, self._ranks = limit, ranks
+        self._rest: Tensor | None = None if batch is None else batch.rest
         self._lasts = None if deferred is None else torch.ones((), dtype=torch.bool, device=deferred)
-
-    @property
-    def _rest(self) -> Float[Tensor, "K 3"]:
-        assert self._batch is not None
-        return self._batch.rest
 
     def end(self, positions: Float[Tensor, "T K 3"] | None, start: int, found: list[Tensor]) -> bool:
         """Looks at a stretch; returns whether to stop, else adds its reach to ``found``.
@@ -268,7 +188,7 @@ class Explosions:
 
     def spared(self, states: States) -> States:
         """The states, or those of rest once the rollout has ended: they can be drawn whatever happened."""
-        if self._lasts is None:
+        if self._lasts is None or self._rest is None:
             return states
         identity = torch.eye(3, dtype=states.deformation_gradients.dtype, device=states.deformation_gradients.device)
         rests = (self._rest, identity, identity)
@@ -280,7 +200,7 @@ class Explosions:
 
     def restart(self, state: SimState) -> SimState:
         """The state, or that of rest once the rollout has ended."""
-        if self._lasts is None:
+        if self._lasts is None or self._rest is None:
             return state
         return SimState(*(torch.where(self._lasts, x, self._rest) for x in (state.positions, state.previous)))
 

@@ -17,11 +17,13 @@ from gausim.training.ranks.ranks import interleave
 from gausim.training.rollout import check_reach, describe
 
 Table = list[list[float]]
+# Found stretch by stretch, and once per step where it is looked at.
+SERIES, SINGLE = ("reach", "images", "momentum", "motion"), ("static", "growth", "gradient_fraction")
 
 
 @dataclass(frozen=True)
 class Found:
-    """The numbers of a step on the host, stretch by stretch.
+    """The numbers of a step on the host.
 
     Attributes:
         reach: how far kernels moved, per stretch, step and sequence.
@@ -49,20 +51,17 @@ class Found:
         if len(parts) == 1:
             return parts[0]
         held = [part for part in parts if part.reach]  # the others had no sequence
-        static = [part.static for part in parts if part.static is not None]
-        growth = [part.growth for part in parts if part.growth is not None]
-        return replace(
-            parts[0],
-            reach=[_beside(tables) for tables in zip(*(part.reach for part in held), strict=True)],
-            images=[_beside(tables) for tables in zip(*(part.images for part in held), strict=True)],
-            momentum=[
-                [sum(values) for values in zip(*lists, strict=True)]
-                for lists in zip(*(part.momentum for part in held), strict=True)
-            ],
-            motion=[sum(values) for values in zip(*(part.motion for part in held), strict=True)],
-            static=sum(static) if static else None,
-            growth=sum(growth) if growth else None,
+        reach, images, momentum, motion = (
+            list(zip(*(getattr(part, name) for part in held), strict=True)) for name in SERIES
         )
+        joined: dict[str, Any] = {"motion": list(map(sum, motion))}
+        joined["momentum"] = [[sum(values) for values in zip(*lists, strict=True)] for lists in momentum]
+        for name, stretches in (("reach", reach), ("images", images)):
+            joined[name] = [[interleave(rows) for rows in zip(*tables, strict=True)] for tables in stretches]
+        for name in ("static", "growth"):
+            known = [value for part in parts if (value := getattr(part, name)) is not None]
+            joined[name] = sum(known) if known else None
+        return replace(parts[0], **joined)
 
     @property
     def frames(self) -> Table:
@@ -70,11 +69,9 @@ class Found:
         return [row for table in self.images for row in table]
 
     def lasting(self, samples: Sequence[SampleFacts], explosion: float) -> Found:
-        """Ends the rollout at its first explosion and checks that all is finite.
+        """Ends the rollout of the samples at its first explosion and checks that all is finite.
 
-        Args:
-            samples: the sequences of the step.
-            explosion: a stretch in which a kernel moves further than this does not count [diagonals].
+        A stretch in which a kernel moves further than ``explosion`` does not count [diagonals].
 
         Raises:
             DivergenceError: a number is not finite; names the step and the sequence where there is one.
@@ -84,9 +81,8 @@ class Found:
             if check_reach(table, start, samples) > explosion:
                 break
             start, lasted = start + len(table), lasted + 1
-        kept = {name: getattr(self, name)[:lasted] for name in ("reach", "images", "momentum", "motion")}
         fraction = self.gradient_fraction if lasted else None  # of the first stretch
-        found = replace(self, **kept, gradient_fraction=fraction)
+        found = replace(self, **{name: getattr(self, name)[:lasted] for name in SERIES}, gradient_fraction=fraction)
         found._check(samples)
         return found
 
@@ -137,25 +133,18 @@ class Statistics:
 
     def fetch(self, norms: Mapping[str, Tensor]) -> Found:
         """Fetches everything at once, the norm of each parameter group's gradient too."""
-        series = {name: getattr(self, name) for name in ("reach", "images", "momentum", "motion")}
-        single = {name: getattr(self, name) for name in ("static", "growth", "gradient_fraction")}
-        parts = [x for kept in series.values() for x in kept]
-        parts += [x for x in (*single.values(), *norms.values()) if x is not None]
+        parts = [x for name in SERIES for x in getattr(self, name)]
+        parts += [x for x in (*(getattr(self, name) for name in SINGLE), *norms.values()) if x is not None]
         device = parts[0].device
         numbers = iter(torch.cat([p.detach().to(device, torch.float32).reshape(-1) for p in parts]).tolist())
-        found: dict[str, Any] = {name: [_take(x.shape, numbers) for x in kept] for name, kept in series.items()}
-        found |= {name: None if x is None else next(numbers) for name, x in single.items()}
+        found: dict[str, Any] = {name: [_take(x.shape, numbers) for x in getattr(self, name)] for name in SERIES}
+        found |= {name: None if getattr(self, name) is None else next(numbers) for name in SINGLE}
         return Found(**found, gradients=dict(zip(norms, numbers, strict=True)))
 
 
 def _take(shape: Sequence[int], numbers: Iterator[float]) -> Any:
     """Numbers in nested lists of a shape."""
     return [_take(shape[1:], numbers) for _ in range(shape[0])] if shape else next(numbers)
-
-
-def _beside(tables: Sequence[Table]) -> Table:
-    """Tables of the ranks' sequences as one of all sequences."""
-    return [interleave(rows) for rows in zip(*tables, strict=True)]
 
 
 def _compare(frames: Table, motion: float, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:

@@ -29,6 +29,9 @@ def optimise(
 ) -> dict[str, float]:
     """One step with all losses; returns what is logged of it.
 
+    ``samples`` are this rank's part of the batch, which may be empty where there are several; ``draws`` are the random
+    numbers of the step, and ``advance`` makes the optimiser's step.
+
     Raises:
         DivergenceError: a number is not finite; no parameter has moved.
     """
@@ -40,7 +43,7 @@ def optimise(
         samples, whole, draws, statistics, learner.ranks, learner.accumulate, learner.rest_loss, learner.objective,
         learner.images, learner.diagonals,
     )  # fmt: skip
-    for term in learner.terms():
+    for term in learner.method.terms():
         term.descend(inputs)
     weights = [p for p in learner.parameters() if p.requires_grad]
     learner.exchange.step(weights, learner.network(), statistics)
@@ -105,7 +108,7 @@ def descend(
     images_term = objective.image_weight * per * losses.sum()
     momentum_term = objective.momentum_weight * per * momentum.sum()
     weighted = momentum_term.requires_grad and objective.momentum_weight > 0
-    if measure and weighted and network and learner.measures_fraction():
+    if measure and weighted and network and learner.measuring:
         statistics.pulls = _pull(images_term, network), _pull(momentum_term, network)
     learner.accumulate(images_term + momentum_term if weighted else images_term)
     statistics.images.append(losses.detach())

@@ -14,18 +14,10 @@ from gausim.io.files import write_durably
 class Table:
     """Rows that are on the disk as soon as they are appended; :meth:`resume_at` drops those that come again.
 
-    Attributes:
-        path: the file.
+    ``key`` is the column that counts. Values outside ``columns`` are left out; where none are given, the table grows.
     """
 
     def __init__(self, path: Path, key: str, columns: Sequence[str] = ()) -> None:
-        """Reads and writes nothing yet.
-
-        Args:
-            path: the file.
-            key: the column that counts.
-            columns: of the table; other values of a row are left out. Where none are given, the table grows.
-        """
         self.path, self._key, self._fixed = path, key, tuple(columns)
         self._columns = list(columns)
 

@@ -23,18 +23,7 @@ from gausim.training.ranks.layout import Layout, RanksStrategy
 
 @dataclass(frozen=True)
 class TrainerSettings(Layout):
-    """How long, how precisely and where a run trains: the keys of ``conf/trainer``.
-
-    Attributes:
-        max_epochs: epochs of the whole run.
-        threads: of torch's operators on the CPU, for each rank; None leaves the process's own number.
-        precision: Lightning's name of it.
-        max_minutes: time budget; None is without.
-        clock: what the budget counts, ``wall`` or ``cpu`` time.
-        log_every_n_steps: optimiser steps between rows of the loggers.
-        progress: whether a progress bar is shown.
-        convergence: ends the run when it has learned; None leaves it all of its epochs.
-    """
+    """How long, how precisely and where a run trains: the keys of ``conf/trainer`` say what the settings are."""
 
     max_epochs: int = 120
     threads: int | None = None
@@ -56,12 +45,7 @@ def make_trainer(
 ) -> Trainer:
     """The Lightning trainer of a run.
 
-    Args:
-        settings: of the run.
-        run_dir: where checkpoints, panels and tables go.
-        callbacks: further ones.
-        loggers: where numbers go.
-        crew: the ranks, where there are several.
+    Its files go to ``run_dir``; the ``crew`` are its ranks, where there are several.
 
     Raises:
         ConfigError: more than one rank without a crew.

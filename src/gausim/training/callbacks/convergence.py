@@ -40,7 +40,7 @@ class Forecast:
 
     Attributes:
         error: loss of the prediction over that of the rest state, both above what the reconstruction leaves on frame 0.
-        moving: share of the rest state's loss that is above what the reconstruction leaves.
+        moving: fraction of the rest state's loss that is above what the reconstruction leaves.
     """
 
     error: float
@@ -60,30 +60,17 @@ class Convergence(Callback):
     """
 
     def __init__(self, *, held_back: int = 4, window: int = 40, tolerance: float = 0.01, sequences: int = 12) -> None:
-        """Keeps the settings.
-
-        Args:
-            held_back: the last so many training frames are foreseen, not trained on, until the end begins.
-            window: the best forecast of so many last ones is compared with the best before [shows of a sequence].
-            tolerance: less improvement than this in ten shows of a sequence is none.
-            sequences: at most so many are judged, spread over all.
-
-        Raises:
-            ConfigError: a number out of range.
-        """
+        """The settings stand in ``conf/base/more.yaml``."""
         if min(held_back, window, sequences) < 1 or not 0 <= tolerance < 1:
             raise ConfigError(
                 "trainer.convergence: expected held_back, window, sequences >= 1 and tolerance in [0, 1), got "
                 f"{held_back}, {window}, {sequences} and {tolerance}."
             )
         self._held_back, self._window, self._tolerance = held_back, window, tolerance
-        self._sequences = sequences
+        self._sequences, self._shows, self._allowance = sequences, 1, 0
         self.forecasts: list[Forecast] = []
-        self.converged = False
+        self.converged, self._judges = False, False
         self._ending_since: int | None = None  # epochs done then
-        self._allowance = 0
-        self._shows = 1
-        self._judges = False
 
     # ------------------------------------------------------------------------------------------------ training
 

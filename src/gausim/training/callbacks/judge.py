@@ -10,19 +10,13 @@ from gausim.training.module import GausSimModule
 
 
 class EpochJudge(Callback):
-    """Shows a metric to a judge after each epoch; its word ends training, and the run is then finished.
+    """Shows a metric to a judge after each epoch; its word ends training, and the run is then finished (``stopped``).
 
-    Attributes:
-        stopped: whether it did.
+    The judge takes the number of epochs done and the mean of the metric (a column of ``epochs.csv``) over the last one;
+    True ends training.
     """
 
     def __init__(self, *, judge: Callable[[int, float], bool], metric: str) -> None:
-        """Keeps the settings.
-
-        Args:
-            judge: takes the number of epochs done and the metric's mean over the last; True ends training.
-            metric: name of the mean, a column of ``epochs.csv``.
-        """
         self._judge, self._metric, self.stopped = judge, metric, False
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -20,7 +20,6 @@ from gausim.results.diagnosis import Diagnosis
 from gausim.runs.names import MOTION
 from gausim.runs.randomness import undisturbed
 from gausim.training.callbacks.cadence import has_come, training_data
-from gausim.training.contracts import Hierarchical
 from gausim.training.module import GausSimModule
 from gausim.training.supervision.points import attach_points
 from gausim.training.table import Table, short
@@ -44,15 +43,7 @@ class MotionWatch(Callback):
     )  # fmt: skip
 
     def __init__(self, *, every_epochs: int = 10, sequences: int = 4) -> None:
-        """Keeps the settings.
-
-        Args:
-            every_epochs: epochs between looks; the last epoch always has one. 0 is never.
-            sequences: at most so many of every object, the first ones.
-
-        Raises:
-            ConfigError: a number out of range.
-        """
+        """Looks every so many epochs (0 is never) and after the last, at the first ``sequences`` of every object."""
         if every_epochs < 0 or sequences < 1:
             raise ConfigError(
                 f"callbacks.motion: expected every_epochs >= 0 and sequences >= 1, got {every_epochs} and {sequences}."
@@ -69,27 +60,27 @@ class MotionWatch(Callback):
         if not (trainer.is_global_zero and has_come(trainer, self._every)):
             return
         assert isinstance(pl_module, GausSimModule)
-        with undisturbed(), torch.no_grad():
+        with undisturbed(), torch.no_grad(), evaluating(pl_module):
             rows = self._look(trainer, pl_module)
         for name, row in rows.items():
             place = {"epoch": trainer.current_epoch + 1, "step": trainer.global_step, "object": name}
             self._table(trainer).append({**place, **{key: short(value) for key, value in row.items()}})
-        means = {key: _mean([row[key] for row in rows.values() if key in row]) for key in self.COLUMNS[3:]}
-        known = {f"motion/{key}": value for key, value in means.items() if np.isfinite(value)}
-        for logger in trainer.loggers if known else ():
-            logger.log_metrics(known, step=trainer.global_step)
+        values = {key: [row[key] for row in rows.values() if key in row] for key in self.COLUMNS[3:]}
+        means = {f"motion/{key}": float(np.mean(known)) for key, known in values.items() if known}
+        for logger in trainer.loggers if means else ():
+            logger.log_metrics(means, step=trainer.global_step)
 
     def _table(self, trainer: Trainer) -> Table:
         return Table(Path(trainer.default_root_dir) / MOTION, "epoch", self.COLUMNS)
 
     def _look(self, trainer: Trainer, module: GausSimModule) -> dict[str, dict[str, float]]:
         rows, first = {}, 0
-        with evaluating(module):
-            for scene_id, item in enumerate(training_data(trainer).objects):
-                found = list(self._predicted(module, item, scene_id, first))
-                first += len(item.sequences)
-                if found:
-                    rows[item.name] = figures(found, item, _units(module, scene_id))
+        units_of_kernels = getattr(module.model, "units_of_kernels", lambda scene_id: ())
+        for scene_id, item in enumerate(training_data(trainer).objects):
+            found = list(self._predicted(module, item, scene_id, first))
+            first += len(item.sequences)
+            if found:
+                rows[item.name] = figures(found, item, units_of_kernels(scene_id))
         return rows
 
     def _predicted(
@@ -118,21 +109,17 @@ def figures(
 ) -> dict[str, float]:
     """The figures of one object; what cannot be told is left out."""
     unseen, diagnosis = item.train_frames.stop, Diagnosis(item.fps)
-    sums: dict[str, list[np.ndarray]] = {}
+    # Prediction and reference by frame, over all sequences: mean distance from the truth, and motion energy.
+    errors, energies = [], []
     for truth, points, attached in found:
         diagnosis.add(truth.positions, truth.rest, {METHOD: points}, {METHOD: [unit[attached] for unit in units]})
         static = truth.rest.expand_as(truth.positions)
-        pairs = {
-            "error": [(x - truth.positions).norm(dim=-1).mean(-1) for x in (points, static)],
-            "energy": [motion_energy(points), motion_energy(truth.positions)],
-        }
-        for name, pair in pairs.items():
-            sums.setdefault(name, []).append(torch.stack(pair).cpu().double().numpy())
-    row = {"error_seen": _ratio(sums["error"], slice(1, unseen))}
-    row["error_unseen"] = _ratio(sums["error"], slice(unseen, None))
+        errors.append([(x - truth.positions).norm(dim=-1).mean(-1).cpu().double().numpy() for x in (points, static)])
+        energies.append([motion_energy(x).cpu().double().numpy() for x in (points, truth.positions)])
+    row = {"error_seen": _ratio(errors, slice(1, unseen)), "error_unseen": _ratio(errors, slice(unseen, None))}
     row["gap"] = row["error_unseen"] - row["error_seen"]
-    row["energy_seen"] = _ratio(sums["energy"], slice(0, unseen - 1))
-    row["energy_unseen"] = _ratio(sums["energy"], slice(unseen - 1, None))
+    row["energy_seen"] = _ratio(energies, slice(0, unseen - 1))
+    row["energy_unseen"] = _ratio(energies, slice(unseen - 1, None))
     read = read_diagnosis({"diagnosis": diagnosis.summary(), "splits": {"seen": [0, unseen]}})
     if read is not None:
         own = read.rows[METHOD]
@@ -145,15 +132,6 @@ def figures(
     return {name: value for name, value in row.items() if np.isfinite(value)}
 
 
-def _units(module: GausSimModule, scene_id: int) -> Sequence[Tensor]:
-    model = module.simulator
-    return model.units_of_kernels(scene_id) if isinstance(model, Hierarchical) else ()
-
-
-def _ratio(pairs: Sequence[np.ndarray], span: slice) -> float:
-    own, reference = (sum(float(pair[i, span].sum()) for pair in pairs) for i in (0, 1))
+def _ratio(pairs: Sequence[Sequence[np.ndarray]], span: slice) -> float:
+    own, reference = (sum(float(pair[i][span].sum()) for pair in pairs) for i in (0, 1))
     return own / reference if reference > 0 else float("nan")
-
-
-def _mean(values: Sequence[float]) -> float:
-    return float(np.mean(values)) if values else float("nan")

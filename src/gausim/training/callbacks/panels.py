@@ -35,15 +35,7 @@ class Panels(Callback):
     """
 
     def __init__(self, *, every_epochs: int = 5, objects: int = 4) -> None:
-        """Keeps the settings.
-
-        Args:
-            every_epochs: epochs between panels; the last epoch always has some. 0 is never.
-            objects: at most so many objects, the first ones.
-
-        Raises:
-            ConfigError: a number out of range.
-        """
+        """Shows the first ``objects`` every so many epochs (0 is never) and after the last."""
         if every_epochs < 0 or objects < 1:
             raise ConfigError(
                 f"callbacks.panels: expected every_epochs >= 0 and objects >= 1, got {every_epochs} and {objects}."
@@ -113,12 +105,8 @@ def _clip(module: GausSimModule, sample: SequenceSample) -> tuple[Clip, dict[str
     errors = {name: values.double().cpu().numpy() for name, values in by_frame.items()}
     own, still = (float(np.mean(errors[name][1:])) for name in (PREDICTION, STATIC))
     moved = _energy(truth)
-    figures = {
-        "l2": own,
-        "static": still,
-        "ratio": own / still if still > 0 else math.nan,
-        "energy": _energy(prediction) / moved if moved > 0 else math.nan,
-    }
+    ratios = own / still if still > 0 else math.nan, _energy(prediction) / moved if moved > 0 else math.nan
+    figures = dict(zip(("l2", "static", "ratio", "energy"), (own, still, *ratios), strict=True))
     name = safe_name(sample.object_name, sample.sequence_name)
     title = f"{sample.object_name}/{sample.sequence_name} {sample.cameras.names[0]}"
     drawn = [to_bytes(images).cpu().numpy() for images in (truth, prediction)]

@@ -10,12 +10,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar
 
-from gausim.data.datamodule import ReadyDataModule
 from gausim.runs.names import EPOCHS
+from gausim.training.callbacks.cadence import training_data
 from gausim.training.callbacks.convergence import Convergence
 from gausim.training.callbacks.time_budget import TimeBudget
 from gausim.training.module import GausSimModule
@@ -89,33 +88,24 @@ class EpochSummary(Callback):
         # The stages of a fit have lengths of their own.
         left = None if module.initial_states is None else _minutes_left(trainer, self._paces)
         judged = any(isinstance(c, Convergence) and c.is_learning for c in cast(Any, trainer).callbacks)
-        return "  ".join(
-            [*parts, *([] if left is None else [f"{'at most' if judged else 'about'} {left:.0f} min left"])]
-        )
+        if left is not None:
+            parts.append(f"{'at most' if judged else 'about'} {left:.0f} min left")
+        return "  ".join(parts)
 
     def _table(self, trainer: Trainer) -> Table:
         return Table(Path(trainer.default_root_dir) / EPOCHS, "epoch", self.COLUMNS)
 
 
 def _minutes_left(trainer: Trainer, paces: Sequence[tuple[int, float]]) -> float | None:
-    """What the epochs to come will take, by a line through T and seconds of those that are over [minutes].
-
-    None where there are none, where nothing says how many frames they predict, or where all that are over had
-    one T, which tells nothing about another.
-    """
-    data: Any = getattr(trainer, "datamodule", None)
+    """What the epochs to come will take, by the time that a predicted frame took lately [minutes]; None for none."""
     done, epochs = trainer.current_epoch + 1, trainer.max_epochs or 0
-    if not isinstance(data, ReadyDataModule) or done >= epochs:
+    shown = sum(steps for steps, _ in paces)
+    if done >= epochs or not shown:
         return None
-    coming = np.array([data.steps(epoch) for epoch in range(done, epochs)])
-    steps, seconds = np.array(paces).T
-    alike = np.ptp(steps) == 0
-    if alike and (coming != steps[0]).any():
-        return None
-    slope = 0.0 if alike else max(0.0, float(np.polyfit(steps, seconds, 1)[0]))
-    left = float(np.maximum(seconds.mean() + slope * (coming - steps.mean()), 0.0).sum()) / 60.0
+    data = training_data(trainer)
+    frames = sum(data.steps(epoch) for epoch in range(done, epochs))
     budgets = [c.minutes_left for c in cast(Any, trainer).callbacks if isinstance(c, TimeBudget)]
-    return float(min([left, *budgets]))
+    return min([frames * sum(seconds for _, seconds in paces) / shown / 60.0, *budgets])
 
 
 class Progress(RichProgressBar):

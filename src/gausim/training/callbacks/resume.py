@@ -28,17 +28,7 @@ class RunCheckpoint(Checkpoint):
     def __init__(
         self, *, every_epochs: int = 1, every_minutes: float = 1.0, every_steps: int = 0, snapshot_every: int = 0
     ) -> None:
-        """Keeps the settings; none of them changes what is learned.
-
-        Args:
-            every_epochs: epochs between saves of ``last.ckpt``; the last epoch is always saved.
-            every_minutes: wall-clock minutes after which it is saved within an epoch; 0 is never.
-            every_steps: optimiser steps after which it is saved within an epoch; 0 is never.
-            snapshot_every: epochs between ``epoch_NNNN.ckpt`` files that stay; 0 is never.
-
-        Raises:
-            ConfigError: a number out of range.
-        """
+        """The settings stand in ``conf/base/more.yaml``; none of them changes what is learned."""
         if every_epochs < 1 or min(every_minutes, every_steps, snapshot_every) < 0:
             raise ConfigError(
                 "callbacks.checkpoint: expected every_epochs >= 1 and every_minutes, every_steps, snapshot_every >= 0, "

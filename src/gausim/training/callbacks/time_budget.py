@@ -19,25 +19,12 @@ class TimeBudget(Callback):
     """
 
     def __init__(self, *, minutes: float, clock: str = "wall") -> None:
-        """Keeps the settings.
-
-        Args:
-            minutes: the budget.
-            clock: ``wall``, or ``cpu`` for processor time of this process.
-
-        Raises:
-            ConfigError: an unknown clock or a budget that is not positive.
-        """
+        """``clock`` is ``wall``, or ``cpu`` for processor time of this process."""
         if clock not in ("wall", "cpu") or not minutes > 0:
             raise ConfigError(f"trainer: expected max_minutes > 0 and clock wall or cpu, got {minutes} and {clock!r}.")
         self._budget = 60.0 * minutes
         self._clock = time.monotonic if clock == "wall" else time.process_time
         self._used, self._mark = 0.0, 0.0
-
-    @property
-    def spent(self) -> bool:
-        """Whether the budget is used up."""
-        return self._used >= self._budget
 
     @property
     def minutes_left(self) -> float:
@@ -58,7 +45,7 @@ class TimeBudget(Callback):
         self._used = float(trainer.strategy.broadcast(self._used + now - self._mark))
         self._mark = now
         self._drive(pl_module)
-        if self.spent:
+        if self._used >= self._budget:
             trainer.should_stop = True
 
     def _drive(self, pl_module: LightningModule) -> None:

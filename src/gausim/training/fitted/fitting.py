@@ -11,13 +11,14 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from gausim.core import FittedDynamics, FittedMethod, FittedState, GaussianScene, SimState, Trajectory
 from gausim.data.dataset import SequenceSample
 from gausim.losses.objective import Objective
+from gausim.models.hierarchy.batch import Member
 from gausim.training.fitted.stages import FitPlan, StagedCurriculum
 from gausim.training.method import Method, Moment, Task
 from gausim.training.optimizers import OptimizerSettings
@@ -42,29 +43,12 @@ class Carried(SimState):
         return Carried.of([part.detach() for part in self.parts])
 
 
-@dataclass(eq=False)
-class FittedStep(Frame):
-    """One predicted frame of a batch, and the state to go on from."""
-
-    state: Carried
-
-
-@dataclass(frozen=True, eq=False)
-class Place:
-    """Where one sequence stands in a batch (see :class:`gausim.training.contracts.Member`)."""
-
-    scene_id: int
-    kernels: slice
-    units: slice
-    unit_of_kernel: Int[Tensor, " K"]
-
-
 @dataclass(frozen=True, eq=False)
 class Batch:
     """Several sequences side by side (see :class:`gausim.training.contracts.SceneBatch`)."""
 
     rest: Float[Tensor, "K 3"]
-    members: tuple[Place, ...]
+    members: tuple[Member, ...]
 
 
 class Sequences(nn.Module):
@@ -72,42 +56,35 @@ class Sequences(nn.Module):
 
     def __init__(self, method: FittedMethod) -> None:
         super().__init__()
-        self.method = cast(nn.Module, method)
+        self.method = cast(Any, method)
         self.scenes: Sequence[GaussianScene] = method.scenes
-
-    @property
-    def fitted(self) -> FittedMethod:
-        """The method, as what it can do."""
-        return cast(FittedMethod, self.method)
 
     def batch(self, scene_ids: Sequence[int]) -> Batch:
         """Rows of one sequence per entry."""
         device = next((p.device for p in self.parameters()), torch.device("cpu"))
         places, kernels, units = [], 0, 0
         for scene_id in scene_ids:
-            unit = self.fitted.unit_of_kernel(scene_id).to(device)
+            unit = self.method.unit_of_kernel(scene_id).to(device)
             ends = kernels + len(unit), units + int(unit.max()) + 1
-            places.append(Place(scene_id, slice(kernels, ends[0]), slice(units, ends[1]), unit))
+            places.append(Member(scene_id, slice(kernels, ends[0]), slice(units, ends[1]), unit))
             kernels, units = ends
         return Batch(torch.cat([self.scenes[i].means for i in scene_ids]).to(device), tuple(places))
 
     def prepare(self, batch: Batch) -> None:
         """Nothing is shared between steps but what a state carries."""
 
-    def step(self, batch: Batch, state: Carried, force: None = None, prepared: None = None) -> FittedStep:
+    def step(self, batch: Batch, state: Carried, force: None = None, prepared: None = None) -> Frame:
         """The next frame of every sequence."""
-        parts = [self.fitted.advance(part) for part in state.parts]
+        parts = [self.method.advance(part) for part in state.parts]
         following = Carried.of(parts)
-        deformation_gradients, rotations = (
-            torch.cat([getattr(p, n) for p in parts]) for n in ("deformation_gradients", "rotations")
+        gradients, rotations = (
+            torch.cat([getattr(p, name) for p in parts]) for name in ("deformation_gradients", "rotations")
         )
-        return FittedStep(
-            following.positions, deformation_gradients, rotations, deformation_gradients.new_zeros(()), following
-        )
+        return Frame(following.positions, gradients, rotations, gradients.new_zeros(()), following)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """The method's."""
-        return {name: list(members) for name, members in self.fitted.parameter_groups().items()}
+        return {name: list(members) for name, members in self.method.parameter_groups().items()}
 
 
 class Penalties:
@@ -130,24 +107,15 @@ class StagedFit(Method):
     """A method with parameters for every sequence, fitted stage by stage.
 
     With ``data.batch_size`` 1 the fits of the sequences do not see each other (their gradients are clipped one by
-    one), but for what the method shares between the sequences of an object.
+    one), but for what the method shares between the sequences of an object. The ``curriculum`` has T of the epochs,
+    which the stages of the ``plan`` set; a rollout ends where a kernel is further than ``explosion`` from rest
+    [diagonals of the scene].
     """
 
     model: Sequences
     initial_states, defers, warns = None, False, False  # after an explosion there is no state of rest to go on from
 
     def __init__(self, fitted: FittedMethod, plan: FitPlan, curriculum: StagedCurriculum, explosion: float) -> None:
-        """Keeps its parts.
-
-        Args:
-            fitted: what is fitted.
-            plan: its stages.
-            curriculum: T of the epochs, which the stages set.
-            explosion: a rollout ends where a kernel is further than this from rest [diagonals of the scene].
-
-        Raises:
-            ConfigError: a stage names what the method does not have.
-        """
         penalties = sorted(fitted.penalties(0)) if any(s.penalties for _, s in plan.order) else []
         plan.check(fitted.parameter_groups(), penalties)
         self.fitted, self.plan, self.curriculum = fitted, plan, curriculum

@@ -21,7 +21,6 @@ class Stage:
     Attributes:
         iterations: optimiser steps for each sequence.
         rates: learning rate of each parameter group that learns; the others rest.
-        loss: between a predicted and a true image.
         frames: predicted frames T at the beginning and at the end of the stage, growing evenly between; 0 is as many
             as training may see.
         schedules: how the rates of a group change, counted in iterations of the stage; ``default`` is for the groups
@@ -104,11 +103,7 @@ class FitPlan:
         return max(1, round(stage.iterations / self.shows))
 
     def check(self, groups: Mapping[str, Sequence[Parameter]], penalties: Sequence[str]) -> None:
-        """Compares the stages with what a method has.
-
-        Raises:
-            ConfigError: a stage names a group or penalty that is not there; names the stage, and what is there.
-        """
+        """Raises ConfigError where a stage names a group or penalty that a method does not have."""
         for name, stage in self.order:
             for what, asked, there in (("rates", stage.rates, groups), ("penalties", stage.penalties, penalties)):
                 unknown = sorted(set(asked) - set(there))

@@ -29,12 +29,7 @@ _STEP = re.compile(r"step_(\d+)")
 
 @dataclass(frozen=True)
 class Media:
-    """The media of one optimiser step: a folder with four files per sequence and a table of the objects.
-
-    Attributes:
-        folder: ``panels/step_NNNNNN`` of the run.
-        step: the optimiser step.
-    """
+    """The media of one optimiser step: a folder with four files per sequence and a table of the objects."""
 
     folder: Path
     step: int
@@ -54,11 +49,11 @@ class Media:
 
     def errors(self, name: str) -> tuple[list[str], list[list[str]]]:
         """Columns and rows of the errors by frame."""
-        return read_table(self.folder / f"{name}.errors.csv")
+        return _read_table(self.folder / f"{name}.errors.csv")
 
     def objects(self) -> tuple[list[str], list[list[str]]]:
         """Columns and rows of the table with a line per object."""
-        return read_table(self.folder / "objects.csv")
+        return _read_table(self.folder / "objects.csv")
 
 
 @runtime_checkable
@@ -72,15 +67,9 @@ class MediaLog(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """One sequence as seen by one camera.
+    """One sequence as seen by one camera: truth and prediction over black, and errors by frame, as they are printed.
 
-    Attributes:
-        name: of its files.
-        title: what is shown, for people.
-        fps: frames per second.
-        truth: ground truth over black.
-        prediction: prediction over black.
-        errors: name -> error by frame, as printed.
+    ``name`` is that of its files, ``title`` is for people.
     """
 
     name: str
@@ -92,20 +81,14 @@ class Clip:
 
 
 def write_media(run: Path, step: int, clips: Sequence[Clip], columns: list[str], rows: list[list[str]]) -> Media:
-    """Writes the media of an optimiser step into the run directory, all or nothing.
-
-    ``columns`` and ``rows`` are those of the table of objects.
-
-    Raises:
-        OSError: the disk refuses.
-    """
+    """Writes the media of an optimiser step into the run directory, all or nothing; the table is that of objects."""
     media = Media(run / FOLDER / f"step_{step:06d}", step)
     temporary = media.folder.with_name(f".{media.folder.name}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     for clip in clips:
         _write_clip(temporary, clip)
-    write_table(temporary / "objects.csv", columns, rows)
+    _write_table(temporary / "objects.csv", columns, rows)
     shutil.rmtree(media.folder, ignore_errors=True)
     os.replace(temporary, media.folder)
     return media
@@ -141,7 +124,7 @@ def _write_clip(folder: Path, clip: Clip) -> None:
     Image.fromarray(slice_panel(truth, prediction)).save(folder / f"{clip.name}.slice.png")
     values = [["" if np.isnan(v) else f"{v:.6g}" for v in series] for series in clip.errors.values()]
     rows = [[str(i), *row] for i, row in enumerate(zip(*values, strict=True))]
-    write_table(folder / f"{clip.name}.errors.csv", ["frame", *clip.errors], rows)
+    _write_table(folder / f"{clip.name}.errors.csv", ["frame", *clip.errors], rows)
 
 
 def _shrunk(frames: UInt8[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F h w 3"]:
@@ -153,26 +136,19 @@ def _shrunk(frames: UInt8[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F h w 3"
 
 
 def frame_panel(
-    truth: UInt8[np.ndarray, "F H W 3"], prediction: UInt8[np.ndarray, "F H W 3"], *, columns: int = 6, gap: int = 2
+    truth: UInt8[np.ndarray, "F H W 3"], prediction: UInt8[np.ndarray, "F H W 3"]
 ) -> UInt8[np.ndarray, "R C 3"]:
-    """Three rows (ground truth, prediction, error colours) of evenly spread frames, the first and the last too."""
-    count = len(truth)
-    chosen = sorted({round(i * (count - 1) / max(1, columns - 1)) for i in range(columns)})
-    errors = [error_colors(truth[i], prediction[i]) for i in chosen]
-    rows = []
-    for images in ([truth[i] for i in chosen], [prediction[i] for i in chosen], errors):
-        padded = [np.pad(image, ((0, gap), (0, gap), (0, 0)), constant_values=64) for image in images]
-        rows.append(np.concatenate(padded, 1))
-    return np.concatenate(rows)
+    """Three rows (ground truth, prediction, error colours) of six evenly spread frames, the first and the last too."""
+    chosen = sorted({round(i * (len(truth) - 1) / 5) for i in range(6)})
+    rows = truth[chosen], prediction[chosen], [error_colors(truth[i], prediction[i]) for i in chosen]
+    padded = [[np.pad(image, ((0, 2), (0, 2), (0, 0)), constant_values=64) for image in row] for row in rows]
+    return np.concatenate([np.concatenate(row, 1) for row in padded])
 
 
 def slice_panel(
     truth: UInt8[np.ndarray, "F H W 3"], prediction: UInt8[np.ndarray, "F H W 3"]
 ) -> UInt8[np.ndarray, "R C 3"]:
-    """Space-time slices of truth, prediction and error, time to the right.
-
-    They go through the line that moves most in the truth.
-    """
+    """Space-time slices of truth, prediction and error along the line that moves most in the truth, time rightwards."""
     line = moving_line(truth)
     first, second = space_time_slice(truth, line), space_time_slice(prediction, line)
     named = {f"truth, {line[0]} {line[1]}": first, "prediction": second, "error": error_colors(first, second)}
@@ -184,14 +160,12 @@ def slice_panel(
     return np.concatenate(parts)
 
 
-def write_table(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Writes a CSV table."""
+def _write_table(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     with path.open("w", newline="") as file:
         csv.writer(file).writerows([columns, *rows])
 
 
-def read_table(path: Path) -> tuple[list[str], list[list[str]]]:
-    """Columns and rows of a CSV table."""
+def _read_table(path: Path) -> tuple[list[str], list[list[str]]]:
     with path.open(newline="") as file:
         columns, *rows = csv.reader(file)
     return columns, rows

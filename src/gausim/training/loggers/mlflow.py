@@ -33,16 +33,10 @@ class MlflowLog(MLFlowLogger):
     def __init__(
         self, save_dir: str | Path, *, database: str | Path, experiment: str = "gausim", name: str | None = None
     ) -> None:
-        """Keeps the settings; nothing is begun before the first number.
+        """Begins nothing before the first number.
 
-        Args:
-            save_dir: the run directory.
-            database: SQLite file of all runs; media go to a folder ``mlflow_artifacts`` beside it.
-            experiment: what the run is listed under.
-            name: what it is called.
-
-        Raises:
-            ConfigError: MLflow is not installed.
+        ``save_dir`` is the run directory, ``database`` the SQLite file of all runs; media go to a folder
+        ``mlflow_artifacts`` beside it.
         """
         if importlib.util.find_spec("mlflow") is None:
             raise ConfigError("logger.mlflow: MLflow is not installed. Call `pip install 'gausim[mlflow]'`.")

@@ -39,17 +39,7 @@ class WandbLog(WandbLogger):
         tags: Sequence[str] = (),
         offline: bool = True,
     ) -> None:
-        """Keeps the settings; nothing is begun before the first number.
-
-        Args:
-            save_dir: the run directory.
-            project: where runs are collected.
-            group: what the run is listed under.
-            name: what it is called.
-            tags: further words to find it by.
-            offline: write to ``save_dir/wandb`` only, for ``wandb sync``; else needs a network and a key
-                (``WANDB_API_KEY``, or ``wandb login`` once).
-        """
+        """Begins nothing before the first number; ``save_dir`` is the run directory, for the rest see wandb's own."""
         self._folder, self._local = Path(save_dir), offline
         super().__init__(
             name=name, save_dir=save_dir, project=project, group=group, tags=list(tags),
@@ -124,7 +114,8 @@ class WandbLog(WandbLogger):
     def save(self) -> None:
         """Closes the row of the latest step, so that it is kept whatever happens to this process."""
         if self._experiment is not None and self._row_is_open:
-            self._experiment.log({}, commit=True)
+            with undisturbed():
+                self._experiment.log({}, commit=True)
             self._row_is_open = False
 
     def finalize(self, status: str) -> None:

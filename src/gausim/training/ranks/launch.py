@@ -7,56 +7,55 @@ all ranks, nothing is started here. What is set up for a run is gone after it.
 
 from __future__ import annotations
 
+import multiprocessing
 import os
-import subprocess
 import sys
 import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from datetime import timedelta
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, TypeVar
 
 import torch
 from lightning.pytorch.plugins.environments import ClusterEnvironment, SLURMEnvironment, TorchElasticEnvironment
+from lightning.pytorch.utilities import rank_zero_only
 from torch import distributed as dist
 
-import gausim
-from gausim.core import ConfigError, RunError
-from gausim.training.ranks.layout import LOCALHOST, Layout, LocalRanks, Place
+from gausim.core import ConfigError, GausSimError, RunError
+from gausim.training.ranks.layout import LOCALHOST, Layout, LocalRanks
 from gausim.training.ranks.ranks import Ranks, is_lost_connection
 
-T = TypeVar("T")
 # Seconds: between looks at the other ranks; for them to end by themselves; for this rank to notice that one is gone
 # before it is ended too (it may be waiting for a device that will never answer).
 LOOK, ENDING, NOTICING = 0.05, 30.0, 60.0
+UNHARMED = "The last checkpoint, if any, is unharmed; the same command continues from it."
 
 
 class Crew:
     """The ranks of one run, from their start to their end; use it as a context.
 
-    Attributes:
-        layout: how many there are.
-        ranks: what they do together.
-        environment: tells Lightning where this rank stands; None for a run of one rank.
+    ``environment`` tells Lightning where this rank stands; it is None for a run of one rank.
     """
 
-    def __init__(self, layout: Layout, program: Sequence[str] = (), place: Place | None = None) -> None:
+    def __init__(
+        self, layout: Layout, follow: Callable[[Crew], object] | None = None, *, rank: int = 0, port: int | None = None
+    ) -> None:
         """Starts nothing yet.
 
-        Args:
-            layout: how many ranks.
-            program: command that becomes one more rank on this machine, given :meth:`Place.argv` as further arguments.
-            place: of a rank that was started so.
+        ``follow`` is what the other ranks on this machine do, a function of a module; a rank that another process has
+        started has the number ``rank`` and finds the first one's store at ``port``.
         """
         self.layout, self.ranks = layout, Ranks()
         self.environment: ClusterEnvironment | None = None
-        self._program, self._place = tuple(program), place
-        self._others: list[_Other] = []
+        self._follow, self._rank, self._port = follow, rank, port
+        self._timeout = timedelta(minutes=layout.timeout_minutes)
+        self._others: dict[int, SpawnProcess] = {}
+        self._logs: tempfile.TemporaryDirectory[str] | None = None
         self._store: dist.TCPStore | None = None
         self._kept = {name: os.environ.get(name) for name in ("MASTER_ADDR", "MASTER_PORT")}
 
@@ -64,8 +63,12 @@ class Crew:
 
     def __enter__(self) -> Crew:
         """Joins ranks that run already; the first rank of a machine without a scheduler is still alone."""
-        if self._place is not None:
-            self._join(self._place)
+        if self._port is not None:
+            self._store = dist.TCPStore(
+                LOCALHOST, self._port, self.layout.size, False, self._timeout, wait_for_workers=False
+            )
+            self._store.set(f"here/{self._rank}", "")
+            self._meet(self._rank, self._store)
         elif self.layout.size > 1:
             self._check_devices()
             self._join_scheduled()
@@ -79,14 +82,10 @@ class Crew:
                 "trainer.devices to that, or trainer.accelerator=cpu."
             )
 
-    def _join(self, place: Place) -> None:
-        timeout = timedelta(seconds=place.timeout)
-        self._store = dist.TCPStore(LOCALHOST, place.port, place.size, False, timeout, wait_for_workers=False)
-        self._store.set(f"here/{place.rank}", "")
-        dist.init_process_group(
-            place.backend, store=self._store, rank=place.rank, world_size=place.size, timeout=timeout
-        )
-        self.environment = LocalRanks(place.rank, place.size, place.port)
+    def _meet(self, rank: int, store: dist.TCPStore) -> None:
+        size = self.layout.size
+        dist.init_process_group(self.layout.backend, store=store, rank=rank, world_size=size, timeout=self._timeout)
+        self.environment = LocalRanks(rank, size, store.port)
 
     def _join_scheduled(self) -> None:
         env: ClusterEnvironment
@@ -107,10 +106,9 @@ class Crew:
                 f"{self.layout.devices} x {self.layout.num_nodes}. Make tasks per node and trainer.devices equal, "
                 "and the numbers of nodes."
             )
-        address = f"tcp://{env.main_address}:{env.main_port}"
         dist.init_process_group(
-            self.layout.backend, init_method=address, rank=env.global_rank(), world_size=env.world_size(),
-            timeout=timedelta(minutes=self.layout.timeout_minutes),
+            self.layout.backend, init_method=f"tcp://{env.main_address}:{env.main_port}", rank=env.global_rank(),
+            world_size=env.world_size(), timeout=self._timeout,
         )  # fmt: skip
         self.environment = env
 
@@ -119,43 +117,27 @@ class Crew:
         """Whether this is the rank that writes."""
         return self.environment is None or self.environment.global_rank() == 0
 
-    def announce(self, make: Callable[[], T]) -> T:
-        """Makes the task on the first rank and tells it those that run already.
-
-        Raises:
-            Exception: what ``make`` raises; they hear of it.
-        """
-        return self.ranks.first(make)
-
     def start(self, task: object) -> None:
         """Starts the ranks that nobody has started yet, and tells them the task (plain data)."""
-        if self.layout.size > 1 and self.environment is None:
-            self._start_others()
-            self.ranks.first(lambda: task)
-
-    def receive(self) -> Any:
-        """The first rank's task, on another one.
-
-        Raises:
-            RunError: it stopped before it had one.
-        """
-        return self.ranks.first(lambda: None)
-
-    def _start_others(self) -> None:
-        size, timeout = self.layout.size, timedelta(minutes=self.layout.timeout_minutes)
-        self._store = dist.TCPStore(LOCALHOST, 0, size, True, timeout, wait_for_workers=False)
-        for rank in range(1, size):
-            place = Place(rank, size, self._store.port, self.layout.backend, timeout.total_seconds())
-            self._others.append(_Other(rank, [*self._program, *place.argv()]))
-        deadline = time.monotonic() + timeout.total_seconds()
-        while not self._store.check([f"here/{other.rank}" for other in self._others]):
-            self._check_others()
+        if self.layout.size == 1 or self.environment is not None:
+            return
+        self._store = dist.TCPStore(LOCALHOST, 0, self.layout.size, True, self._timeout, wait_for_workers=False)
+        self._logs = tempfile.TemporaryDirectory()
+        for rank in range(1, self.layout.size):
+            given = self._follow, self.layout, rank, self._store.port, str(self._log(rank))
+            self._others[rank] = multiprocessing.get_context("spawn").Process(target=_run_rank, args=given)
+            self._others[rank].start()
+        deadline = time.monotonic() + self._timeout.total_seconds()
+        while not self._store.check([f"here/{rank}" for rank in self._others]):
+            if gone := self._obituary():
+                raise RunError(gone)
             if time.monotonic() > deadline:
-                raise RunError(f"ranks 1 to {size - 1} did not start within {self.layout.timeout_minutes:g} minutes.")
+                minutes = self.layout.timeout_minutes
+                raise RunError(f"ranks 1 to {self.layout.size - 1} did not start within {minutes:g} minutes.")
             time.sleep(LOOK)
-        dist.init_process_group(self.layout.backend, store=self._store, rank=0, world_size=size, timeout=timeout)
-        self.environment = LocalRanks(0, size, self._store.port)
+        self._meet(0, self._store)
         threading.Thread(target=self._watch, daemon=True, name="ranks").start()
+        self.ranks.first(lambda: task)
 
     # ------------------------------------------------------------------------------------------------ ending
 
@@ -182,40 +164,36 @@ class Crew:
         if self.ranks.size > 1:
             dist.barrier()
         deadline = time.monotonic() + ENDING
-        for other in self._others:
-            if not other.waited(deadline):
-                warnings.warn(f"rank {other.rank} did not end by itself after the run and was ended.", stacklevel=3)
+        for rank, process in self._others.items():
+            process.join(max(0.0, deadline - time.monotonic()))
+            if process.exitcode is None:
+                warnings.warn(f"rank {rank} did not end by itself after the run and was ended.", stacklevel=3)
 
     def _explain(self, error: BaseException) -> None:
         """Says in place of a broken connection which rank is gone and what it said last."""
         if not is_lost_connection(error):
             return
         deadline = time.monotonic() + ENDING / 3
-        while self._others and time.monotonic() < deadline and all(o.status is None for o in self._others):
+        while self._others and time.monotonic() < deadline and all(p.exitcode is None for p in self._others.values()):
             time.sleep(LOOK)  # its connection breaks a moment before it is gone
-        try:
-            self._check_others()
-        except RunError as told:
-            raise told from error
+        if gone := self._obituary():
+            raise RunError(gone) from error
         words = (str(error) or type(error).__name__).splitlines()[0]
         raise RunError(
             f"rank {self.ranks.rank}: the connection to the other ranks is lost ({words}). One of them has ended or "
-            "did not answer in time; its output tells why. The last checkpoint, if any, is unharmed; the same command "
-            "continues from it."
+            f"did not answer in time; its output tells why. {UNHARMED}"
         ) from error
 
-    def _check_others(self) -> None:
-        for other in self._others:
-            if other.status not in (None, 0):
-                raise RunError(other.obituary())
-
     def _end(self) -> None:
-        others, self._others = self._others, []
-        for other in others:
-            other.end()
+        others, self._others = self._others, {}
+        for process in others.values():
+            process.kill()
+            process.join()
         if dist.is_initialized():
             with suppress(RuntimeError):  # of ranks that are gone
                 dist.destroy_process_group()
+        if self._logs is not None:
+            self._logs.cleanup()
         self._store, self.environment = None, None
         for name, value in self._kept.items():  # Lightning's environments set them
             os.environ.pop(name, None)
@@ -227,69 +205,48 @@ class Crew:
         others, told = self._others, None
         while self._others is others:
             time.sleep(LOOK * 10)
-            gone = next((o for o in others if o.status not in (None, 0)), None)
+            gone = self._obituary()
             if gone is not None:
                 told = told or time.monotonic()
                 if time.monotonic() - told > NOTICING and self._others is others:
-                    print(f"error: {gone.obituary()}", file=sys.stderr, flush=True)
+                    print(f"error: {gone}", file=sys.stderr, flush=True)
                     os._exit(2)
 
+    def _obituary(self) -> str | None:
+        """How the first rank that failed ended, and what it said last; None where none did."""
+        for rank, process in self._others.items():
+            status = process.exitcode
+            if status not in (None, 0):
+                how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
+                hint = " (out of memory?)" if status == -9 else ""
+                said = self._log(rank).read_text(errors="replace").strip().splitlines()[-8:]
+                words = ":\n  " + "\n  ".join(said) + "\n" if said else ". "
+                return f"rank {rank} {how}{hint}{words}{UNHARMED}"
+        return None
 
-class _Other:
-    """A rank that this process started."""
-
-    def __init__(self, rank: int, command: Sequence[str]) -> None:
-        """Starts it; it ends itself when the pipe to this process breaks (:func:`end_with_first`)."""
-        self.rank = rank
-        self._log: IO[bytes] = tempfile.TemporaryFile()
-        home = str(Path(gausim.__file__).resolve().parents[1])
-        path = os.pathsep.join(filter(None, (home, os.environ.get("PYTHONPATH"))))
-        env = {**os.environ, "PYTHONPATH": path, "RANK": str(rank), "LOCAL_RANK": str(rank)}
-        self._process = subprocess.Popen(
-            command, env=env, stdin=subprocess.PIPE, stdout=self._log, stderr=subprocess.STDOUT, start_new_session=True
-        )
-
-    @property
-    def status(self) -> int | None:
-        """Its exit status (negative: the signal), or None while it runs."""
-        return self._process.poll()
-
-    def waited(self, deadline: float) -> bool:
-        """Waits for its end; returns whether it came in time."""
-        try:
-            self._process.wait(max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            return False
-        return True
-
-    def end(self) -> None:
-        """Ends it if it runs."""
-        if self.status is None:
-            self._process.kill()
-        self._process.wait()
-        if self._process.stdin is not None:
-            self._process.stdin.close()
-        self._log.close()
-
-    def obituary(self) -> str:
-        """How it ended and what it said last."""
-        status = self.status or 0
-        how = f"was ended by signal {-status}" if status < 0 else f"ended with status {status}"
-        hint = " (out of memory?)" if status == -9 else ""
-        self._log.seek(0)
-        said = self._log.read().decode(errors="replace").strip().splitlines()[-8:]
-        words = ":\n  " + "\n  ".join(said) + "\n" if said else ". "
-        return (
-            f"rank {self.rank} {how}{hint}{words}The last checkpoint, if any, is unharmed; the same command continues "
-            "from it."
-        )
+    def _log(self, rank: int) -> Path:
+        assert self._logs is not None
+        return Path(self._logs.name) / f"rank_{rank}.txt"
 
 
-def end_with_first() -> None:
-    """Ends this process as soon as the one that started it is gone; for ranks that :class:`Crew` starts."""
+def _run_rank(follow: Callable[[Crew], object], layout: Layout, rank: int, port: int, log: str) -> None:
+    """One more rank, in a process of its own, until the first one is done or gone; its output goes to ``log``."""
+    os.setsid()  # an interrupt from the keyboard is for the first rank alone
+    with open(log, "wb") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    threading.Thread(target=_end_with_first, daemon=True, name="first rank").start()
+    rank_zero_only.rank = rank  # type: ignore[attr-defined]
+    try:
+        with Crew(layout, rank=rank, port=port) as crew:
+            follow(crew)
+    except GausSimError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
 
-    def watch() -> None:
-        sys.stdin.buffer.read()
-        os._exit(1)
 
-    threading.Thread(target=watch, daemon=True, name="first rank").start()
+def _end_with_first() -> None:
+    first = multiprocessing.parent_process()
+    assert first is not None
+    first.join()
+    os._exit(1)

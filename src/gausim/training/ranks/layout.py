@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import torch
 from lightning.fabric.utilities.seed import reset_seed
@@ -18,14 +17,7 @@ LOCALHOST = "127.0.0.1"
 
 @dataclass(frozen=True)
 class Layout:
-    """How many processes train together, and how they talk.
-
-    Attributes:
-        devices: ranks per machine.
-        num_nodes: machines.
-        accelerator: ``auto``, ``cpu`` or ``gpu``.
-        timeout_minutes: a rank that waits longer than this for the others ends with an error.
-    """
+    """How many processes train together (``devices`` are per machine), and how they talk."""
 
     devices: int = 1
     num_nodes: int = 1
@@ -53,35 +45,6 @@ class Layout:
     def backend(self) -> str:
         """Of torch.distributed; what the hosts tell each other goes by gloo in any case."""
         return "cpu:gloo,cuda:nccl" if self.on_gpu else "gloo"
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where a rank that another process started finds the others.
-
-    Attributes:
-        rank: its number.
-        size: how many there are.
-        port: of the first rank's store on this machine.
-        backend: see :class:`Layout`.
-        timeout: seconds to wait for others.
-    """
-
-    rank: int
-    size: int
-    port: int
-    backend: str
-    timeout: float
-
-    @staticmethod
-    def parse(argv: Sequence[str]) -> Place:
-        """Reads :meth:`argv`."""
-        rank, size, port, backend, timeout = argv
-        return Place(int(rank), int(size), int(port), backend, float(timeout))
-
-    def argv(self) -> list[str]:
-        """As arguments of a program."""
-        return [str(x) for x in astuple(self)]
 
 
 class LocalRanks(LightningEnvironment):

@@ -43,12 +43,7 @@ class Ranks:
         return found
 
     def first(self, function: Callable[[], T]) -> T:
-        """What a function returns that only the first rank calls.
-
-        Raises:
-            Exception: what it raised, on the first rank.
-            RunError: on the others, with its words.
-        """
+        """What a function returns that only the first rank calls; what it raises, the others raise as a RunError."""
         if self.size == 1:
             return function()
         answer: list[Any] = [None, None]
@@ -93,11 +88,7 @@ class Ranks:
         return sums
 
     def check_alike(self, fingerprint: str, what: str) -> None:
-        """Compares a text that must be the same everywhere.
-
-        Raises:
-            RunError: it is not; ranks that have drifted apart no longer train one model.
-        """
+        """Raises RunError where a text is not the same everywhere: drifted ranks no longer train one model."""
         found = self.gather(fingerprint)
         different = [rank for rank, text in enumerate(found) if text != found[0]]
         if different:

@@ -10,26 +10,28 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from gausim.core import Renderer
+from gausim.core import Cameras, Renderer
 from gausim.data.images import composite
 from gausim.losses.image import ImageLoss
 from gausim.render.draw import SceneAppearance, draw
 from gausim.training.contracts import SceneBatch
-from gausim.training.rollout import States, ViewGroup
+from gausim.training.rollout import States
 
 # Pixels that are drawn and compared together: enough for each call to be cut by state and not within an image, and to
 # keep a GPU busy; few enough for the images to be a small part of the memory.
 CPU_PIXELS, GPU_PIXELS = 1_000_000, 4_000_000
 
 
-class Chunk(NamedTuple):
-    """States that are drawn and compared together.
+class ViewGroup(NamedTuple):
+    """Sequences of a batch, by their places in it, that one call of the renderer can draw together."""
 
-    Attributes:
-        group: number of their view group.
-        members: their members of the batch, all of that group.
-        span: their steps, counted from the stretch's first.
-    """
+    scene_id: int
+    members: tuple[int, ...]
+    cameras: Cameras
+
+
+class Chunk(NamedTuple):
+    """States that are drawn and compared together: steps of some members of one view group, counted in the stretch."""
 
     group: int
     members: tuple[int, ...]

@@ -15,9 +15,10 @@ from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.data.records import GroundTruth
 from gausim.losses.image import ImageLoss
+from gausim.render.draw import SceneAppearance, draw
 from gausim.training.contracts import SceneBatch
-from gausim.training.rollout import Looks, States, Views, draw_rest
-from gausim.training.supervision.comparison import Comparison, channels
+from gausim.training.rollout import States
+from gausim.training.supervision.comparison import Comparison, ViewGroup, channels
 
 # Losses (T, S) of T predicted frames of S sequences, and the squared change of what is compared, summed. ``start``
 # frames were predicted before them. Differentiable in the states through the losses alone.
@@ -25,12 +26,7 @@ Compare = Callable[[States, int], tuple[Tensor, Tensor]]
 
 
 class StaticFigures(NamedTuple):
-    """What the rest state scores on some frames of a sequence, and how much the truth moves there.
-
-    Attributes:
-        losses: one per frame.
-        motion: squared change of the truth from each frame to the next, one fewer.
-    """
+    """What the rest state scores on each frame of a sequence, and the squared change of the truth to the next one."""
 
     losses: list[float]
     motion: list[float]
@@ -41,10 +37,8 @@ class Sources:
     """What a run has at hand for the making of its supervision.
 
     Attributes:
-        scenes: the rest scenes.
         truth: true motion of a sequence by its number, None where it is not known.
         motions: smooth motions that the model can carry, of a scene by its number; None where it has no such basis.
-        renderer: draws.
         loss: compares images.
     """
 
@@ -66,19 +60,29 @@ class Supervision(Protocol):
         """Scores the rest state on frames ``first`` .. T of a sample."""
 
 
-class ImageSupervision:
-    """Draws predictions in a sample's cameras and compares them with its frames.
+class Looks:
+    """The appearance of every scene's foreground, made once and moved to the device on first use."""
 
-    Attributes:
-        renderer: draws.
-        loss: compares.
-        looks: appearance of the scenes.
-        views: tells which sequences can be drawn together.
-    """
+    def __init__(self, scenes: Sequence[GaussianScene]) -> None:
+        self._scenes = list(scenes)
+        self._made: dict[int, SceneAppearance] = {}
+
+    def of(self, scene_id: int, like: Tensor) -> SceneAppearance:
+        """The appearance of a scene, on the device and in the type of ``like``."""
+        if scene_id not in self._made:
+            scene = self._scenes[scene_id]
+            self._made[scene_id] = SceneAppearance.of(scene, scene.foreground)
+        self._made[scene_id] = self._made[scene_id].to(like)
+        return self._made[scene_id]
+
+
+class ImageSupervision:
+    """Draws predictions in a sample's cameras and compares them with its frames."""
 
     def __init__(self, scenes: Sequence[GaussianScene], renderer: Renderer, loss: ImageLoss) -> None:
         self.renderer, self.loss = renderer, loss
-        self.looks, self.views = Looks(scenes), Views()
+        self.looks = Looks(scenes)
+        self._keys: dict[tuple[int, tuple[str, ...]], Hashable] = {}
         self._rest: dict[Hashable, Rendered] = {}
 
     def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Comparison:
@@ -90,25 +94,36 @@ class ImageSupervision:
         return self._comparison(samples, batch, slice(0, 1))
 
     def _comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch, frames: slice) -> Comparison:
-        groups = self.views.groups(samples)
-        return Comparison(
-            self.renderer,
-            self.loss,
-            batch,
-            groups,
-            [self.looks.of(group.scene_id, batch.rest) for group in groups],
-            [sample.frames[frames] for sample in samples],
-            [
-                self.rest_image(sample, batch.rest[member.kernels]).rgb[0]
-                for sample, member in zip(samples, batch.members, strict=True)
-            ],
-        )
+        places: dict[Hashable, list[int]] = {}
+        for i, sample in enumerate(samples):
+            places.setdefault(self._key(sample), []).append(i)
+        groups = [ViewGroup(samples[p[0]].scene_id, tuple(p), samples[p[0]].cameras) for p in places.values()]
+        members = zip(samples, batch.members, strict=True)
+        looks = [self.looks.of(group.scene_id, batch.rest) for group in groups]
+        rest = [self.rest_image(sample, batch.rest[member.kernels]).rgb[0] for sample, member in members]
+        true = [sample.frames[frames] for sample in samples]
+        return Comparison(self.renderer, self.loss, batch, groups, looks, true, rest)
+
+    def _key(self, sample: SequenceSample) -> Hashable:
+        """What must agree for two sequences to be drawn in one call: scene, cameras and image size.
+
+        A sequence's cameras stand still, so they are fetched from the device once.
+        """
+        cameras, known = sample.cameras, (sample.sequence_id, sample.cameras.names)
+        if known not in self._keys:
+            numbers = [x.detach().cpu().numpy().tobytes() for x in (cameras.viewmats, cameras.Ks)]
+            self._keys[known] = (sample.scene_id, *numbers, cameras.width, cameras.height)
+        return self._keys[known]
 
     def rest_image(self, sample: SequenceSample, rest: Float[Tensor, "K 3"]) -> Rendered:
         """The rest state (one) in a sample's cameras; drawn once per scene and set of cameras."""
-        key = self.views.key(sample)
+        key = self._key(sample)
         if key not in self._rest:
-            self._rest[key] = draw_rest(self.renderer, self.looks.of(sample.scene_id, rest), rest, sample.cameras)
+            look = self.looks.of(sample.scene_id, rest)
+            identity = torch.eye(3, dtype=rest.dtype, device=rest.device)[None, None]
+            units = torch.zeros(rest.shape[0], dtype=torch.long, device=rest.device)
+            with torch.no_grad():
+                self._rest[key] = draw(self.renderer, look, rest[None], identity, identity, units, sample.cameras)
         return self._rest[key]
 
     @torch.no_grad()

@@ -26,9 +26,8 @@ from gausim.data.images import composite
 from gausim.data.records import GroundTruth
 from gausim.ops.deformation import polar_rotation
 from gausim.render.draw import draw
-from gausim.training.rollout import Looks
 from gausim.training.supervision.comparison import channels
-from gausim.training.supervision.images import Sources
+from gausim.training.supervision.images import Looks, Sources
 from gausim.training.supervision.points import PointSupervision
 
 # Adam's moments: a frame is found in some tens of iterations, so they forget soon.
@@ -47,18 +46,7 @@ class MotionTracker:
         momentum: float = 0.7,
         prior: float = 1.0,
     ) -> None:
-        """Keeps its settings.
-
-        Args:
-            sources: the scenes, their smooth motions, the renderer and the image loss.
-            iterations: of Adam per frame.
-            rate: its first step size, in sizes of the motions; it falls linearly to zero.
-            momentum: the share of the last step by which a frame is thought to go on.
-            prior: weight of the squared coordinates beside the image loss.
-
-        Raises:
-            ConfigError: a setting out of range.
-        """
+        """The settings stand in ``conf/supervision/tracks.yaml``; the rate falls linearly to zero."""
         if iterations < 1 or rate <= 0:
             raise ConfigError(
                 f"supervision: expected iterations >= 1 and rate > 0, got iterations={iterations}, rate={rate}."
@@ -69,11 +57,7 @@ class MotionTracker:
         self._looks = Looks(sources.scenes)
 
     def motions(self, scene_id: int) -> SmoothMotions:
-        """The smooth motions of a scene.
-
-        Raises:
-            ConfigError: the model has none.
-        """
+        """The smooth motions of a scene; raises ConfigError where the model has none."""
         if scene_id not in self._motions:
             found = self._sources.motions(scene_id)
             if found is None:
@@ -128,11 +112,7 @@ class TrackSupervision(PointSupervision):
     """
 
     def __init__(self, sources: Sources, *, energy_weight: float = 0.3, **tracking: Any) -> None:
-        """Prepares the tracker with the settings of :class:`MotionTracker`; the weight is of the loss.
-
-        Raises:
-            ConfigError: the model has no smooth motions, or a setting is out of range.
-        """
+        """Prepares the tracker with the settings of :class:`MotionTracker`; the weight is of the loss."""
         super().__init__(sources, energy_weight=energy_weight)
         self.tracker = MotionTracker(sources, **tracking)
         for scene_id in range(len(sources.scenes)):
@@ -161,12 +141,7 @@ class TrackSupervision(PointSupervision):
 
 
 def tracks_or_images(sources: Sources, **settings: Any) -> TrackSupervision | None:
-    """Tracked motion where the model has smooth motions to track it in; else None, which means the images.
-
-    Args:
-        sources: what the run has at hand.
-        settings: of :class:`TrackSupervision`.
-    """
+    """Tracked motion where the model has smooth motions to track it in; else None, which means the images."""
     if any(sources.motions(scene_id) is None for scene_id in range(len(sources.scenes))):
         return None
     return TrackSupervision(sources, **settings)

@@ -35,12 +35,10 @@ class PointSupervision:
     """
 
     def __init__(self, sources: Sources, *, energy_weight: float = 0.0) -> None:
-        """Keeps its parts.
+        """``energy_weight`` is of the squared logarithm of predicted over true motion energy.
 
-        Args:
-            sources: the rest scenes and the true motion.
-            energy_weight: of the squared logarithm of predicted over true motion energy, its mean over the halves of a
-                stretch, times what the rest state scores: a motion that is out of step would else rather stop.
+        Its mean over the halves of a stretch counts, times what the rest state scores: a motion that is out of step
+        would else rather stop.
         """
         self._scenes, self._read = sources.scenes, sources.truth
         self._energy_weight = energy_weight
@@ -70,11 +68,7 @@ class PointSupervision:
         return (100 / self._scenes[sample.scene_id].diagonal) ** 2
 
     def motion(self, sample: SequenceSample) -> GroundTruth:
-        """The motion that a sample is compared with, in all of its frames at least.
-
-        Raises:
-            DataError: the data set does not know it.
-        """
+        """The motion that a sample is compared with, in all its frames; raises DataError where it is not known."""
         if sample.sequence_id not in self._known:
             truth = self._read(sample.sequence_id)
             if truth is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import cast
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from gausim.core import ConfigError, SimState
 from gausim.data.sampler import hash_seed
 from gausim.losses.objective import Objective
-from gausim.training.contracts import Energetic, SceneBatch, Simulator, Step
+from gausim.training.contracts import SceneBatch, Step
 from gausim.training.rollout import after, windows
 
 # The motion that goes on is made smaller or larger by up to these factors, so that no size of motion is left out.
@@ -24,7 +24,7 @@ FREE_MOTION = 1
 
 
 def energy_growth(
-    model: Simulator, batch: SceneBatch, state: SimState, frames: int, stretch: int, draws: torch.Generator
+    model: Any, batch: SceneBatch, state: SimState, frames: int, stretch: int, draws: torch.Generator
 ) -> Iterator[Float[Tensor, " S"]]:
     """Lets the motion of a batch go on freely and says by how much its energy grows.
 
@@ -52,8 +52,7 @@ def energy_growth(
         before, state = now.detach(), after(made, state)
 
 
-def _mean_energy(model: Simulator, batch: SceneBatch, state: SimState, made: list[Step]) -> Float[Tensor, " S"]:
-    assert isinstance(model, Energetic)
+def _mean_energy(model: Any, batch: SceneBatch, state: SimState, made: list[Step]) -> Float[Tensor, " S"]:
     positions, prepared = [state.positions, *(step.positions for step in made)], model.prepare(batch)
     energies = [model.energy(batch, SimState(b, a), prepared) for a, b in zip(positions, positions[1:], strict=False)]
     return torch.stack(energies).mean(0)
@@ -67,13 +66,15 @@ class FreeMotion:
     """
 
     def __init__(self, model: nn.Module, objective: Objective) -> None:
-        """Keeps its parts.
-
-        Raises:
-            ConfigError: a weight was asked for, and the model knows no energy.
-        """
-        self.weight, self._objective = energy_weight(objective, model), objective
-        self._model = cast(Simulator, model)
+        knows, weight = bool(getattr(model, "knows_energy", False)), objective.energy_weight
+        if weight and not knows:
+            name = type(getattr(model, "template", model)).__name__
+            raise ConfigError(
+                f"loss.energy_weight is {weight}, but {name} knows no energy. Use a template that does "
+                "(gausim.models.template.elastic.ElasticTemplate), or set it to 0 or null."
+            )
+        self.weight = float(knows) if weight is None else float(weight)
+        self._model, self._objective = model, objective
 
     def chosen(self, draws: torch.Generator) -> torch.Generator | None:
         """Whether this batch's motion goes on to see if its energy grows: the generator of that, or None."""
@@ -102,17 +103,3 @@ class FreeMotion:
                 backward(self.weight * (losses * growth).sum())
             total += growth.detach().sum() / count
         return total
-
-
-def energy_weight(objective: Objective, model: nn.Module) -> float:
-    """Weight of the energy's growth; one that was asked for needs a model that knows an energy."""
-    knows = isinstance(model, Energetic) and model.knows_energy
-    if objective.energy_weight is None:
-        return 1.0 if knows else 0.0
-    if objective.energy_weight and not knows:
-        name = type(getattr(model, "template", model)).__name__
-        raise ConfigError(
-            f"loss.energy_weight is {objective.energy_weight}, but {name} knows no energy. Use a template that does "
-            "(gausim.models.template.elastic.ElasticTemplate), or set it to 0 or null."
-        )
-    return float(objective.energy_weight)

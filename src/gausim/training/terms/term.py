@@ -20,17 +20,8 @@ from gausim.training.supervision.images import ImageSupervision
 class StepInputs:
     """One step of the optimiser, as its terms see it.
 
-    Attributes:
-        samples: this rank's sequences.
-        whole: facts of all ranks' sequences.
-        draws: random numbers of the step.
-        statistics: what is logged of it.
-        ranks: who computes.
-        backward: takes a loss to the gradients of the parameters.
-        rest_loss: what the rest state scores on the frames of a sample, their mean: the unit of penalties.
-        objective: weights of the terms.
-        images: draws predictions and compares them with frames.
-        diagonals: of the scenes [scene units].
+    ``samples`` are this rank's sequences and ``whole`` the facts of all ranks'; ``draws`` are the random numbers of the
+    step. ``rest_loss`` is what the rest state scores on the frames of a sample, their mean: the unit of penalties.
     """
 
     samples: Sequence[SequenceSample]
