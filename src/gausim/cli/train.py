@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from gausim.data.datamodule import ReadyDataModule
     from gausim.models.step.simulator import GausSim
     from gausim.runs.directory import RunDirectory
+    from gausim.training.callbacks.judge import EpochJudge
     from gausim.training.module import GausSimModule
     from gausim.training.ranks.launch import Crew
 
@@ -76,6 +77,7 @@ def train(cfg: DictConfig) -> float | None:
     from gausim.cli.sweeps.jobs import do_job
     from gausim.compose.config import in_sweep, run_dir
     from gausim.runs.directory import RunDirectory
+    from gausim.training.callbacks.judge import EpochJudge
 
     run = RunDirectory(run_dir())
     if in_sweep():
@@ -144,6 +146,7 @@ def follow(crew: Crew) -> float | None:
     from omegaconf import OmegaConf
 
     from gausim.runs.directory import RunDirectory
+    from gausim.training.callbacks.judge import EpochJudge
 
     task: Any = crew.ranks.first(lambda: None)
     config, path, resume = task
