@@ -77,7 +77,6 @@ def train(cfg: DictConfig) -> float | None:
     from gausim.cli.sweeps.jobs import do_job
     from gausim.compose.config import in_sweep, run_dir
     from gausim.runs.directory import RunDirectory
-    from gausim.training.callbacks.judge import EpochJudge
 
     run = RunDirectory(run_dir())
     if in_sweep():
@@ -146,7 +145,6 @@ def follow(crew: Crew) -> float | None:
     from omegaconf import OmegaConf
 
     from gausim.runs.directory import RunDirectory
-    from gausim.training.callbacks.judge import EpochJudge
 
     task: Any = crew.ranks.first(lambda: None)
     config, path, resume = task
