@@ -6,10 +6,10 @@ import pytest
 import torch
 from helpers.bodies import make_model, make_scene, make_state
 
-from gausim.models.template.template import Template, TemplateState
+from gausim.models.template.template import PreparedTemplate, Template, TemplateState
 
 
-class _Fixed:
+class _Fixed(PreparedTemplate):
     """The same state, whatever the motion."""
 
     def __init__(self, state) -> None:
@@ -17,12 +17,6 @@ class _Fixed:
 
     def __call__(self, motion):
         return self.state
-
-    def carried(self, motion):
-        return motion
-
-    def energy(self, motion):
-        raise NotImplementedError
 
 
 class _Given(Template):

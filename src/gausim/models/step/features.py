@@ -105,16 +105,8 @@ def network_inputs(
 ) -> tuple[Float[Tensor, "N Cn"], Float[Tensor, "E Ce"]]:
     """Node and edge features of the units of one level, from their graph and their solved parents.
 
-    Args:
-        unit: the units.
-        target: their template positions [scene units].
-        above: the parents.
-        edge_index: source and destination.
-        size: diagonal of each unit's scene [scene units].
-        dt: frame interval [s].
-        gravity: acceleration [scene units / s^2].
-        options: among the readings of the paper.
-        coarse: whether positions are those of the coarse prediction.
+    ``target`` are template positions of the units, ``size`` diagonals of their scenes [scene units]; with ``coarse``
+    positions are those of the coarse prediction.
     """
     coarsely = above.carry(target)
     # Stacked and gathered together: on a CPU the number of operations is what costs.

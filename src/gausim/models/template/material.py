@@ -227,14 +227,7 @@ class MaterialTemplate(Template):
     def matrices(
         self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"], dt: float
     ) -> Matrices:
-        """K, M and D of one scene from the material of its units.
-
-        Args:
-            scene_id: of the scene.
-            log_density: of the units.
-            attributes: of the units.
-            dt: frame interval [s].
-        """
+        """K, M and D of one scene from the densities and attributes of its units; ``dt`` is the frame interval [s]."""
         body, frame = self.body(scene_id), dt * REFERENCE_FPS
         units, links = self.decode(body, attributes)
         k = (self.start[0] + GAIN * self.stiffness).exp() * frame**2

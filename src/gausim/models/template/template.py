@@ -139,13 +139,7 @@ class PreparedScenes(PreparedTemplate):
     """The template of a batch, scene by scene."""
 
     def __init__(self, batch: SceneBatch, made: Callable[[int, Tensor], ModalScene], *, conserve_volume: bool) -> None:
-        """Prepares every scene.
-
-        Args:
-            batch: the disjoint graph.
-            made: makes the template of a scene, given its number and the rows of one member's units.
-            conserve_volume: scale deformation gradients to determinant 1.
-        """
+        """Prepares every scene; ``made`` is called with its number and the rows of one member's units."""
         self._conserve_volume = conserve_volume
         self.parts = [
             (made(scene_id, rows[: len(rows) // len(members)]), rows, members)
