@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -73,6 +75,7 @@ def test_energy_of_a_uniform_strain_is_that_of_hooke() -> None:
     assert abs(still) < 1e-9 * abs(energy)
 
 
+@cache
 def _bar(spacing: float = 0.25, modes: int = 40):
     """A bar of 4 x 1 x 1 held at one end, known by its faces only; its units are points on its axis and around it."""
     kernels = _shell((3.875, 0.875, 0.875), 0.125)  # each stands for the cell of 0.125 that begins there
@@ -100,8 +103,9 @@ def test_a_held_bar_vibrates_as_theory_says() -> None:
 
 
 def test_modes_are_orthonormal_under_the_units_mass_and_zero_where_pinned() -> None:
-    values, phi, slopes, _, mass, pinned = _bar(modes=24)
-    np.testing.assert_allclose(np.einsum("nam,n,nak->mk", phi, mass, phi), np.eye(24), atol=2e-2)
+    values, phi, slopes, _, mass, pinned = _bar()
+    lowest = phi[..., :24]
+    np.testing.assert_allclose(np.einsum("nam,n,nak->mk", lowest, mass, lowest), np.eye(24), atol=2e-2)
     assert not phi[pinned].any() and not slopes[pinned].any()
     assert (np.diff(values) > -1e-9).all() and values[0] == 1
 
