@@ -6,6 +6,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -191,7 +192,7 @@ def apply_masks(
         SceneError: if a selection given here selects no kernel at all.
     """
     given = {"simulated": simulated, "pinned": pinned, "foreground": foreground}
-    masks = {n: v(scene) if isinstance(v, Selection) else v for n, v in given.items() if v is not None}
+    masks: dict[str, Any] = {n: v(scene) if isinstance(v, Selection) else v for n, v in given.items() if v is not None}
     for name, mask in masks.items():
         if not mask.any():
             low, high = scene.means.amin(0).tolist(), scene.means.amax(0).tolist()

@@ -29,8 +29,8 @@ def exact_edges(rule: str, level: LevelBatch, positions: Float[Tensor, "N 3"]) -
     current = batched_radius_edges(positions, level.offsets, level.radii, level.max_neighbours)
     if rule == "current":
         return current
-    codes = [edge_codes(edges, level.count) for edges in (level.rest_edges, current)]
-    combined = combine_codes(*codes, level.count, rule=rule)
+    rest, now = (edge_codes(edges, level.count) for edges in (level.rest_edges, current))
+    combined = combine_codes(rest, now, level.count, rule=rule)
     return coded_edges(combined[combined < no_edge(level.count)], level.count)
 
 
