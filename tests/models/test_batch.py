@@ -4,25 +4,25 @@ from functools import partial
 
 import pytest
 import torch
+from helpers.bodies import NEURAL, join_states, make_model, make_scene, make_state
 
+from gausim.models.hierarchy.edges import exact_edges
 from gausim.models.template.elastic import ElasticTemplate
 
-LEVELS = pytest.mark.parametrize(
-    ("predicted", "graph"), [((2, 1), (0.8, 0.35)), ((1,), (0.5,)), ((0,), (0.3,)), ((2, 0), (0.8, 0.3))]
-)
+PAPER = {"gravity": (0.0, 1.0, -3.0), "output_scale": 2.0}
+CASES = {
+    "hierarchy": PAPER,
+    "kernels under the top": PAPER | {"predicted_levels": (2, 0), "graph_radii": (0.8, 0.3)},
+    "elastic": PAPER | {"template": partial(ElasticTemplate, modes=5, neighbours=6)},
+    "neural": NEURAL,
+}
 
 
-@LEVELS
-@pytest.mark.parametrize("elastic", [False, True])
+@pytest.mark.parametrize("options", CASES.values(), ids=CASES)
 @torch.no_grad()
-def test_union_of_scenes_and_sequences_equals_each_alone(
-    make_scene, make_model, make_state, join_states, predicted, graph, elastic
-) -> None:
+def test_union_of_scenes_and_sequences_equals_each_alone(options) -> None:
     scenes = [make_scene(70, dtype=torch.float64), make_scene(55, seed=1, dtype=torch.float64)]
-    options = {"template": partial(ElasticTemplate, modes=5, neighbours=6)} if elastic else {}
-    model = make_model(
-        scenes, predicted_levels=predicted, graph_radii=graph, gravity=(0.0, 1.0, -3.0), output_scale=2.0, **options
-    )
+    model = make_model(scenes, **options)
     ids = (0, 1, 0)
     states = [make_state(scenes[s], seed=i) for i, s in enumerate(ids)]
     forces = [
@@ -46,11 +46,9 @@ def test_union_of_scenes_and_sequences_equals_each_alone(
     assert float((first - third).abs().max()) > 1e-4  # two sequences of one scene keep their own states
 
 
-@LEVELS
+@pytest.mark.parametrize(("predicted", "graph"), [((2, 1), (0.8, 0.35)), ((0,), (0.3,))])
 @torch.no_grad()
-def test_kernels_follow_their_unit_and_held_ones_the_identity(
-    make_scene, make_model, make_state, predicted, graph
-) -> None:
+def test_kernels_follow_their_unit_and_held_ones_the_identity(predicted, graph) -> None:
     scene = make_scene(70)
     model = make_model(scene, predicted_levels=predicted, graph_radii=graph, output_scale=3.0)
     batch = model.batch((0,))
@@ -69,21 +67,21 @@ def test_kernels_follow_their_unit_and_held_ones_the_identity(
     assert [len(f) for f in step.predicted] == [hierarchy.levels[n].count for n in model.predicted_levels]
 
 
-def test_batches_are_cached_and_edges_stay_within_members(make_scene, make_model) -> None:
+def test_batches_are_cached_and_edges_stay_within_members() -> None:
     model = make_model([make_scene(70), make_scene(55, seed=1)])
     batch = model.batch([0, 1])
     assert model.batch((0, 1)) is batch and model.batch((1, 0)) is not batch
     for level in batch.levels:
         owner = torch.cat([torch.full((s.stop - s.start,), i) for i, s in enumerate(level.spans)])
         positions = torch.zeros(level.count, 3)  # all at one place: neighbours are cut off by members only
-        for edges in (level.rest_edges, level.current_edges(positions)):
+        for edges in (level.rest_edges, exact_edges("current", level, positions)):
             assert edges.shape[1] > 0 and torch.equal(owner[edges[0]], owner[edges[1]])
             assert bool((edges[1].diff() >= 0).all())
             assert int(torch.bincount(edges[1]).max()) <= 6
     assert {round(1 / float(v)) for v in batch.dt} == {24, 30}
 
 
-def test_absent_scene_gets_no_gradient(make_scene, make_model, make_state) -> None:
+def test_absent_scene_gets_no_gradient() -> None:
     scenes = [make_scene(70), make_scene(55, seed=1)]
     model = make_model(scenes)
     model.step(model.batch((1,)), make_state(scenes[1])).positions.square().sum().backward()

@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.bodies import make_model, make_scene, make_state
 from helpers.simulators import gausim
 
 from gausim.core import ConfigError, DivergenceError, Dynamics, SceneError, SimState
 from gausim.models.rollout.dynamics import SceneDynamics
 
 
-def test_offers_the_protocol_and_rolls_out_what_steps_give(make_scene, make_model, make_state) -> None:
+def test_offers_the_protocol_and_rolls_out_what_steps_give() -> None:
     scenes = [make_scene(50), make_scene(60, seed=1)]
     model = make_model(scenes)
     dynamics = SceneDynamics(model, 1)
@@ -38,7 +39,7 @@ def test_offers_the_protocol_and_rolls_out_what_steps_give(make_scene, make_mode
     assert not torch.equal(still.positions[2], trajectory.positions[2])
 
 
-def test_rollout_leaves_mode_and_statistics_alone(make_scene, make_model, make_state) -> None:
+def test_rollout_leaves_mode_and_statistics_alone() -> None:
     scene = make_scene(50)
     model = make_model(scene).train()
     before = {k: v.clone() for k, v in model.state_dict().items()}
@@ -47,7 +48,7 @@ def test_rollout_leaves_mode_and_statistics_alone(make_scene, make_model, make_s
     assert all(torch.equal(v, before[k]) for k, v in model.state_dict().items())
 
 
-def test_points_are_carried_by_the_unit_of_their_kernel(make_scene, make_model, make_state) -> None:
+def test_points_are_carried_by_the_unit_of_their_kernel() -> None:
     scene = make_scene(80, dtype=torch.float64)
     model = make_model(scene, output_scale=3.0)
     trajectory = SceneDynamics(model).rollout(make_state(scene), 3)
@@ -78,9 +79,7 @@ def test_points_are_carried_by_the_unit_of_their_kernel(make_scene, make_model, 
 
 
 @pytest.mark.parametrize("edges", ["rest", "union"])
-def test_numbers_that_are_not_finite_stop_the_rollout_and_name_the_frame(
-    make_scene, make_model, make_state, edges
-) -> None:
+def test_numbers_that_are_not_finite_stop_the_rollout_and_name_the_frame(edges) -> None:
     scene = make_scene(50)
     model = make_model(scene, edges=edges)
     state, nan = make_state(scene), torch.full((50, 3), float("nan"))
@@ -96,6 +95,18 @@ def test_numbers_that_are_not_finite_stop_the_rollout_and_name_the_frame(
     assert model.training  # restored after the error too
 
 
+def test_a_device_is_asked_now_and_then_and_at_the_end() -> None:
+    scene = make_scene(50)
+    stepper = SceneDynamics(make_model(scene, edges="rest")).stepper(make_state(scene))
+    stepper._interval = 4  # as on a GPU
+    for _ in range(5):
+        stepper.step()
+    stepper.step(torch.full((50, 3), float("inf")))
+    stepper.step()
+    with pytest.raises(DivergenceError, match="column0: positions are not finite at one of the frames 5 to 7"):
+        stepper.settle()
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -108,12 +119,12 @@ def test_numbers_that_are_not_finite_stop_the_rollout_and_name_the_frame(
         ({"clustering": "kmeans"}, "'kmeans'; expected one of ball,.* complete_linkage"),
     ],
 )
-def test_contradicting_options_are_refused(make_scene, options, message) -> None:
+def test_contradicting_options_are_refused(options, message) -> None:
     with pytest.raises(ConfigError, match=message):
         gausim([make_scene(40)], [24.0], hidden=8, layers=2, **options)
 
 
-def test_scenes_without_rates_or_roots_are_refused(make_scene) -> None:
+def test_scenes_without_rates_or_roots_are_refused() -> None:
     scene = make_scene(40)
     for scenes, fps in (([], []), ([scene], [24.0, 30.0])):
         with pytest.raises(ConfigError, match="expected one rate per scene, at least one"):

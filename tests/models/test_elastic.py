@@ -5,13 +5,14 @@ from functools import partial
 
 import pytest
 import torch
+from helpers.bodies import make_model, make_scene
 
 from gausim.core import SimState
 from gausim.models.hierarchy.clusters import Hierarchy, build_hierarchy
 from gausim.models.initial_state import ModalInitialStates
 from gausim.models.rollout.dynamics import SceneDynamics
-from gausim.models.template.elastic import ElasticScene, ElasticTemplate
-from gausim.models.template.springs import spring_network
+from gausim.models.template.elastic import ElasticScene, ElasticTemplate, PreparedElastic
+from gausim.models.template.springs import neighbour_pairs
 from gausim.models.template.template import Motion
 
 
@@ -24,8 +25,19 @@ def _scene(hierarchy: Hierarchy, *, geometric: float = 0.0, period: float = 12.0
 
 
 @pytest.fixture
-def elastic(make_scene) -> ElasticScene:
+def elastic() -> ElasticScene:
     return _scene(build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5)))
+
+
+def _step(scene: ElasticScene, now: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
+    """Modal coordinates of the next frame."""
+    prepared = PreparedElastic(scene)
+    return prepared.after(*prepared.coordinates(now, before))
+
+
+def _energy(scene: ElasticScene, now: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
+    prepared = PreparedElastic(scene)
+    return prepared.energy(*prepared.coordinates(now, before))
 
 
 def _undamped(scene: ElasticScene) -> None:
@@ -41,26 +53,12 @@ def test_undamped_mode_keeps_its_amplitude_and_turns_by_two_atan_half_omega(elas
     before, now = shape * math.cos(-angle), shape * 1.0
     peak = 0.0
     for frame in range(1, 501):
-        z = elastic(now, before)[0]
+        z = _step(elastic, now, before)[0]
         assert abs(float(z[mode]) - math.cos(angle * frame)) < 1e-3
         assert float(z[torch.arange(9) != mode].abs().max()) < 1e-3  # without mixing the modes do not talk
         before, now = now, torch.einsum("m,ndm->nd", z, elastic.modes)[None]
         peak = max(peak, abs(float(z[mode])))
     assert peak > 0.99
-
-
-def test_first_mode_starts_with_the_given_period(elastic: ElasticScene) -> None:
-    stiffness = _stiffness(elastic)
-    assert math.sqrt(float(torch.linalg.eigvalsh(stiffness)[0])) == pytest.approx(2 * math.pi / 12.0, rel=1e-6)
-
-
-def _stiffness(scene: ElasticScene) -> torch.Tensor:
-    a, _, inverse = scene.matrices()
-    return 2 * (2 * _inertia(scene) - torch.linalg.solve(inverse, a))
-
-
-def _inertia(scene: ElasticScene) -> torch.Tensor:
-    return scene.inertia_root().mT @ scene.inertia_root()
 
 
 def _shake(scene: ElasticScene, generator: torch.Generator) -> None:
@@ -71,21 +69,16 @@ def _shake(scene: ElasticScene, generator: torch.Generator) -> None:
 
 
 @pytest.mark.parametrize("damped", [False, True])
-@pytest.mark.parametrize("seed", range(3))
-def test_discrete_energy_never_grows_for_random_mixing(elastic: ElasticScene, seed: int, damped: bool) -> None:
-    generator = torch.Generator().manual_seed(seed)
+def test_energy_is_kept_without_damping_and_lost_with_it_for_random_mixing(elastic, damped: bool) -> None:
+    generator = torch.Generator().manual_seed(5)
     _shake(elastic, generator)
     if not damped:
         _undamped(elastic)
-    stiffness, inertia = _stiffness(elastic), _inertia(elastic)
-    assert float((stiffness - torch.diag(stiffness.diagonal())).abs().max()) > 0.1  # the modes do mix
-    a, b, _ = elastic.matrices()
-    before, now = torch.randn(2, 9, generator=generator, dtype=torch.float64)
-    energies = []
-    for _ in range(2000):
-        velocity, middle = now - before, (now + before) / 2
-        energies.append(float(velocity @ inertia @ velocity + middle @ stiffness @ middle) / 2)
-        before, now = now, a @ now - b @ before
+    before, now = torch.randn(2, 1, 9, generator=generator, dtype=torch.float64)
+    prepared, energies = PreparedElastic(elastic), []
+    for _ in range(1000):
+        energies.append(float(prepared.energy(now, before)))
+        before, now = now, prepared.after(now, before)
     energy = torch.tensor(energies, dtype=torch.float64)
     assert bool((energy.diff() <= 1e-9 * energy[0]).all())
     if damped:
@@ -94,27 +87,7 @@ def test_discrete_energy_never_grows_for_random_mixing(elastic: ElasticScene, se
         assert float(energy[-1]) == pytest.approx(float(energy[0]), rel=1e-6)
 
 
-def test_the_energy_of_a_state_is_kept_without_damping_and_lost_with_it(elastic: ElasticScene) -> None:
-    generator = torch.Generator().manual_seed(5)
-    for damped in (False, True):
-        _shake(elastic, generator)
-        if not damped:
-            _undamped(elastic)
-        before, now = (
-            torch.einsum("m,ndm->nd", z, elastic.modes)[None] for z in torch.randn(2, 9, generator=generator).double()
-        )
-        energies = []
-        for _ in range(50):
-            energies.append(float(elastic.energy(now, before)))
-            before, now = now, torch.einsum("sm,ndm->snd", elastic(now, before), elastic.modes)
-        if damped:
-            assert all(b <= a * (1 + 1e-5) for a, b in zip(energies, energies[1:], strict=False))
-            assert energies[-1] < 0.97 * energies[0]
-        else:
-            assert energies == pytest.approx([energies[0]] * 50, rel=2e-3)  # the modes are kept in single precision
-
-
-def test_single_precision_rollout_stays_bounded_for_2000_steps(make_scene) -> None:
+def test_single_precision_rollout_stays_bounded() -> None:
     hierarchy = build_hierarchy(make_scene(90), radii=(0.2, 0.5))
     scene = _scene(hierarchy, period=6.0)
     generator = torch.Generator().manual_seed(7)
@@ -123,25 +96,25 @@ def test_single_precision_rollout_stays_bounded_for_2000_steps(make_scene) -> No
     start = torch.randn(2, 9, generator=generator)
     before, now = (torch.einsum("m,ndm->nd", z, scene.modes)[None] for z in start)
     largest = []
-    for _ in range(2000):
-        z = scene(now, before)
+    for _ in range(500):
+        z = _step(scene, now, before)
         before, now = now, torch.einsum("sm,ndm->snd", z, scene.modes)
         largest.append(float(z.abs().max()))
-    assert max(largest) < 1e3 and max(largest[1000:]) <= max(largest[:1000])
+    assert max(largest) < 1e3 and max(largest[250:]) <= max(largest[:250])
 
 
-def _template(make_model, scene, *, conserve_mass=True, **options):
+def _template(scene, *, conserve_mass=True, **options):
     template = partial(ElasticTemplate, modes=9, neighbours=8, **options)
     return make_model(scene, zero_output=True, conserve_mass=conserve_mass, template=template)
 
 
 @torch.no_grad()
 @pytest.mark.parametrize("amount", [0.3, 60.0])
-def test_template_gradients_conserve_volume(make_scene, make_model, amount) -> None:
+def test_template_gradients_conserve_volume(amount) -> None:
     scene = make_scene(90, dtype=torch.float64)
     spread = {}
     for conserve in (True, False):
-        model = _template(make_model, scene, conserve_mass=conserve)
+        model = _template(scene, conserve_mass=conserve)
         batch = model.batch((0,))
         rest = model.hierarchies[0].levels[1].rest
         modes, _, sizes = model.template.basis(0)
@@ -155,10 +128,10 @@ def test_template_gradients_conserve_volume(make_scene, make_model, amount) -> N
 
 
 @torch.no_grad()
-def test_simulator_carries_a_mode_through_its_whole_recursion(make_scene, make_model) -> None:
+def test_simulator_carries_a_mode_through_its_whole_recursion() -> None:
     """One undamped mode, zero network output: kernels of the full simulator swing as the formula says."""
     scene = make_scene(90, dtype=torch.float64)
-    model = _template(make_model, scene, period=12.0, geometric=0.0)
+    model = _template(scene, period=12.0, geometric=0.0)
     model.log_density[0].zero_()  # modes are those of unit density
     inner = model.template.scenes[0]
     inner.damping.fill_(-1e4)
@@ -180,8 +153,8 @@ def test_simulator_carries_a_mode_through_its_whole_recursion(make_scene, make_m
     assert float(error) < 1e-5 * float(shape.abs().max()) + 1e-9
 
 
-def test_parameters_are_grouped_by_role(make_scene, make_model) -> None:
-    model = _template(make_model, [make_scene(60), make_scene(50, seed=1)])
+def test_parameters_are_grouped_by_role() -> None:
+    model = _template([make_scene(60), make_scene(50, seed=1)])
     groups = model.parameter_groups()
     ids = [id(p) for group in groups.values() for p in group]
     assert len(ids) == len(set(ids)) and set(ids) == {id(p) for p in model.parameters()}
@@ -189,12 +162,12 @@ def test_parameters_are_grouped_by_role(make_scene, make_model) -> None:
     assert any(p is model.attributes[1] for p in groups["scene"])
 
 
-def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_order(make_scene) -> None:
+def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_order() -> None:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
     scene = _scene(hierarchy, period=6.0, geometric=1.0)
     springs, level = scene.springs, hierarchy.levels[1]
     assert springs is not None
-    pairs, blocks = spring_network(level.rest.double().numpy(), 8)
+    pairs = neighbour_pairs(level.rest.double().numpy(), 8)
     rest, phi = level.rest.double(), scene.modes.double()
     i, j = (torch.from_numpy(p) for p in pairs.T)
     offset = rest[j] - rest[i]
@@ -208,7 +181,8 @@ def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_or
         return 0.5 * (stiffness * (stretch**2 - along**2)).sum()
 
     first = phi[..., 0]
-    lowest = torch.einsum("ea,eab,eb->", first[j] - first[i], torch.from_numpy(blocks), first[j] - first[i])
+    change = first[j] - first[i]
+    lowest = ((0.7 * (change * offset).sum(-1).square() / length**2 + 0.3 * change.square().sum(-1)) / length**2).sum()
     generator = torch.Generator().manual_seed(3)
     for size in (0.3, 3.0):
         z = (size * scene.scale * torch.randn(9, generator=generator, dtype=torch.float64)).requires_grad_()
@@ -226,11 +200,11 @@ def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_or
     now, before = (s * (basis @ z).view(1, -1, 3) for s in (1.0, 0.9))
     a, b, h = scene.matrices()
     stiff = torch.tensor(scene.initial_log_stiffness).exp()
-    torch.testing.assert_close(scene(now, before)[0], a @ z - b @ (0.9 * z) + h @ (stiff * springs(z[None])[0]),
+    torch.testing.assert_close(_step(scene, now, before)[0], a @ z - b @ (0.9 * z) + h @ (stiff * springs(z[None])[0]),
                                rtol=1e-4, atol=1e-8)  # fmt: skip
 
 
-def test_springs_never_add_more_than_half_of_what_the_stiffness_pulls(make_scene) -> None:
+def test_springs_never_add_more_than_half_of_what_the_stiffness_pulls() -> None:
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
     scene, plain = _scene(hierarchy, period=6.0, geometric=1.0), _scene(hierarchy, period=6.0)
     a, b, _ = scene.matrices()
@@ -238,14 +212,14 @@ def test_springs_never_add_more_than_half_of_what_the_stiffness_pulls(make_scene
     fractions = []
     for size in (0.01, 10.0, 1e5):
         now = torch.einsum("sm,ndm->snd", size * scene.scale * z, scene.modes.double())
-        added = (scene(now, now) - plain(now, now)).norm(dim=-1)
+        added = (_step(scene, now, now) - _step(plain, now, now)).norm(dim=-1)
         pull = ((size * scene.scale * z) @ (torch.eye(9) - a + b).mT).norm(dim=-1)
         fractions.append(added / pull)
     assert float(fractions[0].max()) < 0.1 < float(fractions[1].max())
     assert max(float(s.max()) for s in fractions) == pytest.approx(0.5, rel=1e-3)
 
 
-def test_trained_inertia_is_the_equation_of_motion_with_another_mass(make_scene) -> None:
+def test_trained_inertia_is_the_equation_of_motion_with_another_mass() -> None:
     """Against M (z'' + ...) solved as it is written, with the forces of springs and the energy that goes with them."""
     hierarchy = build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
     scene = _scene(hierarchy, geometric=1.0)
@@ -265,7 +239,7 @@ def test_trained_inertia_is_the_equation_of_motion_with_another_mass(make_scene)
     right = z @ (2 * mass - stiffness / 2) - before @ (mass + stiffness / 4 - damping / 2) + force
     expected = torch.linalg.solve(mass + stiffness / 4 + damping / 2, right[0])
     place = [torch.einsum("sm,ndm->snd", x, scene.modes) for x in (z, before)]
-    torch.testing.assert_close(scene(*place)[0], expected, rtol=1e-4, atol=1e-9)
+    torch.testing.assert_close(_step(scene, *place)[0], expected, rtol=1e-4, atol=1e-9)
     step, middle = (z - before)[0], (z + before)[0] / 2
     energy = (step @ mass @ step + middle @ stiffness @ middle) / 2 + size * scene.springs.potential(middle[None])[0]
-    assert float(scene.energy(*place)) == pytest.approx(float(energy), rel=1e-4)
+    assert float(_energy(scene, *place)) == pytest.approx(float(energy), rel=1e-4)

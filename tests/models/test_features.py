@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from helpers.bodies import make_model, make_scene, make_state
 
 from gausim.core import SimState
 from gausim.models.step.features import FeatureOptions, UnitState, edge_features, network_inputs
@@ -108,7 +109,7 @@ def test_degenerate_geometry_gives_finite_bounded_features_and_gradients(angle: 
             assert bool(torch.isfinite(gradient).all())
 
 
-def test_parent_with_one_child_gives_a_finite_step_and_gradient(make_scene, make_model, make_state) -> None:
+def test_parent_with_one_child_gives_a_finite_step_and_gradient() -> None:
     scene = make_scene(60)
     model = make_model(scene, radii=(0.3, 0.35), clustering="ball")
     batch = model.batch((0,))

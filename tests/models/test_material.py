@@ -9,6 +9,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
+from helpers.bodies import NEURAL, make_model, make_scene, make_state
 from helpers.simulators import silence
 
 from gausim.core import SimState
@@ -17,24 +18,18 @@ from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.step.body_frame import body_axes
 from gausim.models.template.material import DAMPING_GAIN, MaterialTemplate
 from gausim.models.template.solid import solid_body
-
-SETTINGS = {"modes": 9, "spacing": 0.2, "links": 4, "hidden": 8}
-TEMPLATE = partial(MaterialTemplate, **SETTINGS)
-NEURAL = {
-    "template": TEMPLATE, "rest_inputs": True, "velocities": False, "lever": 0.02, "anchor": True,
-    "body_frame": True, "edges": "rest", "attributes": 3,
-}  # fmt: skip
+from gausim.ops.quaternion import quaternion_to_matrix
 
 
 def _template(hierarchy, *, seed: int = 0, **settings) -> MaterialTemplate:
     """In double precision, its decoders and attributes random."""
     torch.manual_seed(seed)
-    made = TEMPLATE([hierarchy], 1, attributes=3, frames=[np.eye(3)], **settings)
+    made = NEURAL["template"]([hierarchy], 1, attributes=3, frames=[np.eye(3)], **settings)
     return made.double().requires_grad_(False)
 
 
 @pytest.fixture(scope="module")
-def hierarchy(make_scene):
+def hierarchy():
     return build_hierarchy(make_scene(90, dtype=torch.float64), radii=(0.2, 0.5))
 
 
@@ -102,7 +97,7 @@ def test_no_attributes_are_a_body_of_one_material(hierarchy) -> None:
 
 
 @pytest.fixture
-def neural(make_scene, make_model):
+def neural():
     return lambda **options: make_model(make_scene(90, dtype=torch.float64), **(NEURAL | options))
 
 
@@ -185,15 +180,9 @@ def _moved(scene, turn, shift):
 
 @pytest.mark.parametrize("framed", [True, False])
 @torch.no_grad()
-def test_a_turned_and_moved_scene_moves_likewise(neural, make_scene, make_model, make_state, framed: bool) -> None:
+def test_a_turned_and_moved_scene_moves_likewise(neural, framed: bool) -> None:
     scene = make_scene(90, dtype=torch.float64)
-    quaternion = torch.tensor([0.5, -0.3, 0.7, 0.4], dtype=torch.float64)
-    w, x, y, z = quaternion / quaternion.norm()
-    turn = torch.stack((
-        torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w))),
-        torch.stack((2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w))),
-        torch.stack((2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y))),
-    ))  # fmt: skip
+    turn = quaternion_to_matrix(torch.tensor([0.5, -0.3, 0.7, 0.4], dtype=torch.float64))
     shift = torch.tensor([3.0, -2.0, 0.5], dtype=torch.float64)
     model = make_model(scene, **(NEURAL | {"body_frame": framed, "output_scale": 1.0}))
     other = make_model(_moved(scene, turn, shift), **(NEURAL | {"body_frame": framed, "output_scale": 1.0}))
@@ -209,14 +198,14 @@ def test_a_turned_and_moved_scene_moves_likewise(neural, make_scene, make_model,
         torch.testing.assert_close(there_own, own, atol=1e-6, rtol=0)
 
 
-def test_the_body_s_axes_turn_with_it(make_scene) -> None:
+def test_the_body_s_axes_turn_with_it() -> None:
     axes = body_axes(make_scene(90, dtype=torch.float64))
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1.0)
     assert axes[0, 2] > 0.9  # from the pinned foot upwards
 
 
-def test_everything_of_the_model_learns(neural, make_state) -> None:
+def test_everything_of_the_model_learns(neural) -> None:
     model = neural()
     batch, state = model.batch((0,)), make_state(model.scenes[0])
     prepared = model.prepare(batch)
@@ -227,19 +216,8 @@ def test_everything_of_the_model_learns(neural, make_state) -> None:
     assert not [n for n in still if "unit_decoder.2.bias" not in n], still  # what is taken off again at rest
 
 
-def test_scenes_of_a_batch_do_not_disturb_each_other(make_scene, make_model, make_state) -> None:
-    scenes = [make_scene(90, dtype=torch.float64), make_scene(80, seed=3, dtype=torch.float64)]
-    model = make_model(scenes, **NEURAL)
-    states = [make_state(s) for s in scenes]
-    joint = SimState(*(torch.cat([getattr(s, n) for s in states]) for n in ("positions", "previous")))
-    with torch.no_grad():
-        made = model.step(model.batch((0, 1)), joint).positions
-        alone = [model.step(model.batch((i,)), states[i]).positions for i in range(2)]
-    torch.testing.assert_close(made, torch.cat(alone), atol=1e-9, rtol=0)
-
-
 @torch.no_grad()
-def test_millimetres_move_like_metres(make_scene, make_model, make_state) -> None:
+def test_millimetres_move_like_metres() -> None:
     scene = make_scene(90, dtype=torch.float64)
     large = replace(scene, means=1000 * scene.means, log_scales=scene.log_scales + np.log(1000.0))
     model, other = make_model(scene, **NEURAL), make_model(large, **NEURAL)
@@ -251,7 +229,7 @@ def test_millimetres_move_like_metres(make_scene, make_model, make_state) -> Non
     torch.testing.assert_close(there.momentum, step.momentum, rtol=1e-4, atol=1e-12)
 
 
-def test_scenes_share_everything_but_densities_and_attributes(make_scene, make_model) -> None:
+def test_scenes_share_everything_but_densities_and_attributes() -> None:
     model = make_model([make_scene(90), make_scene(80, seed=3)], **NEURAL)
     names = [n for n, _ in model.named_parameters()]
     shared = tuple(f"{name}." for name in model.shared())

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
-from helpers.simulators import gausim
+import torch
+from helpers.bodies import make_scene
 
-from gausim.core import SimState
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.template import solid
 from gausim.models.template.elastic import ElasticTemplate
@@ -73,6 +75,7 @@ def test_energy_of_a_uniform_strain_is_that_of_hooke() -> None:
     assert abs(still) < 1e-9 * abs(energy)
 
 
+@cache
 def _bar(spacing: float = 0.25, modes: int = 40):
     """A bar of 4 x 1 x 1 held at one end, known by its faces only; its units are points on its axis and around it."""
     kernels = _shell((3.875, 0.875, 0.875), 0.125)  # each stands for the cell of 0.125 that begins there
@@ -100,8 +103,9 @@ def test_a_held_bar_vibrates_as_theory_says() -> None:
 
 
 def test_modes_are_orthonormal_under_the_units_mass_and_zero_where_pinned() -> None:
-    values, phi, slopes, _, mass, pinned = _bar(modes=24)
-    np.testing.assert_allclose(np.einsum("nam,n,nak->mk", phi, mass, phi), np.eye(24), atol=2e-2)
+    values, phi, slopes, _, mass, pinned = _bar()
+    lowest = phi[..., :24]
+    np.testing.assert_allclose(np.einsum("nam,n,nak->mk", lowest, mass, lowest), np.eye(24), atol=2e-2)
     assert not phi[pinned].any() and not slopes[pinned].any()
     assert (np.diff(values) > -1e-9).all() and values[0] == 1
 
@@ -126,23 +130,12 @@ def test_gradients_of_modes_are_those_of_the_field() -> None:
         np.testing.assert_allclose(slopes[0, :, axis], difference, atol=1e-4 * np.abs(slopes[0]).max())
 
 
-def test_the_template_carries_solid_modes_and_the_simulator_steps_with_them(make_scene) -> None:
-    from functools import partial
-
-    import torch
-
-    scene = make_scene(120)
-    hierarchy = build_hierarchy(scene, radii=(0.2, 0.5))
-    template = ElasticTemplate([hierarchy], 1, modes=9, solid=0.15)
-    own = template.scene(0)
+def test_the_template_carries_solid_modes() -> None:
+    hierarchy = build_hierarchy(make_scene(120), radii=(0.2, 0.5))
+    own = ElasticTemplate([hierarchy], 1, modes=9, solid=0.15).scene(0)
     z = torch.randn(4, 9)
     moved = torch.einsum("sm,ndm->snd", z, own.modes)
     torch.testing.assert_close(moved.flatten(1) @ own.projection.flatten(0, 1), z, atol=1e-3, rtol=1e-3)
-    model = gausim([scene], [24.0], radii=(0.2, 0.5), hidden=8, layers=1, zero_output=True,
-                    template=partial(ElasticTemplate, modes=9, solid=0.15, geometric=1.0))  # fmt: skip
-    batch = model.batch([0])
-    step = model.step(batch, SimState(batch.rest, batch.rest))
-    torch.testing.assert_close(step.positions, batch.rest, atol=1e-5, rtol=0)
 
 
 def test_parts_that_nothing_holds_still_have_orthonormal_modes() -> None:

@@ -4,6 +4,7 @@ from functools import partial
 
 import pytest
 import torch
+from helpers.bodies import make_model, make_scene, make_state
 from torch import Tensor, nn
 from torch.func import functional_call
 
@@ -32,7 +33,7 @@ def _function(stepper: _Stepper, names: list[str], outputs: tuple[int, ...]):
 
 
 @pytest.mark.parametrize("coarse", [False, True])
-def test_gradcheck_of_the_whole_step(make_scene, make_model, make_state, coarse) -> None:
+def test_gradcheck_of_the_whole_step(coarse) -> None:
     scene = make_scene(22, dtype=torch.float64, spare=2)
     model = make_model(
         scene, radii=(0.3, 0.6), edges="union", rest_inputs=coarse, coarse_inputs=coarse, attributes=2, output_scale=2.0
@@ -41,7 +42,7 @@ def test_gradcheck_of_the_whole_step(make_scene, make_model, make_state, coarse)
     _gradcheck(model, scene, make_state(scene), names, outputs=(0, 1, 2, 3))
 
 
-def test_gradcheck_of_the_whole_step_with_the_elastic_template(make_scene, make_model, make_state) -> None:
+def test_gradcheck_of_the_whole_step_with_the_elastic_template() -> None:
     scene = make_scene(22, dtype=torch.float64, spare=2)
     template = partial(ElasticTemplate, modes=4, neighbours=6, geometric=0.01)  # held by no bound
     model = make_model(scene, radii=(0.3, 0.6), edges="rest", attributes=2, template=template)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.bodies import make_model, make_scene, make_state
 
-from gausim.models.template.template import Template, TemplateState
+from gausim.models.template.template import PreparedTemplate, Template, TemplateState
 
 
-class _Fixed:
+class _Fixed(PreparedTemplate):
     """The same state, whatever the motion."""
 
     def __init__(self, state) -> None:
@@ -16,12 +17,6 @@ class _Fixed:
 
     def __call__(self, motion):
         return self.state
-
-    def carried(self, motion):
-        return motion
-
-    def energy(self, motion):
-        raise NotImplementedError
 
 
 class _Given(Template):
@@ -39,7 +34,7 @@ class _Given(Template):
 
 
 @torch.no_grad()
-def test_gradients_act_on_the_template_configuration(make_scene, make_model, make_state) -> None:
+def test_gradients_act_on_the_template_configuration() -> None:
     scene = make_scene(90, dtype=torch.float64)
     model = make_model(scene, predicted_levels=(1,), graph_radii=(0.4,), template=_Given, output_scale=5.0)
     model.log_density[0].zero_()
@@ -65,9 +60,7 @@ def test_gradients_act_on_the_template_configuration(make_scene, make_model, mak
 
 
 @torch.no_grad()
-def test_coarse_template_positions_are_the_centres_of_mass_of_their_children(
-    make_scene, make_model, make_state
-) -> None:
+def test_coarse_template_positions_are_the_centres_of_mass_of_their_children() -> None:
     scene = make_scene(90, dtype=torch.float64)
     model = make_model(scene, template=_Given)
     seen = []
@@ -88,7 +81,7 @@ def test_coarse_template_positions_are_the_centres_of_mass_of_their_children(
 
 @pytest.mark.parametrize("coarse", [False, True])
 @torch.no_grad()
-def test_the_network_sees_accelerations_and_velocities_in_diagonals(make_scene, make_model, make_state, coarse) -> None:
+def test_the_network_sees_accelerations_and_velocities_in_diagonals(coarse) -> None:
     scene, gravity = make_scene(90, dtype=torch.float64), torch.tensor([0.5, 0.0, -4.0], dtype=torch.float64)
     model = make_model(scene, coarse_inputs=coarse, gravity=gravity.tolist(), output_scale=5.0, edges="rest")
     nodes, edges = [], []

@@ -94,11 +94,3 @@ def test_what_nothing_holds_and_what_nothing_frees_is_refused(scene: GaussianSce
     proposed = re.findall(r"z=[-.0-9e]+", str(caught.value))
     assert len(proposed) == 2  # one for either remedy
     assert {tuple(selected(parse_half_space(text)(scene))) for text in proposed} == {(0,)}
-
-
-def test_the_height_proposed_for_pins_holds_something_that_is_simulated(scene: GaussianScene) -> None:
-    raised = dataclasses.replace(scene, simulated=torch.tensor([False, False, True, True]))
-    with pytest.raises(SceneError) as caught:
-        require_pinned(raised)
-    height = re.findall(r"--pin-below (z=\S+)", str(caught.value))[0]
-    assert selected(apply_masks(raised, pinned=parse_half_space(height)).pinned) == [2]

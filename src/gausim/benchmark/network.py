@@ -34,8 +34,7 @@ def run(options: Options) -> list[Row]:
     """Forward and forward + backward of every variant, their ratios to the textbook form, and what training keeps.
 
     Fraction of the peak: useful operations (:func:`useful_flops`) per second over the rate of torch's float32 matrix
-    product (:func:`gausim.benchmark.peaks.peaks`). It may exceed 1: float32 layers go through oneDNN, which on some
-    processors is faster than torch's own product, and bfloat16 is faster than float32.
+    product (:func:`gausim.benchmark.peaks.peaks`). It may exceed 1, as bfloat16 is faster than float32.
     """
     size = Size(nodes=60, edges=700, layers=3, hidden=16) if options.quick else Size()
     with torch_threads(options.threads):

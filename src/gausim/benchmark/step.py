@@ -24,7 +24,6 @@ from gausim.benchmark.harness import (
 from gausim.core import GaussianScene, SimState
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import build_hierarchy
-from gausim.models.hierarchy.edges import EdgeSet
 from gausim.models.step import predictor, simulator
 from gausim.models.step.prepared import Prepared
 from gausim.models.step.simulator import GausSim
@@ -111,7 +110,7 @@ def parts(template: PreparedTemplate) -> Mapping[str, Sequence[tuple[Any, str]]]
     return {
         "aggregation": [(Prepared, "aggregate"), (Prepared, "per_level")],
         "template": [(kind, "carried"), (kind, "__call__")],
-        "edges": [(EdgeSet, "of")],
+        "edges": [(predictor, "exact_edges")],
         "features": [(predictor, "network_inputs")],
         "normalisers": [(RunningNormaliser, "forward")],
         "network": [(MeshGraphNet, "forward")],

@@ -34,33 +34,11 @@ if TYPE_CHECKING:
     from gausim.core.state import SimState, Trajectory
 
 __all__ = [
-    "Cameras",
-    "BusyError",
-    "ConfigError",
-    "DataError",
-    "DivergenceError",
-    "FetchError",
-    "Dynamics",
-    "FittedDynamics",
-    "FittedMethod",
-    "FittedState",
-    "Forces",
-    "GausSimError",
-    "GaussianScene",
-    "Rendered",
-    "Renderer",
-    "RunError",
-    "SceneError",
-    "SimState",
-    "SmoothMotions",
-    "Steppable",
-    "SteppedFrame",
-    "Stepper",
-    "TakesOver",
-    "Trajectory",
-    "roll_out",
-    "trajectory_of",
-]
+    "Cameras", "BusyError", "ConfigError", "DataError", "DivergenceError", "FetchError", "Dynamics",
+    "FittedDynamics", "FittedMethod", "FittedState", "Forces", "GausSimError", "GaussianScene", "Rendered",
+    "Renderer", "RunError", "SceneError", "SimState", "SmoothMotions", "Steppable", "SteppedFrame", "Stepper",
+    "TakesOver", "Trajectory", "roll_out", "trajectory_of",
+]  # fmt: skip
 
 _LATE = ("camera", "fitted", "protocols", "scene", "smooth", "state")
 

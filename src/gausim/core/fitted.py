@@ -71,27 +71,21 @@ class FittedMethod(Protocol):
 
     def notes(self) -> tuple[str, ...]:
         """What a reader of its figures must know: one sentence each, printed under every table."""
-        ...
 
     def unit_of_kernel(self, scene_id: int) -> Int[Tensor, " K"]:
         """The unit of every kernel of a scene, a row of the states' gradients and rotations."""
-        ...
 
     def begin(self, sequence_id: int) -> FittedState:
         """Frame 0 of a sequence; gradients flow into its parameters."""
-        ...
 
     def advance(self, state: FittedState) -> FittedState:
         """The next frame."""
-        ...
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
         """All parameters by the name that stages give a learning rate to."""
-        ...
 
     def penalties(self, sequence_id: int) -> Mapping[str, Tensor]:
         """What else a stage may weigh and minimise for a sequence (smoothness of fields), by name."""
-        ...
 
 
 @runtime_checkable
@@ -104,20 +98,14 @@ class TakesOver(Protocol):
         Raises:
             ConfigError: ``other`` has nothing for it.
         """
-        ...
 
 
 @dataclass(frozen=True, eq=False)
 class FittedDynamics:
-    """A fitted method on one of its sequences, as :class:`gausim.core.Dynamics`.
-
-    Attributes:
-        method: fitted.
-        sequence_id: which sequence; it brings its own initial velocity.
-    """
+    """A fitted method on one of its sequences, as :class:`gausim.core.Dynamics`."""
 
     method: FittedMethod
-    sequence_id: int
+    sequence_id: int  # it brings its own initial velocity
 
     def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
         """Predicts ``steps`` frames; only the positions of ``initial`` count, as frame 0.
@@ -136,16 +124,7 @@ class FittedDynamics:
 
 
 class FittedStepper:
-    """A fitted method frame by frame: :class:`gausim.core.Stepper` that takes no forces.
-
-    Attributes:
-        state: the two latest positions.
-        frame: the latest frame.
-        unit_of_kernel: the unit of each kernel.
-        fps: frames per second.
-        takes_forces: False.
-        limited: 0.
-    """
+    """A fitted method frame by frame: :class:`gausim.core.Stepper` that takes no forces."""
 
     takes_forces: bool = False
     limited: int = 0

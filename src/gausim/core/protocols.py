@@ -23,7 +23,6 @@ class Dynamics(Protocol):
 
     def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
         """Predicts ``steps`` frames after ``initial``; the result has steps + 1 frames, the initial one first."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,32 +47,26 @@ class Stepper(Protocol):
     @property
     def state(self) -> SimState:
         """The two latest positions of all kernels."""
-        ...
 
     @property
     def frame(self) -> SteppedFrame:
         """The latest frame; before the first step the initial one."""
-        ...
 
     @property
     def unit_of_kernel(self) -> Int[Tensor, " K"]:
         """The unit of each kernel, a row of the frames' gradients and rotations."""
-        ...
 
     @property
     def fps(self) -> float:
         """Frames per second."""
-        ...
 
     @property
     def takes_forces(self) -> bool:
         """Whether :meth:`step` may be given a force and held kernels."""
-        ...
 
     @property
     def limited(self) -> int:
         """Frames so far whose forces acted in part only, or that were cut short, to keep within what was learned."""
-        ...
 
     def step(
         self, force: Float[Tensor, "K 3"] | None = None, *, held: Bool[Tensor, " K"] | None = None
@@ -88,11 +81,9 @@ class Stepper(Protocol):
             ConfigError: a force or held kernels, which this method does not take.
             DivergenceError: a position or force is not finite; some methods say so only some frames later.
         """
-        ...
 
     def settle(self) -> None:
         """Raises what is still unsaid: a DivergenceError if any frame so far is not finite."""
-        ...
 
 
 @runtime_checkable
@@ -101,7 +92,6 @@ class Steppable(Dynamics, Protocol):
 
     def stepper(self, initial: SimState) -> Stepper:
         """Begins at a state, whose frame has identity gradients."""
-        ...
 
 
 def roll_out(stepper: Stepper, steps: int, forces: Forces | None = None) -> Trajectory:
@@ -163,4 +153,3 @@ class Renderer(Protocol):
         Colours are per view because they are already evaluated for its directions. No background means black.
         ``depth`` asks for the depth as well.
         """
-        ...

@@ -58,11 +58,7 @@ class ImageLoss(nn.Module):
     def forward(
         self, prediction: Float[Tensor, "B V H W C"], target: Float[Tensor, "B V H W C"]
     ) -> Float[Tensor, " B"]:
-        """Loss of each of B states, averaged over its V views.
-
-        Raises:
-            ConfigError: an image is smaller than the SSIM window.
-        """
+        """Loss of each of B states, averaged over its V views."""
         loss: Tensor = _WithGradient.apply(prediction, target, self)
         return loss
 
@@ -74,16 +70,22 @@ class ImageLoss(nn.Module):
         Raises:
             ConfigError: an image is smaller than the SSIM window.
         """
-        height, width = prediction.shape[2:4]
+        self.check_size(prediction)
+        scale = self.pixels / prediction[0, ..., 0].numel()
+        return image_loss(prediction, target, gaussian_taps(self.window), balance=self.balance, scale=scale)
+
+    def check_size(self, images: Float[Tensor, "B V H W C"]) -> None:
+        """Refuses images that are smaller than the SSIM window.
+
+        Raises:
+            ConfigError: they are.
+        """
+        height, width = images.shape[2:4]
         if min(height, width) < self.window:
             raise ConfigError(
-                f"loss.image: images of {width}x{height} pixels are smaller than the SSIM window of {self.window}. "
-                "Draw larger images or lower loss.image.window."
+                f"loss: images of {width}x{height} pixels are smaller than the SSIM window of {self.window}. "
+                "Draw larger images or lower the loss's `window`."
             )
-        scale = self.pixels / (prediction.shape[1] * height * width)
-        return image_loss(
-            prediction, target, gaussian_taps(self.window), balance=self.balance, scale=scale
-        )  # fmt: skip
 
 
 class _WithGradient(torch.autograd.Function):
@@ -112,9 +114,7 @@ def image_loss(
     balance: float,
     scale: float,
 ) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V H W 3"]]:
-    """Loss of each state and the gradient of their sum with respect to the prediction; neither is part of a graph.
-
-    Never waits for a device.
+    """What :meth:`ImageLoss.value_and_gradient` gives; never waits for a device.
 
     Args:
         prediction: the images.
@@ -128,10 +128,8 @@ def image_loss(
     values: list[Tensor] = []
     gradients: list[Tensor] = []
     for start in range(0, prediction.shape[0], states):
-        part, true = (
-            prediction[start : start + states].detach().clone().requires_grad_(),
-            target[start : start + states],
-        )
+        part = prediction[start : start + states].detach().clone().requires_grad_()
+        true = target[start : start + states]
         with torch.enable_grad():
             value = balance * (part - true).square().sum((1, 2, 3, 4))
             if balance < 1:

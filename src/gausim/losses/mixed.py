@@ -45,16 +45,9 @@ class MixedLoss(ImageLoss):
     def value_and_gradient(
         self, prediction: Float[Tensor, "B V H W C"], target: Float[Tensor, "B V H W C"]
     ) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V H W C"]]:
-        """The losses and the gradient of their sum with respect to the prediction; neither is part of a graph.
-
-        Raises:
-            ConfigError: an image is smaller than the SSIM window.
-        """
-        if self.dssim > 0 and min(prediction.shape[2:4]) < self.window:
-            raise ConfigError(
-                f"loss: images of {prediction.shape[3]}x{prediction.shape[2]} pixels are smaller than the SSIM window "
-                f"of {self.window}. Lower `window` of the stage's loss."
-            )
+        """As :meth:`ImageLoss.value_and_gradient`."""
+        if self.dssim > 0:
+            self.check_size(prediction)
         leaf = prediction.detach().clone().requires_grad_()
         with torch.enable_grad():
             values = self._of_states(leaf, target)

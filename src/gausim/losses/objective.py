@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from gausim.core import ConfigError
 from gausim.losses.image import ImageLoss
@@ -53,15 +53,7 @@ class Objective:
 
     def __post_init__(self) -> None:
         """Checks the ranges."""
-        names = (
-            "image_weight",
-            "static_weight",
-            "rest_image_weight",
-            "momentum_weight",
-            "backprop_steps",
-            "energy_weight",
-            "mixing_weight",
-        )
+        names = ["backprop_steps", *(f.name for f in fields(self) if f.name.endswith("_weight"))]
         negative = [name for name in names if (getattr(self, name) or 0) < 0]
         if negative or self.explosion <= 0:
             raise ConfigError(f"loss: expected {', '.join(negative) or 'explosion'} not to be negative, got {self}.")

@@ -56,10 +56,17 @@ class ModalInitialStates(nn.Module):
         self.scene_of_sequence = tuple(scene_of_sequence)
         self._rest = [s.means for s in model.scenes]
         self._diagonal = [h.diagonal for h in model.hierarchies]
-        self._basis = [_basis(model, i) for i in range(len(model.scenes))]
-        if in_diagonals:
-            largest = [b.norm(dim=1).amax(0).clamp_min(TINY) for b in self._basis]
-            self._basis = [b * (d / most) for b, d, most in zip(self._basis, self._diagonal, largest, strict=True)]
+        self._basis = []
+        for scene_id, diagonal in enumerate(self._diagonal):
+            motions = model.smooth_motions(scene_id)
+            if motions is None:
+                raise ConfigError(
+                    f"model.initial_states: {type(model.template).__name__} carries no basis of motions. "
+                    "Use gausim.models.initial_state.FreeInitialStates with it."
+                )
+            basis = motions.kernels / motions.sizes
+            most = basis.norm(dim=1).amax(0).clamp_min(TINY)
+            self._basis.append(basis * (diagonal / most) if in_diagonals else basis)
         self.velocity = nn.ParameterList(torch.zeros(self._basis[i].shape[-1]) for i in self.scene_of_sequence)
 
     def previous(self, sequence_id: int) -> Float[Tensor, "K 3"]:
@@ -69,18 +76,5 @@ class ModalInitialStates(nn.Module):
 
     def reach(self, change: float) -> float:
         """How far x_{-1} moves when v_0 changes by ``change``, in the scene where that is least [diagonals]."""
-        return change * min(
-            float(basis[..., 0].norm(dim=1).max()) / diagonal
-            for basis, diagonal in zip(self._basis, self._diagonal, strict=True)
-        )
-
-
-def _basis(model: GausSim, scene_id: int) -> Float[Tensor, "K 3 M"]:
-    """The template's own motions at every kernel."""
-    motions = model.smooth_motions(scene_id)
-    if motions is None:
-        raise ConfigError(
-            f"model.initial_states: {type(model.template).__name__} carries no basis of motions. "
-            "Use gausim.models.initial_state.FreeInitialStates with it."
-        )
-    return motions.kernels / motions.sizes
+        moved = [float(basis[..., 0].norm(dim=1).max()) for basis in self._basis]
+        return change * min(most / diagonal for most, diagonal in zip(moved, self._diagonal, strict=True))

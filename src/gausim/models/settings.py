@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from gausim.core import ConfigError
 
+EDGES = ("rest", "current", "union", "intersection")
+
 
 @dataclass(frozen=True)
 class HierarchySettings:
@@ -23,7 +25,7 @@ class HierarchySettings:
         body_frame: work in the body's own axes, so that a scene that is turned or moved moves likewise.
 
     Raises:
-        ConfigError: no level, an unknown key, or diameters that do not fall.
+        ConfigError: no level, an unknown key, diameters that do not fall, or an unknown rule of edges.
     """
 
     levels: Sequence[Mapping[str, float]] = (
@@ -37,7 +39,9 @@ class HierarchySettings:
     body_frame: bool = False
 
     def __post_init__(self) -> None:
-        """Checks the levels."""
+        """Checks the levels and the rule."""
+        if self.edges not in EDGES:
+            raise ConfigError(f"model.simulator.hierarchy.edges is '{self.edges}'; expected one of {', '.join(EDGES)}.")
         if not self.levels or any(set(level) != {"diameter", "edge_length"} for level in self.levels):
             raise ConfigError(
                 "model.simulator.hierarchy.levels: expected at least one {diameter, edge_length}, got "

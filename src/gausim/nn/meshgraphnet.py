@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
-import os
-import shutil
 from collections.abc import Callable, Sequence
 
 import torch
@@ -14,7 +11,6 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as recomputed
 
 from gausim.core import ConfigError
-from gausim.nn.linear import Linear
 from gausim.nn.mlp import ACTIVATIONS, mlp
 
 PRECISIONS = ("fp32", "bf16")
@@ -31,9 +27,9 @@ class _SplitLayer(nn.Module):
     def __init__(self, hidden: int) -> None:
         super().__init__()
         self.edge_norm, self.node_norm = nn.LayerNorm(hidden), nn.LayerNorm(hidden)
-        self.from_edge = Linear(hidden, hidden)
-        self.from_nodes = Linear(hidden, 2 * hidden, bias=False)
-        self.edge_out = Linear(hidden, hidden)
+        self.from_edge = nn.Linear(hidden, hidden)
+        self.from_nodes = nn.Linear(hidden, 2 * hidden, bias=False)
+        self.edge_out = nn.Linear(hidden, hidden)
         self.node = mlp((2 * hidden, hidden, hidden))
 
     def forward(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> tuple[Tensor, Tensor]:
@@ -151,11 +147,7 @@ class MeshGraphNet(nn.Module):
     def forward(
         self, node_features: Float[Tensor, "N Cn"], edge_features: Float[Tensor, "E Ce"], edge_index: Int[Tensor, "2 E"]
     ) -> Float[Tensor, "N Co"]:
-        """Outputs per node; ``edge_index`` holds (source, destination), best sorted by destination.
-
-        Raises:
-            ConfigError: ``compile`` without the compiler it needs.
-        """
+        """Outputs per node; ``edge_index`` holds (source, destination), best sorted by destination."""
         device = node_features.device.type
         bf16 = self.precision == "bf16" or torch.is_autocast_enabled(device)
         with torch.autocast(device, enabled=False):
@@ -171,7 +163,9 @@ class MeshGraphNet(nn.Module):
         # For none and for one the compiler would build a variant each: such graphs run as they are.
         compiled = self.compiled and min(len(nodes), len(edges)) > 1
         if compiled:
-            _compile(modules, nodes.device)
+            for layer in modules:
+                if layer._compiled_call_impl is None:  # all share their code, so the compiler works once
+                    layer.compile(dynamic=True)
         layers: list[Callable] = [layer if compiled else layer.forward for layer in modules]
         if not (self.checkpointed and torch.is_grad_enabled()):
             return _run(layers, nodes, edges, edge_index)[0]
@@ -197,23 +191,3 @@ def _run(layers: Sequence[Callable], nodes: Tensor, edges: Tensor, edge_index: T
     for layer in layers:
         nodes, edges = layer(nodes, edges, edge_index)
     return nodes, edges
-
-
-def _compile(layers: Sequence[nn.Module], device: torch.device) -> None:
-    """Compiles the layers that are not yet; all share their code, so the compiler works once, not once per layer."""
-    pending = [layer for layer in layers if layer._compiled_call_impl is None]
-    if not pending:
-        return
-    compiler = os.environ.get("CXX") or "g++"
-    if device.type == "cpu" and shutil.which(compiler) is None:
-        raise ConfigError(
-            f"model.simulator.network.compile is true, but the C++ compiler '{compiler}' was not found. Install it, "
-            "name another in the environment variable CXX, or set model.simulator.network.compile=false."
-        )
-    if device.type == "cuda" and importlib.util.find_spec("triton") is None:
-        raise ConfigError(
-            "model.simulator.network.compile is true, but triton is not installed. Install it, or set "
-            "model.simulator.network.compile=false."
-        )
-    for layer in pending:
-        layer.compile(dynamic=True)

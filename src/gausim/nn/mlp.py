@@ -6,8 +6,6 @@ from collections.abc import Sequence
 
 from torch import nn
 
-from gausim.nn.linear import Linear
-
 ACTIVATIONS: dict[str, type[nn.Module]] = {"silu": nn.SiLU, "relu": nn.ReLU}
 
 
@@ -15,7 +13,7 @@ def mlp(sizes: Sequence[int], activation: str = "silu") -> nn.Sequential:
     """Linear layers of the given sizes with an activation (of ``ACTIVATIONS``) between them, none after the last."""
     layers: list[nn.Module] = []
     for i, (a, b) in enumerate(zip(sizes[:-1], sizes[1:], strict=True)):
-        layers += ([ACTIVATIONS[activation]()] if i else []) + [Linear(a, b)]
+        layers += ([ACTIVATIONS[activation]()] if i else []) + [nn.Linear(a, b)]
     return nn.Sequential(*layers)
 
 

@@ -2,7 +2,7 @@
 
 Everything here measures in float32: two points are neighbours if their squared distance, in float32, is below the
 squared radius, and of two points at the same distance the one with the lower index is nearer. So the search in a k-d
-tree (:func:`batched_radius_edges`) and the one of torch operations (:func:`neighbour_table`) agree to the last tie.
+tree (:func:`batched_radius_edges`) and the one of torch operations (:func:`neighbour_codes`) agree to the last tie.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 NONE = torch.iinfo(torch.int64).max
 SLACK = 1 + 1e-5  # of distances in the tree, where those of float32 decide, which are good to 3e-7
-TABLE_ELEMENTS = 1 << 24  # distances that neighbour_table holds at a time: 128 MiB of int64 keys
+TABLE_ELEMENTS = 1 << 24  # distances that neighbour_codes holds at a time: 128 MiB of int64 keys
 
 
 def radius_edges(points: Float[Tensor, "N 3"], radius: float, max_neighbours: int) -> Int[Tensor, "2 E"]:
@@ -47,7 +47,7 @@ def batched_radius_edges(
     """:func:`radius_edges` of every member of a disjoint union, with indices into the union.
 
     The search runs on the CPU; tensors of another device are copied there and back. Nothing there waits for the
-    host with :func:`neighbour_table`.
+    host with :func:`neighbour_codes`.
 
     Args:
         points: positions of all members, one member after the other [scene units].
@@ -56,14 +56,10 @@ def batched_radius_edges(
         max_neighbours: cap of incoming edges per point.
 
     Raises:
-        ValueError: a position is NaN or infinite, or the offsets do not run from 0 to N.
+        ValueError: a position is NaN or infinite.
     """
     x = points.detach().to("cpu", torch.float32).numpy()
     starts = offsets.cpu().long().numpy()
-    if len(starts) != len(radii) + 1 or starts[0] != 0 or starts[-1] != len(x) or (np.diff(starts) < 0).any():
-        raise ValueError(
-            f"offsets are {starts.tolist()}; expected {len(radii) + 1} ascending numbers from 0 to {len(x)} points"
-        )
     if not np.isfinite(x).all():
         raise ValueError(
             f"{int((~np.isfinite(x).all(1)).sum())} of {len(x)} positions are NaN or infinite, so they have no "
@@ -109,13 +105,10 @@ def _first(
     return torch.where(found == NONE, NONE, found & 0xFFFFFFFF).sort().values
 
 
-def neighbour_table(
-    points: Float[Tensor, "N 3"],
-    member_of_point: Int[Tensor, " N"],
-    radii: Float[Tensor, " M"],
-    k: int,
-) -> tuple[Int[Tensor, "N k"], Bool[Tensor, "N k"]]:
-    """The edges of :func:`batched_radius_edges` as a table of fixed shape, from torch operations alone.
+def neighbour_codes(
+    points: Float[Tensor, "N 3"], member_of_point: Int[Tensor, " N"], radii: Float[Tensor, " M"], k: int
+) -> Int[Tensor, " N_times_k"]:
+    """The edges of :func:`batched_radius_edges` as N k codes (:func:`edge_codes`), from torch operations alone.
 
     No shape depends on the positions and nothing is read back to the host, so it can be captured in a CUDA graph.
     All N^2 distances are computed, some rows at a time.
@@ -125,72 +118,51 @@ def neighbour_table(
         member_of_point: which member each point belongs to; only points of one member are neighbours.
         radii: per member, edges are shorter than this [scene units].
         k: cap of incoming edges per point.
-
-    Returns:
-        index: sources of the edges into each point, ascending; entries that are not valid hold the point itself.
-        valid: which entries are edges; the others follow them.
     """
     x, count = points.detach().float(), len(points)
     squares = _squared(radii).index_select(0, member_of_point)
     identity = torch.arange(count, device=x.device)
     width = min(k, count)
-    nearest_index = torch.full((count, k), count, device=x.device)
+    source = torch.full((count, k), count, device=x.device)
     for low in range(0, count, max(TABLE_ELEMENTS // max(count, 1), 1)):
         rows = slice(low, low + max(TABLE_ELEMENTS // max(count, 1), 1))
         square = _squares(x - x[rows, None])
         near = (square < squares[rows, None]) & (member_of_point[rows, None] == member_of_point)
         near &= identity[rows, None] != identity
-        nearest_index[rows, :width] = _first(square, near, identity, width)
-    valid = nearest_index < count
-    return torch.where(valid, nearest_index, identity[:, None]), valid
+        source[rows, :width] = _first(square, near, identity, width)
+    edges = torch.stack((source, identity[:, None].expand_as(source))).flatten(1)
+    return torch.where(edges[0] < count, edge_codes(edges, count), no_edge(count)).sort().values
 
 
 def _squared(radii: Tensor) -> Tensor:
     return radii.double().square().float()
 
 
-def combine_edges(a: Int[Tensor, "2 E1"], b: Int[Tensor, "2 E2"], count: int, *, rule: str) -> Int[Tensor, "2 E3"]:
-    """Union or intersection of two edge sets over ``count`` nodes, sorted by destination, then source.
+def edge_codes(edges: Int[Tensor, "2 E"], count: int) -> Int[Tensor, " E"]:
+    """One number per edge (source, destination) over ``count`` nodes, ordered by destination, then source."""
+    return edges[1] * (count + 1) + edges[0]
+
+
+def coded_edges(codes: Int[Tensor, " E"], count: int) -> Int[Tensor, "2 E"]:
+    """The edges of :func:`edge_codes`."""
+    return torch.stack((codes % (count + 1), codes // (count + 1)))
+
+
+def no_edge(count: int) -> int:
+    """The code that fills up a fixed number of codes: of an edge from a dummy node N to itself, behind all others."""
+    return count * (count + 2)
+
+
+def combine_codes(a: Int[Tensor, " A"], b: Int[Tensor, " B"], count: int, *, rule: str) -> Int[Tensor, " A_and_B"]:
+    """Union or intersection of two sets of edges over ``count`` nodes, as A + B ascending codes; no shape is read.
 
     Args:
-        a: edges (source, destination) sorted by destination, then source, without repeats.
-        b: edges sorted likewise.
+        a: codes without repeats but for :func:`no_edge`.
+        b: others.
         count: number of nodes.
         rule: ``union`` or ``intersection``.
-
-    Raises:
-        ValueError: unknown rule.
     """
-    if rule not in ("union", "intersection"):
-        raise ValueError(f"edge rule is {rule!r}; expected 'union' or 'intersection'")
-    codes = [e[1] * count + e[0] for e in (a, b)]
-    code = torch.unique(torch.cat(codes)) if rule == "union" else codes[0][torch.isin(codes[0], codes[1])]
-    return torch.stack((code % count, code // count))
-
-
-def combine_tables(
-    a: tuple[Int[Tensor, "N k1"], Bool[Tensor, "N k1"]],
-    b: tuple[Int[Tensor, "N k2"], Bool[Tensor, "N k2"]],
-    *,
-    rule: str,
-) -> tuple[Int[Tensor, "N k"], Bool[Tensor, "N k"]]:
-    """:func:`combine_edges` of two tables (:func:`neighbour_table`); shapes depend on the tables' shapes alone.
-
-    Returns:
-        The union as a table of k = k1 + k2 columns, the intersection as one of k = k1, sorted like its arguments.
-
-    Raises:
-        ValueError: unknown rule.
-    """
-    (index, valid), (other, other_valid) = a, b
-    count = len(index)
-    shared = ((index[:, :, None] == other[:, None, :]) & valid[:, :, None] & other_valid[:, None, :]).any(2)
-    if rule == "union":
-        index, valid = torch.cat((index, other), 1), torch.cat((valid & ~shared, other_valid), 1)
-    elif rule == "intersection":
-        valid = shared
-    else:
-        raise ValueError(f"edge rule is {rule!r}; expected 'union' or 'intersection'")
-    index = torch.where(valid, index, count).sort(1).values
-    valid = index < count
-    return torch.where(valid, index, torch.arange(count, device=index.device)[:, None]), valid
+    codes = torch.cat((a, b)).sort().values
+    repeated = torch.zeros_like(codes, dtype=torch.bool)
+    repeated[1:] = codes[1:] == codes[:-1]
+    return codes.masked_fill(repeated if rule == "union" else ~repeated, no_edge(count)).sort().values

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,32 +35,23 @@ class Selection(ABC):
 
     def __and__(self, other: Selection) -> Selection:
         """Selected by both."""
-        return _Both(self, other)
+        return _Made(lambda scene: self(scene) & other(scene))
 
     def __or__(self, other: Selection) -> Selection:
         """Selected by either."""
-        return ~(~self & ~other)
+        return _Made(lambda scene: self(scene) | other(scene))
 
     def __invert__(self) -> Selection:
         """Selected exactly where this one does not select."""
-        return _Not(self)
+        return _Made(lambda scene: ~self(scene))
 
 
 @dataclass(frozen=True)
-class _Both(Selection):
-    first: Selection
-    second: Selection
+class _Made(Selection):
+    function: Callable[[GaussianScene], Bool[Tensor, " K"]]
 
     def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
-        return self.first(scene) & self.second(scene)
-
-
-@dataclass(frozen=True)
-class _Not(Selection):
-    selection: Selection
-
-    def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
-        return ~self.selection(scene)
+        return self.function(scene)
 
 
 @dataclass(frozen=True)
@@ -199,7 +192,7 @@ def apply_masks(
         SceneError: if a selection given here selects no kernel at all.
     """
     given = {"simulated": simulated, "pinned": pinned, "foreground": foreground}
-    masks = {n: v(scene) if isinstance(v, Selection) else v for n, v in given.items() if v is not None}
+    masks: dict[str, Any] = {n: v(scene) if isinstance(v, Selection) else v for n, v in given.items() if v is not None}
     for name, mask in masks.items():
         if not mask.any():
             low, high = scene.means.amin(0).tolist(), scene.means.amax(0).tolist()
@@ -208,13 +201,5 @@ def apply_masks(
                 + ", ".join(f"{a} {low[i]:.3g}..{high[i]:.3g}" for a, i in AXES.items())
                 + "; choose the axis and the value within."
             )
-    if "pinned" in masks:
-        masks["pinned"] = masks["pinned"] & masks.get("simulated", scene.simulated)
-    elif "simulated" in masks:
-        masks["pinned"] = scene.pinned & masks["simulated"]
-    return replace(
-        scene,
-        simulated=masks.get("simulated", scene.simulated),
-        pinned=masks.get("pinned", scene.pinned),
-        foreground=masks.get("foreground", scene.foreground),
-    ).validated()
+    masks["pinned"] = masks.get("pinned", scene.pinned) & masks.get("simulated", scene.simulated)
+    return replace(scene, **masks).validated()

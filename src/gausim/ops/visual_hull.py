@@ -16,17 +16,11 @@ _COARSE_RESOLUTION = 48
 
 @dataclass(frozen=True, eq=False)
 class VoxelHull:
-    """A body on a grid of cubic voxels.
+    """A body on a grid of cubic voxels."""
 
-    Attributes:
-        occupied: voxels of the body.
-        origin: centre of voxel (0, 0, 0) [scene units].
-        spacing: edge length of a voxel [scene units].
-    """
-
-    occupied: Bool[Tensor, "X Y Z"]
-    origin: Float[Tensor, " 3"]
-    spacing: float
+    occupied: Bool[Tensor, "X Y Z"]  # voxels of the body
+    origin: Float[Tensor, " 3"]  # centre of voxel (0, 0, 0) [scene units]
+    spacing: float  # edge length of a voxel [scene units]
 
     @property
     def diagonal(self) -> float:

@@ -19,21 +19,14 @@ from gausim.ops.selection import require_pinned
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """One level of N units.
+    """One level of N units."""
 
-    Attributes:
-        rest: centres of mass at rest with unit density [scene units].
-        volume: volumes V_c = sum of V_i.
-        pinned: units made of pinned kernels; they never move. Clusters never mix pinned and free kernels.
-        parent: the unit of the next level that holds each unit; empty at the top level.
-        root: the nearest pinned kernel (index into the simulated kernels), the parent of a top unit.
-    """
-
-    rest: Float[Tensor, "N 3"]
-    volume: Float[Tensor, " N"]
+    rest: Float[Tensor, "N 3"]  # centres of mass at rest with unit density [scene units]
+    volume: Float[Tensor, " N"]  # volumes V_c = sum of V_i
+    # units made of pinned kernels; they never move. Clusters never mix pinned and free kernels.
     pinned: Bool[Tensor, " N"]
-    parent: Int[Tensor, " M"]
-    root: Int[Tensor, " N"]
+    parent: Int[Tensor, " M"]  # the unit of the next level that holds each unit; empty at the top level
+    root: Int[Tensor, " N"]  # the nearest pinned kernel (index into the simulated kernels), the parent of a top unit
 
     @property
     def count(self) -> int:
@@ -43,17 +36,11 @@ class Level:
 
 @dataclass(frozen=True, eq=False)
 class Hierarchy:
-    """Levels 0 (the simulated kernels) to L of one scene.
+    """Levels 0 (the simulated kernels) to L of one scene."""
 
-    Attributes:
-        levels: the levels, kernels first.
-        kernels: scene index of each level-0 unit.
-        diagonal: bounding-box diagonal of the simulated kernels [scene units]; see :func:`build_hierarchy`.
-    """
-
-    levels: tuple[Level, ...]
-    kernels: Int[Tensor, " K"]
-    diagonal: float
+    levels: tuple[Level, ...]  # the levels, kernels first
+    kernels: Int[Tensor, " K"]  # scene index of each level-0 unit
+    diagonal: float  # bounding-box diagonal of the simulated kernels [scene units]; see :func:`build_hierarchy`
 
     def ancestor(self, fine: int, coarse: int) -> Int[Tensor, " N"]:
         """The unit of level ``coarse`` that holds each unit of level ``fine``."""

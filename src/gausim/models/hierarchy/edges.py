@@ -2,55 +2,44 @@
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gausim.core import ConfigError
 from gausim.models.hierarchy.batch import LevelBatch
-from gausim.ops.neighbours import combine_edges, combine_tables, neighbour_table
+from gausim.ops.neighbours import (
+    batched_radius_edges,
+    coded_edges,
+    combine_codes,
+    edge_codes,
+    neighbour_codes,
+    no_edge,
+)
 
-EDGE_RULES = ("rest", "current", "union", "intersection")
 
+def exact_edges(rule: str, level: LevelBatch, positions: Float[Tensor, "N 3"]) -> Int[Tensor, "2 E"]:
+    """Edges of a level whose units are at ``positions`` [scene units], sorted by destination, then source.
 
-class EdgeSet:
-    """Which edges the network sees.
-
-    Edges are sorted by destination, then source. Edges of the dummy node, N -> N, only fill up the number of edges: no
-    other edge touches that node.
+    Args:
+        rule: neighbours at ``rest``, those of the ``current`` state, or the ``union`` or ``intersection`` of both.
+        level: the units.
+        positions: where they are now.
     """
+    if rule == "rest":
+        return level.rest_edges
+    current = batched_radius_edges(positions, level.offsets, level.radii, level.max_neighbours)
+    if rule == "current":
+        return current
+    rest, now = (edge_codes(edges, level.count) for edges in (level.rest_edges, current))
+    combined = combine_codes(rest, now, level.count, rule=rule)
+    return coded_edges(combined[combined < no_edge(level.count)], level.count)
 
-    def __init__(self, rule: str) -> None:
-        """Chooses the rule.
 
-        Args:
-            rule: neighbours at ``rest``, those of the ``current`` state, or the ``union`` or ``intersection`` of both.
+def fixed_edges(rule: str, level: LevelBatch, positions: Float[Tensor, "N 3"]) -> Int[Tensor, "2 E"]:
+    """The same edges, and as many N -> N of a dummy node N as there might be more; not for the rule ``rest``.
 
-        Raises:
-            ConfigError: an unknown rule.
-        """
-        if rule not in EDGE_RULES:
-            raise ConfigError(f"model.simulator.hierarchy.edges is '{rule}'; expected one of {', '.join(EDGE_RULES)}.")
-        self.rule = rule
-
-    def of(self, level: LevelBatch, positions: Float[Tensor, "N 3"]) -> Int[Tensor, "2 E"]:
-        """Edges of a level whose units are at ``positions`` [scene units], without those of the dummy node."""
-        if self.rule == "rest":
-            return level.rest_edges
-        current = level.current_edges(positions)
-        if self.rule == "current":
-            return current
-        return combine_edges(level.rest_edges, current, level.count, rule=self.rule)
-
-    def fixed(self, level: LevelBatch, positions: Float[Tensor, "N 3"]) -> Int[Tensor, "2 E"]:
-        """The same edges, and as many of the dummy node as there might be more; not for the rule ``rest``.
-
-        E is the same for all positions, and nothing is read back to the host.
-        """
-        source, valid = neighbour_table(positions, level.member, level.device_radii, level.max_neighbours)
-        if self.rule != "current":
-            source, valid = combine_tables(level.rest_table, (source, valid), rule=self.rule)
-        count = level.count
-        destination = torch.arange(count, device=source.device)[:, None].expand_as(source)
-        code = torch.where(valid, destination * (count + 1) + source, count * (count + 2)).flatten().sort().values
-        return torch.stack((code % (count + 1), code // (count + 1)))
+    E is the same for all positions, and nothing is read back to the host.
+    """
+    codes = neighbour_codes(positions, level.member, level.device_radii, level.max_neighbours)
+    if rule != "current":
+        codes = combine_codes(edge_codes(level.rest_edges, level.count), codes, level.count, rule=rule)
+    return coded_edges(codes, level.count)

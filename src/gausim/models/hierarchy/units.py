@@ -15,22 +15,15 @@ from gausim.ops.aggregation import weighted_sum
 
 @dataclass(frozen=True, eq=False)
 class FixedUnits:
-    """What of the units of one level stays between two updates of the parameters.
+    """What of the units of one level stays between two updates of the parameters."""
 
-    Attributes:
-        rest: centres of mass X [scene units].
-        mass: m_c = sum of m_i.
-        mass_fraction: m_c over the mass of its parent among the predicted levels; at the top level over itself.
-        log_density: log of m_c / V_c.
-        attributes: plain mean over the kernels.
-        scale: mass of the whole scene times its diagonal, the unit of momenta per step [mass scene units].
-    """
-
-    rest: Float[Tensor, "N 3"]
-    mass: Float[Tensor, " N"]
+    rest: Float[Tensor, "N 3"]  # centres of mass X [scene units]
+    mass: Float[Tensor, " N"]  # m_c = sum of m_i
+    # m_c over the mass of its parent among the predicted levels; at the top level over itself
     mass_fraction: Float[Tensor, " N"]
-    log_density: Float[Tensor, " N"]
-    attributes: Float[Tensor, "N A"]
+    log_density: Float[Tensor, " N"]  # log of m_c / V_c
+    attributes: Float[Tensor, "N A"]  # plain mean over the kernels
+    # mass of the whole scene times its diagonal, the unit of momenta per step [mass scene units]
     scale: Float[Tensor, "N 1"]
 
 

@@ -25,34 +25,21 @@ class GraphedStep:
     Make a new one for every rollout; the capture costs about four steps.
     """
 
-    def __init__(self, step: StepFunction, rest: Float[Tensor, "K 3"], *, capture: bool = True) -> None:
+    def __init__(self, step: StepFunction, rest: Float[Tensor, "K 3"]) -> None:
         """Makes the buffers.
 
         Args:
             step: from state and forces to the next frame; no shape and no branch in it may depend on values.
-            rest: rest positions of all kernels; the state has their shape, type and device.
-            capture: False computes the same between the same buffers, kernel by kernel, on any device.
-
-        Raises:
-            ConfigError: a capture on a device without CUDA graphs.
+            rest: rest positions of all kernels; the state has their shape, type and CUDA device.
         """
-        if capture and rest.device.type != "cuda":
-            raise ConfigError(
-                "model.simulator.rollout.cuda_graph: expected the model on a CUDA device, got "
-                f"{rest.device}. Set it to false."
-            )
-        self._step, self._capture = step, capture
+        self._step = step
         self._state = SimState(torch.zeros_like(rest), torch.zeros_like(rest))
         self._force = torch.zeros_like(rest)
         self._graphs: dict[bool, tuple[torch.cuda.CUDAGraph, SteppedFrame]] = {}
 
     @torch.no_grad()
     def __call__(self, state: SimState, force: Float[Tensor, "K 3"] | None = None) -> SteppedFrame:
-        """Predicts the next frame; the result is a copy of its own.
-
-        Args:
-            state: positions and previous positions [scene units].
-            force: force per kernel [mass scene units / s^2].
+        """The next frame, a copy of its own.
 
         Raises:
             ConfigError: the step cannot be captured, because something in it waits for the device.
@@ -62,32 +49,26 @@ class GraphedStep:
         pushed = force is not None
         if force is not None:
             self._force.copy_(force)
-        if not self._capture:
-            return _copy(self._compute(pushed))
         if pushed not in self._graphs:
             self._graphs[pushed] = self._record(pushed)
-        graph, result = self._graphs[pushed]
+        graph, made = self._graphs[pushed]
         graph.replay()
-        return _copy(result)
-
-    def _compute(self, pushed: bool) -> SteppedFrame:
-        """What is captured."""
-        made = self._step(self._state, self._force if pushed else None)
-        return SteppedFrame(made.positions, made.deformation_gradients, made.rotations)
+        return SteppedFrame(made.positions.clone(), made.deformation_gradients.clone(), made.rotations.clone())
 
     def _record(self, pushed: bool) -> tuple[torch.cuda.CUDAGraph, SteppedFrame]:
+        force = self._force if pushed else None
         device = self._force.device
         aside = torch.cuda.Stream(device)
         aside.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(aside):
             for _ in range(WARM_UP):
-                self._compute(pushed)
+                self._step(self._state, force)
         torch.cuda.current_stream(device).wait_stream(aside)
         graph = torch.cuda.CUDAGraph()
         try:
             # thread_local: the thread that pins memory for a data loader may call CUDA meanwhile.
             with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
-                result = self._compute(pushed)
+                result = self._step(self._state, force)
         except RuntimeError as error:
             raise ConfigError(
                 "model.simulator.rollout.cuda_graph: the step cannot be captured "
@@ -95,7 +76,3 @@ class GraphedStep:
                 "or has a shape that depends on values; set it to false."
             ) from error
         return graph, result
-
-
-def _copy(frame: SteppedFrame) -> SteppedFrame:
-    return SteppedFrame(frame.positions.clone(), frame.deformation_gradients.clone(), frame.rotations.clone())

@@ -1,15 +1,18 @@
-"""Rollouts of one scene by the simulator: :class:`gausim.core.Steppable` without gradients."""
+"""Rollouts of one scene by the simulator, without gradients: :class:`gausim.core.Steppable`."""
 
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gausim.core import Forces, SimState, Trajectory, roll_out
-from gausim.models.rollout.stepper import SceneStepper
+from gausim.core import DivergenceError, Forces, SimState, SteppedFrame, Trajectory, roll_out
+from gausim.models.rollout.cuda_graph import GraphedStep
+from gausim.models.rollout.energy_guard import EnergyGuard
 from gausim.models.step.simulator import GausSim
 from gausim.nn.mode import evaluating
+
+INTERVAL = 64  # frames on a CUDA device between two questions; each makes the host wait until the device has caught up
 
 
 class SceneDynamics:
@@ -39,3 +42,91 @@ class SceneDynamics:
     def stepper(self, initial: SimState) -> SceneStepper:
         """Begins at a state; every step is one of :meth:`rollout`."""
         return SceneStepper(self.model, self.scene_id, initial, energy_ceiling=self.energy_ceiling)
+
+
+class SceneStepper:
+    """Steps of one scene from one initial state, the network's correction held back where it would add energy.
+
+    See :class:`gausim.core.Stepper`.
+    """
+
+    takes_forces: bool = True
+
+    @torch.no_grad()
+    def __init__(
+        self, model: GausSim, scene_id: int, initial: SimState, *, energy_ceiling: float | None = None
+    ) -> None:
+        """Begins at ``initial``, a state of the model's scene number ``scene_id``.
+
+        ``energy_ceiling`` is the highest energy that forces can reach, for models that know one; None: any.
+        """
+        batch = model.batch((scene_id,))
+        member, prepared = batch.members[0], model.prepare(batch)
+        identity = torch.eye(3).to(initial.positions).expand(member.units.stop - member.units.start, 3, 3)
+        self._model, self._name = model, model.scenes[scene_id].name
+        self.fps: float = model.fps[scene_id]
+        self.state, self.frame = initial, SteppedFrame(initial.positions, identity, identity)
+        self.unit_of_kernel: Int[Tensor, " K"] = member.unit_of_kernel
+
+        def step(state: SimState, force: Tensor | None) -> SteppedFrame:
+            return model.step(batch, state, force, prepared)
+
+        graphed = model.rollout.cuda_graph and batch.rest.device.type == "cuda"
+        self._step = GraphedStep(step, batch.rest) if graphed else step
+        self._guard: EnergyGuard | None = None
+        if model.rollout.energy_guard_frames and model.knows_energy:
+            self._guard = EnergyGuard(model, prepared, self._step, ceiling=energy_ceiling)
+        # Whether positions and forces were finite since it was asked last: kept on the device, read now and then.
+        self._finite = torch.ones(2, dtype=torch.bool, device=initial.positions.device)
+        self._number, self._asked = 0, 0
+        self._interval = 1 if initial.positions.device.type == "cpu" else INTERVAL
+        self._note(0, torch.cat((initial.positions, initial.previous)))
+
+    @property
+    def limited(self) -> int:
+        """Frames so far that the energy's ceiling limited."""
+        return 0 if self._guard is None else self._guard.limited
+
+    @torch.no_grad()
+    def step(
+        self, force: Float[Tensor, "K 3"] | None = None, *, held: Bool[Tensor, " K"] | None = None
+    ) -> SteppedFrame:
+        """The next frame; a kernel that is held stays where it is, the shape of its unit does not.
+
+        Raises:
+            DivergenceError: an earlier position, or the force, is not finite (on the CPU at once, on other devices up
+                to :data:`INTERVAL` frames later); the message names the frame.
+        """
+        if force is not None:
+            self._note(1, force)
+        self._ask(now=False)
+        with evaluating(self._model):
+            made = (self._step if self._guard is None else self._guard.step)(self.state, force)
+        positions = made.positions
+        if held is not None:
+            positions = torch.where(held[:, None], self.state.positions, positions)
+        self._number += 1
+        self._note(0, positions)
+        self.state = SimState(positions, self.state.positions)
+        self.frame = SteppedFrame(positions, made.deformation_gradients, made.rotations)
+        return self.frame
+
+    def settle(self) -> None:
+        """Raises a DivergenceError if any frame so far is not finite."""
+        self._ask(now=True)
+
+    def _note(self, kind: int, values: Tensor) -> None:
+        self._finite[kind].logical_and_(torch.isfinite(values).all().to(self._finite.device))
+
+    def _ask(self, *, now: bool) -> None:
+        if not now and self._number % self._interval:
+            return
+        first, last = min(self._asked, self._number), self._number
+        for kind, finite in zip(("positions", "forces"), self._finite.tolist(), strict=True):
+            if not finite:
+                where = f"frame {last}" if first == last else f"one of the frames {first} to {last}"
+                raise DivergenceError(
+                    f"{self._name}: {kind} are not finite at {where}. "
+                    "Reset the state, or use a smaller force or a model trained longer."
+                )
+        self._asked = last + 1

@@ -37,31 +37,26 @@ class EnergyGuard:
     same is cut short, to the longest part of it that does not. So forces bend nothing further than that energy does.
     """
 
-    def __init__(self, model: GausSim, prepared: Prepared, frames: int, *, ceiling: float | None = None) -> None:
+    def __init__(self, model: GausSim, prepared: Prepared, step: StepFunction, *, ceiling: float | None = None) -> None:
         """Begins a rollout of a batch of one scene.
 
         Args:
-            model: whose template has an energy.
+            model: whose template has an energy, and whose settings say over how many frames the limit looks back.
             prepared: of the batch.
-            frames: over which the limit looks back; about a period of the slowest vibration.
+            step: predicts with all of the correction.
             ceiling: the highest energy that is allowed at all; None: whatever forces make of it.
         """
-        self._model, self._prepared = model, prepared
-        self._last: deque[float] = deque(maxlen=frames)
+        self._model, self._prepared, self._step = model, prepared, step
+        self._last: deque[float] = deque(maxlen=model.rollout.energy_guard_frames)
         self._ceiling = ceiling
         self._made: SteppedFrame | None = None
         self.held, self.limited = 0, 0
 
-    def step(self, step: StepFunction, state: SimState, force: Tensor | None) -> SteppedFrame:
-        """The next frame.
+    def step(self, state: SimState, force: Tensor | None) -> SteppedFrame:
+        """The next frame; the work that a force does raises the limit.
 
         Counted are those whose correction was held back (:attr:`held`) and those that the ceiling limited, their force
         weakened or the step itself cut short (:attr:`limited`).
-
-        Args:
-            step: predicts with all of the correction.
-            state: positions and previous positions of the kernels [scene units].
-            force: as of :meth:`gausim.models.step.simulator.GausSim.step`; the work it does raises the limit.
         """
         if not self._last:
             self._last.append(self._model.template.headroom * self._energy(state))
@@ -69,7 +64,7 @@ class EnergyGuard:
             pushed = self._model.pushed(self._prepared, state, force)
             work = max(0.0, self._energy(pushed) - self._energy(state))
             self._last = deque((energy + work for energy in self._last), self._last.maxlen)
-        result = step(state, force)
+        result = self._step(state, force)
         energy, limit = self._energy(_after(result, state)), max(self._last)
         if energy > limit:
             result, energy = self._held_back(state, force, energy, limit)

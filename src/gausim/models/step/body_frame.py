@@ -47,15 +47,11 @@ def _signed(axis: np.ndarray, offset: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Axes and origins of the scenes of a batch, for every unit of every predicted level and for every root.
+    """Axes and origins of the scenes of a batch, for every unit of every predicted level and for every root."""
 
-    Attributes:
-        axes: (N, 3, 3) per level, coarse to fine; rows are the body's axes in scene coordinates.
-        origins: (N, 3) per level [scene units].
-    """
-
+    # (N, 3, 3) per level, coarse to fine; rows are the body's axes in scene coordinates
     axes: tuple[Float[Tensor, "_ 3 3"], ...]
-    origins: tuple[Float[Tensor, "_ 3"], ...]
+    origins: tuple[Float[Tensor, "_ 3"], ...]  # (N, 3) per level [scene units]
 
     @classmethod
     def of(cls, batch: SceneBatch, axes: Float[Tensor, "S 3 3"], origins: Float[Tensor, "S 3"]) -> Frames:

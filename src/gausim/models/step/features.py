@@ -19,19 +19,12 @@ ANGLES = ("cos_sin", "inner")
 
 @dataclass(frozen=True, eq=False)
 class UnitState:
-    """Aggregated state of the N units of one level (or of their parents), in diagonals of the scene.
+    """Aggregated state of the N units of one level (or of their parents), in diagonals of the scene."""
 
-    Attributes:
-        rest: X.
-        now: x_t.
-        before: x_{t-1}.
-        after: the predicted position at t+1 where it is known (parents), else the coarse prediction.
-    """
-
-    rest: Float[Tensor, "N 3"]
-    now: Float[Tensor, "N 3"]
-    before: Float[Tensor, "N 3"]
-    after: Float[Tensor, "N 3"]
+    rest: Float[Tensor, "N 3"]  # X
+    now: Float[Tensor, "N 3"]  # x_t
+    before: Float[Tensor, "N 3"]  # x_{t-1}
+    after: Float[Tensor, "N 3"]  # the predicted position at t+1 where it is known (parents), else the coarse prediction
 
 
 @dataclass(frozen=True)
@@ -68,18 +61,6 @@ class FeatureOptions:
         if not (self.velocities or self.rest_inputs):
             raise ConfigError(
                 "model.simulator.features.velocities=false needs rest_inputs=true: the network would see nothing."
-            )
-
-    def check_frame(self, body_frame: bool) -> None:
-        """Refuses gravity, which is a direction of the scene, in the body's own axes.
-
-        Raises:
-            ConfigError: that is so.
-        """
-        if body_frame and any(self.gravity):
-            raise ConfigError(
-                "model.simulator.features.gravity is a direction of the scene: set "
-                "model.simulator.hierarchy.body_frame=false with it."
             )
 
     @property
@@ -122,18 +103,10 @@ def network_inputs(
     *,
     coarse: bool = False,
 ) -> tuple[Float[Tensor, "N Cn"], Float[Tensor, "E Ce"]]:
-    """Node and edge features of the units of one level.
+    """Node and edge features of the units of one level, from their graph and their solved parents.
 
-    Args:
-        unit: the units.
-        target: their template positions [scene units].
-        above: their solved parents.
-        edge_index: source and destination.
-        size: diagonal of each unit's scene [scene units].
-        dt: frame interval [s].
-        gravity: acceleration [scene units / s^2].
-        options: among the readings of the paper.
-        coarse: whether positions are those of the coarse prediction.
+    ``target`` are template positions of the units, ``size`` diagonals of their scenes [scene units]; with ``coarse``
+    positions are those of the coarse prediction.
     """
     coarsely = above.carry(target)
     # Stacked and gathered together: on a CPU the number of operations is what costs.

@@ -54,11 +54,7 @@ class Head:
     ) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3 3"]]:
         """F = U diag(lambda) V^T, behind it that of the lever, and its rotation U V^T.
 
-        Args:
-            output: of the network.
-            lever: from the parent to each unit before its own gradient [scene units]; None without a lever head.
-            length: diagonal of each unit's scene [scene units].
-            conserve_mass: det F = 1.
+        ``lever`` is as :func:`lever_gradient` takes it, None without a lever head.
         """
         gradient, rotation = gradient_from_output(output[:, :OUTPUTS] * self.output_scale, conserve_mass=conserve_mass)
         if lever is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from typing import cast
 
 import torch
@@ -11,22 +10,16 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gausim.models.hierarchy.batch import LevelBatch
-from gausim.models.hierarchy.edges import EdgeSet
+from gausim.models.hierarchy.edges import exact_edges, fixed_edges
 from gausim.models.step.features import FeatureOptions, network_inputs
 from gausim.models.step.head import Head
 from gausim.models.step.recursion import Solved, Units
 from gausim.nn.mlp import zero_output as initialise_zero
-from gausim.nn.normaliser import RunningNormaliser, gathering_nothing
+from gausim.nn.normaliser import RunningNormaliser
 
 
 class GradientPredictor(nn.Module):
-    """F of every unit from its own state, that of its parent and of its neighbours.
-
-    Attributes:
-        features: what the network sees.
-        edges: of which neighbours.
-        head: how its output is read.
-    """
+    """F of every unit from its own state, that of its parent and of its neighbours."""
 
     gravity: Tensor
 
@@ -37,18 +30,12 @@ class GradientPredictor(nn.Module):
         features: FeatureOptions,
         network: Callable[..., nn.Module],
         head: Head,
-        edges: EdgeSet,
+        edges: str,
         conserve_mass: bool,
     ) -> None:
-        """Builds the networks and the normalisers of their inputs.
+        """Builds the networks, one for all predicted levels or one each, and the normalisers of their inputs.
 
-        Args:
-            networks: one for all predicted levels, or as many as there are.
-            features: what is seen of units and edges.
-            network: called with node_features=, edge_features= and outputs=.
-            head: how the output is read.
-            edges: which neighbours are seen.
-            conserve_mass: det F = 1.
+        ``network`` is called with node_features=, edge_features= and outputs=.
         """
         super().__init__()
         self.features, self.edges, self.head, self._conserve_mass = features, edges, head, conserve_mass
@@ -62,30 +49,17 @@ class GradientPredictor(nn.Module):
             initialise_zero(cast(nn.Sequential, one.decoder))
         self.network: nn.Module = made[0] if networks == 1 else nn.ModuleList(made)
 
-    def freeze_statistics(self) -> None:
-        """The statistics of the inputs gather nothing more."""
-        self.node_normaliser.frozen = self.edge_normaliser.frozen = True
-
-    def gathering_nothing(self) -> AbstractContextManager[None]:
-        """A block whose inputs do not count for the statistics."""
-        return gathering_nothing([self.node_normaliser, self.edge_normaliser])
-
     def forward(
         self, level: LevelBatch, unit: Units, above: Solved, target: Float[Tensor, "N 3"], position: int
     ) -> Float[Tensor, "N O"]:
         """The network's raw output for each unit of the level at ``position``, coarse to fine.
 
-        Args:
-            level: the graph.
-            unit: its units.
-            above: their solved parents.
-            target: template positions [scene units].
-            position: of the level.
+        The units' parents are solved, ``target`` are their template positions [scene units].
         """
         network = self.network[position] if isinstance(self.network, nn.ModuleList) else self.network
         coarse = self.features.coarse_inputs and position > 0
         fixed = self._fixes_shapes(unit.now)
-        edge_index = (self.edges.fixed if fixed else self.edges.of)(level, unit.now)
+        edge_index = (fixed_edges if fixed else exact_edges)(self.edges, level, unit.now)
         # Edges of the dummy node stand behind all others; their features are never seen, those of any node will do.
         present = edge_index.clamp_max(level.count - 1) if fixed else edge_index
         nodes, edges = network_inputs(
@@ -106,4 +80,4 @@ class GradientPredictor(nn.Module):
 
     def _fixes_shapes(self, positions: Tensor) -> bool:
         """Whether the number of edges must not depend on the state: where steps may be captured in a CUDA graph."""
-        return self.edges.rule != "rest" and positions.device.type == "cuda" and not self.training
+        return self.edges != "rest" and positions.device.type == "cuda" and not self.training

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,30 +20,19 @@ class Prepared:
     """Constants of a batch between two updates of the parameters.
 
     Gradients flow through them, so one that was made with gradients serves the steps of one backward pass.
-
-    Attributes:
-        batch: what it was made for.
-        mass: masses of the simulated kernels.
-        mass_fraction: mass of every kernel over that of its finest predicted unit; 0 for never-simulated kernels.
-        levels: the predicted levels, coarse to fine.
-        roots: what the top level hangs on.
-        template: the template of the batch.
-        frames: the bodies' axes in which levels, roots and template are; None where these are the scene's.
-        rest: centres of mass of the finest predicted units in the scene's axes [scene units].
-        still: the network's outputs at rest per level, taken off others; None where they are not.
-        with_gradients: whether it was made with gradients enabled.
     """
 
-    batch: SceneBatch
-    mass: Float[Tensor, " M"]
+    batch: SceneBatch  # what it was made for
+    mass: Float[Tensor, " M"]  # masses of the simulated kernels
+    # mass of every kernel over that of its finest predicted unit; 0 for never-simulated kernels
     mass_fraction: Float[Tensor, " K"]
-    levels: tuple[FixedUnits, ...]
-    roots: Solved
-    template: PreparedTemplate
-    frames: Frames | None
-    rest: Float[Tensor, "N 3"]
+    levels: tuple[FixedUnits, ...]  # the predicted levels, coarse to fine
+    roots: Solved  # what the top level hangs on
+    template: PreparedTemplate  # the template of the batch
+    frames: Frames | None  # the bodies' axes in which levels, roots and template are; None where these are the scene's
+    rest: Float[Tensor, "N 3"]  # centres of mass of the finest predicted units in the scene's axes [scene units]
+    # the network's outputs at rest per level, taken off others; None where they are not
     still: tuple[Tensor, ...] | None
-    with_gradients: bool
 
     def aggregate(self, positions: Float[Tensor, "K 3"]) -> Float[Tensor, "N 3"]:
         """Centres of mass of the finest predicted units."""
@@ -58,18 +46,6 @@ class Prepared:
     def per_level(self, finest: Float[Tensor, "N 3"]) -> list[Tensor]:
         """Positions of every predicted level, coarse to fine: coarser units are the centres of mass of the finer."""
         return per_level(self.batch, [level.mass_fraction for level in self.levels], finest)
-
-    def check_serves(self, batch: SceneBatch) -> None:
-        """Refuses a batch that it was not made for.
-
-        Raises:
-            ValueError: that is so, or it carries no gradients while they are enabled.
-        """
-        if self.batch is not batch or (torch.is_grad_enabled() and not self.with_gradients):
-            raise ValueError(
-                "step: `prepared` was made for another batch, or without gradients while they are enabled now. "
-                "Call prepare(batch) where step is called."
-            )
 
     def in_scene_axes(
         self, finest: Solved, template: Tensor | None, predicted: list[Tensor]

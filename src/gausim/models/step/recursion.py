@@ -14,48 +14,28 @@ from gausim.ops.deformation import polar_rotation
 
 @dataclass(frozen=True, eq=False)
 class Units:
-    """Mass-weighted aggregates of the N units of one level, in the order of its rows.
+    """Mass-weighted aggregates of the N units of one level, in the order of its rows."""
 
-    Attributes:
-        rest: X [scene units].
-        now: x_t.
-        before: x_{t-1}.
-        mass: m_c = sum of m_i.
-        log_density: log of m_c / V_c.
-        attributes: plain mean over the kernels.
-    """
-
-    rest: Float[Tensor, "N 3"]
-    now: Float[Tensor, "N 3"]
-    before: Float[Tensor, "N 3"]
-    mass: Float[Tensor, " N"]
-    log_density: Float[Tensor, " N"]
-    attributes: Float[Tensor, "N A"]
+    rest: Float[Tensor, "N 3"]  # X [scene units]
+    now: Float[Tensor, "N 3"]  # x_t
+    before: Float[Tensor, "N 3"]  # x_{t-1}
+    mass: Float[Tensor, " N"]  # m_c = sum of m_i
+    log_density: Float[Tensor, " N"]  # log of m_c / V_c
+    attributes: Float[Tensor, "N A"]  # plain mean over the kernels
 
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The solved level above (or the roots of the top level), and which of its P units is the parent of each unit.
+    """The solved level above (or the roots of the top level), and which of its P units is the parent of each unit."""
 
-    Attributes:
-        rest: X [scene units].
-        now: x_t.
-        before: x_{t-1}.
-        after: x_{t+1}.
-        template: template positions.
-        gradient: accumulated deformation gradients.
-        rotation: accumulated rotations.
-        index: the parent of each of the N units below.
-    """
-
-    rest: Float[Tensor, "P 3"]
-    now: Float[Tensor, "P 3"]
-    before: Float[Tensor, "P 3"]
-    after: Float[Tensor, "P 3"]
-    template: Float[Tensor, "P 3"]
-    gradient: Float[Tensor, "P 3 3"]
-    rotation: Float[Tensor, "P 3 3"]
-    index: Int[Tensor, " N"]
+    rest: Float[Tensor, "P 3"]  # X [scene units]
+    now: Float[Tensor, "P 3"]  # x_t
+    before: Float[Tensor, "P 3"]  # x_{t-1}
+    after: Float[Tensor, "P 3"]  # x_{t+1}
+    template: Float[Tensor, "P 3"]  # template positions
+    gradient: Float[Tensor, "P 3 3"]  # accumulated deformation gradients
+    rotation: Float[Tensor, "P 3 3"]  # accumulated rotations
+    index: Int[Tensor, " N"]  # the parent of each of the N units below
 
     @classmethod
     def roots(cls, rest: Float[Tensor, "P 3"]) -> Solved:

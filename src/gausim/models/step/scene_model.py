@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gausim.core import ConfigError, GaussianScene, SimState, SmoothMotions
-from gausim.models.hierarchy.batch import BatchBuilder, GraphOptions, SceneBatch
+from gausim.models.hierarchy.batch import BatchBuilder, SceneBatch
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.settings import HierarchySettings
 from gausim.models.step.body_frame import Frames, body_axes
@@ -19,6 +19,7 @@ from gausim.models.step.predictor import GradientPredictor
 from gausim.models.step.prepared import Prepared
 from gausim.models.template.smooth import smooth_motions
 from gausim.models.template.template import Motion, Template
+from gausim.nn.normaliser import normalisers_of
 
 
 class SceneModel(nn.Module, ABC):
@@ -60,8 +61,7 @@ class SceneModel(nn.Module, ABC):
             )
             for scene, own in zip(scenes, self.body_axes, strict=True)
         )  # fmt: skip
-        graph = GraphOptions(settings.edge_lengths, settings.max_neighbours)
-        self._builder = BatchBuilder(self.scenes, self.hierarchies, self.fps, self.predicted_levels, graph)
+        self._builder = BatchBuilder(self.scenes, self.hierarchies, self.fps, settings)
         self._batches: dict[tuple[tuple[int, ...], torch.device], SceneBatch] = {}
         origins = [s.means.mean(0) if settings.body_frame else torch.zeros(3) for s in scenes]
         self.register_buffer("axes", torch.from_numpy(np.stack(self.body_axes)).to(scenes[0].means), persistent=False)
@@ -160,4 +160,5 @@ class SceneModel(nn.Module, ABC):
         """
         for module in (self,) if scenes else self.shared().values():
             module.requires_grad_(False)
-        self.predictor.freeze_statistics()
+        for normaliser in normalisers_of(self.predictor):
+            normaliser.frozen = True

@@ -9,9 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gausim.core import GaussianScene, SimState, SteppedFrame
+from gausim.core import ConfigError, GaussianScene, SimState, SteppedFrame
 from gausim.models.hierarchy.batch import LevelBatch, SceneBatch
-from gausim.models.hierarchy.edges import EdgeSet
 from gausim.models.hierarchy.units import FixedUnits, fixed_units
 from gausim.models.settings import HierarchySettings, RolloutSettings
 from gausim.models.step.features import FeatureOptions
@@ -22,6 +21,7 @@ from gausim.models.step.recursion import Solved, Units, advance, inherit
 from gausim.models.step.scene_model import SceneModel
 from gausim.models.template.template import Motion, RestTemplate, Template
 from gausim.nn.meshgraphnet import MeshGraphNet
+from gausim.nn.normaliser import gathering_nothing, normalisers_of
 from gausim.ops.aggregation import weighted_sum
 
 DEFAULT_HIERARCHY, DEFAULT_FEATURES = HierarchySettings(), FeatureOptions()
@@ -30,16 +30,12 @@ PLAIN_HEAD, PLAIN_ROLLOUT = Head(), RolloutSettings()
 
 @dataclass(frozen=True, eq=False)
 class Step(SteppedFrame):
-    """What a step gives: x_{t+1} of a batch, and accumulated gradients and rotations of its finest units.
+    """What a step gives: x_{t+1} of a batch, and accumulated gradients and rotations of its finest units."""
 
-    Attributes:
-        momentum: sum over levels and parents of ||m_c x_c - sum m_i x_i||^2, masses over that of the scene and lengths
-            over its diagonal; zero where it is switched off.
-        predicted: the network's own gradients F, per predicted level, coarse to fine.
-    """
-
+    # sum over levels and parents of ||m_c x_c - sum m_i x_i||^2, masses over that of the scene and lengths over its
+    # diagonal; zero where it is switched off
     momentum: Float[Tensor, ""]
-    predicted: tuple[Float[Tensor, "_ 3 3"], ...]
+    predicted: tuple[Float[Tensor, "_ 3 3"], ...]  # the network's own gradients F, per predicted level, coarse to fine
 
 
 class GausSim(SceneModel):
@@ -78,7 +74,11 @@ class GausSim(SceneModel):
             ConfigError: parts that do not go together.
             SceneError: a scene has nothing pinned, or nothing else.
         """
-        features.check_frame(hierarchy.body_frame)
+        if hierarchy.body_frame and any(features.gravity):
+            raise ConfigError(
+                "model.simulator.features.gravity is a direction of the scene: set "
+                "model.simulator.hierarchy.body_frame=false with it."
+            )
         super().__init__(scenes, fps, hierarchy, features.attributes)
         self.conserve_momentum, self.rollout = conserve_momentum, rollout
         self.template = template(
@@ -87,7 +87,7 @@ class GausSim(SceneModel):
         )  # fmt: skip
         self.predictor = GradientPredictor(
             networks=1 if hierarchy.share_network else len(self.predicted_levels), features=features, network=network,
-            head=head, edges=EdgeSet(hierarchy.edges), conserve_mass=conserve_mass,
+            head=head, edges=hierarchy.edges, conserve_mass=conserve_mass,
         )  # fmt: skip
 
     def prepare(self, batch: SceneBatch) -> Prepared:
@@ -104,8 +104,8 @@ class GausSim(SceneModel):
         if frames is not None:
             levels = tuple(replace(level, rest=frames.into(i, level.rest)) for i, level in enumerate(levels))
             roots = frames.into(0, roots)
-        template, grad = self.template.prepare(batch, levels[-1]), torch.is_grad_enabled()
-        prepared = Prepared(batch, mass, fraction, levels, Solved.roots(roots), template, frames, rest, None, grad)
+        template = self.template.prepare(batch, levels[-1])
+        prepared = Prepared(batch, mass, fraction, levels, Solved.roots(roots), template, frames, rest, None)
         return replace(prepared, still=self._outputs_at_rest(prepared)) if self.predictor.head.anchor else prepared
 
     def step(
@@ -125,12 +125,8 @@ class GausSim(SceneModel):
                 step (METHOD section 6).
             prepared: from :meth:`prepare`, shared by steps between which no parameter changes; made here when None.
             correction_scale: factor on the network's output; 0 leaves the template alone.
-
-        Raises:
-            ValueError: ``prepared`` is of another batch, or carries no gradients while they are enabled.
         """
         prepared = self.prepare(batch) if prepared is None else prepared
-        prepared.check_serves(batch)
         if force is not None:
             state = self.pushed(prepared, state, force)
         now, before = prepared.finest(state.positions), prepared.finest(state.previous)
@@ -172,7 +168,7 @@ class GausSim(SceneModel):
         """The network's output for every unit of every predicted level where nothing moves."""
         rest = prepared.levels[-1].rest
         outputs: list[Tensor] = []
-        with self.predictor.gathering_nothing():
+        with gathering_nothing(normalisers_of(self.predictor)):
             self._descend(prepared, rest, rest, 0.0, outputs)
         return tuple(outputs)
 

@@ -26,7 +26,7 @@ from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.solid import solid_body
 from gausim.models.template.springs import held_below, unit_springs
-from gausim.models.template.template import PreparedScenes, Template, modal_coordinates
+from gausim.models.template.template import ModalScene, PreparedScenes, Template
 
 # Logarithms of stiffness and damping may move ten times faster than the mixing of modes; written as gains on the
 # parameters so that one learning rate serves both.
@@ -45,16 +45,9 @@ class ElasticScene(nn.Module):
 
     def __init__(
         self,
-        hierarchy: Hierarchy,
-        finest: int,
-        *,
-        modes: int,
-        neighbours: int,
-        period: float,
-        amplitude: float,
-        geometric: float,
-        solid: float,
-    ) -> None:
+        hierarchy: Hierarchy, finest: int, *,
+        modes: int, neighbours: int, period: float, amplitude: float, geometric: float, solid: float,
+    ) -> None:  # fmt: skip
         """``period`` of the lowest mode [frames], ``amplitude`` [diagonals] and ``geometric`` only set the start."""
         super().__init__()
         level = hierarchy.levels[finest]
@@ -99,20 +92,6 @@ class ElasticScene(nn.Module):
     def _identity(self) -> Tensor:
         return torch.eye(len(self.values), dtype=self.values.dtype, device=self.values.device)
 
-    def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:
-        """|G v|^2 / 2 + (G m)^T K G m / 2 and the springs' beyond it, constants but for the displacements.
-
-        v is the step and m the middle of both, as the trapezoidal rule has it: without damping and springs the
-        template keeps this number exactly. G is the root of the inertia.
-        """
-        z, previous = modal_coordinates(now, before, self.projection.flatten(0, 1))
-        root, mixing = (x.detach() for x in self.roots())
-        step, middle = z - previous, (z + previous) / 2
-        heavy = torch.stack((step, middle)) @ self.inertia_root().detach().mT
-        energy = 0.5 * (heavy[0].square().sum(-1) + ((heavy[1] * root) @ mixing).square().sum(-1))
-        size = self.gain.detach() * (self.initial_log_stiffness + SPECTRUM_GAIN * self.stiffness.detach()).exp()
-        return energy + size * self.springs.potential(middle)
-
     def dissipation(self) -> Tensor:
         """D (M, M)."""
         log_damping = INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping
@@ -131,46 +110,33 @@ class ElasticScene(nn.Module):
         back = torch.linalg.inv(inertia)
         return back @ now @ inertia, back @ before @ inertia, back @ inverse @ back.mT
 
-    def forward(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S M"]:
-        """Modal coordinates at t + 1 from the displacements at t and t - 1 of S sequences."""
-        return PreparedElastic(self).coordinates(now, before)
 
-
-class PreparedElastic:
+class PreparedElastic(ModalScene):
     """An elastic scene while its parameters do not change: the matrices of its step."""
 
     def __init__(self, scene: ElasticScene) -> None:
         """Computes the constants; gradients flow through them."""
+        super().__init__(scene.projection, scene.modes, scene.gradients)
         self.scene = scene
         a, b, h = scene.matrices()
-        self.projection = scene.projection.flatten(0, 1)
-        # Positions and gradients of a unit side by side: one product gives both.
-        self.motions = torch.cat((scene.modes, scene.gradients.flatten(1, 2)), 1).flatten(0, 1)
         self.transition = torch.cat((a.mT, -b.mT))
-        size = (scene.initial_log_stiffness + SPECTRUM_GAIN * scene.stiffness).exp()
-        self.turned = scene.gain * size * h.mT
+        self.size = scene.gain * (scene.initial_log_stiffness + SPECTRUM_GAIN * scene.stiffness).exp()
+        self.turned = self.size * h.mT
         # I - A + B = H K: how the trained stiffness pulls back.
         self.pull = torch.eye(len(a), dtype=a.dtype, device=a.device) - a.mT + b.mT
 
-    def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
-        """All of it: the network's corrections are small here."""
-        return displacement
+    def after(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+        """z_{t+1}; what the springs add is held below a share of the stiffness's pull."""
+        linear = torch.cat((z, previous), -1) @ self.transition
+        return linear + held_below(self.scene.springs(z) @ self.turned, z @ self.pull)
 
-    def coordinates(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S M"]:
-        """Modal coordinates at t + 1 from the displacements at t and t - 1 of S sequences."""
-        z, previous = modal_coordinates(now, before, self.projection)
-        after = torch.cat((z, previous), -1) @ self.transition
-        # What the springs add.
-        return after + held_below(self.scene.springs(z) @ self.turned, z @ self.pull)
-
-    def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
-        """Displacement and its gradient, row by row, of every unit at t + 1."""
-        z = self.coordinates(now, before)
-        return (z @ self.motions.mT).view(*now.shape[:2], 12)
-
-    def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:
-        """Energy, see :meth:`ElasticScene.energy`."""
-        return self.scene.energy(now, before)
+    def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
+        """|G v|^2 / 2 + (G m)^T K G m / 2 and the springs' beyond it; kept exactly without damping and springs."""
+        root, mixing = (x.detach() for x in self.scene.roots())
+        step, middle = z - previous, (z + previous) / 2
+        heavy = torch.stack((step, middle)) @ self.scene.inertia_root().detach().mT
+        energy = 0.5 * (heavy[0].square().sum(-1) + ((heavy[1] * root) @ mixing).square().sum(-1))
+        return energy + self.size.detach() * self.scene.springs.potential(middle)
 
 
 class ElasticTemplate(Template):
@@ -212,17 +178,11 @@ class ElasticTemplate(Template):
         self.conserve_volume = conserve_volume
         self.scenes = nn.ModuleList(
             ElasticScene(
-                h,
-                finest,
-                modes=modes,
-                neighbours=neighbours,
-                period=period,
-                amplitude=amplitude,
-                geometric=geometric,
-                solid=solid,
+                h, finest, modes=modes, neighbours=neighbours, period=period, amplitude=amplitude,
+                geometric=geometric, solid=solid,
             )
             for h in hierarchies
-        )
+        )  # fmt: skip
 
     def scene(self, scene_id: int) -> ElasticScene:
         """Modes and matrices of one scene."""

@@ -42,7 +42,7 @@ from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.solid import POISSON, SolidBody, solid_body
 from gausim.models.template.springs import Springs, neighbour_pairs
-from gausim.models.template.template import PreparedScenes, Template, modal_coordinates
+from gausim.models.template.template import ModalScene, PreparedScenes, Template
 from gausim.nn.mlp import mlp
 
 # Decoded logarithms saturate here: a factor of twelve either way.
@@ -63,32 +63,19 @@ REFERENCE_FPS = 24.0
 
 
 class BodyModes(nn.Module):
-    """What the geometry of one scene tells, in modal coordinates; nothing in here is trained.
+    """What the geometry of one scene tells, in modal coordinates; nothing in here is trained."""
 
-    Attributes:
-        modes: Phi (N, 3, M), orthonormal under the units' volumes.
-        gradients: of the modes (N, 3, 3, M) [1 / scene units].
-        projection: (N, 3, M), z = sum_n projection_n u_n.
-        values: eigenvalues of the homogeneous body (M,), the first is 1.
-        stiffness: K_i of shear and B_i of volume (2, N, M, M), their sum is the homogeneous body's.
-        inertia: root of M_i, (N, 3, M).
-        links: pairs of units (2, E).
-        stretch: root of S_ij, (E, M).
-        springs: the links as springs, their stiffness per unit of S_ij.
-        between: root of T_ij, (E, 3, M).
-        distance: logarithm of the links' lengths over their mean (E,).
-    """
-
-    modes: Tensor
-    gradients: Tensor
-    projection: Tensor
-    values: Tensor
-    stiffness: Tensor
-    inertia: Tensor
-    links: Tensor
-    stretch: Tensor
-    between: Tensor
-    distance: Tensor
+    modes: Tensor  # Phi (N, 3, M), orthonormal under the units' volumes
+    gradients: Tensor  # of the modes (N, 3, 3, M) [1 / scene units]
+    projection: Tensor  # (N, 3, M), z = sum_n projection_n u_n
+    values: Tensor  # eigenvalues of the homogeneous body (M,), the first is 1
+    stiffness: Tensor  # K_i of shear and B_i of volume (2, N, M, M), their sum is the homogeneous body's
+    inertia: Tensor  # root of M_i, (N, 3, M)
+    links: Tensor  # pairs of units (2, E)
+    stretch: Tensor  # root of S_ij, (E, M)
+    between: Tensor  # root of T_ij, (E, 3, M)
+    distance: Tensor  # logarithm of the links' lengths over their mean (E,)
+    springs: Springs  # the links as springs, their stiffness per unit of S_ij
 
     def __init__(self, hierarchy: Hierarchy, finest: int, frame: np.ndarray, *, modes: int, spacing: float, links: int):
         """Computes everything in the body's own axes ``frame`` (3, 3); see :class:`MaterialTemplate`."""
@@ -163,19 +150,12 @@ def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np
 
 @dataclass(frozen=True, eq=False)
 class Matrices:
-    """What moves one scene [frame units].
+    """What moves one scene [frame units]."""
 
-    Attributes:
-        stiffness: K (M, M).
-        inertia: M (M, M).
-        damping: D (M, M).
-        links: factor on every link's stiffness as a spring beyond the linear (E,).
-    """
-
-    stiffness: Float[Tensor, "M M"]
-    inertia: Float[Tensor, "M M"]
-    damping: Float[Tensor, "M M"]
-    links: Float[Tensor, " E"]
+    stiffness: Float[Tensor, "M M"]  # K (M, M)
+    inertia: Float[Tensor, "M M"]  # M (M, M)
+    damping: Float[Tensor, "M M"]  # D (M, M)
+    links: Float[Tensor, " E"]  # factor on every link's stiffness as a spring beyond the linear (E,)
 
 
 class MaterialTemplate(Template):
@@ -247,14 +227,7 @@ class MaterialTemplate(Template):
     def matrices(
         self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"], dt: float
     ) -> Matrices:
-        """K, M and D of one scene from the material of its units.
-
-        Args:
-            scene_id: of the scene.
-            log_density: of the units.
-            attributes: of the units.
-            dt: frame interval [s].
-        """
+        """K, M and D of one scene from the densities and attributes of its units; ``dt`` is the frame interval [s]."""
         body, frame = self.body(scene_id), dt * REFERENCE_FPS
         units, links = self.decode(body, attributes)
         k = (self.start[0] + GAIN * self.stiffness).exp() * frame**2
@@ -291,15 +264,13 @@ def _saturated(logarithms: Tensor) -> Tensor:
     return LARGEST_LOG * torch.tanh(logarithms / LARGEST_LOG)
 
 
-class PreparedMaterial:
+class PreparedMaterial(ModalScene):
     """A scene's body while no parameter changes."""
 
     def __init__(self, body: BodyModes, matrices: Matrices) -> None:
         """Computes the constants; gradients flow through them."""
-        self.matrices, self.springs = matrices, body.springs
-        self.projection, self.positions = body.projection.flatten(0, 1), body.modes.flatten(0, 1)
-        # Positions and gradients of a unit side by side: one product gives both.
-        self.motions = torch.cat((body.modes, body.gradients.flatten(1, 2)), 1).flatten(0, 1)
+        super().__init__(body.projection, body.modes, body.gradients)
+        self.matrices, self.springs, self.positions = matrices, body.springs, body.modes.flatten(0, 1)
         self.operator = matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2
 
     def change(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
@@ -309,11 +280,9 @@ class PreparedMaterial:
         operator = self.operator + stiffer / 4
         return torch.linalg.solve(operator, force[..., None])[..., 0]
 
-    def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
-        """Displacement and its gradient, row by row, of every unit at t + 1."""
-        z, previous = modal_coordinates(now, before, self.projection)
-        after = 2 * z - previous + self.change(z, previous)
-        return (after @ self.motions.mT).view(*now.shape[:2], 12)
+    def after(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+        """z_{t+1}."""
+        return 2 * z - previous + self.change(z, previous)
 
     def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
         """Its projection onto the modes.
@@ -324,12 +293,8 @@ class PreparedMaterial:
         z = displacement.flatten(1) @ self.projection
         return (z @ self.positions.mT).view_as(displacement)
 
-    def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:
-        """v^T M v / 2 + m^T K m / 2 and the links' beyond it: v the step, m the middle of both states, constants all.
-
-        Without damping and links beyond the linear the template keeps this number exactly.
-        """
-        z, previous = modal_coordinates(now, before, self.projection)
+    def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
+        """v^T M v / 2 + m^T K m / 2 and the links' beyond it: without damping and these it is kept exactly."""
         step, middle = z - previous, (z + previous) / 2
         inertia, stiffness = self.matrices.inertia.detach(), self.matrices.stiffness.detach()
         energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)

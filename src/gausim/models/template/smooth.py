@@ -16,13 +16,9 @@ def smooth_motions(
     finest: int,
     motions: tuple[Float[Tensor, "N 3 M"], Float[Tensor, "N 3 3 M"], Float[Tensor, " M"]],
 ) -> SmoothMotions:
-    """Carries motions of units to their kernels: unit displacement plus its gradient times the offset in the unit.
+    """Carries motions of the units of a level to their kernels: the unit's displacement, its gradient times the offset.
 
-    Args:
-        scene: the scene.
-        hierarchy: its units.
-        finest: level of the units that move.
-        motions: displacements and gradients of the units by each motion, and its size (see ``SmoothMotions.sizes``).
+    ``motions`` are displacements and gradients of the units, and sizes (see ``SmoothMotions.sizes``).
     """
     modes, gradients, sizes = motions
     unit = hierarchy.ancestor(0, finest)

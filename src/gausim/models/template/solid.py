@@ -38,17 +38,11 @@ SUPPORT = 3
 
 @dataclass(frozen=True)
 class Grid:
-    """A regular grid of quadratic B-splines.
+    """A regular grid of quadratic B-splines."""
 
-    Attributes:
-        origin: of the first node's cell [scene units].
-        spacing: between nodes [scene units].
-        shape: nodes along each axis.
-    """
-
-    origin: np.ndarray
-    spacing: float
-    shape: tuple[int, int, int]
+    origin: np.ndarray  # of the first node's cell [scene units]
+    spacing: float  # between nodes [scene units]
+    shape: tuple[int, int, int]  # nodes along each axis
 
     @property
     def size(self) -> int:
@@ -128,21 +122,13 @@ def stiffness(grid: Grid, centres: np.ndarray, weights: np.ndarray) -> list[list
 
 @dataclass(frozen=True, eq=False)
 class SolidBody:
-    """The lowest modes of a body, anywhere in it.
+    """The lowest modes of a body, anywhere in it."""
 
-    Attributes:
-        grid: of the splines.
-        values: eigenvalues (M,), ascending.
-        field: coefficients (3, nodes, M) of the modes, orthonormal under the units' mass.
-        centres: of the integration cells (Q, 3) [scene units].
-        weights: their volumes (Q,), those outside the body at :data:`OUTSIDE` of it [scene units^3].
-    """
-
-    grid: Grid
-    values: np.ndarray
-    field: np.ndarray
-    centres: np.ndarray
-    weights: np.ndarray
+    grid: Grid  # of the splines
+    values: np.ndarray  # eigenvalues (M,), ascending
+    field: np.ndarray  # coefficients (3, nodes, M) of the modes, orthonormal under the units' mass
+    centres: np.ndarray  # of the integration cells (Q, 3) [scene units]
+    weights: np.ndarray  # their volumes (Q,), those outside the body at :data:`OUTSIDE` of it [scene units^3]
 
     def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Modes (P, 3, M) and their gradients (P, 3, 3, M) [1 / scene units] at points (P, 3)."""

@@ -24,34 +24,18 @@ def neighbour_pairs(rest: np.ndarray, neighbours: int) -> np.ndarray:
     return pairs[pairs[:, 0] != pairs[:, 1]]
 
 
-def spring_network(rest: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
-    """Undirected springs (E, 2) between nearest neighbours and their stiffness blocks (E, 3, 3), k = 1 / length^2."""
-    pairs = neighbour_pairs(rest, neighbours)
-    offset = rest[pairs[:, 1]] - rest[pairs[:, 0]]
-    length = np.maximum(np.linalg.norm(offset, axis=1), 1e-9 * np.abs(rest).max())[:, None, None]
-    outer = offset[:, :, None] * offset[:, None, :] / length**2
-    blocks = ((1 - TRANSVERSE_STIFFNESS) * outer + TRANSVERSE_STIFFNESS * np.eye(3)) / length**2
-    return pairs, blocks
-
-
 class Springs(nn.Module):
     """Springs between units as they turn and stretch by more than a little, in modal coordinates.
 
     A spring from d_0 to d = d_0 + Psi z has the energy k (|d| - |d_0|)^2 / 2, linearised k (n . Psi z)^2 / 2 with
     n = d_0 / |d_0|. The force is minus the gradient of the difference, so it has a potential and vanishes at rest to
     second order: the linear part is left to the trained matrices.
-
-    Attributes:
-        modes: Psi, differences of the modes between the ends, (3 E, M).
-        offset: d_0 (E, 3) [scene units].
-        length: |d_0| (E,) [scene units].
-        stiffness: k (E,), up to the factor that the calls take.
     """
 
-    modes: Tensor
-    offset: Tensor
-    length: Tensor
-    stiffness: Tensor
+    modes: Tensor  # Psi, differences of the modes between the ends, (3 E, M)
+    offset: Tensor  # d_0 (E, 3) [scene units]
+    length: Tensor  # |d_0| (E,) [scene units]
+    stiffness: Tensor  # k (E,), up to the factor that the calls take
 
     def __init__(self, offset: np.ndarray, difference: np.ndarray, stiffness: np.ndarray) -> None:
         """Springs along ``offset`` (E, 3), between whose ends the modes differ by ``difference`` (E, 3, M)."""
@@ -111,12 +95,17 @@ class Springs(nn.Module):
 
 
 def unit_springs(rest: np.ndarray, phi: np.ndarray, neighbours: int) -> Springs:
-    """Springs of :func:`spring_network` between units, stiffness such that the first mode has the value 1."""
-    pairs, blocks = spring_network(rest, neighbours)
-    difference = phi[pairs[:, 1]] - phi[pairs[:, 0]]
+    """Springs between neighbouring units, k ~ 1 / length^2, such that the first mode has the value 1.
+
+    That value is of springs that keep :data:`TRANSVERSE_STIFFNESS` of their stiffness across their direction.
+    """
+    pairs = neighbour_pairs(rest, neighbours)
+    offset, difference = rest[pairs[:, 1]] - rest[pairs[:, 0]], phi[pairs[:, 1]] - phi[pairs[:, 0]]
+    length = np.maximum(np.linalg.norm(offset, axis=1), 1e-9 * np.abs(rest).max())[:, None, None]
+    outer = offset[:, :, None] * offset[:, None, :] / length**2
+    blocks = ((1 - TRANSVERSE_STIFFNESS) * outer + TRANSVERSE_STIFFNESS * np.eye(3)) / length**2
     first = difference[:, :, 0]
     lowest = np.einsum("ea,eab,eb->", first, blocks, first)
-    offset = rest[pairs[:, 1]] - rest[pairs[:, 0]]
     return Springs(offset, difference, (1 - TRANSVERSE_STIFFNESS) / ((offset**2).sum(1) * lowest))
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -38,26 +37,22 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class TemplateState:
-    """The template of the finest predicted level.
+    """The template of the finest predicted level."""
 
-    Attributes:
-        positions: unit positions [scene units].
-        deformation_gradients: of each unit, or None for the identity.
-    """
-
-    positions: Float[Tensor, "N 3"]
-    deformation_gradients: Float[Tensor, "N 3 3"] | None
+    positions: Float[Tensor, "N 3"]  # unit positions [scene units]
+    deformation_gradients: Float[Tensor, "N 3 3"] | None  # of each unit, or None for the identity
 
 
-@runtime_checkable
-class PreparedTemplate(Protocol):
-    """The template of a batch while parameters do not change."""
+class PreparedTemplate:
+    """The template of a batch while parameters do not change; this one is the rest state, whatever the motion."""
 
     def __call__(self, motion: Motion) -> TemplateState:
         """The template state at t + 1."""
+        return TemplateState(motion.rest, None)
 
     def carried(self, motion: Motion) -> Motion:
         """The part of the motion that goes on: what the network sees of both states."""
+        return motion
 
     def energy(self, motion: Motion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch.
@@ -65,6 +60,7 @@ class PreparedTemplate(Protocol):
         Raises:
             NotImplementedError: the template has none.
         """
+        raise NotImplementedError("the rest state has no energy")
 
 
 class Template(nn.Module, ABC):
@@ -104,40 +100,46 @@ class Template(nn.Module, ABC):
         return None
 
 
-def modal_coordinates(
-    now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"], projection: Float[Tensor, "D M"]
-) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M"]]:
-    """z_t and z_{t-1} of the displacements of S sequences; ``projection`` has a row per unit and axis."""
-    z, previous = (torch.cat((now, before)).flatten(1) @ projection).chunk(2)
-    return z, previous
+class ModalScene(ABC):
+    """A template in modal coordinates z of one scene, while its parameters do not change; for S sequences at once."""
 
-
-class PreparedScene(Protocol):
-    """The template of one scene while its parameters do not change, from the displacements of S sequences."""
+    def __init__(
+        self, projection: Float[Tensor, "N 3 M"], modes: Float[Tensor, "N 3 M"], gradients: Float[Tensor, "N 3 3 M"]
+    ) -> None:
+        """From what gives z of displacements, and what z gives: displacements and their gradients."""
+        self.projection = projection.flatten(0, 1)
+        # Positions and gradients of a unit side by side: one product gives both.
+        self.motions = torch.cat((modes, gradients.flatten(1, 2)), 1).flatten(0, 1)
 
     def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
         """Displacement and its gradient, row by row, of every unit at t + 1."""
+        return (self.after(*self.coordinates(now, before)) @ self.motions.mT).view(*now.shape[:2], 12)
 
-    def energy(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, " S"]:
-        """Energy; what is trained counts as constant."""
+    def coordinates(
+        self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]
+    ) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M"]]:
+        """z_t and z_{t-1}."""
+        z, previous = (torch.cat((now, before)).flatten(1) @ self.projection).chunk(2)
+        return z, previous
 
     def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
-        """The part of a displacement that the network sees, of what the template carries from frame to frame."""
+        """The part of a displacement that the network sees, of what the template carries from frame to frame: all."""
+        return displacement
+
+    @abstractmethod
+    def after(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+        """z_{t+1}."""
+
+    @abstractmethod
+    def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
+        """Energy, constants but for the state; v the step, m the middle of both, as the trapezoidal rule has it."""
 
 
-class PreparedScenes:
+class PreparedScenes(PreparedTemplate):
     """The template of a batch, scene by scene."""
 
-    def __init__(
-        self, batch: SceneBatch, made: Callable[[int, Tensor], PreparedScene], *, conserve_volume: bool
-    ) -> None:
-        """Prepares every scene.
-
-        Args:
-            batch: the disjoint graph.
-            made: makes the template of a scene, given its number and the rows of one member's units.
-            conserve_volume: scale deformation gradients to determinant 1.
-        """
+    def __init__(self, batch: SceneBatch, made: Callable[[int, Tensor], ModalScene], *, conserve_volume: bool) -> None:
+        """Prepares every scene; ``made`` is called with its number and the rows of one member's units."""
         self._conserve_volume = conserve_volume
         self.parts = [
             (made(scene_id, rows[: len(rows) // len(members)]), rows, members)
@@ -163,7 +165,7 @@ class PreparedScenes:
         return TemplateState(motion.rest + moved[:, :3], deformation)
 
     def carried(self, motion: Motion) -> Motion:
-        """The part of the motion that goes on: what the network sees of both states."""
+        """The part of the motion that goes on, scene by scene."""
         made = []
         for part, rows, members in self.parts:
             both = torch.cat(self._displacements(motion, rows, members))
@@ -173,7 +175,9 @@ class PreparedScenes:
 
     def energy(self, motion: Motion) -> Float[Tensor, " S"]:
         """Energy of every member of the batch."""
-        found = [part.energy(*self._displacements(motion, rows, members)) for part, rows, members in self.parts]
+        found = [
+            p.energy(*p.coordinates(*self._displacements(motion, rows, members))) for p, rows, members in self.parts
+        ]
         order = torch.tensor([m for _, _, members in self.parts for m in members], device=motion.rest.device)
         return torch.cat(found).index_select(0, order.argsort())
 
@@ -194,18 +198,5 @@ class RestTemplate(Template):
         super().__init__()
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
-        """Rest positions, identity deformation gradients."""
-        return _AtRest()
-
-
-class _AtRest:
-    """Rest positions, identity deformation gradients, no energy; the network sees all of the motion."""
-
-    def __call__(self, motion: Motion) -> TemplateState:
-        return TemplateState(motion.rest, None)
-
-    def carried(self, motion: Motion) -> Motion:
-        return motion
-
-    def energy(self, motion: Motion) -> Float[Tensor, " S"]:
-        raise NotImplementedError("the rest state has no energy")
+        """Rest positions, identity deformation gradients, no energy; the network sees all of the motion."""
+        return PreparedTemplate()

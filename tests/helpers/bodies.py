@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
-import pytest
 import torch
-from helpers.simulators import gausim
 from torch import Tensor
 
 from gausim.core import GaussianScene, SimState
 from gausim.models.step.simulator import GausSim
+from gausim.models.template.material import MaterialTemplate
+from helpers.simulators import gausim
+
+# The settings of `model=gausim`, small.
+NEURAL = {
+    "template": partial(MaterialTemplate, modes=9, spacing=0.2, links=4, hidden=8),
+    "rest_inputs": True, "velocities": False, "lever": 0.02, "anchor": True,
+    "body_frame": True, "edges": "rest", "attributes": 3,
+}  # fmt: skip
 
 
-def _scene(count: int = 70, *, seed: int = 0, dtype: torch.dtype = torch.float32, spare: int = 6) -> GaussianScene:
+def make_scene(count: int = 70, *, seed: int = 0, dtype: torch.dtype = torch.float32, spare: int = 6) -> GaussianScene:
     """A column of kernels whose foot is pinned; the first ``spare`` kernels are not simulated at all."""
     generator = torch.Generator().manual_seed(seed)
     means = torch.rand(count, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.5, 0.4, 1.2]) + 0.1
@@ -32,7 +40,7 @@ def _scene(count: int = 70, *, seed: int = 0, dtype: torch.dtype = torch.float32
     )
 
 
-def _model(scenes: GaussianScene | Sequence[GaussianScene], *, seed: int = 0, **options: object) -> GausSim:
+def make_model(scenes: GaussianScene | Sequence[GaussianScene], *, seed: int = 0, **options: object) -> GausSim:
     """A simulator with random weights, densities, attributes and normaliser statistics, in evaluation mode."""
     scenes = [scenes] if isinstance(scenes, GaussianScene) else list(scenes)
     torch.manual_seed(seed)
@@ -44,11 +52,11 @@ def _model(scenes: GaussianScene | Sequence[GaussianScene], *, seed: int = 0, **
             parameter.copy_(0.4 * torch.randn(parameter.shape))
     for i, scene in enumerate(scenes):
         for j in range(3):
-            model.step(model.batch((i,)), _state(scene, seed=j))
+            model.step(model.batch((i,)), make_state(scene, seed=j))
     return model.eval()
 
 
-def _state(scene: GaussianScene, *, seed: int = 0, amount: float = 0.02) -> SimState:
+def make_state(scene: GaussianScene, *, seed: int = 0, amount: float = 0.02) -> SimState:
     """Free kernels displaced at random in both frames."""
     generator = torch.Generator().manual_seed(100 + seed)
     shift = torch.randn(2, scene.count, 3, generator=generator, dtype=torch.float64).to(scene.means) * amount
@@ -56,35 +64,10 @@ def _state(scene: GaussianScene, *, seed: int = 0, amount: float = 0.02) -> SimS
     return SimState(scene.means + shift[0], scene.means + shift[1])
 
 
-def _join(states: Sequence[SimState]) -> SimState:
+def join_states(states: Sequence[SimState]) -> SimState:
     return SimState(torch.cat([s.positions for s in states]), torch.cat([s.previous for s in states]))
 
 
-def _permuted(scene: GaussianScene, order: Tensor) -> GaussianScene:
+def permuted(scene: GaussianScene, order: Tensor) -> GaussianScene:
     names = ("means", "log_scales", "quats", "opacity_logits", "sh", "simulated", "pinned", "foreground")
     return replace(scene, **{n: getattr(scene, n)[order] for n in names})
-
-
-@pytest.fixture(scope="session")
-def make_scene() -> Callable[..., GaussianScene]:
-    return _scene
-
-
-@pytest.fixture(scope="session")
-def make_model() -> Callable[..., GausSim]:
-    return _model
-
-
-@pytest.fixture(scope="session")
-def make_state() -> Callable[..., SimState]:
-    return _state
-
-
-@pytest.fixture(scope="session")
-def join_states() -> Callable[..., SimState]:
-    return _join
-
-
-@pytest.fixture(scope="session")
-def permuted() -> Callable[..., GaussianScene]:
-    return _permuted
