@@ -81,7 +81,7 @@ def feed(model: GausSim, deformation_gradients: Callable[..., tuple[Tensor, Tens
         unit, position = seen.pop()
         return deformation_gradients(level, unit, above, target, position)
 
-    model.predictor.forward, model.predictor.gradient = forward, gradient  # type: ignore[method-assign]
+    model.predictor.forward, model.predictor.deformation_gradient = forward, gradient  # type: ignore[method-assign]
 
 
 def change_head(model: GausSim, **settings: float) -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gausim.ops.deformation import bounded_deformation, determinant, gradient_from_output, polar_rotation
+from gausim.ops.deformation import bounded_deformation, deformation_gradient_from_output, determinant, polar_rotation
 
 
 def _outputs(scale: float, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -15,14 +15,14 @@ def _outputs(scale: float, dtype: torch.dtype = torch.float64) -> Tensor:
     ("scale", "dtype"), [(0.5, torch.float32), (1.0, torch.float64), (20.0, torch.float64), (1e4, torch.float64)]
 )
 def test_mass_on_gives_determinant_one_for_large_outputs(scale: float, dtype: torch.dtype) -> None:
-    gradient, _ = gradient_from_output(_outputs(scale, dtype), conserve_mass=True)
+    gradient, _ = deformation_gradient_from_output(_outputs(scale, dtype), conserve_mass=True)
     assert (torch.linalg.det(gradient.double()) - 1).abs().max() < 1e-5
     assert (gradient - torch.eye(3, dtype=dtype)).abs().amax((-1, -2)).min() > 1e-2  # no trivial identity
 
 
 def test_without_mass_conservation_leaves_the_product_of_the_clamped_stretches() -> None:
     output = _outputs(4.0)
-    gradient, _ = gradient_from_output(output, conserve_mass=False)
+    gradient, _ = deformation_gradient_from_output(output, conserve_mass=False)
     expected = output[:, 8:].clamp(-5, 5).sum(-1)
     assert torch.allclose(torch.linalg.det(gradient).log(), expected, atol=1e-6)
     assert (torch.linalg.det(gradient) - 1).abs().median() > 0.5
@@ -30,12 +30,12 @@ def test_without_mass_conservation_leaves_the_product_of_the_clamped_stretches()
 
 def test_zero_output_is_the_identity() -> None:
     for conserve in (True, False):
-        for value in gradient_from_output(torch.zeros(4, 11), conserve_mass=conserve):
+        for value in deformation_gradient_from_output(torch.zeros(4, 11), conserve_mass=conserve):
             assert torch.equal(value, torch.eye(3).expand(4, 3, 3))
 
 
 def test_second_result_is_the_polar_rotation_of_the_first() -> None:
-    gradient, rotation = gradient_from_output(_outputs(1.0), conserve_mass=True)
+    gradient, rotation = deformation_gradient_from_output(_outputs(1.0), conserve_mass=True)
     eye = torch.eye(3, dtype=torch.float64)
     assert torch.allclose(rotation @ rotation.mT, eye.expand_as(rotation), atol=1e-12)
     stretch = rotation.mT @ gradient
@@ -45,7 +45,7 @@ def test_second_result_is_the_polar_rotation_of_the_first() -> None:
 
 def test_gradcheck_of_the_head() -> None:
     output = _outputs(0.7)[:4].requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: gradient_from_output(x, conserve_mass=True), output)
+    assert torch.autograd.gradcheck(lambda x: deformation_gradient_from_output(x, conserve_mass=True), output)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

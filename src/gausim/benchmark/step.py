@@ -115,7 +115,7 @@ def parts(template: PreparedTemplate) -> Mapping[str, Sequence[tuple[Any, str]]]
         "normalisers": [(RunningNormaliser, "forward")],
         "network": [(MeshGraphNet, "forward")],
         "recursion and kernels": [
-            (predictor.GradientPredictor, "gradient"), (simulator, "advance"), (simulator, "inherit"),
+            (predictor.DeformationPredictor, "deformation_gradient"), (simulator, "advance"), (simulator, "inherit"),
         ],
     }  # fmt: skip
 

@@ -60,7 +60,7 @@ class HierarchySettings:
 
     @property
     def predicted(self) -> tuple[int, ...]:
-        """Levels of the hierarchy whose gradients are predicted, coarse to fine; 0 is that of the kernels."""
+        """Levels of the hierarchy for which F is predicted, coarse to fine; 0 is that of the kernels."""
         first = len(self.diameters)
         return tuple(first - position for position in range(len(self.levels)))
 

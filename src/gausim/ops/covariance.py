@@ -17,9 +17,11 @@ def covariance_from_scales(log_scales: Float[Tensor, "*N 3"], quats: Float[Tenso
     return factor @ factor.mT
 
 
-def transport_covariance(covars: Float[Tensor, "*N 3 3"], gradient: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:
-    """G S G^T: the covariance of matter deformed by the gradient G (METHOD section 2)."""
-    return gradient @ covars @ gradient.mT
+def transport_covariance(
+    covars: Float[Tensor, "*N 3 3"], deformation_gradient: Float[Tensor, "*N 3 3"]
+) -> Float[Tensor, "*N 3 3"]:
+    """G S G^T: the covariance of matter deformed by G (METHOD section 2)."""
+    return deformation_gradient @ covars @ deformation_gradient.mT
 
 
 def kernel_volumes(log_scales: Float[Tensor, "*N 3"], scale: float) -> Float[Tensor, " *N"]:

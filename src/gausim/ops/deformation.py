@@ -12,7 +12,7 @@ MAX_LOG_STRETCH = 5.0  # bound of the logarithmic stretch (METHOD section 2)
 POLAR_ITERATIONS = 8
 
 
-def gradient_from_output(
+def deformation_gradient_from_output(
     output: Float[Tensor, "N 11"], *, conserve_mass: bool
 ) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3 3"]]:
     """F = U diag(lambda) V^T and its rotation U V^T from 11 numbers; zero output gives the identity.
@@ -29,19 +29,21 @@ def gradient_from_output(
     return (u * torch.exp(stretch)[..., None, :]) @ v.mT, u @ v.mT
 
 
-def bounded_deformation(gradient: Float[Tensor, "N 3 3"], least: float, *, unit: bool) -> Float[Tensor, "N 3 3"]:
-    """The gradient where its determinant is at least ``least`` > 0, else the identity: matter is not turned inside out.
+def bounded_deformation(
+    deformation_gradient: Float[Tensor, "N 3 3"], least: float, *, unit: bool
+) -> Float[Tensor, "N 3 3"]:
+    """G where its determinant is at least ``least`` > 0, else the identity: matter is not turned inside out.
 
     Args:
-        gradient: deformation gradients.
+        deformation_gradient: G of N units.
         least: smallest determinant.
         unit: whether to scale them to determinant 1 (volume kept).
     """
-    det = determinant(gradient)
+    det = determinant(deformation_gradient)
     kept = ~(det < least)  # so that NaN stays NaN
-    identity = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
-    gradient = torch.where(kept[:, None, None], gradient, identity)
-    return gradient * torch.where(kept, det, 1.0).pow(-1 / 3)[:, None, None] if unit else gradient
+    identity = torch.eye(3, dtype=deformation_gradient.dtype, device=deformation_gradient.device)
+    bounded = torch.where(kept[:, None, None], deformation_gradient, identity)
+    return bounded * torch.where(kept, det, 1.0).pow(-1 / 3)[:, None, None] if unit else bounded
 
 
 def determinant(a: Float[Tensor, "*N 3 3"]) -> Float[Tensor, " *N"]:
@@ -49,9 +51,9 @@ def determinant(a: Float[Tensor, "*N 3 3"]) -> Float[Tensor, " *N"]:
     return (a[..., 0, :] * torch.linalg.cross(a[..., 1, :], a[..., 2, :])).sum(-1)
 
 
-def polar_rotation(gradient: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:
+def polar_rotation(deformation_gradient: Float[Tensor, "*N 3 3"]) -> Float[Tensor, "*N 3 3"]:
     """Rotation of the polar decomposition by Newton's iteration R <- (R + R^-T) / 2 (Higham 1986); det > 0 assumed."""
-    rotation = gradient
+    rotation = deformation_gradient
     for _ in range(POLAR_ITERATIONS):
         cofactors = torch.linalg.cross(rotation.roll(-1, -2), rotation.roll(-2, -2))
         scale = (rotation[..., 0, :] * cofactors[..., 0, :]).sum(-1)  # the determinant

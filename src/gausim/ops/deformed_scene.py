@@ -40,9 +40,9 @@ def deformed_scene(
     moved = (change > _UNMOVED)[unit_of_kernel]
     log_scales, quats, sh = scene.log_scales.clone(), scene.quats.clone(), scene.sh.clone()
     for index in moved.nonzero()[:, 0].split(_KERNELS_AT_ONCE):
-        gradient = deformation_gradients[unit_of_kernel[index]].double()
+        deformation_gradient = deformation_gradients[unit_of_kernel[index]].double()
         covars = covariance_from_scales(scene.log_scales[index].double(), scene.quats[index].double())
-        lengths, axes = torch.linalg.eigh(gradient @ covars @ gradient.mT)
+        lengths, axes = torch.linalg.eigh(deformation_gradient @ covars @ deformation_gradient.mT)
         # A reflection is no rotation; turning one axis round leaves the covariance as it is.
         axes = torch.cat((axes[..., :2], axes[..., 2:] * torch.det(axes)[:, None, None]), -1)
         log_scales[index] = (0.5 * lengths.clamp_min(1e-30).log()).to(log_scales)

@@ -23,7 +23,7 @@ class Inheritance:
 
     rest: Float[Tensor, "K 3"]  # rest positions of all kernels [scene units]
     unit: Int[Tensor, " K"]  # the unit of each kernel, -1 for kernels that never move
-    # where each unit stands among the `padded` rows of gradients; the other rows are identities
+    # where each unit stands among the `padded` rows of deformation gradients; the other rows are identities
     rows: Int[Tensor, " N"]
     padded: int  # number of these rows
 
@@ -34,7 +34,7 @@ class Member:
 
     scene_id: int  # which scene it is of
     kernels: slice  # its rows of the state (all kernels of the scene)
-    units: slice  # its rows of :class:`Step` gradients and rotations; the last of them is the identity unit
+    units: slice  # its rows of a :class:`Step`; the last of them is the identity unit
     # unit of every kernel, counted from `units.start`; pinned and never-simulated kernels point to the identity unit
     unit_of_kernel: Int[Tensor, " K"]
 

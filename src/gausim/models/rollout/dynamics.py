@@ -31,7 +31,7 @@ class SceneDynamics:
         return own.new_zeros(scene.count).index_copy(0, hierarchy.kernels.to(own.device), own)
 
     def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
-        """Predicts ``steps`` frames; frame 0 is the initial state with identity gradients (METHOD: the rest state).
+        """Predicts ``steps`` frames; frame 0 is the initial state with G = I (METHOD: the rest state).
 
         Raises:
             DivergenceError: a position or force is not finite; the message names the frame.

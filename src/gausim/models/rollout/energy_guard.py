@@ -103,7 +103,7 @@ class EnergyGuard:
 
     def _part(self, made: SteppedFrame, state: SimState, scale: float) -> SteppedFrame:
         positions = state.positions + scale * (made.positions - state.positions)
-        if self._made is None:  # the first step: from identity gradients
+        if self._made is None:  # the first step: from G = I
             before = turned = torch.eye(3).to(positions).expand_as(made.deformation_gradients)
         else:
             before, turned = self._made.deformation_gradients, self._made.rotations

@@ -69,8 +69,9 @@ class Frames:
         return self.axes[level].mT @ matrices @ self.axes[level]
 
     def back(self, solved: Solved, rest: Float[Tensor, "N 3"]) -> Solved:
-        """What the recursion hands to the kernels, in scene coordinates."""
+        """The solved finest level in scene coordinates, for the kernels that inherit from it."""
         last = len(self.axes) - 1
         after = (self.axes[last].mT @ solved.after[..., None])[..., 0] + self.origins[last]
-        gradient, rotation = self.turned_back(last, solved.gradient), self.turned_back(last, solved.rotation)
-        return replace(solved, rest=rest, after=after, gradient=gradient, rotation=rotation)
+        turned = self.turned_back(last, solved.deformation_gradient)
+        rotation = self.turned_back(last, solved.rotation)
+        return replace(solved, rest=rest, after=after, deformation_gradient=turned, rotation=rotation)

@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.ops.deformation import gradient_from_output
+from gausim.ops.deformation import deformation_gradient_from_output
 
-# Levers shorter than this move by less than they are told: no gradient moves a unit on its parent [diagonals].
+# Shorter levers move by less than the output says: a deformation about the parent cannot move a unit on it [diagonals].
 SHORT = 0.03
 # Floor of a lever's length [diagonals].
 TINY = 1e-4
@@ -28,8 +28,8 @@ class Head:
 
     Attributes:
         output_scale: factor on the eleven numbers.
-        zero_output: start with zero output (identity gradients).
-        lever: three more outputs per unit move its lever by so many diagonals each, see :func:`lever_gradient`; 0
+        zero_output: start with zero output (F = I).
+        lever: three more outputs per unit move its lever by so many diagonals each, see :func:`lever_deformation`; 0
             leaves them out.
         anchor: take the network's outputs at rest off, so that rest is an equilibrium.
     """
@@ -54,26 +54,28 @@ class Head:
     ) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3 3"]]:
         """F = U diag(lambda) V^T, behind it that of the lever, and its rotation U V^T.
 
-        ``lever`` is as :func:`lever_gradient` takes it, None without a lever head.
+        ``lever`` is as :func:`lever_deformation` takes it, None without a lever head.
         """
-        gradient, rotation = gradient_from_output(output[:, :OUTPUTS] * self.output_scale, conserve_mass=conserve_mass)
+        deformation_gradient, rotation = deformation_gradient_from_output(
+            output[:, :OUTPUTS] * self.output_scale, conserve_mass=conserve_mass
+        )
         if lever is None:
-            return gradient, rotation
+            return deformation_gradient, rotation
         shift = output[:, OUTPUTS:] * (self.lever * length)
-        return lever_gradient(shift, lever, length, conserve_mass=conserve_mass) @ gradient, rotation
+        return lever_deformation(shift, lever, length, conserve_mass=conserve_mass) @ deformation_gradient, rotation
 
 
-def lever_gradient(
+def lever_deformation(
     shift: Float[Tensor, "N 3"], lever: Float[Tensor, "N 3"], length: Float[Tensor, "N 1"], *, conserve_mass: bool
 ) -> Float[Tensor, "N 3 3"]:
-    """The gradient that takes the lever w from the parent to w + s; zero shift gives the identity.
+    """The deformation gradient that takes the lever w from the parent to w + s; zero shift gives the identity.
 
     F = (w + s) w^T / |w|^2 + d (I - w w^T / |w|^2) with d = (1 + s.w / |w|^2)^(-1/2), so that det F = 1; d = 1 without
     mass conservation. A translation of a unit is linear in s, where a rotation about the parent would be needed else.
 
     Args:
         shift: s [scene units]; it is scaled by |w|^2 / (|w|^2 + (SHORT length)^2).
-        lever: w = x_i - x_p before the unit's own gradient [scene units].
+        lever: w = x_i - x_p before F acts [scene units].
         length: diagonal of each unit's scene [scene units].
         conserve_mass: whether det F = 1.
     """

@@ -1,4 +1,4 @@
-"""What the network predicts: a deformation gradient for every unit of a level (METHOD sections 2 and 3)."""
+"""The network's prediction: a deformation gradient F for every unit of a level (METHOD sections 2 and 3)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gausim.nn.mlp import zero_output as initialise_zero
 from gausim.nn.normaliser import RunningNormaliser
 
 
-class GradientPredictor(nn.Module):
+class DeformationPredictor(nn.Module):
     """F of every unit from its own state, that of its parent and of its neighbours."""
 
     gravity: Tensor
@@ -71,7 +71,7 @@ class GradientPredictor(nn.Module):
         output: Tensor = network(nodes, edges, edge_index)[: level.count]
         return output
 
-    def gradient(
+    def deformation_gradient(
         self, output: Float[Tensor, "N O"], level: LevelBatch, above: Solved, target: Float[Tensor, "N 3"]
     ) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3 3"]]:
         """F and its rotation of each unit; the identity where the output is zero."""

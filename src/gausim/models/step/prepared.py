@@ -50,7 +50,7 @@ class Prepared:
     def in_scene_axes(
         self, finest: Solved, template: Tensor | None, predicted: list[Tensor]
     ) -> tuple[Solved, Tensor | None, list[Tensor]]:
-        """The finest level, the template's gradients and all F, in the scene's axes."""
+        """The finest level, the template's P and all F, in the scene's axes."""
         frames = self.frames
         if frames is None:
             return finest, template, predicted

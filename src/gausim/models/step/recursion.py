@@ -26,29 +26,29 @@ class Units:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The solved level above (or the roots of the top level), and which of its P units is the parent of each unit."""
+    """The solved level of the parents p (or the roots of the top level), and the parent of each unit below."""
 
     rest: Float[Tensor, "P 3"]  # X [scene units]
     now: Float[Tensor, "P 3"]  # x_t
     before: Float[Tensor, "P 3"]  # x_{t-1}
     after: Float[Tensor, "P 3"]  # x_{t+1}
-    template: Float[Tensor, "P 3"]  # template positions
-    gradient: Float[Tensor, "P 3 3"]  # accumulated deformation gradients
-    rotation: Float[Tensor, "P 3 3"]  # accumulated rotations
+    template: Float[Tensor, "P 3"]  # T_p
+    deformation_gradient: Float[Tensor, "P 3 3"]  # C_p, accumulated
+    rotation: Float[Tensor, "P 3 3"]  # Q_p, accumulated
     index: Int[Tensor, " N"]  # the parent of each of the N units below
 
     @classmethod
     def roots(cls, rest: Float[Tensor, "P 3"]) -> Solved:
-        """What the units of the top level hang on: one root each, which never moves."""
+        """The roots of the units of the top level: one each, which never moves."""
         identity = torch.eye(3, dtype=rest.dtype, device=rest.device).expand(len(rest), 3, 3).contiguous()
         index = torch.arange(len(rest), device=rest.device)
         return cls(rest, rest, rest, rest, rest, identity, identity, index)
 
     def carry(self, target: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """The coarse prediction x_p + G_p (T - T_p)."""
-        gradient = self.gradient.index_select(0, self.index)
+        """The coarse prediction x_p + C_p (T - T_p)."""
+        deformation_gradient = self.deformation_gradient.index_select(0, self.index)
         offset = target - self.template.index_select(0, self.index)
-        return self.after.index_select(0, self.index) + apply(gradient, offset)
+        return self.after.index_select(0, self.index) + apply(deformation_gradient, offset)
 
 
 def apply(matrix: Float[Tensor, "N 3 3"], vector: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
@@ -57,17 +57,20 @@ def apply(matrix: Float[Tensor, "N 3 3"], vector: Float[Tensor, "N 3"]) -> Float
 
 
 def advance(
-    gradient: Float[Tensor, "N 3 3"], rotation: Float[Tensor, "N 3 3"], target: Float[Tensor, "N 3"], above: Solved
+    deformation_gradient: Float[Tensor, "N 3 3"],
+    rotation: Float[Tensor, "N 3 3"],
+    target: Float[Tensor, "N 3"],
+    above: Solved,
 ) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3 3"], Float[Tensor, "N 3"]]:
-    """Accumulated gradients G = F G_p and rotations, and the new places x_p + G (T - T_p) of the units.
+    """Accumulated deformation gradients C = F C_p and rotations Q, and new positions x_p + C (T - T_p) of the units.
 
     Args:
-        gradient: the units' own gradients F.
-        rotation: the units' own rotations.
+        deformation_gradient: F of the units.
+        rotation: U V^T of the units.
         target: template positions T of the units [scene units].
         above: the solved parents.
     """
-    accumulated = gradient @ above.gradient.index_select(0, above.index)
+    accumulated = deformation_gradient @ above.deformation_gradient.index_select(0, above.index)
     offset = target - above.template.index_select(0, above.index)
     after = above.after.index_select(0, above.index) + apply(accumulated, offset)
     return accumulated, rotation @ above.rotation.index_select(0, above.index), after
@@ -76,21 +79,22 @@ def advance(
 def inherit(
     finest: Solved, template: Float[Tensor, "N 3 3"] | None, kernels: Inheritance
 ) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
-    """Positions x_c + G_c (X_k - X_c) of all kernels, gradients and rotations of the units, identities among them.
+    """Positions x_c + G_c (X_k - X_c) of all kernels, G and Q of the units, identities among them.
 
     Args:
         finest: the finest predicted level, solved.
-        template: the template's gradients, which act first; None for the identity. Their rotations are constants:
-            they only turn colours.
-        kernels: who inherits from whom.
+        template: deformation gradients P of the template, G = C P; None for the identity. Their rotations are
+            constants: they only turn colours.
+        kernels: the unit of every kernel.
     """
-    gradient, rotation = finest.gradient, finest.rotation
+    deformation_gradient, rotation = finest.deformation_gradient, finest.rotation
     if template is not None:
-        gradient = gradient @ template
+        deformation_gradient = deformation_gradient @ template
         rotation = rotation @ polar_rotation(template.detach())
     unit = kernels.unit.clamp_min(0)
     offset = kernels.rest - finest.rest.index_select(0, unit)
-    moved = finest.after.index_select(0, unit) + apply(gradient.index_select(0, unit), offset)
+    moved = finest.after.index_select(0, unit) + apply(deformation_gradient.index_select(0, unit), offset)
     positions = torch.where((kernels.unit < 0)[:, None], kernels.rest, moved)
     identity = torch.eye(3, dtype=moved.dtype, device=moved.device).expand(kernels.padded, 3, 3)
-    return positions, identity.index_copy(0, kernels.rows, gradient), identity.index_copy(0, kernels.rows, rotation)
+    rows = kernels.rows
+    return positions, identity.index_copy(0, rows, deformation_gradient), identity.index_copy(0, rows, rotation)

@@ -15,7 +15,7 @@ from gausim.models.hierarchy.batch import BatchBuilder, SceneBatch
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.settings import HierarchySettings
 from gausim.models.step.body_frame import Frames, body_axes
-from gausim.models.step.predictor import GradientPredictor
+from gausim.models.step.predictor import DeformationPredictor
 from gausim.models.step.prepared import Prepared
 from gausim.models.template.smooth import smooth_motions
 from gausim.models.template.template import Motion, Template
@@ -35,7 +35,7 @@ class SceneModel(nn.Module, ABC):
     axes: Tensor
     origins: Tensor
     template: Template
-    predictor: GradientPredictor
+    predictor: DeformationPredictor
 
     def __init__(
         self, scenes: Sequence[GaussianScene], fps: Sequence[float], settings: HierarchySettings, attributes: int
@@ -129,11 +129,11 @@ class SceneModel(nn.Module, ABC):
         motions = self.template.basis(scene_id)
         if motions is None:
             return None
-        modes, gradients, sizes = motions
+        modes, slopes, sizes = motions
         axes = self.axes[scene_id].to(modes)
         modes = torch.einsum("ba,nbm->nam", axes, modes)
-        gradients = torch.einsum("ca,ncdm,db->nabm", axes, gradients, axes)
-        own = modes, gradients, sizes
+        slopes = torch.einsum("ca,ncdm,db->nabm", axes, slopes, axes)
+        own = modes, slopes, sizes
         return smooth_motions(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], own)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:

@@ -15,7 +15,7 @@ from gausim.models.hierarchy.units import FixedUnits, fixed_units
 from gausim.models.settings import HierarchySettings, RolloutSettings
 from gausim.models.step.features import FeatureOptions
 from gausim.models.step.head import Head
-from gausim.models.step.predictor import GradientPredictor
+from gausim.models.step.predictor import DeformationPredictor
 from gausim.models.step.prepared import Prepared
 from gausim.models.step.recursion import Solved, Units, advance, inherit
 from gausim.models.step.scene_model import SceneModel
@@ -30,12 +30,12 @@ PLAIN_HEAD, PLAIN_ROLLOUT = Head(), RolloutSettings()
 
 @dataclass(frozen=True, eq=False)
 class Step(SteppedFrame):
-    """What a step gives: x_{t+1} of a batch, and accumulated gradients and rotations of its finest units."""
+    """Result of a step: x_{t+1} of a batch, and deformation gradients G and rotations Q of its finest units."""
 
     # sum over levels and parents of ||m_c x_c - sum m_i x_i||^2, masses over that of the scene and lengths over its
     # diagonal; zero where it is switched off
     momentum: Float[Tensor, ""]
-    predicted: tuple[Float[Tensor, "_ 3 3"], ...]  # the network's own gradients F, per predicted level, coarse to fine
+    predicted: tuple[Float[Tensor, "_ 3 3"], ...]  # F per predicted level, coarse to fine
 
 
 class GausSim(SceneModel):
@@ -64,7 +64,7 @@ class GausSim(SceneModel):
             features: what the network sees of them.
             network: called with node_features=, edge_features= and outputs=.
             head: how its output becomes a deformation gradient.
-            template: what the gradients deform; called with (hierarchies, finest level, attributes=,
+            template: state that F deforms; called with (hierarchies, finest level, attributes=,
                 frames= (axes of the scenes), conserve_volume=conserve_mass).
             conserve_mass: det F = 1.
             conserve_momentum: compute the momentum loss.
@@ -85,7 +85,7 @@ class GausSim(SceneModel):
             self.hierarchies, self.predicted_levels[-1], attributes=features.attributes, frames=self.body_axes,
             conserve_volume=conserve_mass,
         )  # fmt: skip
-        self.predictor = GradientPredictor(
+        self.predictor = DeformationPredictor(
             networks=1 if hierarchy.share_network else len(self.predicted_levels), features=features, network=network,
             head=head, edges=hierarchy.edges, conserve_mass=conserve_mass,
         )  # fmt: skip
@@ -137,7 +137,7 @@ class GausSim(SceneModel):
     def _descend(
         self, prepared: Prepared, now: Tensor, before: Tensor, correction_scale: float, outputs: list[Tensor]
     ) -> tuple[Solved, Tensor | None, Tensor, list[Tensor]]:
-        """The predicted levels, coarse to fine: the finest one solved, the template's gradients, momentum and all F.
+        """The predicted levels, coarse to fine: the finest one solved, the template's P, momentum and all F.
 
         The network's outputs, before anything is taken off, are appended to ``outputs``.
         """
@@ -156,9 +156,11 @@ class GausSim(SceneModel):
             output = self.predictor(level, unit, above, target, position)
             outputs.append(output)
             moved = output if prepared.still is None else output - prepared.still[position]
-            gradient, rotation = self.predictor.gradient(moved * (correction_scale * level.free), level, above, target)
-            predicted.append(gradient)
-            accumulated, turned, after = advance(gradient, rotation, target, above)
+            deformation_gradient, rotation = self.predictor.deformation_gradient(
+                moved * (correction_scale * level.free), level, above, target
+            )
+            predicted.append(deformation_gradient)
+            accumulated, turned, after = advance(deformation_gradient, rotation, target, above)
             if position and self.conserve_momentum:
                 momentum = momentum + _momentum(level, unit, after, above.after, prepared.levels[position - 1])
             above = Solved(unit.rest, x, previous, after, target, accumulated, turned, above.index)

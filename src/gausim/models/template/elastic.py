@@ -172,7 +172,7 @@ class ElasticTemplate(Template):
             solid: spacing of the grid on which the modes of the body around the kernels are computed [diagonals].
             attributes: of the units, not read here: what a scene is made of is in its matrices.
             frames: axes of the scenes, not read here.
-            conserve_volume: scale the template's gradients to determinant 1 (METHOD's mass conservation).
+            conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).
         """
         super().__init__()
         self.conserve_volume = conserve_volume
@@ -199,7 +199,7 @@ class ElasticTemplate(Template):
         return (f"{prefix}scenes.{scene_id}.",)
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
-        """The template with its matrices computed: positions X + Phi z and gradients I + grad(Phi) z."""
+        """The template with its matrices computed: positions X + Phi z, deformation gradients I + grad(Phi) z."""
         return PreparedScenes(
             batch, lambda scene_id, _: PreparedElastic(self.scene(scene_id)), conserve_volume=self.conserve_volume
         )

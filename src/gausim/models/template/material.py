@@ -193,7 +193,7 @@ class MaterialTemplate(Template):
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
             damping: initial c_0 and c_1 [1 / frame, frames].
-            conserve_volume: scale the template's gradients to determinant 1 (METHOD's mass conservation).
+            conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).
         """
         super().__init__()
         self.conserve_volume = conserve_volume

@@ -157,7 +157,7 @@ class PreparedScenes(PreparedTemplate):
         return now.view(len(members), -1, 3), before.view(len(members), -1, 3)
 
     def __call__(self, motion: Motion) -> TemplateState:
-        """Positions X + u and gradients I + grad u, their determinants bounded."""
+        """Positions X + u and deformation gradients I + grad u, their determinants bounded."""
         made = [part(*self._displacements(motion, rows, members)).flatten(0, 1) for part, rows, members in self.parts]
         moved = made[0] if len(made) == 1 else torch.cat(made).index_select(0, self._places)
         deformation = moved[:, 3:].reshape(-1, 3, 3) + torch.eye(3, dtype=moved.dtype, device=moved.device)
