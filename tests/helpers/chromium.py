@@ -91,16 +91,14 @@ class Page:
                 raise TimeoutError(f"{what or holds}: not within {timeout} s; problems: {self.problems}")
             time.sleep(0.1)
 
-    def picture(self, path: Path | str | None = None) -> bytes:
-        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        if path is not None:
-            Path(path).write_bytes(data)
-        return data
+    def picture(self) -> bytes:
+        """What is seen, as PNG."""
+        return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
 
-    def mouse(self, kind: str, x: float, y: float, *, held: bool = False, modifiers: int = 0, **more: Any) -> None:
+    def mouse(self, kind: str, x: float, y: float, *, held: bool = False, modifiers: int = 0) -> None:
         self.call(
             "Input.dispatchMouseEvent", type=kind, x=x, y=y, modifiers=modifiers, button="left" if held else "none",
-            buttons=1 if held and kind != "mouseReleased" else 0, clickCount=1 if held else 0, **more,
+            buttons=1 if held and kind != "mouseReleased" else 0, clickCount=1 if held else 0,
         )  # fmt: skip
 
     def press(self, x: float, y: float, modifiers: int = 0) -> None:
@@ -110,29 +108,25 @@ class Page:
             time.sleep(0.05)
         self.mouse("mousePressed", x, y, held=True, modifiers=modifiers)
 
-    def drag_to(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8, modifiers: int = 0) -> None:
-        """Moves with the button held."""
-        for step in range(1, steps + 1):
-            share = step / steps
-            x, y = (a + (b - a) * share for a, b in zip(start, end, strict=True))
-            self.mouse("mouseMoved", x, y, held=True, modifiers=modifiers)
-            time.sleep(0.04)
-
     def release(self, x: float, y: float, modifiers: int = 0) -> None:
         self.mouse("mouseReleased", x, y, held=True, modifiers=modifiers)
 
-    def click(self, x: float, y: float) -> None:
-        self.press(x, y)
-        self.release(x, y)
+    def drag(
+        self, start: tuple[float, float], end: tuple[float, float], *, modifiers: int = 0, hold: bool = False
+    ) -> None:
+        """Drags from point to point; ``hold`` keeps the button down."""
+        self.press(*start, modifiers)
+        for step in range(1, 9):
+            x, y = (a + (b - a) * step / 8 for a, b in zip(start, end, strict=True))
+            self.mouse("mouseMoved", x, y, held=True, modifiers=modifiers)
+            time.sleep(0.04)
+        if not hold:
+            self.release(*end, modifiers)
 
     def give_file(self, path: Path) -> None:
         """Gives a file to the page's file input, as its dialog would."""
         root = self.call("DOM.getDocument", depth=-1)["root"]["nodeId"]
-        node = self.wait(
-            lambda: self.call("DOM.querySelector", nodeId=root, selector="input[type=file]")["nodeId"],
-            10,
-            "a file input",
-        )
+        node = self.call("DOM.querySelector", nodeId=root, selector="input[type=file]")["nodeId"]
         self.call("DOM.setFileInputFiles", nodeId=node, files=[str(path)])
 
     def press_button(self, label: str, elements: str = "button, [role=tab]") -> None:
@@ -164,16 +158,17 @@ class Page:
             time.sleep(0.2)
             return before if before and before == self.run(script) else None
 
-        self.click(*self.wait(place, 20, f"{label!r}"))
-        time.sleep(0.3)
+        middle = self.wait(place, 20, f"{label!r}")
+        self.press(*middle)
+        self.release(*middle)
 
 
 @contextmanager
-def chromium(folder: Path, *, size: tuple[int, int] = (1280, 800), more: tuple[str, ...] = ()) -> Iterator[Page]:
+def chromium(folder: Path, *, size: tuple[int, int]) -> Iterator[Page]:
     """A fresh browser with one page."""
     home = folder / "chromium"
     home.mkdir(parents=True, exist_ok=True)
-    command = [PROGRAM, *FLAGS, *more, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={home}",
+    command = [PROGRAM, *FLAGS, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={home}",
                "--remote-debugging-port=0", "about:blank"]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:

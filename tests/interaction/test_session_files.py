@@ -132,10 +132,10 @@ def test_what_is_no_session_is_refused(text: str, message: str) -> None:
 def test_files_that_cannot_be_read(tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(DataError, match="no such file"):
         load_session(tmp_path / "none.json")
-    with pytest.raises(DataError, match="expected a session"):
+    with pytest.raises(DataError, match="cannot be read"):
         load_session(tmp_path)
     (tmp_path / "b.json").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DataError, match="cannot be read as text"):
+    with pytest.raises(DataError, match="malformed|invalid|codec"):
         load_session(tmp_path / "b.json")
     save_session(SESSION, tmp_path / "s.json")
     monkeypatch.setattr(sessions, "MOST_BYTES", 100)
