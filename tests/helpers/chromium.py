@@ -103,9 +103,8 @@ class Page:
 
     def press(self, x: float, y: float, modifiers: int = 0) -> None:
         """Moves to a point and presses the left button there."""
-        for near in (-3, -1, 0):
+        for near in (-3, 0):
             self.mouse("mouseMoved", x + near, y, modifiers=modifiers)
-            time.sleep(0.05)
         self.mouse("mousePressed", x, y, held=True, modifiers=modifiers)
 
     def release(self, x: float, y: float, modifiers: int = 0) -> None:
@@ -116,10 +115,9 @@ class Page:
     ) -> None:
         """Drags from point to point; ``hold`` keeps the button down."""
         self.press(*start, modifiers)
-        for step in range(1, 9):
-            x, y = (a + (b - a) * step / 8 for a, b in zip(start, end, strict=True))
+        for step in range(1, 6):
+            x, y = (a + (b - a) * step / 5 for a, b in zip(start, end, strict=True))
             self.mouse("mouseMoved", x, y, held=True, modifiers=modifiers)
-            time.sleep(0.04)
         if not hold:
             self.release(*end, modifiers)
 

@@ -29,13 +29,14 @@ from gausim.viewer.guard import Door
 from gausim.viewer.recording import record
 
 pytestmark = needs_chromium
-SIZE = (900, 600)
+SIZE = (1280, 800)
 
 
 @contextmanager
 def opened(subject: Subject, folder: Path) -> Iterator[tuple[Viewer, Page]]:
     """A viewer and a browser that shows it; nothing may have gone wrong at the end."""
     viewer = Viewer(subject, Door(port=0))
+    viewer.live.pace = 0.2  # a browser that draws by software answers the mouse between frames
     viewer.start()
     try:
         with chromium(folder, size=SIZE) as page:
@@ -67,10 +68,10 @@ def play(viewer: Viewer, page: Page) -> None:
     centres = hands._centres(scene.means)
     root = viewer.placing.to_page(scene.means[scene.pinned]).mean(0)
     start = on_screen(viewer, centres[(centres - root).norm(dim=-1).argmax()])
-    end = (start[0] + 120, start[1])
+    end = (start[0] + 160, start[1])
     page.drag(start, end, hold=True)
     page.wait(lambda: live.interaction.acting, 10, "a force")
-    begun = live.interaction.frame_number
+    begun, live.pace = live.interaction.frame_number, 4.0
     page.wait(lambda: live.interaction.frame_number > begun + 40, 30, "five periods")
     force = next(e.event for e in reversed(interaction.session().entries) if isinstance(e.event, Force))
     moved = interaction.trajectory().positions[-40:].mean(0) - scene.means  # it swings about where the pull holds it
@@ -83,6 +84,7 @@ def play(viewer: Viewer, page: Page) -> None:
         on_screen(viewer, viewer.placing.to_page(at[hands.mask].mean(0))) for at in (scene.means + moved, scene.means)
     )
     assert seen[0] > rest[0], "did not move to the right on the screen"
+    live.pace = 0.2
     page.release(*end)
     page.wait(lambda: not live.interaction.acting, 10, "letting go")
     page.press_button("Pause")
@@ -133,7 +135,7 @@ def test_page_brushes_flicks_and_takes_a_session(make_interaction: Callable[...,
         page.wait(lambda: isinstance(hands.selection, Kernels), 10, "a brushed region")
         assert int(hands.mask.sum()) > 1
         start = on_screen(viewer, hands._centres(interaction.scene.means)[0])
-        end = (start[0] + 120, start[1])
+        end = (start[0] + 160, start[1])
         page.drag(start, end, modifiers=CTRL, hold=True)
         assert not interaction.acting, "a flick pulls before it is released"
         page.release(*end, modifiers=CTRL)
