@@ -103,8 +103,9 @@ class Page:
 
     def press(self, x: float, y: float, modifiers: int = 0) -> None:
         """Moves to a point and presses the left button there."""
-        for near in (-3, 0):
+        for near in (-3, -1, 0):
             self.mouse("mouseMoved", x + near, y, modifiers=modifiers)
+            time.sleep(0.05)
         self.mouse("mousePressed", x, y, held=True, modifiers=modifiers)
 
     def release(self, x: float, y: float, modifiers: int = 0) -> None:
@@ -159,6 +160,7 @@ class Page:
         middle = self.wait(place, 20, f"{label!r}")
         self.press(*middle)
         self.release(*middle)
+        time.sleep(0.3)
 
 
 @contextmanager

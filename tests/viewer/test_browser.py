@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -108,10 +109,13 @@ def test_page_is_dragged_reset_and_replayed(make_interaction: Callable[..., Inte
 
 
 @pytest.mark.slow
-def test_trained_run_is_dragged_reset_and_replayed(toy_run: Path, tmp_path: Path) -> None:
+def test_trained_run_is_dragged_reset_and_replayed(tmp_path: Path) -> None:
+    run_dir, data = os.environ.get("GAUSIM_TEST_RUN"), os.environ.get("GAUSIM_TEST_RUN_DATA")
+    if not run_dir:
+        pytest.skip("GAUSIM_TEST_RUN is not set: it names a trained run (GAUSIM_TEST_RUN_DATA: its data set)")
     from gausim.compose.build import load_run
 
-    made = playable_run(load_run(toy_run), keep=None)
+    made = playable_run(load_run(run_dir, data={"root": data} if data else None), keep=None)
     with opened(subject_of(made, title="a run", beside=None, up="z", sessions=tmp_path), tmp_path) as (viewer, page):
         play(viewer, page)
 
