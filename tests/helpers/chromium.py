@@ -125,25 +125,31 @@ class Page:
     def give_file(self, path: Path) -> None:
         """Gives a file to the page's file input, as its dialog would."""
         root = self.call("DOM.getDocument", depth=-1)["root"]["nodeId"]
-        node = self.call("DOM.querySelector", nodeId=root, selector="input[type=file]")["nodeId"]
-        self.call("DOM.setFileInputFiles", nodeId=node, files=[str(path)])
+
+        def node() -> int:
+            return self.call("DOM.querySelector", nodeId=root, selector="input[type=file]")["nodeId"]
+
+        self.call("DOM.setFileInputFiles", nodeId=self.wait(node, 10, "a file input"), files=[str(path)])
 
     def press_button(self, label: str, elements: str = "button, [role=tab]") -> None:
-        """Clicks the panel's button or tab of this label, or the innermost of other elements."""
-        self._press(
-            f"[...document.querySelectorAll({json.dumps(elements)})].filter(b => b.innerText.trim() === "
-            f"{json.dumps(label)} && b.offsetParent).pop()",
-            label,
-        )
+        """Clicks the panel's button or tab of this label with the mouse."""
+        self._press(_labelled(label, elements), label)
+
+    def press_text(self, label: str, elements: str) -> None:
+        """Clicks the innermost of some elements with this text."""
+        self._click(_labelled(label, elements), label)
 
     def press_input(self, label: str) -> None:
         """Clicks the panel's input that stands beside this label."""
-        self._press(
-            "(() => { let e = [...document.querySelectorAll('label, div, span')].filter(e => e.innerText.trim() === "
-            f"{json.dumps(label)} && e.offsetParent).pop(); "
+        self._click(
+            f"(() => {{ let e = {_labelled(label, 'label, div, span')}; "
             "while (e && !e.querySelector('input')) e = e.parentElement; return e && e.querySelector('input'); })()",
             label,
         )
+
+    def _click(self, element: str, label: str) -> None:
+        script = f"(() => {{ const found = {element}; if (found) found.click(); return !!found; }})()"
+        self.wait(lambda: self.run(script), 20, f"{label!r}")
 
     def _press(self, element: str, label: str) -> None:
         """Clicks the middle of an element once it stands still: folders open slowly."""
@@ -161,6 +167,13 @@ class Page:
         self.press(*middle)
         self.release(*middle)
         time.sleep(0.3)
+
+
+def _labelled(label: str, elements: str) -> str:
+    return (
+        f"[...document.querySelectorAll({json.dumps(elements)})].filter(e => e.innerText.trim() === "
+        f"{json.dumps(label)} && e.offsetParent).pop()"
+    )
 
 
 @contextmanager

@@ -165,14 +165,14 @@ def test_page_looks_from_a_camera_of_the_data_set(make_interaction: Callable[...
     subject = Subject("a column", interaction, cameras=cameras, sessions=tmp_path)
     with opened(subject, tmp_path) as (viewer, page):
         client = next(iter(viewer.server.get_clients().values()))
-        page.press_button("Cameras of the data set", "div, legend, span, p")
+        page.press_text("Cameras of the data set", "div, legend, span, p")
         time.sleep(2.0)  # the folder opens slowly
         page.press_input("Show them")
         page.wait(lambda: all(frustum.visible for frustum in viewer.sights._frustums), 10, "frustums")
         expected = viewer.sights._pose(cameras, 1)[0]
         assert np.linalg.norm(client.camera.position - expected) > 0.5
         page.press_input("Look from")
-        page.press_button(cameras.names[1], "[role=option]")
+        page.press_text(cameras.names[1], "[role=option]")
         page.wait(lambda: np.linalg.norm(client.camera.position - expected) < 1e-3, 10, "the camera's place")
 
 
