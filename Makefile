@@ -17,6 +17,8 @@ RUN ?= outputs/demo/seed_0
 DIRS ?= $(if $(filter-out file,$(origin RUN)),$(RUN),outputs)
 ARGS ?=
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
+# Each process begins with one stretch of the files and then takes from the others, so that few files are set up twice.
+PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 .PHONY: help install test test-slow test-types fuzz test-notebooks docs lint format data demo dataset train evaluate simulate report benchmark clean
 
@@ -33,17 +35,17 @@ $(STAMP): pyproject.toml constraints.txt
 	touch $@
 
 test: install ## Run the default tests (without the slow ones)
-	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) -m "not slow" $(ARGS)
+	$(PYTEST) -m "not slow" $(ARGS)
 
 test-slow: install ## Run the slow tests
-	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) -m slow $(ARGS)
+	$(PYTEST) -m slow $(ARGS)
 
 test-types: install ## Run the default tests with every annotated type and shape checked at run time (twice the time)
-	GAUSIM_CHECK_TYPES=1 $(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) -m "not slow" $(ARGS)
+	GAUSIM_CHECK_TYPES=1 $(PYTEST) -m "not slow" $(ARGS)
 
 # One at a time: each is written for two cores, and compiling in two processes at once would compile twice.
 test-notebooks: install ## Execute the notebooks on the embedded synthetic data
-	$(ONE_THREAD) $(BIN)/python -m pytest --nbmake --nbmake-timeout=600 notebooks
+	$(ONE_THREAD) $(BIN)/python -m pytest -p nbmake --nbmake --nbmake-timeout=600 notebooks
 
 fuzz: install ## Feed 20,000 damaged files to the readers: make fuzz ARGS="--count 1000 --seed 7"
 	PYTHONPATH=.:tests $(ONE_THREAD) $(BIN)/python tests/fuzz/run.py $(ARGS)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import ast
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 import torch
+from helpers.shared import Shared
 from jaxtyping import _import_hook, install_import_hook
 
 if TYPE_CHECKING:
@@ -48,19 +50,39 @@ def data_root() -> Path:
 
 
 @pytest.fixture(scope="session")
-def trainings(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Trainings]:
-    """Runs of `gausim train` in processes of their own, on a toy object."""
-    from helpers.toy_runs import trainings  # not before the checks of types are installed
-
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
+    """Makes a folder once for all processes of the session: ``shared("name", function that writes it)``."""
     base = tmp_path_factory.getbasetemp()
-    with trainings((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "toy_runs") as made:
+    return Shared((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared")
+
+
+@pytest.fixture(scope="session")
+def toy(shared: Shared) -> Path:
+    """The toy object on disk: 36 kernels, two sequences of 20 frames (8 seen), three views of 32 x 32 pixels."""
+    from helpers.toy_object import write_toy_object  # not before the checks of types are installed
+
+    return shared("toy", write_toy_object)
+
+
+@pytest.fixture(scope="session")
+def trainings(shared: Shared) -> Iterator[Trainings]:
+    """Runs of `gausim train` on the toy object, in processes of their own."""
+    from helpers.toy_runs import Trainings
+
+    with Trainings(shared) as made:
         yield made
 
 
 @pytest.fixture(scope="session")
 def toy_run(trainings: Trainings) -> Path:
-    """The directory of a finished run of three epochs, for all tests that need one; not to be changed."""
+    """The directory of a finished run of three epochs on a toy of three sequences; not to be changed."""
     return trainings.whole("whole", "trainer=cpu", "trainer.max_epochs=3")
+
+
+@pytest.fixture
+def own_toy_run(toy_run: Path, tmp_path: Path) -> Path:
+    """A copy of :func:`toy_run`, for commands that write into it."""
+    return Path(shutil.copytree(toy_run, tmp_path / "toy_run" / "seed_0"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,4 +1,4 @@
-"""What tests of commands share: toy data sets and runs of the session, and evaluations in this process."""
+"""Fixtures of the commands' tests: a second toy object, a joint run, and evaluations in this process."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from helpers import joint_runs
-from helpers.toy_object import write_toy_object
+from helpers.shared import Shared
 
 from gausim.cli import evaluate
 from gausim.cli import train as command
@@ -14,24 +14,20 @@ from gausim.runs.directory import RunDirectory
 
 
 @pytest.fixture(scope="session")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The toy object, which no test changes."""
-    return write_toy_object(tmp_path_factory.mktemp("data") / "toy").root
-
-
-@pytest.fixture(scope="session")
-def other(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def other(shared: Shared) -> Path:
     """Another object, which no test changes."""
-    return joint_runs.other_object(tmp_path_factory.mktemp("stores") / "other")
+    return shared("other", joint_runs.other_object)
 
 
 @pytest.fixture(scope="session")
-def joint(toy: Path, other: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def joint(toy: Path, other: Path, shared: Shared) -> Path:
     """A run of both objects, the second pinned by its own selection; not to be changed."""
-    run = tmp_path_factory.mktemp("joint") / "seed_0"
-    asked = ["data=joint", joint_runs.both(toy, other), "data.batch_size=3", f"hydra.run.dir={run}"]
-    assert command.main([*joint_runs.TINY, *asked, "optimizer.ema_decay=0.5"]) == 0
-    return run
+
+    def train(run: Path) -> None:
+        asked = ["data=joint", joint_runs.both(toy, other), "data.batch_size=3", f"hydra.run.dir={run}"]
+        assert command.main([*joint_runs.TINY, *asked, "optimizer.ema_decay=0.5"]) == 0
+
+    return shared("joint", train)
 
 
 @pytest.fixture

@@ -91,16 +91,14 @@ class Page:
                 raise TimeoutError(f"{what or holds}: not within {timeout} s; problems: {self.problems}")
             time.sleep(0.1)
 
-    def picture(self, path: Path | str | None = None) -> bytes:
-        data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
-        if path is not None:
-            Path(path).write_bytes(data)
-        return data
+    def picture(self) -> bytes:
+        """What is seen, as PNG."""
+        return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
 
-    def mouse(self, kind: str, x: float, y: float, *, held: bool = False, modifiers: int = 0, **more: Any) -> None:
+    def mouse(self, kind: str, x: float, y: float, *, held: bool = False, modifiers: int = 0) -> None:
         self.call(
             "Input.dispatchMouseEvent", type=kind, x=x, y=y, modifiers=modifiers, button="left" if held else "none",
-            buttons=1 if held and kind != "mouseReleased" else 0, clickCount=1 if held else 0, **more,
+            buttons=1 if held and kind != "mouseReleased" else 0, clickCount=1 if held else 0,
         )  # fmt: skip
 
     def press(self, x: float, y: float, modifiers: int = 0) -> None:
@@ -110,47 +108,48 @@ class Page:
             time.sleep(0.05)
         self.mouse("mousePressed", x, y, held=True, modifiers=modifiers)
 
-    def drag_to(self, start: tuple[float, float], end: tuple[float, float], steps: int = 8, modifiers: int = 0) -> None:
-        """Moves with the button held."""
-        for step in range(1, steps + 1):
-            share = step / steps
-            x, y = (a + (b - a) * share for a, b in zip(start, end, strict=True))
-            self.mouse("mouseMoved", x, y, held=True, modifiers=modifiers)
-            time.sleep(0.04)
-
     def release(self, x: float, y: float, modifiers: int = 0) -> None:
         self.mouse("mouseReleased", x, y, held=True, modifiers=modifiers)
 
-    def click(self, x: float, y: float) -> None:
-        self.press(x, y)
-        self.release(x, y)
+    def drag(
+        self, start: tuple[float, float], end: tuple[float, float], *, modifiers: int = 0, hold: bool = False
+    ) -> None:
+        """Drags from point to point; ``hold`` keeps the button down."""
+        self.press(*start, modifiers)
+        for step in range(1, 6):
+            x, y = (a + (b - a) * step / 5 for a, b in zip(start, end, strict=True))
+            self.mouse("mouseMoved", x, y, held=True, modifiers=modifiers)
+        if not hold:
+            self.release(*end, modifiers)
 
     def give_file(self, path: Path) -> None:
         """Gives a file to the page's file input, as its dialog would."""
         root = self.call("DOM.getDocument", depth=-1)["root"]["nodeId"]
-        node = self.wait(
-            lambda: self.call("DOM.querySelector", nodeId=root, selector="input[type=file]")["nodeId"],
-            10,
-            "a file input",
-        )
-        self.call("DOM.setFileInputFiles", nodeId=node, files=[str(path)])
+
+        def node() -> int:
+            return self.call("DOM.querySelector", nodeId=root, selector="input[type=file]")["nodeId"]
+
+        self.call("DOM.setFileInputFiles", nodeId=self.wait(node, 10, "a file input"), files=[str(path)])
 
     def press_button(self, label: str, elements: str = "button, [role=tab]") -> None:
-        """Clicks the panel's button or tab of this label, or the innermost of other elements."""
-        self._press(
-            f"[...document.querySelectorAll({json.dumps(elements)})].filter(b => b.innerText.trim() === "
-            f"{json.dumps(label)} && b.offsetParent).pop()",
-            label,
-        )
+        """Clicks the panel's button or tab of this label with the mouse."""
+        self._press(_labelled(label, elements), label)
+
+    def press_text(self, label: str, elements: str) -> None:
+        """Clicks the innermost of some elements with this text."""
+        self._click(_labelled(label, elements), label)
 
     def press_input(self, label: str) -> None:
         """Clicks the panel's input that stands beside this label."""
-        self._press(
-            "(() => { let e = [...document.querySelectorAll('label, div, span')].filter(e => e.innerText.trim() === "
-            f"{json.dumps(label)} && e.offsetParent).pop(); "
+        self._click(
+            f"(() => {{ let e = {_labelled(label, 'label, div, span')}; "
             "while (e && !e.querySelector('input')) e = e.parentElement; return e && e.querySelector('input'); })()",
             label,
         )
+
+    def _click(self, element: str, label: str) -> None:
+        script = f"(() => {{ const found = {element}; if (found) found.click(); return !!found; }})()"
+        self.wait(lambda: self.run(script), 20, f"{label!r}")
 
     def _press(self, element: str, label: str) -> None:
         """Clicks the middle of an element once it stands still: folders open slowly."""
@@ -164,16 +163,25 @@ class Page:
             time.sleep(0.2)
             return before if before and before == self.run(script) else None
 
-        self.click(*self.wait(place, 20, f"{label!r}"))
+        middle = self.wait(place, 20, f"{label!r}")
+        self.press(*middle)
+        self.release(*middle)
         time.sleep(0.3)
 
 
+def _labelled(label: str, elements: str) -> str:
+    return (
+        f"[...document.querySelectorAll({json.dumps(elements)})].filter(e => e.innerText.trim() === "
+        f"{json.dumps(label)} && e.offsetParent).pop()"
+    )
+
+
 @contextmanager
-def chromium(folder: Path, *, size: tuple[int, int] = (1280, 800), more: tuple[str, ...] = ()) -> Iterator[Page]:
+def chromium(folder: Path, *, size: tuple[int, int]) -> Iterator[Page]:
     """A fresh browser with one page."""
     home = folder / "chromium"
     home.mkdir(parents=True, exist_ok=True)
-    command = [PROGRAM, *FLAGS, *more, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={home}",
+    command = [PROGRAM, *FLAGS, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={home}",
                "--remote-debugging-port=0", "about:blank"]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True)
     try:

@@ -65,87 +65,40 @@ def turn(degrees: float, axis: Sequence[float]) -> np.ndarray:
     return pose
 
 
-def angle_in_degrees(root: Path) -> None:
-    """The field of view is written in degrees where radian belongs, and no focal length."""
-
-    def change(data: Json) -> None:
-        angle = 2 * math.atan(data["w"] / (2 * data["fl_x"]))
-        for key in ("fl_x", "fl_y"):
-            data.pop(key)
-        data["camera_angle_x"] = math.degrees(angle)
-
-    every_transforms(root, change)
-
-
-def lens_from_degrees(root: Path) -> None:
-    """The focal length was computed with the tangent of degrees."""
+def lens(root: Path, *, written: bool) -> None:
+    """The field of view is written in degrees where radian belongs, or the focal length was computed so."""
 
     def change(data: Json) -> None:
         angle = math.degrees(2 * math.atan(data["w"] / (2 * data["fl_x"])))
-        data["fl_x"] = data["fl_y"] = abs(data["w"] / (2 * math.tan(angle / 2)))
+        if written:
+            del data["fl_x"], data["fl_y"]
+            data["camera_angle_x"] = angle
+        else:
+            data["fl_x"] = data["fl_y"] = abs(data["w"] / (2 * math.tan(angle / 2)))
 
     every_transforms(root, change)
 
 
-def opencv_poses(root: Path) -> None:
-    every_pose(root, lambda pose, _: pose @ _FLIP)
-
-
-def inverted_poses(root: Path) -> None:
-    every_pose(root, lambda pose, _: np.linalg.inv(pose @ _FLIP))
-
-
-def millimetres(root: Path) -> None:
-    def change(pose: np.ndarray, _: str) -> np.ndarray:
-        pose[:3, 3] *= 1000
-        return pose
-
-    every_pose(root, change)
-
-
-def inverted_masks(root: Path) -> None:
-    def change(pixels: np.ndarray) -> np.ndarray:
-        pixels[..., 3] = 255 - pixels[..., 3]
-        return pixels
-
-    every_image(root, change)
-
-
-def no_masks(root: Path) -> None:
-    def change(pixels: np.ndarray) -> np.ndarray:
-        pixels[..., 3] = 255
-        return pixels
-
-    every_image(root, change)
+def every_alpha(root: Path, change: Callable[[np.ndarray], np.ndarray | int]) -> None:
+    every_image(root, lambda p: np.dstack((p[..., :3], np.broadcast_to(np.uint8(change(p[..., 3])), p.shape[:2]))))
 
 
 def wrong_rate(root: Path, factor: float) -> None:
-    def change(data: Json) -> None:
-        data["fps"] = data["fps"] * factor
-
-    edit(root / "dataset.json", change)
-    every_transforms(root, change)
+    for path in (root / "dataset.json", *root.glob("sequences/*/transforms.json")):
+        edit(path, lambda data: data.update(fps=data["fps"] * factor))
 
 
-def wrong_rate_in_one_file(root: Path) -> None:
-    edit(root / "dataset.json", lambda data: data.update(fps=data["fps"] * 4))
-
-
-def missing_images(root: Path) -> None:
-    folder = sorted((root / "sequences").iterdir())[-1] / views_of(root)[1]
-    for path in sorted(folder.iterdir())[5:8]:
+def missing_images(root: Path, *, listed: bool = True) -> None:
+    """Frames 5 to 7 of one camera are gone from the folder, or from the list too."""
+    sequence, view = sorted((root / "sequences").iterdir())[-1], views_of(root)[1]
+    for path in sorted((sequence / view).iterdir())[5:8]:
         path.unlink()
-
-
-def missing_frames(root: Path) -> None:
-    """Frames 5 to 7 of one camera are gone, from the folder and from the list."""
-    missing_images(root)
-    view, path = views_of(root)[1], sorted(root.glob("sequences/*/transforms.json"))[-1]
 
     def change(data: Json) -> None:
         data["frames"] = [e for e in data["frames"] if e["camera"] != view or e["frame"] not in (5, 6, 7)]
 
-    edit(path, change)
+    if not listed:
+        edit(sequence / "transforms.json", change)
 
 
 def moved_camera(root: Path, view: int = 1, degrees: float = 2.0) -> None:
@@ -160,28 +113,29 @@ def moved_cameras(root: Path) -> None:
     every_pose(root, lambda pose, camera: pose @ by[camera])
 
 
+def reorder(folder: Path, place: Callable[[int], int]) -> None:
+    """Every frame of a camera becomes the frame at another place, or the nearest that there is."""
+    paths = sorted(folder.iterdir())
+    content = [path.read_bytes() for path in paths]
+    for number, path in enumerate(paths):
+        path.write_bytes(content[min(max(place(number), 0), len(paths) - 1)])
+
+
 def out_of_step(root: Path, view: int = 1, frames: int = 2) -> None:
     """A camera is late (its first frame comes again so many times) or, with a negative number, early."""
-    for folder in (path / views_of(root)[view] for path in (root / "sequences").iterdir()):
-        paths = sorted(folder.iterdir())
-        content = [path.read_bytes() for path in paths]
-        for number, path in enumerate(paths):
-            path.write_bytes(content[min(max(number - frames, 0), len(paths) - 1)])
+    for sequence in (root / "sequences").iterdir():
+        reorder(sequence / views_of(root)[view], lambda number: number - frames)
 
 
 def nothing_moves(root: Path) -> None:
     for folder in root.glob("sequences/*/*/"):
-        paths = sorted(folder.iterdir())
-        for path in paths[1:]:
-            shutil.copy(paths[0], path)
+        reorder(folder, lambda number: 0)
 
 
-def sixteen_bit(root: Path) -> None:
-    every_image(root, lambda pixels: pixels.astype(np.uint16) * 257)
-
-
-def without_alpha(root: Path) -> None:
-    every_image(root, lambda pixels: pixels[..., :3])
+def not_at_rest(root: Path) -> None:
+    """One sequence begins in the middle of the motion."""
+    for folder in sorted((root / "sequences").iterdir())[-1].glob("*/"):
+        reorder(folder, lambda number: number + 6)
 
 
 def film_for_frames(root: Path) -> None:
@@ -219,63 +173,43 @@ def films_for_folders(root: Path) -> None:
             path.unlink()
 
 
-def no_pin(root: Path) -> None:
-    masks_path(root / "scene.ply").unlink()
-
-
-def not_at_rest(root: Path, first: int = 6) -> None:
-    """One sequence begins in the middle of the motion."""
-    for folder in sorted((root / "sequences").iterdir())[-1].glob("*/"):
-        paths = sorted(folder.iterdir())
-        content = [path.read_bytes() for path in paths]
-        for number, path in enumerate(paths):
-            path.write_bytes(content[min(number + first, len(paths) - 1)])
-
-
-def one_view(root: Path) -> None:
-    def change(data: Json) -> None:
-        data.update(train_views=data["views"][:1], heldout_views=data["views"][1:])
-
-    edit(root / "dataset.json", change)
-
-
-def dark_camera(root: Path) -> None:
-    every_image(root, lambda pixels: (pixels * [0.6, 0.6, 0.6, 1]).astype(np.uint8), f"*/{views_of(root)[1]}/*")
-
-
-def flickering_camera(root: Path) -> None:
-    """Every other frame of one camera is darker by a tenth."""
+def darker(root: Path, factor: float, every: int = 1) -> None:
+    """Every so many frames of one camera are darker."""
     for path in root.glob(f"sequences/*/{views_of(root)[1]}/*.png"):
-        if int(path.stem) % 2:
-            pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) * [0.9, 0.9, 0.9, 1]
+        if int(path.stem) % every == every - 1:
+            pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) * [factor, factor, factor, 1]
             assert cv2.imwrite(str(path), pixels.astype(np.uint8))
 
 
+def one_view(root: Path) -> None:
+    edit(root / "dataset.json", lambda d: d.update(train_views=d["views"][:1], heldout_views=d["views"][1:]))
+
+
 MISTAKES: dict[str, Callable[[Path], None]] = {
-    "field of view in degrees": angle_in_degrees,
-    "focal length from degrees": lens_from_degrees,
-    "OpenCV poses": opencv_poses,
-    "inverted poses": inverted_poses,
-    "millimetres": millimetres,
-    "inverted masks": inverted_masks,
-    "nothing cut out": no_masks,
+    "field of view in degrees": lambda root: lens(root, written=True),
+    "focal length from degrees": lambda root: lens(root, written=False),
+    "OpenCV poses": lambda root: every_pose(root, lambda pose, _: pose @ _FLIP),
+    "inverted poses": lambda root: every_pose(root, lambda pose, _: np.linalg.inv(pose @ _FLIP)),
+    "millimetres": lambda root: every_pose(root, lambda pose, _: np.vstack((pose[:3] * [1, 1, 1, 1000], pose[3:]))),
+    "inverted masks": lambda root: every_alpha(root, lambda alpha: 255 - alpha),
+    "nothing cut out": lambda root: every_alpha(root, lambda alpha: 255),
     "rate times 4": lambda root: wrong_rate(root, 4),
     "rate over 4": lambda root: wrong_rate(root, 0.25),
-    "rate in one file": wrong_rate_in_one_file,
+    "rate in one file": lambda root: edit(root / "dataset.json", lambda data: data.update(fps=data["fps"] * 4)),
     "missing images": missing_images,
-    "missing frames": missing_frames,
+    "missing frames": lambda root: missing_images(root, listed=False),
     "one camera moved": moved_camera,
     "all cameras moved": moved_cameras,
     "one camera 2 frames late": out_of_step,
     "one camera 2 frames early": lambda root: out_of_step(root, frames=-2),
     "nothing moves": nothing_moves,
-    "16-bit PNG": sixteen_bit,
-    "no alpha": without_alpha,
+    "16-bit PNG": lambda root: every_image(root, lambda pixels: pixels.astype(np.uint16) * 257),
+    "no alpha": lambda root: every_image(root, lambda pixels: pixels[..., :3]),
     "a film for frames": film_for_frames,
     "films for folders": films_for_folders,
-    "no pin": no_pin,
+    "no pin": lambda root: masks_path(root / "scene.ply").unlink(),
     "not at rest": not_at_rest,
     "one view": one_view,
-    "a dark camera": dark_camera,
-    "a flickering camera": flickering_camera,
+    "a dark camera": lambda root: darker(root, 0.6),
+    "a flickering camera": lambda root: darker(root, 0.9, every=2),
 }

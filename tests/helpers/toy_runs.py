@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import csv
-import fcntl
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
-
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from typing import Any, Self
 
 from gausim.runs.checkpoint import digest, read_checkpoint
 from helpers import toy_object
+from helpers.shared import Shared
 from helpers.simulators import LEVELS
 
 # The smallest run in which everything happens that a resumed run could get wrong.
@@ -28,65 +24,66 @@ TINY = (
 )  # fmt: skip
 
 
-class Trainings:
-    """Trains in processes of their own, which may be killed (see ``killed_runs.py``).
+class Server:
+    """The program ``killed_runs.py``, which starts when it is first needed."""
+
+    def __init__(self) -> None:
+        self._process: subprocess.Popen[str] | None = None
+
+    def order(self, argv: list[str], **death: Any) -> tuple[int, str]:
+        """Exit status (negative: the signal) and output of `gausim train`."""
+        if self._process is None:
+            program = [sys.executable, str(Path(__file__).with_name("killed_runs.py"))]
+            self._process = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.write(json.dumps({"argv": argv, **death}) + "\n")
+        self._process.stdin.flush()
+        found = json.loads(self._process.stdout.readline())
+        return found["status"], found["output"]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None:
+            self._process.communicate()  # closes its input, at which it ends
+
+
+class Trainings(Server):
+    """Trains a toy object with three sequences in processes of their own, which may be killed.
 
     Attributes:
         folder: where the runs go.
     """
 
-    def __init__(self, folder: Path, server: subprocess.Popen[str]) -> None:
-        self.folder, self._server = folder, server
-        self.given = (f"data.root={folder / 'toy'}", f"paths.output_root={folder}", *TINY)
-
-    def order(self, argv: list[str], **death: Any) -> tuple[int, str]:
-        """Exit status (negative: the signal) and output of `gausim train`."""
-        assert self._server.stdin is not None and self._server.stdout is not None
-        self._server.stdin.write(json.dumps({"argv": argv, **death}) + "\n")
-        self._server.stdin.flush()
-        found = json.loads(self._server.stdout.readline())
-        return found["status"], found["output"]
+    def __init__(self, shared: Shared) -> None:
+        super().__init__()
+        self._shared = shared
+        self.folder = shared("toy_runs", Path.mkdir)
+        self.given = (f"data.root={shared('toy_of_three', _write_toy)}", f"paths.output_root={self.folder}", *TINY)
 
     def __call__(self, name: str, *overrides: str, **death: Any) -> tuple[int, str]:
         return self.order([*self.given, f"name={name}", *overrides], **death)
 
     def whole(self, name: str, *overrides: str) -> Path:
         """A run that nothing disturbs, made once per session; what it said is in ``NAME.txt``."""
-        run = self.run(name)
-        with one_at_a_time(self.folder):
-            if not (run / "FINISHED").exists():
-                status, output = self(name, *overrides)
-                assert status == 0, output
-                (self.folder / f"{name}.txt").write_text(output)
-        return run
+
+        def make(folder: Path) -> None:
+            status, output = self(name, *overrides)
+            assert status == 0, output
+            (self.folder / f"{name}.txt").write_text(output)
+
+        self._shared(f"made_{name}", make)
+        return self.run(name)
 
     def run(self, name: str) -> Path:
         """The directory of a run."""
         return self.folder / name / "seed_0"
 
 
-@contextmanager
-def trainings(folder: Path) -> Iterator[Trainings]:
-    """Trainings in a folder that the processes of a test session share, on a toy object with three sequences."""
-    folder.mkdir(exist_ok=True)
-    with one_at_a_time(folder):
-        if not (folder / "toy").exists():
-            toy = toy_object.ToyObject(folder / "making", toy_object.toy_scene())
-            toy.amplitudes["seq_002"] = 0.3
-            toy_object.write_object(toy).root.rename(folder / "toy")
-    program = [sys.executable, str(Path(__file__).with_name("killed_runs.py"))]
-    with subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
-        yield Trainings(folder, server)
-        assert server.stdin is not None
-        server.stdin.close()
-
-
-@contextmanager
-def one_at_a_time(folder: Path) -> Iterator[None]:
-    """A block that the processes of a test session enter one after the other."""
-    with (folder / "lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
+def _write_toy(folder: Path) -> None:
+    amplitudes = {**toy_object.AMPLITUDES, "seq_002": 0.3}
+    toy_object.write_object(toy_object.ToyObject(folder, toy_object.toy_scene(), amplitudes=amplitudes))
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -110,6 +107,8 @@ def learned(run: Path) -> dict[str, str]:
 
 def curves(run: Path) -> dict[str, list[tuple[int, float]]]:
     """What TensorBoard shows of a run."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
     events = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0})
     events.Reload()
     return {tag: [(e.step, e.value) for e in events.Scalars(tag)] for tag in events.Tags()["scalars"]}

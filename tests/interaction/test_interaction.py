@@ -42,14 +42,6 @@ def test_stepping_is_the_rollout_bit_for_bit(make_column, make_simulator, passiv
     assert float((whole.positions[-1] - scene.means).abs().max()) > 1e-3
 
 
-def test_an_interaction_without_events_is_the_rollout(make_interaction) -> None:
-    live = make_interaction(keep=None)
-    for _ in range(10):
-        live.step()
-    assert same(live.trajectory(), live._dynamics.rollout(live._initial, 10))
-    assert live.tick == live.frame_number == 10 and live.session().entries == ()
-
-
 def play(live: Interaction) -> None:
     """Every kind of event, a divergence excepted."""
     todo = {
@@ -184,19 +176,23 @@ def test_a_force_is_a_multiple_of_the_weight(make_column) -> None:
 
 
 def test_pinned_kernels_never_move(make_interaction) -> None:
-    live = make_interaction()
+    live = make_interaction(keep=4)
     pinned, held = live.scene.pinned | ~live.scene.simulated, Kernels(tuple(range(70, 80)))
     live.act(Gravity(X, 1.0))
     for _ in range(4):
         live.step()
+    kept = live.trajectory()  # the latest frames only
+    assert kept.frames == 4 and torch.equal(kept.positions[-1], live.frame.positions)
     live.act(Pin(held))
     where = live.frame.positions[70:80].clone()
     live.act(Force(Whole(), Y, 3.0))
-    for _ in range(8):
+    for _ in range(4):
         live.step()
         assert torch.equal(live.frame.positions[70:80], where)
         assert torch.equal(live.frame.positions[pinned], live.scene.means[pinned])
     assert float((where - live.scene.means[70:80]).norm(dim=-1).median()) > 1e-3
+    live.restart()
+    assert live.trajectory().frames == 1 and live.tick == 0 and live.session().entries == ()
 
 
 def test_what_cannot_be_done_is_refused_and_not_recorded(make_interaction) -> None:
@@ -297,14 +293,3 @@ def test_divergence_stops_until_a_reset(make_interaction, how, message) -> None:
     live.step()
     assert live.trajectory().frames == 3 and torch.isfinite(live.trajectory().positions).all()
     assert same(replay(make_interaction(), live.session()), live.trajectory())
-
-
-def test_only_the_latest_frames_are_kept(make_interaction) -> None:
-    live = make_interaction(keep=4)
-    live.act(Gravity(X, 1.0))
-    for _ in range(9):
-        live.step()
-    kept = live.trajectory()
-    assert kept.frames == 4 and torch.equal(kept.positions[-1], live.frame.positions)
-    live.restart()
-    assert live.trajectory().frames == 1 and live.tick == 0 and live.session().entries == ()

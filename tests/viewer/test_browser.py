@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import os
-import socket
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from helpers.chromium import CTRL, SHIFT, chromium, needs_chromium
+from helpers.chromium import CTRL, SHIFT, Page, chromium, needs_chromium
 
 pytest.importorskip("viser", reason="the extra 'view' is not installed")
 
@@ -33,46 +30,50 @@ from gausim.viewer.guard import Door
 from gausim.viewer.recording import record
 
 pytestmark = needs_chromium
+SIZE = (1280, 800)
 
 
 @contextmanager
-def served(subject: Subject) -> Iterator[Viewer]:
+def opened(subject: Subject, folder: Path) -> Iterator[tuple[Viewer, Page]]:
+    """A viewer and a browser that shows it; nothing may have gone wrong at the end."""
     viewer = Viewer(subject, Door(port=0))
+    viewer.live.pace = 0.2  # a browser that draws by software answers the mouse between frames
     viewer.start()
     try:
-        yield viewer
+        with chromium(folder, size=SIZE) as page:
+            page.open(viewer.url)
+            page.wait(lambda: "simulated" in page.text() and viewer.live.interaction.tick > 3, 60, "the page")
+            yield viewer, page
+            ours = [text for text in page.problems if "passive event listener" not in text]  # viser's own
+            assert not ours, ours
+            home = (viewer.url, viewer.url.replace("http", "ws"), "data:", "blob:")
+            outside = [address for address in page.requests if not address.startswith(home)]
+            assert not outside, outside
+            assert viewer.live.is_alive() and viewer.server.junk == viewer.server.failed == 0
     finally:
         viewer.stop()
 
 
-def on_screen(viewer: Viewer, point: torch.Tensor, size: tuple[int, int] = (1280, 800)) -> tuple[float, float]:
+def on_screen(viewer: Viewer, point: torch.Tensor) -> tuple[float, float]:
     """Where a point of the page's scene is seen [pixels]."""
-    client = next(iter(viewer.server.get_clients().values()))
-    camera = client.camera
+    camera = next(iter(viewer.server.get_clients().values())).camera
     seen = SO3(camera.wxyz).as_matrix().T @ (point.double().numpy() - camera.position)
-    focal = size[1] / 2 / np.tan(camera.fov / 2)
-    return size[0] / 2 + focal * seen[0] / seen[2], size[1] / 2 + focal * seen[1] / seen[2]
+    focal = SIZE[1] / 2 / np.tan(camera.fov / 2)
+    return SIZE[0] / 2 + focal * seen[0] / seen[2], SIZE[1] / 2 + focal * seen[1] / seen[2]
 
 
-def play(viewer: Viewer, page: Any, folder: Path, interaction: Interaction) -> None:
-    """Drags the farthest part to the right, and checks what the issue asks for."""
-    page.open(viewer.url)
-    page.wait(lambda: "simulated" in page.text() and viewer.live.interaction.tick > 3, 60, "the page")
-    hands, live = viewer.hands, viewer.live
-    page.picture(folder / "loaded.png")
-    # The part that moves most: the one farthest from what is pinned.
+def play(viewer: Viewer, page: Page) -> None:
+    """Drags the part that is farthest from what is pinned to the right, saves, replays and resets."""
+    hands, live, interaction = viewer.hands, viewer.live, viewer.live.interaction
     scene = interaction.scene
     centres = hands._centres(scene.means)
     root = viewer.placing.to_page(scene.means[scene.pinned]).mean(0)
-    chosen = centres[(centres - root).norm(dim=-1).argmax()]
-    start = on_screen(viewer, chosen)
+    start = on_screen(viewer, centres[(centres - root).norm(dim=-1).argmax()])
     end = (start[0] + 160, start[1])
-    page.press(*start)
-    page.drag_to(start, end)
+    page.drag(start, end, hold=True)
     page.wait(lambda: live.interaction.acting, 10, "a force")
-    begun = live.interaction.frame_number
+    begun, live.pace = live.interaction.frame_number, 4.0
     page.wait(lambda: live.interaction.frame_number > begun + 40, 30, "five periods")
-    page.picture(folder / "dragged.png")
     force = next(e.event for e in reversed(interaction.session().entries) if isinstance(e.event, Force))
     moved = interaction.trajectory().positions[-40:].mean(0) - scene.means  # it swings about where the pull holds it
     along = torch.tensor(force.direction) / torch.tensor(force.direction).norm()
@@ -80,9 +81,11 @@ def play(viewer: Viewer, page: Any, folder: Path, interaction: Interaction) -> N
     assert float(mean) > 1e-4, f"moved {float(mean):.2e} diagonals along the drag"
     across = (moved[hands.mask].mean(0) / scene.diagonal - mean * along).norm()
     assert float(mean) > float(across), "moved more across the drag than along it"
-    seen = on_screen(viewer, viewer.placing.to_page((scene.means + moved)[hands.mask].mean(0)))
-    rest = on_screen(viewer, viewer.placing.to_page(scene.means[hands.mask].mean(0)))
+    seen, rest = (
+        on_screen(viewer, viewer.placing.to_page(at[hands.mask].mean(0))) for at in (scene.means + moved, scene.means)
+    )
     assert seen[0] > rest[0], "did not move to the right on the screen"
+    live.pace = 0.2
     page.release(*end)
     page.wait(lambda: not live.interaction.acting, 10, "letting go")
     page.press_button("Pause")
@@ -92,99 +95,17 @@ def play(viewer: Viewer, page: Any, folder: Path, interaction: Interaction) -> N
     page.press_button("Save the session")
     page.wait(lambda: viewer.page.saved, 10, "a saved session")
     again = replay(interaction, load_session(viewer.page.saved[-1]))
-    assert again.frames == recorded.frames
     for name in ("positions", "deformation_gradients", "rotations"):
         assert torch.equal(getattr(again, name), getattr(recorded, name)), name
     page.press_button("Play", "[role=tab]")
     page.press_button("Reset")
     page.wait(lambda: live.interaction.frame_number == 0, 10, "a reset")
-    assert torch.equal(interaction.frame.positions, scene.means)
-    time.sleep(0.5)
-    page.picture(folder / "reset.png")
-    ours = [text for text in page.problems if "passive event listener" not in text]  # viser's own
-    assert not ours, ours
-    outside = [
-        u for u in page.requests if not u.startswith((viewer.url, "data:", "blob:", viewer.url.replace("http", "ws")))
-    ]
-    assert not outside, outside
-    assert not live.message and viewer.server.junk == viewer.server.failed == 0
+    assert torch.equal(interaction.frame.positions, scene.means) and not live.message
 
 
 def test_page_is_dragged_reset_and_replayed(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
-    interaction = make_interaction(keep=None)
-    subject = Subject("a column", interaction, sessions=tmp_path / "sessions")
-    with served(subject) as viewer, chromium(tmp_path) as page:
-        play(viewer, page, tmp_path, interaction)
-
-
-def test_page_brushes_flicks_and_takes_a_session(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
-    interaction = make_interaction(keep=None)
-    with served(Subject("a column", interaction, sessions=tmp_path)) as viewer, chromium(tmp_path) as page:
-        hands, live = viewer.hands, viewer.live
-        page.open(viewer.url)
-        page.wait(lambda: "simulated" in page.text() and live.interaction.tick > 3, 60, "the page")
-        centre = on_screen(viewer, viewer.placing.to_page(interaction.scene.means).mean(0))
-        start, end = (centre[0] - 250, centre[1] - 250), (centre[0] + 250, centre[1] + 250)
-        page.press(*start, modifiers=SHIFT)
-        page.drag_to(start, end, modifiers=SHIFT)
-        page.release(*end, modifiers=SHIFT)
-        page.wait(lambda: isinstance(hands.selection, Kernels), 10, "a brushed region")
-        assert int(hands.mask.sum()) > 1
-        tip = hands._centres(interaction.scene.means)[0]
-        start = on_screen(viewer, tip)
-        end = (start[0] + 120, start[1])
-        page.press(*start, modifiers=CTRL)
-        page.drag_to(start, end, modifiers=CTRL)
-        assert not interaction.acting, "a flick pulls before it is released"
-        page.release(*end, modifiers=CTRL)
-        page.wait(lambda: any(isinstance(e.event, Impulse) for e in interaction.session().entries), 10, "an impulse")
-        page.press_button("Pause")
-        page.wait(lambda: not live.playing, 10, "a pause")
-        recorded, session = interaction.trajectory(), interaction.session()
-        save_session(session, tmp_path / "flick.json")
-        page.press_button("Session")
-        page.give_file(tmp_path / "flick.json")
-        page.wait(lambda: live.message.startswith("The session is over"), 60, "the session's end")
-        again = interaction.trajectory()
-        assert again.frames == recorded.frames and torch.equal(again.positions, recorded.positions)
-        page.picture(tmp_path / "replayed.png")
-        broken = tmp_path / "broken.json"
-        broken.write_text("{")
-        page.give_file(broken)
-        page.wait(lambda: "the file" in live.message, 10, "what is wrong with the file")
-        assert live.is_alive() and viewer.server.junk == viewer.server.failed == 0
-
-
-@pytest.mark.slow
-def test_page_looks_from_a_camera_of_the_data_set(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
-    interaction = make_interaction()
-    cameras = orbit_cameras(interaction.scene.means, azimuths=[0.0, 90.0], size=(64, 48))
-    subject = Subject("a column", interaction, cameras=cameras, sessions=tmp_path)
-    with served(subject) as viewer, chromium(tmp_path) as page:
-        page.open(viewer.url)
-        page.wait(lambda: "simulated" in page.text() and viewer.live.interaction.tick > 3, 60, "the page")
-        client = next(iter(viewer.server.get_clients().values()))
-        page.press_button("Cameras of the data set", "div, legend, span, p")
-        time.sleep(2.0)  # the folder opens slowly
-        page.press_input("Show them")
-        page.wait(lambda: all(frustum.visible for frustum in viewer.sights._frustums), 10, "frustums")
-        expected = viewer.sights._pose(cameras, 1)[0]
-        assert np.linalg.norm(client.camera.position - expected) > 0.5
-        page.press_input("Look from")
-        page.press_button(cameras.names[1], "[role=option]")
-        page.wait(lambda: np.linalg.norm(client.camera.position - expected) < 1e-3, 10, "the camera's place")
-        page.picture(tmp_path / "from_camera.png")
-        assert viewer.server.junk == viewer.server.failed == 0
-
-
-@pytest.mark.slow
-def test_real_splats_are_dragged_reset_and_replayed(data_root: Path, tmp_path: Path) -> None:
-    scene = load_scene(data_root / "splats" / "playbot_lod3.ply")
-    scene = apply_masks(scene, pinned=parse_half_space("y=-0.12", above=True))
-    made = playable_scene(scene, fps=30.0, seed=0, keep=None)
-    subject = subject_of(made, title="playbot", beside=None, up="-y", sessions=tmp_path / "sessions")
-    with served(subject) as viewer, chromium(tmp_path) as page:
-        play(viewer, page, tmp_path, made.interaction)
+    with opened(Subject("a column", make_interaction(keep=None), sessions=tmp_path), tmp_path) as (viewer, page):
+        play(viewer, page)
 
 
 @pytest.mark.slow
@@ -195,49 +116,82 @@ def test_trained_run_is_dragged_reset_and_replayed(tmp_path: Path) -> None:
     from gausim.compose.build import load_run
 
     made = playable_run(load_run(run_dir, data={"root": data} if data else None), keep=None)
-    subject = subject_of(made, title="a run", beside=None, up="z", sessions=tmp_path / "sessions")
-    with served(subject) as viewer, chromium(tmp_path) as page:
-        play(viewer, page, tmp_path, made.interaction)
+    with opened(subject_of(made, title="a run", beside=None, up="z", sessions=tmp_path), tmp_path) as (viewer, page):
+        play(viewer, page)
 
 
+@pytest.mark.slow
+def test_real_splats_are_dragged_reset_and_replayed(data_root: Path, tmp_path: Path) -> None:
+    scene = load_scene(data_root / "splats" / "playbot_lod3.ply")
+    scene = apply_masks(scene, pinned=parse_half_space("y=-0.12", above=True))
+    made = playable_scene(scene, fps=30.0, seed=0, keep=None)
+    with opened(subject_of(made, title="playbot", beside=None, up="-y", sessions=tmp_path), tmp_path) as shown:
+        play(*shown)
+
+
+@pytest.mark.slow
+def test_page_brushes_flicks_and_takes_a_session(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
+    interaction = make_interaction(keep=None)
+    with opened(Subject("a column", interaction, sessions=tmp_path), tmp_path) as (viewer, page):
+        hands, live = viewer.hands, viewer.live
+        centre = on_screen(viewer, viewer.placing.to_page(interaction.scene.means).mean(0))
+        page.drag((centre[0] - 200, centre[1] - 200), (centre[0] + 200, centre[1] + 200), modifiers=SHIFT)
+        page.wait(lambda: isinstance(hands.selection, Kernels), 10, "a brushed region")
+        assert int(hands.mask.sum()) > 1
+        start = on_screen(viewer, hands._centres(interaction.scene.means)[0])
+        end = (start[0] + 160, start[1])
+        page.drag(start, end, modifiers=CTRL, hold=True)
+        assert not interaction.acting, "a flick pulls before it is released"
+        page.release(*end, modifiers=CTRL)
+        page.wait(lambda: any(isinstance(e.event, Impulse) for e in interaction.session().entries), 10, "an impulse")
+        page.press_button("Pause")
+        page.wait(lambda: not live.playing, 10, "a pause")
+        recorded = interaction.trajectory()
+        save_session(interaction.session(), tmp_path / "flick.json")
+        page.press_button("Session")
+        page.give_file(tmp_path / "flick.json")
+        page.wait(lambda: live.message.startswith("The session is over"), 60, "the session's end")
+        again = interaction.trajectory()
+        assert again.frames == recorded.frames and torch.equal(again.positions, recorded.positions)
+        (tmp_path / "broken.json").write_text("{")
+        page.give_file(tmp_path / "broken.json")
+        page.wait(lambda: "the file" in live.message, 10, "what is wrong with the file")
+
+
+@pytest.mark.slow
+def test_page_looks_from_a_camera_of_the_data_set(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
+    interaction = make_interaction()
+    cameras = orbit_cameras(interaction.scene.means, azimuths=[0.0, 90.0], size=(64, 48))
+    subject = Subject("a column", interaction, cameras=cameras, sessions=tmp_path)
+    with opened(subject, tmp_path) as (viewer, page):
+        client = next(iter(viewer.server.get_clients().values()))
+        page.press_text("Cameras of the data set", "div, legend, span, p")
+        time.sleep(2.0)  # the folder opens slowly
+        page.press_input("Show them")
+        page.wait(lambda: all(frustum.visible for frustum in viewer.sights._frustums), 10, "frustums")
+        expected = viewer.sights._pose(cameras, 1)[0]
+        assert np.linalg.norm(client.camera.position - expected) > 0.5
+        page.press_input("Look from")
+        page.press_text(cameras.names[1], "[role=option]")
+        page.wait(lambda: np.linalg.norm(client.camera.position - expected) < 1e-3, 10, "the camera's place")
+
+
+@pytest.mark.slow
 def test_exported_page_plays_without_a_network(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
-    scene = make_interaction().scene
-    frames = 12
+    scene, frames = make_interaction().scene, 12
     positions = scene.means.expand(frames, -1, -1).clone()
     positions[:, :, 0] += torch.linspace(0, 0.6, frames)[:, None] * scene.diagonal
     identity = torch.eye(3).expand(frames, 1, 3, 3)
     unit = torch.zeros(scene.count, dtype=torch.long)
     path = record(scene, Trajectory(positions, identity, identity, unit, 6.0), tmp_path / "column.html")
-    # Everything that any part of the page would send goes to this socket, workers included.
-    with socket.create_server(("127.0.0.1", 0)) as trap:
-        trap.settimeout(0.2)
-        asked: list[bytes] = []
-        ended = threading.Event()
-
-        def listen() -> None:
-            while not ended.is_set():
-                try:
-                    asked.append(trap.accept()[0].recv(200))
-                except TimeoutError:
-                    continue
-
-        thread = threading.Thread(target=listen)
-        thread.start()
-        try:
-            proxy = f"--proxy-server=http://127.0.0.1:{trap.getsockname()[1]}"
-            with chromium(tmp_path, more=(proxy, "--proxy-bypass-list=<-loopback>")) as page:
-                page.open(path.as_uri())
-                page.wait(lambda: page.run("!!document.querySelector('canvas')"), 30, "a picture")
-                page.wait(lambda: page.run("document.title").startswith("column"), 10, "its title")
-                pictures = []
-                for _ in range(6):
-                    time.sleep(0.4)
-                    pictures.append(page.picture(tmp_path / "export.png"))
-                assert len(set(pictures)) > 2, "nothing moves"
-                outside = [u for u in page.requests if not u.startswith(("file:", "data:", "blob:"))]
-                assert not outside, outside
-        finally:
-            ended.set()
-            thread.join()
-    of_page = [text for text in asked if b"google" not in text and b"gstatic" not in text]
-    assert not of_page, of_page
+    with chromium(tmp_path, size=SIZE) as page:
+        page.open(path.as_uri())
+        page.wait(lambda: page.run("!!document.querySelector('canvas')"), 30, "a picture")
+        page.wait(lambda: page.run("document.title").startswith("column"), 10, "its title")
+        pictures = set()
+        for _ in range(6):
+            time.sleep(0.4)
+            pictures.add(page.picture())
+        assert len(pictures) > 2, "nothing moves"
+        outside = [address for address in page.requests if not address.startswith(("file:", "data:", "blob:"))]
+        assert not outside, outside

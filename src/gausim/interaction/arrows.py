@@ -20,13 +20,7 @@ _SHORT, _LONG = 0.08, 0.35
 
 @dataclass(frozen=True, eq=False)
 class Arrow:
-    """A force as an arrow.
-
-    Attributes:
-        start: where it acts: the middle of its kernels [scene units].
-        end: its tip.
-        label: its size in words.
-    """
+    """A force as an arrow from the middle of its kernels to its tip [scene units], with its size in words."""
 
     start: Float[Tensor, " 3"]
     end: Float[Tensor, " 3"]
@@ -48,19 +42,9 @@ def arrows_of(live: Interaction) -> list[Arrow]:
 
 
 def draw_arrows(
-    image: np.ndarray,
-    arrows: Sequence[Arrow],
-    viewmat: Float[Tensor, "4 4"],
-    K: Float[Tensor, "3 3"],
+    image: np.ndarray, arrows: Sequence[Arrow], viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"]
 ) -> np.ndarray:
-    """A copy of a (H, W, 3) uint8 picture of one camera with arrows over it.
-
-    Args:
-        image: the picture.
-        arrows: what is drawn; those behind the camera are left out.
-        viewmat: world to camera.
-        K: intrinsics of the picture [pixels].
-    """
+    """A copy of a (H, W, 3) uint8 picture of one camera with arrows over it; those behind the camera are left out."""
     drawn = np.ascontiguousarray(image).copy()
     for arrow in arrows:
         ends = torch.stack((arrow.start, arrow.end)).double() @ viewmat[:3, :3].double().T + viewmat[:3, 3].double()

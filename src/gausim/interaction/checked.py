@@ -35,12 +35,14 @@ class Checked(Struct, frozen=True):
                 msgspec.structs.force_setattr(self, name, converted)
 
 
-def made(kind: type[Any], fields: dict[str, Any]) -> Any:
+def made(kind: type[Any], fields: Any) -> Any:
     """A record of the fields of a file or a command line, which must be those that it has.
 
     Raises:
-        ConfigError: a field is missing, unknown or wrong.
+        ConfigError: a field is missing, unknown or wrong, or there are no fields.
     """
+    if not isinstance(fields, dict):
+        raise ConfigError("expected an object.")
     names = {field.name: field.required for field in msgspec.structs.fields(kind)}
     missing = [name for name, required in names.items() if required and name not in fields]
     unknown = [name for name in fields if name not in names]

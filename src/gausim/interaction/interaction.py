@@ -23,7 +23,7 @@ from gausim.core import (
     trajectory_of,
 )
 from gausim.interaction.pushes import Push, exposure, scaled
-from gausim.interaction.selections import Selected
+from gausim.interaction.selections import Selected, selection_to_json
 from gausim.interaction.session import (
     MOST_EVENTS,
     MOST_STEPS,
@@ -60,15 +60,11 @@ class Interaction:
     """One object that is pushed about. Not for several threads at once.
 
     Attributes:
-        scene: the rest scene.
         tick: steps since the session began; events are recorded at it.
         frame_number: steps since the last reset.
         frame: the latest frame.
         held: kernels that are pinned by hand.
-        gravity: acceleration that makes a weight of a mass [scene units / s^2].
-        most_force: the largest force, and the largest sum of them on a kernel [weights].
         broken: why the simulation stopped; None while it goes on.
-        masses: of the kernels, up to a common factor.
     """
 
     def __init__(
@@ -117,8 +113,6 @@ class Interaction:
         self._exposure = exposure(scene, self.masses, self._free)
         self._frames: deque[SteppedFrame] = deque(maxlen=keep)
         self.restart()
-
-    # ---------------------------------------------------------------------------------------------------- running
 
     def restart(self) -> None:
         """A new session from the initial state; what was recorded is forgotten."""
@@ -210,8 +204,6 @@ class Interaction:
         """What was done so far."""
         return ForceSession(self.made_with, self.fps, self.tick, tuple(self._entries), self.gravity, self.seed)
 
-    # ----------------------------------------------------------------------------------------------------- acting
-
     @property
     def acting(self) -> tuple[str, ...]:
         """Names of the forces that act."""
@@ -279,13 +271,13 @@ class Interaction:
     def _movable(self, on: Selected) -> Bool[Tensor, " K"]:
         mask = on.mask(self.scene, self.units).to(self._free.device) & self._free
         if not bool(mask.any()):
-            raise ConfigError(f"selection {on.to_json()}: expected kernels that can move, got only pinned ones.")
+            raise ConfigError(
+                f"selection {selection_to_json(on)}: expected kernels that can move, got only pinned ones."
+            )
         return mask
 
     def _push(self, on: Selected, direction: tuple[float, float, float], weights: float, frames: int | None) -> Push:
         return Push(self._movable(on), scaled(direction, weights * self.gravity), frames)
-
-    # ----------------------------------------------------------------------------------------------------- forces
 
     def _force(self) -> Float[Tensor, "K 3"] | None:
         """Sum of all that acts on every kernel [mass scene units / s^2]; None if nothing does."""
@@ -305,8 +297,6 @@ class Interaction:
         seconds = self.tick / self.fps
         waves = (math.sin(2 * math.pi * f * seconds + p) for f, p in zip(_GUSTS, self._phases, strict=True))
         return self._wind.weights * (1 + self._wind.gusts * sum(waves) / len(_GUSTS))
-
-    # ----------------------------------------------------------------------------------------------------- sanity
 
     def _check(self, frame: SteppedFrame) -> None:
         number = self.frame_number + 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import groupby
 from typing import Annotated, Any
 
 import msgspec
@@ -26,10 +27,6 @@ class Whole(Checked, frozen=True):
         """True for the kernels that are selected."""
         return scene.simulated.clone()
 
-    def to_json(self) -> dict[str, Any]:
-        """As a session's file says it."""
-        return {"whole": True}
-
 
 class Unit(Checked, frozen=True):
     """The kernels of one unit of the hierarchy.
@@ -43,11 +40,7 @@ class Unit(Checked, frozen=True):
     index: Natural
 
     def mask(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]]) -> Bool[Tensor, " K"]:
-        """True for the kernels of the unit.
-
-        Args:
-            scene: the rest scene.
-            units: the unit of every kernel at levels 1, 2, ...; -1 for kernels of none.
+        """True for the kernels of the unit; ``units`` are those of every kernel at levels 1, 2, ..., -1 for none.
 
         Raises:
             ConfigError: there is no such level or unit.
@@ -67,10 +60,6 @@ class Unit(Checked, frozen=True):
                 f"{int(unit.max())}."
             )
         return chosen
-
-    def to_json(self) -> dict[str, Any]:
-        """As a session's file says it."""
-        return {"level": self.level, "unit": self.index}
 
 
 class Kernels(Checked, frozen=True):
@@ -100,16 +89,6 @@ class Kernels(Checked, frozen=True):
         chosen[list(self.numbers)] = True
         return chosen
 
-    def to_json(self) -> dict[str, Any]:
-        """As a session's file says it: ranges, both ends included."""
-        ranges: list[list[int]] = []
-        for number in self.numbers:
-            if ranges and number == ranges[-1][1] + 1:
-                ranges[-1][1] = number
-            else:
-                ranges.append([number, number])
-        return {"kernels": ", ".join(str(a) if a == b else f"{a}-{b}" for a, b in ranges)}
-
 
 class Ball(Checked, frozen=True):
     """Simulated kernels whose rest position lies in a ball.
@@ -138,16 +117,25 @@ class Ball(Checked, frozen=True):
             )
         return chosen
 
-    def to_json(self) -> dict[str, Any]:
-        """As a session's file says it."""
-        return {"centre": list(self.centre), "radius": self.radius}
-
 
 Selected = Whole | Unit | Kernels | Ball
 
 
+def selection_to_json(on: Selected) -> dict[str, Any]:
+    """As a session's file says it; listed kernels as ranges, both ends included."""
+    match on:
+        case Whole():
+            return {"whole": True}
+        case Unit():
+            return {"level": on.level, "unit": on.index}
+        case Ball():
+            return {"centre": list(on.centre), "radius": on.radius}
+    runs = [[number for _, number in run] for _, run in groupby(enumerate(on.numbers), lambda x: x[1] - x[0])]
+    return {"kernels": ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)}
+
+
 def selection_from_json(value: Any) -> Selected:
-    """Reads what ``to_json`` wrote.
+    """Reads what :func:`selection_to_json` wrote.
 
     Raises:
         ConfigError: it is something else; names the field.

@@ -9,6 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +22,7 @@ from torch.nn import Module
 
 from gausim.core import ConfigError, DataError, GaussianScene, SimState
 from gausim.interaction.checked import Checked, Natural, Vector, made
-from gausim.interaction.selections import Selected, Whole, selection_from_json
+from gausim.interaction.selections import Selected, Whole, selection_from_json, selection_to_json
 from gausim.io.files import write_durably
 
 FORMAT = "gausim.session/1"
@@ -32,7 +34,10 @@ _Text = Annotated[str, Meta(max_length=200)]
 
 
 class _Done(Checked, frozen=True):
-    """Something that is done; a direction may have any length but zero."""
+    """Something that is done ``on`` a selection, in a ``direction`` of any length but zero.
+
+    The size of a force, ``weights``, counts weights of the free kernels that it acts on; pinned ones feel nothing.
+    """
 
     def __post_init__(self) -> None:
         Checked.__post_init__(self)
@@ -42,15 +47,7 @@ class _Done(Checked, frozen=True):
 
 
 class Force(_Done, frozen=True):
-    """A force that lasts until it is released, or some frames; one of the same name takes the place of the last.
-
-    Attributes:
-        on: what it acts on; pinned kernels of it feel nothing.
-        direction: of any length but zero.
-        weights: its size [weights of the free kernels that it acts on].
-        frames: how long it lasts; None: until it is released.
-        name: by which it is released.
-    """
+    """A force that lasts until it is released, or some frames; one of the same name takes the place of the last."""
 
     on: Selected
     direction: Vector
@@ -60,23 +57,13 @@ class Force(_Done, frozen=True):
 
 
 class Release(_Done, frozen=True):
-    """Ends the force of a name, or all forces.
-
-    Attributes:
-        name: of the force; None: all of them.
-    """
+    """Ends the force of a name, or all forces."""
 
     name: _Name | None = None
 
 
 class Impulse(_Done, frozen=True):
-    """A push within one frame.
-
-    Attributes:
-        on: what it acts on.
-        direction: of any length but zero.
-        weight_seconds: its size; 1 gives the speed that weight gives in a second.
-    """
+    """A push within one frame; one weight second gives the speed that weight gives in a second."""
 
     on: Selected
     direction: Vector
@@ -84,12 +71,7 @@ class Impulse(_Done, frozen=True):
 
 
 class Gravity(_Done, frozen=True):
-    """Gravity besides that in which the object was recorded, until the next one.
-
-    Attributes:
-        direction: of any length but zero.
-        weights: its size [weights of the object]; 0 for none.
-    """
+    """Gravity besides that in which the object was recorded, until the next one; 0 weights for none."""
 
     direction: Vector
     weights: _Amount
@@ -99,7 +81,6 @@ class Wind(_Done, frozen=True):
     """A wind, until the next one: a force on every kernel that goes with its cross-section.
 
     Attributes:
-        direction: in which it blows; of any length but zero.
         weights: its force on the whole object, in the mean over time [weights of the object]; 0 for none.
         gusts: how much it rises and falls, in 0..1.
     """
@@ -110,21 +91,13 @@ class Wind(_Done, frozen=True):
 
 
 class Pin(_Done, frozen=True):
-    """Holds kernels where they are.
-
-    Attributes:
-        on: what is held.
-    """
+    """Holds kernels where they are."""
 
     on: Selected
 
 
 class Unpin(_Done, frozen=True):
-    """Lets go of kernels that were pinned by hand; those that the scene pins stay so.
-
-    Attributes:
-        on: what is let go.
-    """
+    """Lets go of kernels that were pinned by hand; those that the scene pins stay so."""
 
     on: Selected = Whole()
 
@@ -178,15 +151,10 @@ class MadeWith(Checked, frozen=True):
         name: str = "rest",
         run: str = "",
     ) -> MadeWith:
-        """Hashes what the numbers of a simulation depend on.
+        """Hashes what the numbers of a simulation depend on: the rest scene, the method and the initial state.
 
-        Args:
-            scene: the rest scene.
-            model: the method: its state dict if it is a torch module, else its type.
-            initial: the initial state.
-            settings: of the method, whatever its state dict does not say.
-            name: of the initial state.
-            run: name of the run.
+        Of a method counts its state dict if it is a torch module, else its type; ``settings`` is whatever they do not
+        say. The initial state is called ``name``.
         """
         masks = (scene.simulated, scene.pinned)
         gaussians = (scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh)
@@ -236,14 +204,8 @@ class ForceSession(Checked, frozen=True):
 
 def save_session(session: ForceSession, path: Path | str) -> None:
     """Writes a session, one event a line; replaces the file atomically."""
-    header = {
-        "format": FORMAT,
-        "made_with": msgspec.structs.asdict(session.made_with),
-        "fps": session.fps,
-        "gravity": session.gravity,
-        "seed": session.seed,
-        "steps": session.steps,
-    }
+    header = {name: getattr(session, name) for name in ("fps", "gravity", "seed", "steps")}
+    header = {"format": FORMAT, "made_with": msgspec.structs.asdict(session.made_with)} | header
     lines = [f"  {json.dumps(name)}: {json.dumps(value, allow_nan=False)}" for name, value in header.items()]
     events = ",\n".join("    " + json.dumps(_to_json(entry), allow_nan=False) for entry in session.entries)
     lines.append('  "events": [' + (f"\n{events}\n  ]" if events else "]"))
@@ -260,18 +222,17 @@ def load_session(path: Path | str) -> ForceSession:
     path = Path(path)
     try:
         size = path.stat().st_size
-        if not path.is_file() or size > MOST_BYTES:
+        if size > MOST_BYTES:
             raise DataError(f"{path}: expected a session of at most {MOST_BYTES >> 20} MiB, got {size} bytes.")
-        text = path.read_text(encoding="utf-8")
+        return parse_session(path.read_bytes(), str(path))
     except FileNotFoundError:
         raise DataError(f"{path}: no such file. Save one in `gausim view`, or with `save_session`.") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: cannot be read as text ({error}).") from error
-    return parse_session(text, str(path))
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error}).") from error
 
 
-def parse_session(text: str, source: str = "session") -> ForceSession:
-    """Reads a session from its text; ``source`` names it in errors.
+def parse_session(text: str | bytes, source: str = "session") -> ForceSession:
+    """Reads a session from its text, in UTF-8; ``source`` names it in errors.
 
     Raises:
         DataError: as :func:`load_session`.
@@ -284,30 +245,31 @@ def parse_session(text: str, source: str = "session") -> ForceSession:
         return _session({name: item for name, item in value.items() if name != "format"})
     except RecursionError:
         raise DataError(f"{source}: is nested too deeply. Write the session again.") from None
-    except msgspec.DecodeError as error:
-        raise DataError(f"{source}: {error}. Correct it, or record the session again.") from error
-    except ConfigError as error:
-        raise DataError(f"{source}: {error} Correct it, or record the session again.") from error
+    except (msgspec.DecodeError, UnicodeDecodeError, ConfigError) as error:
+        what = str(error).removesuffix(".")
+        raise DataError(f"{source}: {what}. Correct it, or record the session again.") from error
 
 
 def _session(value: dict[str, Any]) -> ForceSession:
-    events, made_with = value.pop("events", None), value.pop("made_with", None)
+    events = value.pop("events", None)
     if not isinstance(events, list):
         raise ConfigError("field 'events': expected a list.")
-    if not isinstance(made_with, dict):
-        raise ConfigError("field 'made_with': expected an object of texts.")
-    try:
-        value["made_with"] = made(MadeWith, made_with)
-    except ConfigError as error:
-        raise ConfigError(f"field 'made_with': {error}") from error
+    with _inside("field 'made_with'"):
+        value["made_with"] = made(MadeWith, value.get("made_with"))
     entries = []
     for place, item in enumerate(events[: MOST_EVENTS + 1]):
-        try:
+        with _inside(f"event {place}"):
             entries.append(_entry(item))
-        except ConfigError as error:
-            raise ConfigError(f"event {place}: {error}") from error
     session: ForceSession = made(ForceSession, value | {"entries": tuple(entries)})
     return session
+
+
+@contextmanager
+def _inside(place: str) -> Iterator[None]:
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{place}: {error}") from error
 
 
 def _entry(item: Any) -> Entry:
@@ -324,7 +286,7 @@ def _entry(item: Any) -> Entry:
 def _to_json(entry: Entry) -> dict[str, Any]:
     values = msgspec.structs.asdict(entry.event)
     if "on" in values:
-        values["on"] = values["on"].to_json()
+        values["on"] = selection_to_json(values["on"])
     return {"at": entry.at, "do": type(entry.event).__name__.lower(), **values}
 
 
@@ -337,5 +299,5 @@ def digest(*parts: str | Tensor) -> str:
         else:
             value = part.detach().cpu().contiguous()
             result.update(f"tensor {value.dtype} {tuple(value.shape)};".encode())
-            result.update(value.view(-1).view(torch.uint8).numpy().tobytes() if value.numel() else b"")
+            result.update(value.view(-1).view(torch.uint8).numpy().tobytes())
     return result.hexdigest()[:32]

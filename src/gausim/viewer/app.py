@@ -19,7 +19,7 @@ from gausim.viewer.pipeline import Worker
 from gausim.viewer.server import GuardedServer
 from gausim.viewer.shown import Shown
 from gausim.viewer.sights import Sights
-from gausim.viewer.splats import SIZE, Placing, pack
+from gausim.viewer.splats import SIZE, Placing, add_splats, pack
 from gausim.viewer.subject import Subject
 
 # Colours follow the camera so often while time stands [times per second].
@@ -44,22 +44,20 @@ class Viewer:
         page: the panel.
         eye: position of the camera that moved last [page units].
         workers: the stages after the simulation.
+
+    Raises:
+        ConfigError: the door's settings are unsafe or wrong, or the address cannot be bound.
     """
 
     def __init__(self, subject: Subject, door: Door) -> None:
-        """Starts to listen; :meth:`start` begins to simulate.
-
-        Raises:
-            ConfigError: the door's settings are unsafe or wrong, or the address cannot be bound.
-        """
+        """Starts to listen; :meth:`start` begins to simulate."""
         scene = subject.interaction.scene
         self.server = GuardedServer(door, label="gausim")
         self.placing = Placing.of(scene)
         self._painter = Painter(scene, subject.interaction.units, subject.interaction.masses)
-        paint, send = self.workers = (Worker("paint", self._paint), Worker("send", self._send))
-        self._painted = send.put
+        self.workers = (Worker("paint", self._paint), Worker("send", self._send))
         self.live = Live(
-            subject.interaction, paint.put, takes=subject.takes, companion=subject.companion,
+            subject.interaction, self.workers[0].put, takes=subject.takes, companion=subject.companion,
             watched=lambda: bool(self.server.get_clients()),
         )  # fmt: skip
         self.server.scene.set_up_direction(f"{'' if subject.up.startswith('-') else '+'}{subject.up}")  # type: ignore[arg-type]
@@ -76,32 +74,20 @@ class Viewer:
         self._place_beside(subject)
         first = self._paint_now(self.live.shown())
         self.server.frame_bytes = first.buffer.nbytes
-        self._splats = self._add("/splats", first.buffer)
-        self._beside = self._add("/beside", first.beside) if first.beside is not None else None
+        self._splats = add_splats(self.server.scene, "/splats", first.buffer)
+        self._beside = add_splats(self.server.scene, "/beside", first.beside) if first.beside is not None else None
         self.server.on_client_connect(self._connected)
 
     def _place_beside(self, subject: Subject) -> None:
         if subject.companion is None:
             return
         other, offset = subject.companion.interaction, self.sights.aside
-        at = (float(offset[0]), float(offset[1]), float(offset[2]))
-        self._other_placing = Placing(self.placing.centre, self.placing.scale, at)
+        x, y, z = map(float, offset)
+        self._other_placing = Placing(self.placing.centre, self.placing.scale, (x, y, z))
         self._other_painter = Painter(other.scene, other.units, other.masses)
         top = float((self._other_placing.to_page(other.scene.means.float()).numpy() @ self.sights.up).max())
         above = offset + (top + 0.06 * SIZE) * self.sights.up
         self.server.scene.add_label("/name_beside", subject.companion.name, position=above, anchor="bottom-center")
-
-    def _add(self, name: str, buffer: np.ndarray) -> Any:
-        """Splats of a packed buffer."""
-        count = len(buffer)
-        node = self.server.scene.add_gaussian_splats(
-            name, centers=np.zeros((count, 3)), covariances=np.tile(np.eye(3) * 1e-4, (count, 1, 1)),
-            rgbs=np.zeros((count, 3)), opacities=np.zeros((count, 1)),
-        )  # fmt: skip
-        node.buffer = buffer
-        return node
-
-    # ------------------------------------------------------------------------------------- running
 
     @property
     def url(self) -> str:
@@ -142,8 +128,6 @@ class Viewer:
         client.camera.on_update(moved)
         self.repaint()
 
-    # ------------------------------------------------------------------------------------- stages
-
     @torch.no_grad()
     def _paint_now(self, shown: Shown) -> _Painted:
         legend, buffer = self._packed(self._painter, self.placing, shown, highlight=self.page.highlight)
@@ -164,7 +148,7 @@ class Viewer:
         return legend, pack(shown.frame.positions.cpu(), covars, rgb, painter.opacities, placing)
 
     def _paint(self, shown: Shown) -> None:
-        self._painted(self._paint_now(shown))
+        self.workers[1].put(self._paint_now(shown))
 
     def _send(self, painted: _Painted) -> None:
         with self.server.atomic():

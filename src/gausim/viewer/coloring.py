@@ -24,14 +24,7 @@ _SELECTED, _HELD = (1.0, 0.55, 0.1), (0.25, 0.5, 1.0)
 
 @dataclass(frozen=True)
 class Legend:
-    """What the colours say.
-
-    Attributes:
-        text: one line.
-        low: value of the first colour of the scale; None where there is no scale.
-        high: value of the last one.
-        unit: of these values.
-    """
+    """What the colours say: one line, and the values at both ends of the scale where there is one."""
 
     text: str
     low: float | None = None
@@ -43,22 +36,17 @@ class Painter:
     """Colours and covariances of the frames of one scene."""
 
     def __init__(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]], masses: Float[Tensor, " K"]) -> None:
-        """Takes the scene, the unit of every kernel at levels 1, 2, ... and the masses."""
         self._look = SceneAppearance.of(scene.to("cpu"))
-        self._units = [u.cpu() for u in units]
         self._masses, self._diagonal = masses.float().cpu(), scene.diagonal
         self._moving = (scene.simulated & ~scene.pinned).cpu()
+        self._levels = {f"Hierarchy, level {i} ({int(u.max()) + 1} units)": u for i, u in enumerate(units, 1)}
         self._highest: dict[str, float] = {}
         self.opacities = self._look.opacities
 
     @property
     def modes(self) -> tuple[str, ...]:
         """What can be shown."""
-        levels = [self._level_name(i) for i in range(len(self._units))]
-        return (VIEW, BASE, *levels, STRAIN, SPEED, MASS)
-
-    def _level_name(self, index: int) -> str:
-        return f"Hierarchy, level {index + 1} ({int(self._units[index].max()) + 1} units)"
+        return (VIEW, BASE, *self._levels, STRAIN, SPEED, MASS)
 
     def forget(self) -> None:
         """Scales begin anew."""
@@ -75,25 +63,22 @@ class Painter:
         """Covariances [scene units^2], colours in [0, 1] and what they say.
 
         Args:
-            frame: positions, gradients and rotations.
-            unit_of_kernel: rows of the gradients.
+            frame: what is painted.
+            unit_of_kernel: rows of its deformation gradients.
             speed: of the kernels [scene units / s].
             mode: one of :attr:`modes`.
             eye: where the camera is [scene units].
         """
-        positions, deformation_gradients, rotations, unit = (
-            frame.positions.cpu(), frame.deformation_gradients.cpu(), frame.rotations.cpu(), unit_of_kernel.cpu()
-        )  # fmt: skip
-        look = self._look.to(positions)
+        positions, unit = frame.positions.cpu(), unit_of_kernel.cpu()
+        deformation_gradients, look = frame.deformation_gradients.cpu(), self._look.to(positions)
         if mode == VIEW:
             covars, rgb = deformed_appearance(
-                positions[None], deformation_gradients[None], rotations[None], unit, look.covars, look.sh,
+                positions[None], deformation_gradients[None], frame.rotations.cpu()[None], unit, look.covars, look.sh,
                 eye[None].to(positions),
             )  # fmt: skip
             return covars[0], rgb[0, 0], Legend("spherical harmonics for the camera that moved last")
-        covars = transport_covariance(look.covars, deformation_gradients[unit])
-        rgb, legend = self._value(deformation_gradients[unit], speed.cpu(), mode)
-        return covars, rgb, legend
+        of_kernels = deformation_gradients[unit]
+        return transport_covariance(look.covars, of_kernels), *self._value(of_kernels, speed.cpu(), mode)
 
     def _value(self, deformation_gradients: Tensor, speed: Tensor, mode: str) -> tuple[Tensor, Legend]:
         if mode == STRAIN:
@@ -105,9 +90,8 @@ class Painter:
             weight = self._masses.clamp_min(1e-12).log10()
             low, high = float(weight[self._moving].min()), float(weight[self._moving].max())
             return _ramp((weight - low) / max(high - low, 1e-6)), Legend("mass, logarithm to base 10", low, high)
-        for index, units in enumerate(self._units):
-            if mode == self._level_name(index):
-                return hues(units), Legend(f"one colour per unit of level {index + 1}; grey: never simulated")
+        if mode in self._levels:
+            return hues(self._levels[mode].cpu()), Legend("one colour per unit of this level; grey: never simulated")
         return (0.5 + C0 * self._look.sh[:, 0]).clamp(0, 1), Legend("base colours, the same from every side")
 
     def _scaled(self, mode: str, value: Tensor, text: str, unit: str) -> tuple[Tensor, Legend]:

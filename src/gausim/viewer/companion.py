@@ -41,11 +41,3 @@ class Companion:
                 self.interaction.step()
         except (DivergenceError, ConfigError) as error:
             self.message = str(error)
-
-    def begin(self, *, anew: bool) -> None:
-        """Back to its initial state, within the session or in a new one."""
-        if anew:
-            self.interaction.restart()
-        else:
-            self.interaction.reset()
-        self.message = ""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -30,22 +30,17 @@ class Films:
         """Takes the sequences by name, the rest scene and what draws it."""
         self._records, self._renderer = dict(records), renderer
         self._look = SceneAppearance.of(scene, scene.foreground)
-        self._known: OrderedDict[tuple[str, str, int], np.ndarray] = OrderedDict()
-        first = next(iter(self._records.values()))
-        self.views: tuple[str, ...] = tuple(first.views)
+        self._decoded = lru_cache(_KEPT)(self._decode)
+        self.views: tuple[str, ...] = tuple(next(iter(self._records.values())).views)
 
     def truth(self, sequence: str, view: str, number: int) -> UInt8[np.ndarray, "H W 3"] | None:
         """The recorded frame over black; None after the recording's end."""
-        record = self._records[sequence]
-        if number >= record.count:
-            return None
-        key = (sequence, view, number)
-        if key not in self._known:
-            rgb, _ = composite(record.frames(range(number, number + 1), [view])[:, 0])
-            self._known[key] = to_bytes(rgb[0]).numpy()
-            if len(self._known) > _KEPT:
-                self._known.popitem(last=False)
-        return self._known[key]
+        return self._decoded(sequence, view, number) if number < self._records[sequence].count else None
+
+    def _decode(self, sequence: str, view: str, number: int) -> np.ndarray:
+        rgb, _ = composite(self._records[sequence].frames(range(number, number + 1), [view])[:, 0])
+        decoded: np.ndarray = to_bytes(rgb[0]).numpy()
+        return decoded
 
     @torch.no_grad()
     def drawn(self, sequence: str, view: str, shown: Shown) -> UInt8[np.ndarray, "H W 3"]:

@@ -13,12 +13,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from trimesh import Trimesh
+from trimesh.creation import icosahedron
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 from viser.transforms import SO3
 
-from gausim.core import ConfigError
 from gausim.interaction.selections import Kernels, Selected, Unit, Whole
 from gausim.interaction.session import Force, Impulse, Release
 from gausim.viewer.live import Live
@@ -38,6 +37,7 @@ class Hands:
     Attributes:
         selection: what is chosen, or None.
         mask: its kernels; none of them while nothing is chosen.
+        level: what a click picks, one of :attr:`level_names`; at first the largest parts, if there are any.
         gain: force of a drag as long as the object's diagonal [weights].
         notice: called when the selection changes.
     """
@@ -59,7 +59,7 @@ class Hands:
         self.gain = 8.0
         self.notice: Callable[[], None] = lambda: None
         self._label = server.scene.add_label("/weight", "", visible=False)
-        self.choose_level(self.first_level)
+        self.choose_level(self.level_names[-2 if units else -1])
         # What a ray may pass a kernel's centre by: the kernel's own size, and a little for the hand [page units].
         self._reach = scene.log_scales.float().cpu().exp().amax(-1) * placing.scale + 0.004 * SIZE
         server.scene.on_rect_select(modifier="shift")(self._brushed)
@@ -70,20 +70,9 @@ class Hands:
         """What a click can pick."""
         return (*(f"Level {i + 1}: {int(u.max()) + 1} units" for i, u in enumerate(self._units)), WHOLE)
 
-    @property
-    def first_level(self) -> str:
-        """What a click picks at first: the largest parts, if there are any."""
-        return self.level_names[max(0, len(self._units) - 1)]
-
     def choose_level(self, name: str) -> None:
-        """Handles for the units of another level.
-
-        Raises:
-            ConfigError: there is no such level.
-        """
-        if name not in self.level_names:
-            raise ConfigError(f"{name!r}: expected one of {', '.join(self.level_names)}.")
-        level = self.level_names.index(name)
+        """Handles for the units of another level, one of :attr:`level_names`."""
+        self.level, level = name, self.level_names.index(name)
         rest = self._live.interaction.scene.means
         with self._lock:
             self._level = level if level < len(self._units) else None
@@ -111,7 +100,7 @@ class Hands:
     def _make_handles(self, centres: np.ndarray, radii: np.ndarray) -> None:
         # What is picked must stand before the old handles are gone: the index an event carries is one of these.
         self._pick = self._server.scene.add_batched_glb(
-            "/handles", invisible_octahedron(), np.tile(np.array([1, 0, 0, 0], np.float32), (len(centres), 1)), centres,
+            "/handles", invisible_handle(), np.tile(np.array([1, 0, 0, 0], np.float32), (len(centres), 1)), centres,
             batched_scales=radii, lod="off", cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
         self._dots = self._server.scene.add_point_cloud(
@@ -140,14 +129,8 @@ class Hands:
             if self._shown_handles:
                 self._dots.points = centres
 
-    # ------------------------------------------------------------------------------------- selecting
-
     def select(self, on: Selected | None) -> None:
-        """Chooses a part, or nothing.
-
-        Raises:
-            ConfigError: the selection is of no kernel.
-        """
+        """Chooses a part, or nothing."""
         scene = self._live.interaction.scene
         self.mask = torch.zeros_like(self._free) if on is None else on.mask(scene, self._units).cpu() & self._free
         self.selection = on
@@ -183,8 +166,6 @@ class Hands:
         inside = in_rectangle(self._page, event.client.camera, event.screen_min, event.screen_max) & self._free
         numbers = inside.nonzero()[:, 0].tolist()
         self.select(Kernels(tuple(numbers)) if numbers else None)
-
-    # ------------------------------------------------------------------------------------- dragging
 
     def _grasp(self, event: Any) -> None:
         """A drag that begins on what is not selected selects it."""
@@ -232,16 +213,15 @@ class Hands:
 
 
 @cache
-def invisible_octahedron() -> bytes:
-    """A binary glTF of a transparent unit octahedron, which catches the pointer.
+def invisible_handle() -> bytes:
+    """A binary glTF of a transparent icosahedron of radius 1, which catches the pointer.
 
     A mesh of opacity 0 still hides the splats behind it, which are drawn last and tested against the depth; glTF
     materials that blend are loaded as ones that leave the depth alone.
     """
-    corners = [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]]
-    faces = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]]
+    mesh = icosahedron()
     clear = PBRMaterial(alphaMode="BLEND", baseColorFactor=[255, 255, 255, 0], doubleSided=True)
-    mesh = Trimesh(corners, faces, visual=TextureVisuals(material=clear))
+    mesh.visual = TextureVisuals(material=clear)
     return bytes(mesh.export(file_type="glb"))  # type: ignore[arg-type]
 
 
@@ -252,21 +232,11 @@ def first_hit(
     direction: Sequence[float],
     among: Bool[Tensor, " K"],
 ) -> int | None:
-    """The first of some kernels that a ray passes, or None.
-
-    Args:
-        points: centres of all kernels.
-        reach: how far from a centre still counts.
-        origin: where the ray begins.
-        direction: where it leads; of any length but zero.
-        among: only these kernels.
-    """
-    along = points.new_tensor([float(v) for v in direction])
-    if not float(along.norm()) > 0:
-        return None
+    """The first ``among`` some kernels whose centre a ray passes within its ``reach``, or None."""
+    along = torch.nn.functional.normalize(points.new_tensor([float(v) for v in direction]), dim=0)
     away = points - points.new_tensor([float(v) for v in origin])
-    depth = away @ (along / along.norm())
-    passed = (away - depth[:, None] * along / along.norm()).norm(dim=-1)
+    depth = away @ along
+    passed = (away - depth[:, None] * along).norm(dim=-1)
     hit = (among & (depth > 0) & (passed <= reach)).nonzero()[:, 0]
     return int(hit[depth[hit].argmin()]) if len(hit) else None
 
@@ -279,8 +249,8 @@ def in_rectangle(
     Args:
         points: on the page.
         camera: a viser camera: world pose (wxyz, position), vertical field of view [rad], aspect (width / height).
-        low: left upper corner, in 0..1 of the picture.
-        high: right lower corner.
+        low: left upper corner of the rectangle, in 0..1 of the picture.
+        high: its right lower corner.
     """
     rotation = torch.from_numpy(SO3(np.asarray(camera.wxyz, float)).as_matrix()).to(points)
     seen = (points - points.new_tensor([float(v) for v in camera.position])) @ rotation

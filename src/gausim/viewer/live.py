@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import queue
 import threading
 import time
@@ -47,15 +46,7 @@ class Live(threading.Thread):
         companion: Companion | None = None,
         watched: Callable[[], bool] = lambda: True,
     ) -> None:
-        """Begins to simulate with :meth:`start`.
-
-        Args:
-            interaction: what is simulated.
-            publish: takes every frame, at once.
-            takes: what can be played besides.
-            companion: what is simulated beside it.
-            watched: whether anybody looks on; time stands while nobody does.
-        """
+        """Begins to simulate with :meth:`start`; ``publish`` takes every frame; time stands unless ``watched()``."""
         super().__init__(name="gausim-simulate", daemon=True)
         self.interaction, self.takes, self.companion = interaction, tuple(takes), companion
         self._publish, self._watched = publish, watched
@@ -63,15 +54,12 @@ class Live(threading.Thread):
         self._overrun = self._stopping = False
         self.message, self.playing, self.pace, self.source = "", True, 1.0, LIVE
         self.rate = Rate()
-        frame = interaction.frame
-        size = 4 * (2 * frame.positions.numel() + 2 * frame.deformation_gradients.numel())
+        size = 4 * 2 * (interaction.frame.positions.numel() + interaction.frame.deformation_gradients.numel())
         self._history: deque[Shown] = deque(maxlen=max(32, min(3000, _HISTORY_BYTES // size)))
         self._place: int | None = None  # on the timeline; None: its end, where the live simulation goes on
         self._script: ForceSession | None = None  # a session that is played back
         self._loaded: dict[str, tuple[Trajectory, Trajectory | None]] = {}
         self._remember()
-
-    # ------------------------------------------------------------------------------------- from any thread
 
     def do(self, command: Callable[[], None]) -> None:
         """Has the simulating thread run something; when far too much waits, all forces are let go instead."""
@@ -83,8 +71,6 @@ class Live(threading.Thread):
     def stop(self) -> None:
         """Ends the thread."""
         self._stopping = True
-
-    # ------------------------------------------------------------------------------------- in this thread
 
     def run(self) -> None:
         """Simulates until :meth:`stop`."""
@@ -169,7 +155,11 @@ class Live(threading.Thread):
         self._act(event)
 
     def play(self) -> None:
-        """Time goes on."""
+        """Time goes on.
+
+        Raises:
+            DivergenceError: the simulation broke; only a reset helps.
+        """
         if self.source == LIVE:
             if self.interaction.broken is not None:
                 raise DivergenceError(self.interaction.broken)
@@ -189,20 +179,18 @@ class Live(threading.Thread):
         """Back to the beginning of what is shown; ends a session that is played back."""
         self.message, self._script, self._place = "", None, None
         if self.source == LIVE:
-            self._begin(anew=False)
+            self._begin(Interaction.reset)
 
     def begin(self) -> None:
         """A new session: what was recorded is forgotten."""
         self.message, self._script, self.source = "", None, LIVE
-        self._begin(anew=True)
+        self._begin(Interaction.restart)
 
-    def _begin(self, *, anew: bool) -> None:
-        if anew:
-            self.interaction.restart()
-        else:
-            self.interaction.reset()
+    def _begin(self, how: Callable[[Interaction], None]) -> None:
+        how(self.interaction)
         if self.companion is not None:
-            self.companion.begin(anew=anew)
+            how(self.companion.interaction)
+            self.companion.message = ""
         self._history.clear()
         self._place = None
         self._remember()
@@ -225,9 +213,7 @@ class Live(threading.Thread):
     def choose(self, source: str) -> None:
         """Shows the live simulation or a take, which is made when it is first asked for."""
         if source != LIVE and source not in self._loaded:
-            take = next((t for t in self.takes if t.name == source), None)
-            if take is None:
-                raise ConfigError(f"{source!r}: expected {LIVE!r} or one of {[t.name for t in self.takes]}.")
+            take = next(t for t in self.takes if t.name == source)
             self._loaded[source] = take.load(), take.beside() if take.beside is not None else None
         self.source, self._place, self._script, self.message = source, None, None, ""
 
@@ -235,14 +221,6 @@ class Live(threading.Thread):
         """Shows a frame of the timeline; time stands."""
         frames = len(self._history) if self.source == LIVE else self._loaded[self.source][0].frames
         self.playing, self._place = False, max(0, min(number, frames - 1))
-
-    def set_pace(self, pace: float) -> None:
-        """Sets the speed of time; 1 is real time."""
-        if not (math.isfinite(pace) and 0.01 <= pace <= 8):
-            raise ConfigError(f"speed: expected 0.01 to 8, got {pace}.")
-        self.pace = pace
-
-    # ------------------------------------------------------------------------------------- frames
 
     def _remember(self) -> None:
         beside = Shown.of(self.companion.interaction) if self.companion is not None else None

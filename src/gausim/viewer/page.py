@@ -9,7 +9,6 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from gausim.core import GausSimError
 from gausim.interaction.selections import Selected
 from gausim.interaction.session import Event, Gravity, Impulse, Pin, Release, Unpin, Wind, parse_session, save_session
 from gausim.interaction.words import parse_direction
@@ -21,8 +20,6 @@ from gausim.viewer.shown import LIVE, Shown
 AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 # Said while forces act in part only.
 _AT_LIMIT = "At the limit of what was learned: the forces act only in part. Pull less for what would really happen."
-# Files that one run of the viewer writes at most.
-_MOST_FILES = 200
 # The panel is brought up to date so often [times per second].
 _REFRESHES = 4.0
 
@@ -49,23 +46,11 @@ class Page:
         repaint: Callable[[], None],
         forget_scales: Callable[[], None],
     ) -> None:
-        """Builds the panel.
-
-        Args:
-            server: the viser server.
-            live: what is controlled.
-            hands: selections and drags.
-            modes: what kernels can be coloured by.
-            title: what is shown, one line.
-            down: axis along which gravity pulls at first.
-            sessions: folder that saved sessions go to.
-            repaint: called when colours change.
-            forget_scales: called when colour scales begin anew.
-        """
+        """Builds the panel; gravity pulls along ``down`` at first, and sessions are saved in a folder."""
         self._live, self._hands, self._sessions = live, hands, sessions
         self._repaint, self._forget_scales, self._down, self._title = repaint, forget_scales, down, title
         self.mode, self.highlight, self.saved = VIEW, True, list[Path]()
-        self._refreshed, self._modes, self._note = 0.0, modes, ""
+        self._refreshed, self._modes = 0.0, modes
         gui = server.gui
         self._status = gui.add_html("")
         tabs = gui.add_tab_group()
@@ -74,8 +59,6 @@ class Page:
             with tabs.add_tab(name):
                 build(gui)
         hands.notice = self._selected
-
-    # ------------------------------------------------------------------------------------- building
 
     def _play_tab(self, gui: Any) -> None:
         live = self._live
@@ -86,15 +69,15 @@ class Page:
         works = {"Play": live.play, "Pause": live.pause, "Step": live.step_once, "Reset": self._reset}
         self._on_press_of(gui.add_button_group("Time", tuple(works)), works)
         pace = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0, hint="1 is real time")
-        self._on_change(pace, (0.1, 4.0), lambda value: live.do(lambda: live.set_pace(value)))
+        self._on_change(pace, (0.1, 4.0), lambda value: setattr(live, "pace", value))
         self._timeline = gui.add_slider("Frame", 0, 1, 1, 0, hint="The timeline; moving it stops time.")
         self._on_change(self._timeline, (0, 1 << 20), lambda value: live.do(lambda: live.scrub(int(value))))
 
     def _push_tab(self, gui: Any) -> None:
         hands = self._hands
         gui.add_html(_small("Drag a part to pull at it; with Ctrl to flick it. Shift and drag brushes a region."))
-        level = gui.add_dropdown("Picks", hands.level_names, initial_value=hands.first_level)
-        self._on_change(level, hands.level_names, self._choose_level)
+        level = gui.add_dropdown("Picks", hands.level_names, initial_value=hands.level)
+        self._on_change(level, hands.level_names, hands.choose_level)
         self._chosen = gui.add_html("")
         self._selected()
         gain = gui.add_slider("Pull", 0.5, 20.0, 0.5, hands.gain, hint="Weights of the part per diagonal of drag")
@@ -137,8 +120,6 @@ class Page:
         self._on_press(gui.add_button("Begin a new session"), self._begin)
         self._saved_text = gui.add_html("")
 
-    # ------------------------------------------------------------------------------------- callbacks
-
     def _on_press(self, button: Any, work: Callable[[], None]) -> None:
         async def pressed(_: Any) -> None:
             self._live.do(work)
@@ -173,8 +154,6 @@ class Page:
 
         handle.on_update(changed)
 
-    # ------------------------------------------------------------------------------------- what they do
-
     def _reset(self) -> None:
         self._live.reset()
         self._calm()
@@ -196,13 +175,6 @@ class Page:
         self._forget_scales()
         for strength in self._strengths:
             strength.value = 0.0
-
-    def _choose_level(self, name: str) -> None:
-        try:
-            self._hands.choose_level(name)
-            self._note = ""
-        except GausSimError as error:
-            self._note = str(error)
 
     def _on_selection(self, kind: Callable[[Selected], Event]) -> None:
         if self._hands.selection is None:
@@ -231,9 +203,6 @@ class Page:
         self._live.do(lambda: self._save_for(event.client))
 
     def _save_for(self, client: Any) -> None:
-        if len(self.saved) >= _MOST_FILES:
-            self._live.message = f"{_MOST_FILES} sessions were saved already; start the viewer again to save more."
-            return
         session = self._live.interaction.session()
         name = f"session_{datetime.now():%Y%m%d_%H%M%S}_{len(self.saved):03d}.json"
         path = self._sessions / name
@@ -251,16 +220,9 @@ class Page:
         self._live.do(lambda: self._play_file(event.target.value.content))
 
     def _play_file(self, content: bytes) -> None:
-        try:
-            text = content.decode("utf-8")
-        except UnicodeDecodeError:
-            self._live.message = "The file is no text in UTF-8; expected a session that gausim saved."
-            return
-        self._live.replay(parse_session(text, "the file"))
+        self._live.replay(parse_session(content, "the file"))
         self._source.value = LIVE
         self._calm()
-
-    # ------------------------------------------------------------------------------------- bringing up to date
 
     def refresh(self, shown: Shown, legend: Legend, displayed: float, *, now: bool = False) -> None:
         """Shows rates, the frame number, messages and the legend; a few times a second is enough."""
@@ -281,18 +243,17 @@ class Page:
         state = "playing" if live.playing else "paused"
         beside = live.companion.message if live.companion is not None else ""
         limit = _AT_LIMIT if shown.source == LIVE and live.interaction.resisting else ""
-        problems = [text for text in (live.message, self._note, beside, limit) if text]
+        problems = [text for text in (live.message, beside, limit) if text]
         acting = ", ".join(live.interaction.acting) if shown.source == LIVE else ""
+        warnings = "".join(
+            f"<div style='margin-top:.3em;padding:.3em;background:#fff3cd;color:#664d03;border-radius:3px'>"
+            f"{html.escape(problem[:600])}</div>" for problem in problems
+        )  # fmt: skip
         text = (
             f"<div style='padding:.3em .6em;font-size:.85em'>{state} | frame {shown.number} of {shown.last}<br>"
-            f"simulated {simulated:.1f} / s | displayed {displayed:.1f} / s"
-            + f"<br>acting: {html.escape(acting[:60] or 'nothing')}"
-            + "".join(
-                f"<div style='margin-top:.3em;padding:.3em;background:#fff3cd;color:#664d03;border-radius:3px'>"
-                f"{html.escape(problem[:600])}</div>" for problem in problems
-            )
-            + "</div>"
-        )  # fmt: skip
+            f"simulated {simulated:.1f} / s | displayed {displayed:.1f} / s<br>"
+            f"acting: {html.escape(acting[:60] or 'nothing')}{warnings}</div>"
+        )
         if text != self._status.content:
             self._status.content = text
 

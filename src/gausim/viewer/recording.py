@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from gausim.io.files import write_durably
 from gausim.viewer.coloring import BASE, VIEW, Painter
 from gausim.viewer.guard import Door
 from gausim.viewer.server import GuardedServer
-from gausim.viewer.splats import SIZE, Placing, pack
+from gausim.viewer.splats import SIZE, Placing, add_splats, pack
 
 # Buffers of all frames are held at once, and a page holds them in base64 [bytes].
 _LARGEST = 1 << 30
@@ -63,14 +63,12 @@ def record(
     numbers = _frames(scene, trajectory, every)
     server = GuardedServer(Door(port=0), label=scene.name)
     try:
-        data = _recorded(server, scene, trajectory, numbers, every / trajectory.fps, up, colors, kind, dark)
+        serializer = _recorded(server, scene, trajectory, numbers, up, VIEW if colors == "view" else BASE)
+        page = _sealed(serializer.as_html(dark_mode=dark), scene.name).encode() if kind == "html" else None
+        write_durably(Path(path), page or serializer.serialize())
     finally:
         server.stop()
-    if isinstance(data, str):
-        data = _sealed(data, scene.name).encode()
-    path = Path(path)
-    write_durably(path, data)
-    return path
+    return Path(path)
 
 
 def _frames(scene: GaussianScene, trajectory: Trajectory, every: int) -> range:
@@ -97,54 +95,41 @@ def _frames(scene: GaussianScene, trajectory: Trajectory, every: int) -> range:
 
 @torch.no_grad()
 def _recorded(
-    server: GuardedServer,
-    scene: GaussianScene,
-    trajectory: Trajectory,
-    numbers: range,
-    seconds: float,
-    up: str,
-    colors: str,
-    kind: str,
-    dark: bool,
-) -> bytes | str:
-    """The serialized recording: the first frame is the scene, every later one a new buffer after a pause."""
+    server: GuardedServer, scene: GaussianScene, trajectory: Trajectory, numbers: range, up: str, mode: str
+) -> Any:
+    """The recording, to be serialised: the first frame is the scene, every later one a new buffer after a pause."""
     placing, sign = Placing.of(scene), -1.0 if up.startswith("-") else 1.0
     axis = up.removeprefix("-")
-    eye = np.array(_EYE[axis]) * 1.2 * SIZE * np.where(np.array(list("xyz")) == axis, sign, 1.0)
+    vertical = np.array([name == axis for name in "xyz"])
+    eye = np.array(_EYE[axis]) * 1.2 * SIZE * np.where(vertical, sign, 1.0)
     painter = Painter(scene, (), torch.ones(scene.count))
     server.scene.set_up_direction(f"{'-' if sign < 0 else '+'}{axis}")  # type: ignore[arg-type]
     server.scene.world_axes.visible = False
     camera = server.initial_camera
-    camera.position, camera.look_at, camera.up = eye, np.zeros(3), sign * (np.array(list("xyz")) == axis)
-    still = torch.zeros(scene.count)
+    camera.position, camera.look_at, camera.up = eye, np.zeros(3), sign * vertical
+    still, seen_from = torch.zeros(scene.count), placing.to_scene(torch.tensor(eye, dtype=torch.float32))
 
     def buffer(number: int) -> np.ndarray:
         frame = SteppedFrame(
             trajectory.positions[number].float(), trajectory.deformation_gradients[number].float(),
             trajectory.rotations[number].float(),
         )  # fmt: skip
-        mode, seen_from = VIEW if colors == "view" else BASE, placing.to_scene(torch.tensor(eye, dtype=torch.float32))
         covars, rgb, _ = painter(frame, trajectory.unit_of_kernel, still, mode, seen_from)
         return pack(frame.positions, covars, rgb, painter.opacities, placing)
 
-    first = np.zeros((scene.count, 3))
-    node = server.scene.add_gaussian_splats(
-        "/splats", centers=first, covariances=np.tile(np.eye(3), (scene.count, 1, 1)), rgbs=first,
-        opacities=first[:, :1],
-    )  # fmt: skip
-    node.buffer = buffer(numbers[0])
-    serializer = server.get_scene_serializer()
+    node = add_splats(server.scene, "/splats", buffer(numbers[0]))
+    serializer, seconds = server.get_scene_serializer(), numbers.step / trajectory.fps
     for number in numbers[1:]:
         serializer.insert_sleep(seconds)
         node.buffer = buffer(number)
     serializer.insert_sleep(seconds)
-    return serializer.as_html(dark_mode=dark) if kind == "html" else serializer.serialize()
+    return serializer
 
 
 def _sealed(page: str, name: str) -> str:
     """The page with its title, and a policy by which the browser refuses it any request."""
     policy = f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}" />'
-    head = page.index("<head>") + len("<head>")
-    start = page.index("<title>", head) + len("<title>")
-    end = page.index("</title>", start)
-    return page[:head] + policy + page[head:start] + html.escape(f"{name} - gausim") + page[end:]
+    head, _, rest = page.partition("<head>")
+    before, _, titled = rest.partition("<title>")
+    title = html.escape(f"{name} - gausim")
+    return f"{head}<head>{policy}{before}<title>{title}</title>{titled.partition('</title>')[2]}"

@@ -74,13 +74,8 @@ class GuardedServer(viser.ViserServer):
         """
         if viser.__version__ != "1.1.1":
             raise ConfigError(f"viser {viser.__version__}: expected 1.1.1 (`pip install viser==1.1.1`).")
-        self.door, self.junk, self.failed, self.sent, self.frame_bytes = (
-            door.checked(),
-            0,
-            0,
-            dict[int, Rate](),
-            1 << 62,
-        )
+        self.door, self.sent = door.checked(), dict[int, Rate]()
+        self.junk, self.failed, self.frame_bytes = 0, 0, 1 << 62
         try:
             family = socket.AF_INET6 if ":" in door.host else socket.AF_INET
             listener = socket.create_server((door.host, door.port), family=family)

@@ -21,8 +21,7 @@ class Shown:
     """A frame and what belongs to it.
 
     Attributes:
-        frame: positions, gradients and rotations.
-        unit_of_kernel: rows of the gradients.
+        unit_of_kernel: rows of the frame's deformation gradients.
         speed: of the kernels [scene units / s].
         held: kernels pinned by hand; None for none.
         number: its place on the timeline.

@@ -27,7 +27,7 @@ _APART = 1.25
 
 
 class Sights:
-    """The cameras of one viewer.
+    """The cameras of one viewer, their frustums and the panel of videos, as far as the subject has them.
 
     Attributes:
         up: vertical direction.
@@ -37,7 +37,6 @@ class Sights:
     """
 
     def __init__(self, server: Any, placing: Placing, subject: Subject) -> None:
-        """Adds frustums, the list of cameras and the panel of videos, as far as the subject has them."""
         self._server, self._placing, self._films = server, placing, subject.films
         self._cameras = subject.cameras
         self._takes = {take.name: take.sequence for take in subject.takes}
@@ -65,8 +64,7 @@ class Sights:
         right /= max(float(np.linalg.norm(right)), 1e-9)
         scene = subject.interaction.scene
         across = self._placing.to_page(scene.means[scene.foreground].float().cpu()).double().numpy() @ right
-        offset: np.ndarray = right * max(_APART * float(np.ptp(across)), 0.3 * SIZE)
-        return offset
+        return np.asarray(right * max(_APART * float(np.ptp(across)), 0.3 * SIZE))
 
     def _first(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Position, target and vertical field of view of the first look."""
@@ -117,8 +115,6 @@ class Sights:
             client.camera.position = position
             client.camera.look_at = position + forward * max(float(-position @ forward), 0.1)
             client.camera.fov = fov
-
-    # ------------------------------------------------------------------------------------- videos
 
     def _add_films(self, films: Any) -> None:
         gui = self._server.gui

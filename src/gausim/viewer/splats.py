@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,10 +36,10 @@ class Placing:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @staticmethod
-    def of(scene: GaussianScene, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Placing:
+    def of(scene: GaussianScene) -> Placing:
         """Puts the simulated kernels into the middle, their diagonal :data:`SIZE` long."""
         moving = scene.means[scene.simulated].float().cpu()
-        return Placing((moving.amax(0) + moving.amin(0)) / 2, SIZE / scene.diagonal, offset)
+        return Placing((moving.amax(0) + moving.amin(0)) / 2, SIZE / scene.diagonal)
 
     def to_page(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
         """Scene points on the page."""
@@ -67,6 +68,17 @@ def pack(
     rgba = torch.cat((rgb, opacities[:, None].to(rgb)), -1)
     buffer[:, 7:] = (rgba.clamp(0, 1) * 255 + 0.5).to(torch.uint8).contiguous().numpy().view(np.uint32)
     return buffer
+
+
+def add_splats(scene: Any, name: str, buffer: UInt32[np.ndarray, "K 8"]) -> Any:
+    """Adds packed kernels to a viser scene; setting the ``buffer`` of what is returned shows others."""
+    count = len(buffer)
+    node = scene.add_gaussian_splats(
+        name, centers=np.zeros((count, 3)), covariances=np.tile(np.eye(3), (count, 1, 1)), rgbs=np.zeros((count, 3)),
+        opacities=np.zeros((count, 1)),
+    )  # fmt: skip
+    node.buffer = buffer
+    return node
 
 
 def half_covariances(covars: Float[Tensor, "K 3 3"]) -> np.ndarray:
