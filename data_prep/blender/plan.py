@@ -96,7 +96,7 @@ class Plan(Options):
     def settings(self) -> dict[str, Any]:
         """All settings in one mapping, by the names of their options; what the manifest records."""
         flat = asdict(self)
-        return {**flat, **flat.pop("pictures"), **flat.pop("soft")}
+        return flat.pop("pictures") | flat.pop("soft") | flat
 
     @property
     def view_names(self) -> list[str]:

@@ -161,6 +161,12 @@ def test_impossible_plans_are_refused(make: Callable[[], object], what: str) -> 
         make()
 
 
+def test_manifest_names_settings_as_the_command_does() -> None:
+    settings = PLAN.settings()
+    assert settings["stills"] == 23 and settings["stiffness"] == 0.7 and settings["name"] == "box"
+    assert not {"pictures", "soft"} & set(settings)
+
+
 def test_pushes_are_of_their_number_and_act_on_the_upper_part(surface: Surface) -> None:
     actions = [action(PLAN, surface, i) for i in range(10)]
     assert actions == [action(PLAN, surface, i) for i in range(10)]
