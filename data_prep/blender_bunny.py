@@ -11,12 +11,12 @@ import argparse
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from data_prep.blender.environment import Blender, default_environment, find_blender
-from data_prep.blender.plan import Plan
+from data_prep.blender.plan import Pictures, Plan, Soft
 from data_prep.common.command import add_options, cores, given, headline, run_command, stage_parser
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, run_stage
@@ -46,7 +46,7 @@ def make_set(
 
         return make_images(mesh, work, plan, connect(), workers=workers, tick=tick)
 
-    stage = Stage("blender_bunny", REVISION, {"mesh": mesh}, asdict(plan), ("numpy",))
+    stage = Stage("blender_bunny", REVISION, {"mesh": mesh}, plan.settings(), ("numpy",))
     return run_stage(stage, out, make, force=force)
 
 
@@ -58,7 +58,9 @@ def main(argv: list[str] | None = None) -> int:
     add("--out", type=Path, metavar="DIR", help="where to (default: data/NAME)")
     add("--force", action="store_true", help="replace a set of other settings")
     add("--quick", action="store_true", help="2 sequences of 8 small frames, 4 views, 6 stills")
-    add_options(parser.add_argument_group("sizes and motion", "Defaults are the paper's."), Plan, unset=True)
+    group = parser.add_argument_group("sizes and motion", "Defaults are the paper's.")
+    for kind in (Plan, Pictures, Soft):
+        add_options(group, kind, unset=True)
     add = parser.add_argument_group("Blender").add_argument
     add("--blender-env", type=Path, metavar="DIR",
         help="its environment, created if missing (default: gausim/blender-VERSION in the user's cache)")  # fmt: skip
@@ -70,7 +72,9 @@ def main(argv: list[str] | None = None) -> int:
 def _run(arguments: argparse.Namespace, tick: Tick) -> str:
     began = time.monotonic()
     plan = Plan(name=arguments.mesh.stem)
-    plan = replace(plan.quick() if arguments.quick else plan, **given(Plan, arguments))
+    plan = plan.quick() if arguments.quick else plan
+    pictures, soft = replace(plan.pictures, **given(Pictures, arguments)), replace(plan.soft, **given(Soft, arguments))
+    plan = replace(plan, **given(Plan, arguments), pictures=pictures, soft=soft)
     out, folder = arguments.out or Path("data") / plan.name, arguments.blender_env or default_environment()
     manifest = make_set(
         arguments.mesh, out, plan, lambda: find_blender(arguments.blender_python, folder, say=_say),

@@ -37,7 +37,7 @@ def synthesize(out: Path, plan: Plan, *, workers: int, force: bool = False, tick
     Raises:
         DataError: ``out`` holds something else.
     """
-    stage = Stage("synthesize", REVISION, {}, asdict(plan), PACKAGES, former="synthetic.json")
+    stage = Stage("synthesize", REVISION, {}, asdict(plan), PACKAGES)
     return run_stage(stage, out, lambda work: _write_all(work, plan, workers, tick), force=force)
 
 

@@ -7,7 +7,7 @@ surface), ``cage`` (lattice), ``camera``, ``samples``, ``motion`` (what moves; N
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,31 @@ TRAIN_ELEVATIONS, HELDOUT_ELEVATION, STILL_ELEVATION = (18.0, 22.0, 16.0, 24.0),
 
 
 @dataclass(frozen=True)
+class Pictures(Options):
+    """Stills and sizes of a set."""
+
+    stills: int = option(200, "pictures of the rest state (200)", least=1, most=10000)
+    resolution: tuple[int, int] = option(
+        (540, 960), "of the sequences [pixels] (540 960)", least=8, most=8192, nargs=2, metavar=("W", "H")
+    )
+    still_resolution: tuple[int, int] = option(
+        (540, 960), "of the stills [pixels] (540 960)", least=8, most=8192, nargs=2, metavar=("W", "H")
+    )
+    samples: int = option(16, "light paths per pixel (16)", least=1, most=65536)
+
+
+@dataclass(frozen=True)
+class Soft(Options):
+    """The soft body that moves the object."""
+
+    stiffness: float = option(0.7, "of the soft body's springs, below 1 (default: 0.7)", least=0.05, most=0.999)
+    bend: float = option(5.0, "resistance to bending (default: 5)", least=0, most=10)
+    damping: float = option(0.02, "of vibrations (default: 0.02)", least=0, most=50)
+    speed: float = option(0.11, "of time in the soft body (default: 0.11)", least=0.02, most=1)
+    steps: int = option(30, "least steps per 1/192 s; more lose less energy (default: 30)", least=1, most=1000)
+
+
+@dataclass(frozen=True)
 class Plan(Options):
     """Sizes and settings of a set; the defaults are the paper's synthetic set."""
 
@@ -44,24 +69,13 @@ class Plan(Options):
     frames: int = option(60, "of each, at 24 per second (60)", least=2, most=10000)
     views: int = option(5, "cameras; the paper has 4 to 6 (5)", least=1, most=64)
     heldout: int = option(1, "how many of them are never trained on (1)", least=0, most=63)
-    stills: int = option(200, "pictures of the rest state (200)", least=1, most=10000)
-    resolution: tuple[int, int] = option(
-        (540, 960), "of the sequences [pixels] (540 960)", least=8, most=8192, nargs=2, metavar=("W", "H")
-    )
-    still_resolution: tuple[int, int] = option(
-        (540, 960), "of the stills [pixels] (540 960)", least=8, most=8192, nargs=2, metavar=("W", "H")
-    )
-    samples: int = option(16, "light paths per pixel (16)", least=1, most=65536)
     points: int = option(2048, "vertices whose true motion is stored (2048)", least=1, most=100_000)
     amplitude: tuple[float, float] = option(
         (8.0, 13.0), "largest displacement of a sequence, drawn from this range [%% of the diagonal] (default: 8 13)",
         least=0.5, most=30, nargs=2, metavar=("LOW", "HIGH"),
     )  # fmt: skip
-    stiffness: float = option(0.7, "of the soft body's springs, below 1 (default: 0.7)", least=0.05, most=0.999)
-    bend: float = option(5.0, "resistance to bending (default: 5)", least=0, most=10)
-    damping: float = option(0.02, "of vibrations (default: 0.02)", least=0, most=50)
-    speed: float = option(0.11, "of time in the soft body (default: 0.11)", least=0.02, most=1)
-    steps: int = option(30, "least steps per 1/192 s; more lose less energy (default: 30)", least=1, most=1000)
+    pictures: Pictures = Pictures()
+    soft: Soft = Soft()
     seed: int = option(0, "of everything random (default: 0)", least=0, most=2**31 - 1)
 
     def __post_init__(self) -> None:
@@ -76,8 +90,13 @@ class Plan(Options):
 
     def quick(self) -> Plan:
         """The same in small, for tests: 2 sequences of 8 frames."""
-        small: dict[str, Any] = {"resolution": (64, 64), "still_resolution": (96, 96), "samples": 4, "points": 256}
-        return replace(self, sequences=2, frames=8, views=4, stills=6, **small)
+        small = Pictures(stills=6, resolution=(64, 64), still_resolution=(96, 96), samples=4)
+        return replace(self, sequences=2, frames=8, views=4, points=256, pictures=small)
+
+    def settings(self) -> dict[str, Any]:
+        """All settings in one mapping, by the names of their options; what the manifest records."""
+        flat = asdict(self)
+        return flat.pop("pictures") | flat.pop("soft") | flat
 
     @property
     def view_names(self) -> list[str]:
@@ -150,7 +169,7 @@ def video_poses(plan: Plan, surface: Surface) -> list[list[list[float]]]:
 def still_poses(plan: Plan, surface: Surface) -> list[list[list[float]]]:
     """Camera to world of each still, spread evenly over the upper dome."""
     highest, distance = math.sin(math.radians(STILL_ELEVATION)), _distance(surface)
-    elevations = [math.asin((i + 0.5) / plan.stills * highest) for i in range(plan.stills)]
+    elevations = [math.asin((i + 0.5) / plan.pictures.stills * highest) for i in range(plan.pictures.stills)]
     return [_pose(surface, i * GOLDEN_ANGLE, elevation, distance) for i, elevation in enumerate(elevations)]
 
 
@@ -195,7 +214,7 @@ def still_job(plan: Plan, surface: Surface, root: Path, numbers: range) -> dict[
     """The job of some stills."""
     poses = still_poses(plan, surface)
     images = [{"file": str(root / "static" / still_name(i)), "frame": None, "pose": poses[i]} for i in numbers]
-    return {**_job(plan, surface, root, plan.still_resolution), "motion": None, "images": images}
+    return {**_job(plan, surface, root, plan.pictures.still_resolution), "motion": None, "images": images}
 
 
 def sequence_job(plan: Plan, surface: Surface, root: Path, number: int) -> dict[str, Any]:
@@ -207,18 +226,17 @@ def sequence_job(plan: Plan, surface: Surface, root: Path, number: int) -> dict[
         for frame in range(plan.frames)
         for view, pose in zip(plan.view_names, poses, strict=True)
     ]
-    soft = {name: getattr(plan, name) for name in ("stiffness", "bend", "damping", "speed", "steps")}
     motion = {
         **action(plan, surface, number), "file": str(folder / "ground_truth.npz"), "frames": plan.frames,
-        "trial_frames": TRIAL_FRAMES, "substeps": SUBSTEPS, "push_ticks": PUSH_TICKS, "soft": soft,
+        "trial_frames": TRIAL_FRAMES, "substeps": SUBSTEPS, "push_ticks": PUSH_TICKS, "soft": asdict(plan.soft),
     }  # fmt: skip
-    return {**_job(plan, surface, root, plan.resolution), "motion": motion, "images": images}
+    return {**_job(plan, surface, root, plan.pictures.resolution), "motion": motion, "images": images}
 
 
 def _job(plan: Plan, surface: Surface, root: Path, size: tuple[int, int]) -> dict[str, Any]:
     return {
         "task": "make", "rest": str(root / "rest_mesh.npz"), "cage": cage(surface), "camera": camera(size),
-        "samples": plan.samples,
+        "samples": plan.pictures.samples,
     }  # fmt: skip
 
 

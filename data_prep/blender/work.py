@@ -63,7 +63,9 @@ def make_images(mesh: Path, work: Path, plan: Plan, blender: Blender, *, workers
     held = io.BytesIO()
     np.savez_compressed(held, **vars(surface))
     write_durably(root / "rest_mesh.npz", held.getvalue())
-    stills = [range(i, min(i + STILLS_PER_JOB, plan.stills)) for i in range(0, plan.stills, STILLS_PER_JOB)]
+    stills = [
+        range(i, min(i + STILLS_PER_JOB, plan.pictures.stills)) for i in range(0, plan.pictures.stills, STILLS_PER_JOB)
+    ]
     jobs = [still_job(plan, surface, root, numbers) for numbers in stills]
     jobs += [sequence_job(plan, surface, root, number) for number in range(plan.sequences)]
     _run(jobs, blender, workers, tick)
@@ -72,7 +74,7 @@ def make_images(mesh: Path, work: Path, plan: Plan, blender: Blender, *, workers
     _write_overview(root, plan)
     for half in (path for path in root.rglob(".*") if path.is_file()):
         half.unlink()  # of a Blender that was killed
-    images = plan.stills + plan.sequences * plan.frames * plan.views
+    images = plan.pictures.stills + plan.sequences * plan.frames * plan.views
     return {"blender": versions, "sequences": sequences, "images": images, "files": files_in(root)}
 
 
@@ -138,7 +140,7 @@ def _describe_stills(folder: Path, plan: Plan, surface: Surface) -> None:
     frames = [
         {"file_path": still_name(i), "transform_matrix": pose} for i, pose in enumerate(still_poses(plan, surface))
     ]
-    write_json(folder / "transforms.json", {**intrinsics(plan.still_resolution), "frames": frames})
+    write_json(folder / "transforms.json", {**intrinsics(plan.pictures.still_resolution), "frames": frames})
 
 
 def _describe_sequence(root: Path, plan: Plan, surface: Surface, number: int) -> dict[str, Any]:
@@ -159,7 +161,7 @@ def _describe_sequence(root: Path, plan: Plan, surface: Surface, number: int) ->
         for frame in range(plan.frames)
         for i, (view, pose) in enumerate(zip(plan.view_names, video_poses(plan, surface), strict=True))
     ]  # fmt: skip
-    write_json(folder / "transforms.json", {**intrinsics(plan.resolution), "fps": FPS, "frames": frames})
+    write_json(folder / "transforms.json", {**intrinsics(plan.pictures.resolution), "fps": FPS, "frames": frames})
     wanted = round(100 * chosen["amplitude"] / surface.diagonal, 3)
     return {
         "name": folder.name, "kind": chosen["kind"], "amplitude_wanted_percent": wanted,
@@ -185,12 +187,12 @@ def _motion(path: Path, plan: Plan) -> tuple[float, np.ndarray]:
 def _write_overview(root: Path, plan: Plan) -> None:
     """``overview.png``: a row for each of the first sequences' views, frames from left to right."""
     frames = np.unique(np.linspace(0, plan.frames - 1, OVERVIEW_FRAMES).round().astype(int))
-    scale = OVERVIEW_SIDE / max(plan.resolution)
-    size = tuple(max(1, round(side * scale)) for side in plan.resolution)
+    scale = OVERVIEW_SIDE / max(plan.pictures.resolution)
+    size = tuple(max(1, round(side * scale)) for side in plan.pictures.resolution)
     rows = []
     for number in range(min(plan.sequences, 6)):
         folder, view = root / "sequences" / sequence_name(number), plan.view_names[number % plan.views]
-        pictures = [read_rgba(folder / frame_name(view, int(frame)), plan.resolution) for frame in frames]
+        pictures = [read_rgba(folder / frame_name(view, int(frame)), plan.pictures.resolution) for frame in frames]
         shown = [picture[..., 2::-1] * (picture[..., 3:] / 255) for picture in pictures]
         rows.append(np.hstack([cv2.resize(s.astype(np.uint8), size, interpolation=cv2.INTER_AREA) for s in shown]))
     write_image(root / "overview.png", np.vstack(rows), 3)

@@ -28,6 +28,8 @@ from gausim.io.plain_json import parse_json
 
 MANIFEST = "stage.json"
 PLAN = "plan.json"
+# Records of sets that were made before every stage wrote a manifest; --force replaces such a set.
+EARLIER_MANIFESTS = ("synthetic.json",)
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,6 @@ class Stage:
     inputs: Mapping[str, Path]  # files it reads, by the names that the manifest gives them
     settings: Mapping[str, Any]  # everything that was chosen; plain data (as JSON knows it)
     packages: Sequence[str] = ()  # libraries whose versions may matter; recorded, not compared
-    former: str = MANIFEST  # record of earlier versions in the place of the manifest; `force` replaces such a result
 
     def key(self) -> dict[str, Any]:
         """Identity of a result: name and revision of the stage, settings, and the inputs' hashes.
@@ -71,8 +72,7 @@ def run_stage(
         DataError: ``out`` holds something else; nothing was touched.
     """
     key, old = stage.key(), out.with_name(f".{out.name}.old")
-    replaced = force and not (out / MANIFEST).is_file() and (out / stage.former).is_file()
-    known = None if replaced else _known(out, key, force=force)
+    known = _known(out, key, force=force)
     if known is not None:
         shutil.rmtree(old, ignore_errors=True)  # of a replacement that was killed at its very end
         return {**known, "made": False}
@@ -159,6 +159,10 @@ def _known(out: Path, key: Mapping[str, Any], *, force: bool) -> dict[str, Any] 
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return None
     if not (out / MANIFEST).is_file():
+        if any((out / name).is_file() for name in EARLIER_MANIFESTS):
+            if force:
+                return None
+            raise DataError(f"{out}: was made by an earlier version. Choose another --out, or replace it with --force.")
         raise DataError(
             f"{out}: exists and is not the result of a stage ({MANIFEST} is missing). Choose another --out."
         )

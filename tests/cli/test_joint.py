@@ -101,7 +101,7 @@ def test_a_network_of_another_shape_is_refused_by_name(joint: Path, other: Path,
     [
         (["experiment=finetune"], r"init_from: name the trained run.*init_from=RUN"),
         (["freeze=network"], r"freeze: a network at random.*init_from=RUN"),
-        (["init_from=nowhere"], "nowhere: no run here"),
+        (["init_from=nowhere"], r"nowhere/last\.ckpt: no such checkpoint"),
         (["experiment=separate"], r"data\.names: \[\] asked for, the roots hold \['toy', 'other'\]"),
     ],
 )

@@ -23,7 +23,7 @@ import pytest
 from data_prep.blender import environment as blender_env
 from data_prep.blender.environment import REQUIREMENTS, BlenderError, BlenderProcess, create_environment, find_blender
 from data_prep.blender.meshes import Mesh
-from data_prep.blender.plan import Plan, action, cage, camera, sequence_job, still_job, video_poses
+from data_prep.blender.plan import Pictures, Plan, Soft, action, cage, camera, sequence_job, still_job, video_poses
 from data_prep.blender.surface import Surface, make_surface
 from data_prep.blender_bunny import main, make_set
 from gausim.core import ConfigError, DataError
@@ -31,8 +31,8 @@ from gausim.data.objects import ObjectData
 from gausim.data.verify import verify
 
 PLAN = Plan(
-    name="box", up="z", sequences=3, frames=4, views=3, heldout=1, stills=23, resolution=(20, 12),
-    still_resolution=(16, 16), samples=1, points=40,
+    name="box", up="z", sequences=3, frames=4, views=3, heldout=1, points=40,
+    pictures=Pictures(stills=23, resolution=(20, 12), still_resolution=(16, 16), samples=1),
 )  # fmt: skip
 BOX = "".join(f"v {x} {y} {z}\n" for x in (0, 1) for y in (0, 2) for z in (0, 3))
 BOX += "f 1 2 4 3\nf 5 7 8 6\nf 1 5 6 2\nf 3 4 8 7\nf 1 3 7 5\nf 2 6 8 4\n"
@@ -143,22 +143,28 @@ def test_several_workers_give_the_same_bytes_and_the_first_error_ends_all(mesh: 
 
 
 @pytest.mark.parametrize(
-    ("change", "what"),
+    ("make", "what"),
     [
-        ({"sequences": 0}, "--sequences: expected 1 to 1000, got 0"),
-        ({"frames": 1}, "--frames"),
-        ({"heldout": 3}, "--heldout: expected fewer than the 3"),
-        ({"resolution": (20, 1)}, "--resolution"),
-        ({"still_resolution": (99999, 20)}, "--still-resolution"),
-        ({"amplitude": (9.0, 8.0)}, "--amplitude: expected the smaller"),
-        ({"amplitude": (9.0, float("nan"))}, "--amplitude"),
-        ({"stiffness": 1.5}, "--stiffness"),
-        ({"up": "w"}, "--up"),
+        (lambda: replace(PLAN, sequences=0), "--sequences: expected 1 to 1000, got 0"),
+        (lambda: replace(PLAN, frames=1), "--frames"),
+        (lambda: replace(PLAN, heldout=3), "--heldout: expected fewer than the 3"),
+        (lambda: Pictures(resolution=(20, 1)), "--resolution"),
+        (lambda: Pictures(still_resolution=(99999, 20)), "--still-resolution"),
+        (lambda: replace(PLAN, amplitude=(9.0, 8.0)), "--amplitude: expected the smaller"),
+        (lambda: replace(PLAN, amplitude=(9.0, float("nan"))), "--amplitude"),
+        (lambda: Soft(stiffness=1.5), "--stiffness"),
+        (lambda: replace(PLAN, up="w"), "--up"),
     ],
 )
-def test_impossible_plans_are_refused(change: dict[str, Any], what: str) -> None:
+def test_impossible_plans_are_refused(make: Callable[[], object], what: str) -> None:
     with pytest.raises(ConfigError, match=what):
-        replace(PLAN, **change)
+        make()
+
+
+def test_manifest_names_settings_as_the_command_does() -> None:
+    settings = PLAN.settings()
+    assert settings["stills"] == 23 and settings["stiffness"] == 0.7 and settings["name"] == "box"
+    assert not {"pictures", "soft"} & set(settings)
 
 
 def test_pushes_are_of_their_number_and_act_on_the_upper_part(surface: Surface) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,17 +52,6 @@ def test_another_result_is_replaced_only_by_force(stage: Stage, tmp_path: Path, 
     assert read_manifest(tmp_path / "out")["results"] == {"frames": 6}
     assert run_stage(other, tmp_path / "out", lambda work: {"frames": 7}, force=True)["results"] == {"frames": 7}
     assert not (tmp_path / "out" / "a.txt").exists()
-
-
-def test_a_result_of_an_earlier_version_is_replaced_only_by_force(stage: Stage, tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "former.json").write_text("{}")
-    later = replace(stage, former="former.json")
-    for refused, force in ((stage, True), (later, False)):
-        with pytest.raises(DataError, match="not the result of a stage"):
-            run_stage(refused, tmp_path / "out", make, force=force)
-    assert run_stage(later, tmp_path / "out", make, force=True)["results"] == {"frames": 6}
-    assert not (tmp_path / "out" / "former.json").exists()
 
 
 def test_what_was_interrupted_goes_on_and_is_no_result(stage: Stage, tmp_path: Path) -> None:

@@ -44,8 +44,6 @@ class Film:
     pts: np.ndarray  # time stamps of its N frames in presentation order, in units of ``time_base``
     time_base: Fraction  # of the stamps [s]
     rate: Fraction  # frames per second
-    variable: bool  # intervals between frames vary by more than rounding
-    intervals: tuple[float, float]  # the shortest and the longest interval between frames [s]
     size: tuple[int, int]  # width and height as shown, that is after rotation [pixels]
     rotation: int  # by which pictures are turned to be upright, counter-clockwise [degree], a multiple of 90
     timecode: Timecode | None  # the label of its first frame; None where the file has none that can be used
@@ -58,6 +56,18 @@ class Film:
     def times(self) -> np.ndarray:
         """When each of the N frames is shown, float64 [s]."""
         return np.asarray(self.pts * float(self.time_base), np.float64)
+
+    @property
+    def intervals(self) -> tuple[float, float]:
+        """The shortest and the longest interval between frames [s]."""
+        gaps = np.diff(self.pts) * float(self.time_base)
+        return float(gaps.min()), float(gaps.max())
+
+    @property
+    def variable(self) -> bool:
+        """Whether intervals between frames vary by more than rounding."""
+        usual = 1 / float(self.rate)
+        return max(abs(gap - usual) for gap in self.intervals) > JITTER * usual + float(self.time_base)
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -91,13 +101,11 @@ def probe(path: Path) -> Film:
         raise DataError(f"{path}: no frame can be decoded. Copy it again from the camera.")
     gaps = np.diff(pts) * float(time_base)
     rate = _rate(gaps, declared, float(time_base))
-    uneven = np.abs(gaps - 1 / float(rate)).max() > JITTER / float(rate) + float(time_base)
     timecode, fault = _timecode(label, count, rate)
     return Film(
-        path=path, pts=pts, time_base=time_base, rate=rate, variable=bool(uneven),
-        intervals=(float(gaps.min()), float(gaps.max())), size=_shown_size(path, first),
-        rotation=int(first.rotation) % 360,
-        timecode=timecode, timecode_fault=fault, sound=sound, codec=codec, hdr=HDR.get(int(first.color_trc)),
+        path=path, pts=pts, time_base=time_base, rate=rate, size=_shown_size(path, first),
+        rotation=int(first.rotation) % 360, timecode=timecode,
+        timecode_fault=fault, sound=sound, codec=codec, hdr=HDR.get(int(first.color_trc)),
     )  # fmt: skip
 
 
