@@ -126,8 +126,11 @@ class _Builder:
         properties, is_closed = {}, True
         for name, parameter in inspect.signature(found).parameters.items():
             child = place.children.get(name)
-            if parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
-                is_closed = is_closed and parameter.kind != parameter.VAR_KEYWORD
+            if parameter.kind is parameter.VAR_KEYWORD:
+                # Named arguments of a TypedDict are given by the code; others may be anything.
+                is_closed = is_closed and str(parameter.annotation).startswith("Unpack[")
+            elif parameter.kind is parameter.VAR_POSITIONAL:
+                continue
             elif child is not None or parameter.default is not parameter.empty:  # the others are given by the code
                 hint = _hint(parameter.annotation, getattr(init, "__globals__", {}))
                 schema = self._child(f"{path}.{name}", child or Place(), hint)
