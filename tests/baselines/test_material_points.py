@@ -18,7 +18,7 @@ from gausim.baselines.material_point.driven import clustered, opaque
 from gausim.baselines.material_point.method import Discretisation, MaterialPoints
 from gausim.baselines.material_point.physdreamer import ModulusField, PhysDreamer
 from gausim.baselines.material_point.physgaussian import PhysGaussian
-from gausim.baselines.mpm import Grid, Material, MPMSolver, Particles, ParticleState, TimeStep
+from gausim.baselines.mpm import Filling, Grid, Material, MPMSolver, Particles, ParticleState, TimeStep
 from gausim.core import ConfigError, FittedMethod, FittedState, GaussianScene, SceneError, TakesOver
 from gausim.ops.quaternion import quaternion_to_matrix
 
@@ -94,6 +94,19 @@ def test_transparent_kernels_follow_the_nearest_particle() -> None:
     assert int(driven.followed[35, 0]) == int(near)
     with pytest.raises(SceneError, match=r"opacity above 0.99999.*model\.method\.opacity"):
         opaque(scene, 0.99999)
+
+
+def test_filled_interiors_are_particles_and_pinned_near_pins() -> None:
+    scene = replace(toy_scene(), log_scales=torch.full((36, 3), math.log(0.2)))
+    filling = Filling(cells=16, dense=0.5, per_cell=2)
+    driven = gaussian(scene, filling=filling).body(0).driven
+    assert len(driven.rest) > 36 and torch.equal(driven.rest[:36], scene.means)
+    interior, pinned = driven.rest[36:], driven.pinned[36:]
+    assert torch.equal(pinned, scene.pinned[torch.cdist(interior, scene.means).argmin(1)]) and 0 < pinned.sum() < len(
+        pinned
+    )
+    clusters = dreamer(scene, filling=filling, particles=10_000).body(0).driven
+    assert len(clusters.rest) > 36 and int(clusters.pinned.sum()) > int(scene.pinned.sum())
 
 
 @pytest.mark.parametrize("make", [dreamer, gaussian])

@@ -82,14 +82,16 @@ def test_settings_of_the_elastic_template_that_are_gone_are_dropped_or_refused()
 
 
 def test_the_settings_of_material_points_are_in_groups() -> None:
+    filling = {"_target_": "gausim.baselines.mpm.Filling", "dense": 2.0}
     old = {
         "_target_": "gausim.baselines.physdreamer.PhysDreamer", "particles": 8, "young_modulus": 1e5, "cells": 20,
-        "density": 2000.0, "modulus_scale": 1.0, "filling": None,
+        "density": 2000.0, "modulus_scale": 1.0, "filling": filling,
     }  # fmt: skip
     new = with_present_names(old)
     assert set(new) == {"_target_", "particles", "material", "discretisation", "modulus"}
     assert new["material"] == {"_target_": "gausim.baselines.mpm.Material", "young_modulus": 1e5, "density": 2000.0}
-    assert new["discretisation"]["cells"] == 20 and new["modulus"]["scale"] == 1.0
+    assert new["discretisation"]["cells"] == 20 and new["discretisation"]["filling"] == filling
+    assert new["modulus"]["scale"] == 1.0
     assert with_present_names(new) == new
     flows = {"_target_": "gausim.baselines.physgaussian.PhysGaussian", "material": "von_mises", "yield_stress": 1.0}
     with pytest.raises(ValueError, match="no longer supported"):

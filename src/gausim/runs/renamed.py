@@ -43,10 +43,8 @@ SCHEDULES = ("ConstantSchedule", "CosineSchedule")
 UNSUPPORTED: dict[str, dict[str, Any]] = {
     "Objective": {"input_noise": None},
     **dict.fromkeys(("PointSupervision", "TrackSupervision", "tracks_or_images"), {"velocity_weight": None}),
-    "Discretisation": {"filling": None},
     "ModulusField": {"parametrisation": "log"},
-    "PhysDreamer": {"gradients": True, "parametrisation": "log", "filling": None},
-    "PhysGaussian": {"filling": None},
+    "PhysDreamer": {"gradients": True, "parametrisation": "log"},
     **dict.fromkeys(("SpringMass", "ConstantVelocity"), {"gradients": True}),
 }
 IMAGES = "gausim.training.supervision.images.training_views"
@@ -86,7 +84,9 @@ ELASTIC = "gausim.models.template.elastic.ElasticTemplate"
 SETTLED: dict[str, Any] = {"damping": "full", "inertia": "trained", "hidden": 0}
 # The material points' settings that are in groups now; what flowed is gone.
 _MATERIAL = ("gausim.baselines.mpm.Material", ("young_modulus", "poisson_ratio", "density"))
-_GRID = ("gausim.baselines.material_point.method.Discretisation", ("cells", "damping", "substeps", "courant"))
+_GRID = (
+    "gausim.baselines.material_point.method.Discretisation", ("cells", "damping", "substeps", "courant", "filling"),
+)  # fmt: skip
 GROUPS: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
     "gausim.baselines.material_point.physdreamer.PhysDreamer": {
         "material": _MATERIAL,

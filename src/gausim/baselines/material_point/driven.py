@@ -64,14 +64,18 @@ class Driven:
         return torch.where(self.held[:, None], self.means, positions), own, polar_rotation(own)
 
 
-def clustered(scene: GaussianScene, most: int, *, followed: int = FOLLOWED) -> Driven:
-    """At most ``most`` driving particles by k-means of the simulated kernels; pinned ones by themselves.
+def clustered(
+    scene: GaussianScene, most: int, interior: Float[Tensor, "M 3"] | None = None, *, followed: int = FOLLOWED
+) -> Driven:
+    """At most ``most`` driving particles by k-means of the simulated kernels and of ``interior`` points [scene units].
+
+    Pinned kernels and points make clusters of their own, in proportion.
 
     Raises:
-        SceneError: there are fewer kernels than a kernel shall follow particles.
+        SceneError: fewer simulated kernels than the particles that each kernel follows.
     """
-    points = scene.means[scene.simulated].double().cpu().numpy()
-    pinned = scene.pinned[scene.simulated].cpu().numpy()
+    points, pinned = (v.cpu().numpy() for v in _with_interior(scene, scene.simulated, interior))
+    points = points.astype(np.float64)
     if len(points) < followed:
         raise SceneError(
             f"{scene.name}: expected at least {followed} simulated kernels (each follows so many particles), got "
@@ -84,8 +88,8 @@ def clustered(scene: GaussianScene, most: int, *, followed: int = FOLLOWED) -> D
     return follow(scene, rest, torch.arange(len(rest)) >= len(rest) - held, followed)
 
 
-def opaque(scene: GaussianScene, least: float) -> Driven:
-    """Every simulated kernel of more opacity than ``least`` is a particle; others follow the nearest.
+def opaque(scene: GaussianScene, least: float, interior: Float[Tensor, "M 3"] | None = None) -> Driven:
+    """Simulated kernels of more opacity than ``least`` and ``interior`` points as particles; others follow the nearest.
 
     Raises:
         SceneError: no simulated kernel is opaque enough.
@@ -93,7 +97,18 @@ def opaque(scene: GaussianScene, least: float) -> Driven:
     chosen = scene.simulated & (torch.sigmoid(scene.opacity_logits) > least)
     if not bool(chosen.any()):
         raise SceneError(f"{scene.name}: no simulated kernel has an opacity above {least}. Lower model.method.opacity.")
-    return follow(scene, scene.means[chosen], scene.pinned[chosen], 1)
+    return follow(scene, *_with_interior(scene, chosen, interior), 1)
+
+
+def _with_interior(
+    scene: GaussianScene, chosen: Bool[Tensor, " K"], interior: Float[Tensor, "M 3"] | None
+) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, " P"]]:
+    """Chosen kernels and interior points, and which of them are pinned: a point is where its nearest kernel is."""
+    points, pinned = scene.means[chosen], scene.pinned[chosen]
+    if interior is None:
+        return points, pinned
+    nearest = cKDTree(points.double().cpu().numpy()).query(interior.double().cpu().numpy())[1]
+    return torch.cat((points, interior.to(points))), torch.cat((pinned, pinned[torch.from_numpy(nearest).long()]))
 
 
 def follow(scene: GaussianScene, rest: Float[Tensor, "P 3"], pinned: Bool[Tensor, " P"], count: int) -> Driven:

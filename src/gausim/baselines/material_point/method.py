@@ -20,11 +20,21 @@ from torch.nn import Parameter
 
 from gausim.baselines.fitted import Fitted, Recorded, moved
 from gausim.baselines.material_point.driven import Driven
-from gausim.baselines.mpm import Grid, Material, MPMSolver, Particles, ParticleState, TimeStep
+from gausim.baselines.mpm import (
+    Filling,
+    Grid,
+    Material,
+    MPMSolver,
+    Particles,
+    ParticleState,
+    TimeStep,
+    fill_interior,
+)
 from gausim.baselines.mpm.runtime import warp
 from gausim.core import ConfigError, FittedState, GaussianScene
 from gausim.nn.mlp import mlp, zero_output
 from gausim.nn.planes import SUM, Planes
+from gausim.ops.covariance import covariance_from_scales
 
 # Range of Young's modulus in PhysDreamer [simulation units]; outside nothing sensible is simulated.
 LEAST_MODULUS, GREATEST_MODULUS = 1e3, 5e8
@@ -81,12 +91,14 @@ class Discretisation:
         damping: rate at which the grid loses velocity [1 / s].
         substeps: per frame; None derives them from the bound of the time step.
         courant: c of that bound, dt < c dx / sqrt(E / rho); measured, 0.5 is stable up to nu = 0.4.
+        filling: thresholds by which the interior gets particles; None leaves it empty.
     """
 
     cells: int
     damping: float = 0.0
     substeps: int | None = None
     courant: float = 0.5
+    filling: Filling | None = None
 
 
 @dataclass(frozen=True)
@@ -97,7 +109,7 @@ class Domain:
         side: longest side of the scene in the simulation [simulation units].
         size: edge of the cubic domain, in whose middle the scene is [simulation units].
         cells: cells per axis over the whole domain.
-        settings: damping and substeps.
+        settings: damping, substeps and filling.
     """
 
     side: float
@@ -116,6 +128,15 @@ class Domain:
         scale = self.side / float((high - low).amax())
         x, y, z = (self.size / 2 - scale * (low + high) / 2).tolist()
         return SceneMapping(scale, (x, y, z))
+
+    def interior(self, scene: GaussianScene) -> Float[Tensor, "M 3"] | None:
+        """Points that fill the interior of a scene [scene units]; None without filling."""
+        if self.settings.filling is None:
+            return None
+        mapping, body = self.mapping(scene), scene.select(scene.simulated)
+        means, opacities = mapping.to_simulation(body.means), torch.sigmoid(body.opacity_logits)
+        covars = mapping.scale**2 * covariance_from_scales(body.log_scales, body.quats)
+        return mapping.to_scene(fill_interior(means, covars, opacities, self.size, self.settings.filling))
 
 
 def extent(scene: GaussianScene) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:

@@ -121,8 +121,8 @@ class PhysDreamer(MaterialPoints):
         return min(GREATEST_MODULUS, speed**2 * material.density)
 
     def drive(self, scene: GaussianScene) -> Driven:
-        """K-means of the simulated kernels."""
-        return clustered(scene, self.most)
+        """K-means of the simulated kernels and of the points that fill the interior."""
+        return clustered(scene, self.most, self.domain.interior(scene))
 
     def modulus(self, scene_id: int) -> Float[Tensor, " P"]:
         """Young's modulus of the driving particles [simulation units]."""

@@ -68,8 +68,8 @@ class PhysGaussian(MaterialPoints):
             self.register_buffer(f"young_{scene_id}", moduli)
 
     def drive(self, scene: GaussianScene) -> Driven:
-        """Every opaque kernel."""
-        return opaque(scene, self.opacity)
+        """Every opaque kernel and every point that fills the interior."""
+        return opaque(scene, self.opacity, self.domain.interior(scene))
 
     def modulus(self, scene_id: int) -> Float[Tensor, " P"]:
         """Young's modulus of the particles [simulation units]."""

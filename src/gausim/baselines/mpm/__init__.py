@@ -7,14 +7,17 @@ Warp is imported when the first solver is made, not before. Elastic particles th
 """
 
 from gausim.baselines.mpm.config import Grid, Material, TimeStep
+from gausim.baselines.mpm.filling import Filling, fill_interior
 from gausim.baselines.mpm.particles import Particles, ParticleState
 from gausim.baselines.mpm.solver import MPMSolver
 
 __all__ = [
+    "Filling",
     "Grid",
     "MPMSolver",
     "Material",
     "ParticleState",
     "Particles",
     "TimeStep",
+    "fill_interior",
 ]
