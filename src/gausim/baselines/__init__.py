@@ -1,1 +1,1 @@
-"""Methods to compare with; each offers the same contract of dynamics."""
+"""Methods for comparison, with the same protocol of dynamics."""

@@ -1,4 +1,4 @@
-"""What fitted methods have in common (:class:`gausim.core.FittedMethod`); by itself, the method that never moves."""
+"""Base of the methods that are fitted per sequence (:class:`gausim.core.FittedMethod`), and the static method."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def moved(value: T, device: torch.device) -> T:
 
 
 class Recorded(TypedDict):
-    """What a method is fitted to: the options of :class:`Fitted`, which every other method passes on.
+    """Inputs of every fitted method: the options of :class:`Fitted`, which its subclasses pass on.
 
     Attributes:
         scenes: the rest scenes.
@@ -40,13 +40,13 @@ class Recorded(TypedDict):
 
 
 class Fitted(nn.Module):
-    """A method with a gradient and a rotation for every kernel, and nothing to learn: a base for others.
+    """Base of fitted methods: a deformation gradient and a rotation per kernel, no parameters, no motion.
 
-    It is made with what it is fitted to (:class:`Recorded`), which it keeps as attributes.
+    The options (:class:`Recorded`) become attributes.
 
     Attributes:
-        name: its row in tables.
-        extrapolates: whether frames beyond the seen ones are foreseen.
+        name: name of the method in tables.
+        extrapolates: whether the method predicts frames beyond the seen ones.
     """
 
     name = "static"
@@ -60,7 +60,7 @@ class Fitted(nn.Module):
         self.scene_of_sequence, self.seen = tuple(scene_of_sequence), seen
 
     def notes(self) -> tuple[str, ...]:
-        """Nothing."""
+        """No notes."""
         return ()
 
     def unit_of_kernel(self, scene_id: int) -> Int[Tensor, " K"]:
@@ -74,15 +74,15 @@ class Fitted(nn.Module):
         return FittedState(sequence_id, 0, rest, identity, identity)
 
     def advance(self, state: FittedState) -> FittedState:
-        """The same again."""
+        """The same state in the next frame."""
         return replace(state, frame=state.frame + 1)
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
-        """None."""
+        """No parameters."""
         return {}
 
     def penalties(self, sequence_id: int) -> Mapping[str, Tensor]:
-        """None."""
+        """No penalties."""
         return {}
 
     @property
@@ -91,8 +91,8 @@ class Fitted(nn.Module):
 
 
 class Static(Fitted):
-    """The rest state for ever. It scores deceptively well on late frames, so every table needs it beside others."""
+    """The rest state in every frame: every table needs this row, whose errors in late frames are deceptively small."""
 
     def notes(self) -> tuple[str, ...]:
-        """That nothing is learned."""
+        """The note that nothing is learned."""
         return ("Stands still in the rest state; nothing is learned.",)

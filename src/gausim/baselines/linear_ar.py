@@ -1,7 +1,7 @@
 """Linear AR(2) on principal modes of the true 3D states: a reference row, not a method.
 
-It sees what no method sees (the true positions, also of the first two frames) and knows no physics, images or
-network: linear elasticity in few modes, fitted by least squares. What foresees worse than this has not learned much.
+It uses data that no method has (the true positions, also of the first two frames), but no physics, images or network:
+linear elasticity in few modes, fitted by least squares. A method that predicts worse than this has learned little.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ def fit_linear_ar2(displacements: Sequence[Float[Tensor, "F P 3"]], n_modes: int
     """Fits modes and coefficients to the seen frames of all sequences by least squares, in float64.
 
     The modes are those of the displacements themselves, not of their deviation from a mean: the rest state is the
-    equilibrium. Where the motion has fewer modes than asked for, the rest carry nothing (least-norm solution).
+    equilibrium. Where the motion has fewer modes than requested, the others are 0 (least-norm solution).
 
     Args:
         displacements: displacement from the rest state per sequence, each with at least three frames [scene units].
-        n_modes: number of modes M, at most the number of frames in all.
+        n_modes: number of modes M, at most the total number of frames.
 
     Raises:
-        DataError: a sequence is too short to hold one transition.
+        DataError: there is no sequence, or one has fewer than three frames.
     """
     if not displacements or any(len(d) < 3 for d in displacements):
         raise DataError("linear AR(2): expected at least one sequence with at least three seen frames in each.")

@@ -1,4 +1,4 @@
-"""The static prediction: nothing moves. The row that every table needs beside it."""
+"""The static prediction: nothing moves. Every table compares with it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gausim.core import Forces, GaussianScene, SimState, Trajectory
 
 
 class StaticDynamics:
-    """The rest state for ever, whatever the initial state and the forces.
+    """The rest state in every frame, for any initial state and forces.
 
     Args:
         scene: the rest scene.

@@ -1,6 +1,6 @@
 """Complete-linkage agglomeration cut at a diameter, on the pairs that are closer than it; compiled.
 
-Two clusters may merge only if every cross pair is within the diameter, so pairs farther apart never matter: the
+Two clusters may merge only if every cross pair is within the diameter, so pairs farther apart have no influence: the
 nearest-neighbour chain (Benzecri 1982, Juan 1982; Murtagh 1983) on the sparse graph of close pairs gives the same
 clusters as the full distance matrix, because complete linkage is reducible and a missing pair stays missing.
 """
@@ -41,7 +41,7 @@ def _box_reach(boxes, a, b):
 
 @numba.njit(**HELPER)
 def _farthest_of_nodes(depth, points, boxes, a, b, square, stack):
-    """Squared distance of the farthest points of two nodes, by branch and bound; any value above ``square`` will do."""
+    """Squared distance of the farthest points of two nodes, by branch and bound, or any value above ``square``."""
     count = points.shape[1]
     best = 0.0
     stack[0, 0], stack[1, 0], top = a, b, 0
@@ -93,7 +93,7 @@ def cross_squares(depth, points, boxes, ends, nodes, pairs, square):
 def _rows(count, pairs, squares, square):
     """Adjacency of the pairs within ``square``: starts, sizes, neighbours, squared distances, twins.
 
-    The twin of an entry is the place of the same pair in the other's row.
+    The twin of an entry is the position of the same pair in the row of the other unit.
     """
     sizes = np.zeros(count, np.int64)
     for p in range(pairs.shape[1]):
@@ -156,7 +156,7 @@ def complete_linkage(count, pairs, squares, square):
         square: the squared bound.
 
     Returns:
-        label (count,): the number of one unit of the cluster.
+        label (count,): the number of one unit of the cluster for every unit.
     """
     starts, sizes, neighbours, weights, twins = _rows(count, pairs, squares, square)
     into = np.arange(count)
@@ -167,7 +167,7 @@ def complete_linkage(count, pairs, squares, square):
         while length:
             tip = chain[length - 1]
             if not sizes[tip]:
-                break  # farther than the bound from all others for good: only ever the chain's first
+                break  # farther than the bound from all others; this happens only to the first of a chain
             nearest, before = -1, chain[length - 2] if length > 1 else -1
             weight = np.inf
             for at in range(starts[tip], starts[tip] + sizes[tip]):

@@ -1,4 +1,4 @@
-"""Says so when numba or Warp compiles: a first call that takes seconds must not look like one that hangs."""
+"""Log messages while numba or Warp compiles, so that a first call of some seconds does not seem to hang."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ _compiled: set[str] = set()
 
 
 @contextmanager
-def announced(what: str, *, keeper: str = "numba") -> Iterator[None]:
-    """Logs once per process that ``what`` is being compiled, if the first block about it takes long."""
-    if what in _compiled:
+def announced(name: str, *, compiler: str = "numba") -> Iterator[None]:
+    """Logs that ``name`` is being compiled if its first block of the process takes more than ANNOUNCE_AFTER."""
+    if name in _compiled:
         yield
         return
-    text = f"Compiling {what} (once, some seconds; {keeper} keeps the result for later runs)."
+    text = f"Compiling {name} (once, some seconds; {compiler} keeps the result for later runs)."
     timer = threading.Timer(ANNOUNCE_AFTER, logger.warning, (text,))
     timer.daemon = True
     timer.start()
     try:
         yield
-        _compiled.add(what)
+        _compiled.add(name)
     finally:
         timer.cancel()

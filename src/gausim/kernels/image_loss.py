@@ -2,8 +2,8 @@
 
 An image is a flat run of H W 3 floats. For each row inside the box that is not black, five maps (x, y, x^2, x y, y^2)
 are blurred along H, then along W, and give the derivatives of SSIM with respect to the blurred x, x^2 and x y. These
-pass through the adjoint of the blur: along W at once, along H when the rows below are there too. So only as many rows
-as the window is high are kept, and they stay in the first cache. Channels lie interleaved: a step along W is three
+pass through the adjoint of the blur: along W at once, along H when the rows below are computed, too. So only as many
+rows as the window is high are kept, and they stay in the first cache. Channels lie interleaved: a step along W is three
 floats. Inner loops run over one row without branches, on indices that cannot be negative, so that LLVM turns them into
 vector instructions; the tuple of taps has its length in its type, so loops over it unroll.
 """
@@ -25,7 +25,7 @@ from gausim.kernels.pool import shared_pool
 
 C1, C2 = np.float32(SSIM_C1), np.float32(SSIM_C2)
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
-# All of fastmath but the promise that there is no NaN: a prediction that is not finite must give such a loss.
+# fastmath without the assumption of finite numbers: the loss of a prediction that is not finite must not be finite.
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
@@ -87,7 +87,7 @@ def ssim_slopes(maps, taps, slopes, pad):
 
 @numba.njit(fastmath=FAST, **HELPER)
 def spread_along_width(slopes, taps, spread):
-    """The adjoint of the blur along W, borders included: ``slopes`` lie between zeros, ``spread`` keeps its margin."""
+    """The adjoint of the blur along W with borders; ``slopes`` has margins of zeros, ``spread`` includes its margin."""
     half = 3 * (len(taps) // 2)
     for m in range(3):
         source, target = slopes[m], spread[m]
@@ -97,7 +97,7 @@ def spread_along_width(slopes, taps, spread):
             for k in range(len(taps)):
                 total += taps[k] * source[i + 3 * k]
             target[i] = total
-        for j in range(1, len(taps) // 2 + 1):  # what fell outside came from the reflected pixel
+        for j in range(1, len(taps) // 2 + 1):  # values beyond the border belong to the reflected pixel
             for c in range(3):
                 target[half + 3 * j + c] += target[half - 3 * j + c]
                 target[count - half - 3 - 3 * j + c] += target[count - half - 3 + 3 * j + c]
@@ -105,7 +105,7 @@ def spread_along_width(slopes, taps, spread):
 
 @numba.njit(fastmath=FAST, **HELPER)
 def gather_row(spread, offsets, weights, x, y, by_error, by_ssim, gradient):
-    """The gradient of one row and its sum of squared errors; ``offsets`` and ``weights`` are of the rows around it."""
+    """Loss gradient and sum of squared errors of one row; ``offsets`` and ``weights`` are of the rows around it."""
     first = spread.reshape(-1)
     second, third = first[spread.shape[2] :], first[2 * spread.shape[2] :]
     total = ZERO
@@ -125,7 +125,7 @@ def gather_row(spread, offsets, weights, x, y, by_error, by_ssim, gradient):
 
 @numba.njit(fastmath=FAST, **HELPER)
 def mark_colour(x, y, columns):
-    """Marks the columns of one row where an image is not zero; returns whether there are any."""
+    """Marks the columns of one row where an image is not zero; returns true if there is one."""
     found = np.int32(0)
     for i in range(columns.shape[0]):
         here = np.int32((x[i] != ZERO) | (y[i] != ZERO))
@@ -146,7 +146,7 @@ def widened(low, high, length, margin, least):
 
 @numba.njit(**HELPER)
 def coloured_box(x, y, height, width, window):
-    """Rows and columns (top, bottom, left, right) outside which loss and gradient are exactly zero."""
+    """Rows and columns (top, bottom, left, right) outside which the loss and its gradient are exactly zero."""
     columns = np.zeros(3 * width, np.int32)
     top, bottom, left, right = height, 0, width, 0
     for row in range(height):
@@ -166,7 +166,7 @@ def coloured_box(x, y, height, width, window):
 
 @numba.njit(**HELPER)
 def reflected(row, top, bottom):
-    """The row that stands in for one beyond the border (which itself is not repeated)."""
+    """The row that replaces one beyond the border, by reflection without repeating the border row."""
     if row < top:
         row = 2 * top - row
     return 2 * (bottom - 1) - row if row >= bottom else row
@@ -181,7 +181,7 @@ def adjoint_weights(row, top, bottom, taps, slots, size, inset):
         source = row + k - half
         weight = np.float32(0)
         if top <= source < bottom:
-            for tap in range(window):  # the row itself, and the rows beyond a border that it stands in for
+            for tap in range(window):  # the row itself, and the rows beyond a border that it replaces
                 if reflected(source + tap - half, top, bottom) == row:
                     weight += taps[tap]
         offsets = tuple_setitem(offsets, k, np.uint64((source % window) * size + inset))
@@ -191,17 +191,17 @@ def adjoint_weights(row, top, bottom, taps, slots, size, inset):
 
 @numba.njit(**KERNEL)
 def compare(x, y, shape, taps, slots, by_error, by_ssim, gradient):
-    """Sums of squared errors and of 1 - SSIM over pixels and channels of one image; writes the gradient.
+    """Sums of squared errors and of 1 - SSIM over pixels and channels of one image; writes the loss gradient.
 
     Args:
         x: the prediction, H W 3 floats in a row.
         y: the truth, likewise.
         shape: (H, W), each at least the window.
         taps: of the window along one axis, a tuple of float32 of odd length.
-        slots: a tuple of as many uint64 (its type tells numba the window).
-        by_error: what the squared errors are multiplied by in the gradient, times two.
-        by_ssim: what SSIM is multiplied by in the gradient.
-        gradient: written, as long as ``x``.
+        slots: a tuple of as many uint64 (numba compiles for the length in its type).
+        by_error: twice the factor of the squared errors in the loss.
+        by_ssim: factor of SSIM in the loss.
+        gradient: output, as long as ``x``.
     """
     height, width = shape
     window, half = len(taps), len(taps) // 2
@@ -241,11 +241,11 @@ def compare(x, y, shape, taps, slots, by_error, by_ssim, gradient):
 def image_loss(
     prediction: Tensor, target: Tensor, taps: tuple[float, ...], *, balance: float, scale: float
 ) -> tuple[Tensor, Tensor]:
-    """:func:`gausim.losses.image.image_loss`, the images divided over torch's number of threads."""
+    """:func:`gausim.losses.image.image_loss`, on torch's number of threads."""
     states, views, height, width, _ = prediction.shape
     x, y = (array(v).reshape(states * views, -1) for v in (prediction, target))
     gradient, sums = np.empty_like(x), np.empty((states * views, 2))
-    # Tuples tell numba the window by their type.
+    # The length of the window is part of the type of these tuples.
     window, slots = tuple(np.float32(tap) for tap in taps), (np.uint64(0),) * len(taps)
     by_error, by_ssim = np.float32(2 * scale * balance), np.float32(-0.5 * scale * (1 - balance))
 

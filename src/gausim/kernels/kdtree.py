@@ -1,4 +1,4 @@
-"""A balanced k-d tree with bounding boxes, compiled: what the clustering stands on."""
+"""A balanced k-d tree with bounding boxes, compiled, for the clustering."""
 
 # Annotations would be checked by beartype in the tests, around functions that numba has to compile.
 # mypy: allow-untyped-defs, allow-untyped-calls
@@ -9,8 +9,8 @@ import numpy as np
 
 from gausim.kernels.jit import HELPER, KERNEL
 
-# numba freezes constants and called functions into its cached code and looks only at the file that holds the caller:
-# after changing what other files import from here, delete their cache (__pycache__/*.nb?).
+# numba compiles constants and called functions into its cached code and checks only the file of the caller for changes:
+# after changing a name that other files import from here, delete their cache (__pycache__/*.nb?).
 STACK = 96  # entries of a traversal's stack: more than twice the depth of any tree that fits in memory
 
 
@@ -85,11 +85,11 @@ def node_range(node, depth, count):
 
 
 @numba.njit(**HELPER)
-def _box_gap(boxes, node, own):
+def _box_gap(boxes, node, leaf):
     """Squared distance between the boxes of two nodes of one tree."""
     total = 0.0
     for a in range(3):
-        d = max(boxes[node, a] - boxes[own, 3 + a], boxes[own, a] - boxes[node, 3 + a], 0.0)
+        d = max(boxes[node, a] - boxes[leaf, 3 + a], boxes[leaf, a] - boxes[node, 3 + a], 0.0)
         total += d * d
     return total
 
@@ -102,17 +102,16 @@ def close_pairs(depth, points, boxes, square, capacity):
         pairs (2, p) int32 and whether all of them fitted into ``capacity``.
     """
     count = points.shape[1]
-    pairs = np.empty((2, capacity), np.int32)  # memory is taken only as it is written
+    pairs = np.empty((2, capacity), np.int32)  # the system provides memory only as it is written
     stack = np.empty(STACK, np.int32)
     found = 0
     for leaf in range(1 << depth):
-        own = (1 << depth) + leaf
         low, high = (leaf * count) >> depth, ((leaf + 1) * count) >> depth
         stack[0], top = 1, 0
         while top >= 0:
             node = stack[top]
             top -= 1
-            if _box_gap(boxes, node, own) > square:
+            if _box_gap(boxes, node, (1 << depth) + leaf) > square:
                 continue
             if not node >> depth:
                 stack[top + 1], stack[top + 2] = 2 * node, 2 * node + 1

@@ -1,8 +1,8 @@
 """Operations with two forms: the plain one of torch, which is the reference, and a fast one compiled by numba.
 
-A step is made of hundreds of operations on small arrays; on a processor most of its time is their overhead. A fast form
-is such a chain written out once more, with its gradients, for float32 on the CPU. A method calls the operation by its
-one name; which form serves a call is decided here and nowhere else. numba is imported when a fast form first serves.
+A step consists of hundreds of operations on small arrays, whose overhead takes most of its time on a processor. A fast
+form is one compiled function for a chain of them, with its adjoint, for float32 on the CPU. A method calls the
+operation by its name; this module chooses the form of each call. numba is imported at the first call of a fast form.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ OPERATIONS: dict[str, Operation[..., Any]] = {}
 
 
 class Operation(Generic[P, R]):
-    """A plain function that a fast form stands in for where it can.
+    """A plain function and the fast form that replaces it where its inputs allow.
 
     Attributes:
         plain: computes the result on every device and in every type, by torch.
-        enabled: whether the fast form may serve.
+        enabled: False forces the plain form.
     """
 
     def __init__(self, plain: Callable[P, R], fast: str) -> None:
@@ -38,20 +38,20 @@ class Operation(Generic[P, R]):
 
     @functools.cached_property
     def fast(self) -> Callable[P, R]:
-        """The fast form; takes what :attr:`plain` takes."""
+        """The fast form, which has the arguments of :attr:`plain`."""
         module, name = self._fast.split(":")
         found: Callable[P, R] = getattr(import_module(module), name)
         return found
 
     def __call__(self, *args: P.args, **options: P.kwargs) -> R:
-        """The result, by the fast form where every tensor fits it."""
+        """The result, by the fast form where every tensor fits."""
         if not self.fits(*args, **options):
             return self.plain(*args, **options)
         with announced(self._fast.split(":")[1].replace("_", " ")):
             return self.fast(*args, **options)
 
     def fits(self, *args: Any, **options: Any) -> bool:
-        """Whether the fast form serves such a call: all on the CPU, every real number a float32, in eager mode."""
+        """True if the fast form applies: all tensors on the CPU, floating ones in float32, and no torch.compile."""
         if not self.enabled or torch.compiler.is_compiling():
             return False
         tensors = [value for value in (*args, *options.values()) if isinstance(value, Tensor)]
@@ -59,7 +59,7 @@ class Operation(Generic[P, R]):
 
 
 def operation(fast: str) -> Callable[[Callable[P, R]], Operation[P, R]]:
-    """Makes an operation of the plain function below; ``fast`` = ``module:function`` is imported late."""
+    """Makes an operation of the plain function below; ``fast`` = ``module:function`` is imported at the first call."""
 
     def register(plain: Callable[P, R]) -> Operation[P, R]:
         OPERATIONS[plain.__name__] = made = Operation(plain, fast)
@@ -83,5 +83,5 @@ def plain_forms(names: Iterable[str] | None = None) -> Iterator[None]:
 
 
 def array(tensor: Tensor) -> np.ndarray:
-    """The tensor's numbers as a contiguous array, without a copy where it is contiguous already."""
+    """The tensor as a contiguous array, without a copy where it is contiguous already."""
     return tensor.detach().contiguous().numpy()

@@ -11,10 +11,10 @@ from typing import Any
 
 
 class WorkerPool:
-    """Runs tasks on ``threads`` threads, the caller's included. Survives fork and pickling (threads are remade)."""
+    """Runs tasks on ``threads`` threads, the caller's included. Works after fork and pickling, with new threads."""
 
     def __init__(self, threads: int) -> None:
-        """Makes no thread yet; the first parallel call does."""
+        """Threads start with the first parallel call."""
         self.threads = threads
         self._executor: ThreadPoolExecutor | None = None
         self._pid = 0
@@ -49,15 +49,15 @@ class WorkerPool:
         return self._executor
 
     def __getstate__(self) -> dict[str, Any]:
-        """Only the number of threads travels."""
+        """Only the number of threads is pickled."""
         return {"threads": self.threads}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Starts without threads, as new."""
+        """Starts without threads, like a new pool."""
         self.__init__(state["threads"])  # type: ignore[misc]
 
 
 @functools.cache
 def shared_pool(threads: int) -> WorkerPool:
-    """The process's pool of that many threads; rooms that work one after the other share its threads."""
+    """The process's pool of that many threads, for all callers."""
     return WorkerPool(threads)

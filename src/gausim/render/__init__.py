@@ -1,4 +1,4 @@
-"""Rendering: Gaussians to images, differentiably. Renderers are interchangeable (core.Renderer)."""
+"""Differentiable rendering of Gaussians; renderers are interchangeable (core.Renderer)."""
 
 from gausim.render.draw import SceneAppearance, draw, draw_trajectory, film, to_bytes
 

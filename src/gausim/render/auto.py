@@ -1,4 +1,4 @@
-"""The renderer that suits the tensors: gsplat on CUDA, the compiled CPU renderer elsewhere."""
+"""Choice of the renderer by device: gsplat on CUDA, the compiled CPU renderer elsewhere."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ logger = logging.getLogger(__name__)
 class AutoRenderer:
     """Draws tensors on the CPU with CpuRenderer and tensors on a CUDA device with GsplatRenderer (core.Renderer).
 
-    Where a CUDA device is used but gsplat cannot be, images are drawn on the CPU and copied back: correct, and far
-    faster than plain torch on the device, but the device waits. The choice follows from the machine and from where the
-    tensors are, and is logged once per process and kind of device, with the reason where gsplat is passed over.
+    Where the tensors are on a CUDA device but gsplat is not usable, images are drawn on the CPU and copied back: far
+    faster than plain torch on the device, but the device waits. The choice is logged once per process and type of
+    device, with the reason where gsplat is not used.
     """
 
     def __init__(self, *, threads: int | None = None, near: float = 0.01) -> None:
@@ -64,18 +64,18 @@ class AutoRenderer:
 
 @functools.cache
 def chosen(device: str) -> str:
-    """Names what draws tensors on this type of device, ``gsplat`` or ``cpu``, and logs it when it is first asked."""
+    """Name of the renderer for tensors on this type of device, ``gsplat`` or ``cpu``; the first call logs it."""
     if device == "cpu":
         reason = "the tensors are on the CPU" if torch.cuda.is_available() else "PyTorch sees no CUDA device"
         logger.info("render=auto: images are drawn by the CPU renderer, not by gsplat: %s.", reason)
         return "cpu"
-    passed_over = gsplat.unavailable()
-    if passed_over is None:
+    reason_against = gsplat.unavailable()
+    if reason_against is None:
         logger.info("render=auto: images are drawn by gsplat on the GPU.")
         return "gsplat"
     logger.warning(
         "render=auto: images are drawn on the CPU and copied back to %s, which is slow, because %s.",
         device,
-        passed_over,
+        reason_against,
     )
     return "cpu"

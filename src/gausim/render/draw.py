@@ -1,4 +1,4 @@
-"""From a deformed scene to images: covariances, view-dependent colours and the call of a renderer."""
+"""Images of a deformed scene: covariances, view-dependent colours and the call of a renderer."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from gausim.ops.spherical_harmonics import spherical_harmonics_basis
 
 @dataclass(frozen=True, eq=False)
 class SceneAppearance:
-    """What of a scene stays the same in every frame; made once, drawn thousands of times.
+    """Constants of a scene for drawing, computed once for all frames.
 
     Attributes:
-        covars: rest covariances [scene units^2] of the n kernels that are drawn.
-        opacities: after the sigmoid.
+        covars: rest covariances of the n kernels that are drawn [scene units^2].
+        opacities: opacities in [0, 1].
         sh: colour coefficients.
         sh_degree: their degree, 0..3.
-        index: which of the scene's kernels are drawn; None means all.
+        index: indices of the drawn kernels in the scene; None means all.
     """
 
     covars: Float[Tensor, "n 3 3"]
@@ -74,23 +74,23 @@ def draw(
     """Draws B deformed states of one scene in every camera (METHOD section 2).
 
     Kernel k of unit c has covariance G_c S_k G_c^T and the colour of its spherical harmonics at Q_c^T d, d the unit
-    vector from the camera to the kernel. Differentiable in ``positions``, ``gradients`` and ``rotations``, and in the
-    tensors of a SceneAppearance.
+    vector from the camera to the kernel. Differentiable in ``positions``, ``deformation_gradients`` and
+    ``rotations``, and in the tensors of a SceneAppearance.
 
     Args:
-        renderer: what draws.
-        scene: the rest scene; training passes a SceneAppearance made once.
+        renderer: the renderer.
+        scene: the rest scene, or its SceneAppearance, which training computes once.
         positions: kernel means of each state [scene units].
         deformation_gradients: accumulated deformation gradients G of the N units.
-        rotations: their accumulated rotations Q.
+        rotations: accumulated rotations Q of the units.
         unit_of_kernel: the unit of each kernel.
         cameras: V views.
         background: colour behind the kernels; black when absent.
-        mask: draw only these kernels; goes with a GaussianScene (a SceneAppearance has chosen its own).
-        depth: draw the depth as well (core.Rendered).
+        mask: draw only these kernels of a GaussianScene (a SceneAppearance is masked when it is made).
+        depth: draw the depth, too (core.Rendered).
 
     Raises:
-        ConfigError: a mask beside a SceneAppearance.
+        ConfigError: a mask is given with a SceneAppearance.
     """
     if isinstance(scene, GaussianScene):
         scene = SceneAppearance.of(scene, mask)
@@ -127,14 +127,14 @@ def deformed_appearance(
     sh: Float[Tensor, "n basis 3"],
     centers: Float[Tensor, "V 3"],
 ) -> tuple[Float[Tensor, "B n 3 3"], Float[Tensor, "B V n 3"]]:
-    """Covariances G S G^T and colours max(0, 0.5 + sum_b sh_b Y_b(Q^T d)) of the kernels as each camera sees them.
+    """Covariances G S G^T of the kernels and their colours max(0, 0.5 + sum_b sh_b Y_b(Q^T d)) for each camera.
 
     Differentiable in all but the camera centres.
 
     Args:
         positions: kernel means of B states [scene units].
         deformation_gradients: accumulated deformation gradients G of the N units.
-        rotations: their accumulated rotations Q.
+        rotations: accumulated rotations Q of the units.
         unit_of_kernel: the unit of each kernel.
         covars: rest covariances S [scene units^2].
         sh: colour coefficients of degree 0..3.
@@ -157,7 +157,7 @@ def draw_trajectory(
     mask: Bool[Tensor, " K"] | None = None,
     chunk: int = 16,
 ) -> Iterator[Rendered]:
-    """Draws a trajectory for evaluation, ``chunk`` frames at a time, without gradients.
+    """Draws a trajectory for evaluation, ``chunk`` frames at a time, without loss gradients.
 
     Yields:
         The images of the next frames, (frames, V, ...), in order.

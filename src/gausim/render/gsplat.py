@@ -19,10 +19,10 @@ INSTALL = "pip install 'gausim[gpu]'"
 
 
 def unavailable() -> str | None:
-    """Says in one line why gsplat cannot draw on this machine, or None if it can.
+    """The reason, in one line, why gsplat is not usable on this machine; None if it is.
 
-    Looks for a CUDA device, for gsplat in the version whose conventions are ours, and for its kernels. A gsplat from
-    the package index compiles them when they are first looked for, which takes minutes once per machine.
+    The conditions are a CUDA device, gsplat in the supported version, and its kernels. A gsplat from the package index
+    compiles its kernels at their first import, which takes minutes once per machine.
     """
     if not torch.cuda.is_available():
         return "PyTorch sees no CUDA device (it needs an NVIDIA driver and a CUDA build of torch)"
@@ -34,7 +34,7 @@ def unavailable() -> str | None:
         return f"gsplat is {gsplat.__version__}, expected {VERSION} ({INSTALL})"
     try:
         from gsplat.cuda._backend import _C as kernels
-    except Exception as error:  # nvcc, the linker and the loader fail in many ways; the first line names the culprit
+    except Exception as error:  # nvcc, the linker and the loader raise many types; the first line has the cause
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
         return f"gsplat's CUDA kernels do not build or load: {reason}"
     if kernels is None:
@@ -48,7 +48,7 @@ class GsplatRenderer:
     Conventions are the reference's: the covariance of the image widened by 0.3 pixels^2, contributions below 1/255
     dropped, alpha at most 0.999 (compiled into gsplat, no option here), no kernel skipped for its small radius, no far
     plane within 1e10 scene units. All states and views are one call of gsplat. It waits for the device once per call,
-    to learn how many tiles the kernels touch. Values that are not finite are not looked for.
+    for the number of tiles that the kernels touch. Values are not checked for being finite.
     """
 
     def __init__(self, *, near: float = 0.01) -> None:
@@ -93,7 +93,7 @@ class GsplatRenderer:
         behind = means.new_zeros(3) if background is None else background.to(means)
         views = viewmats.shape[:2]
         if means.shape[1] == 0:  # gsplat divides by the number of kernels
-            empty = colors.sum()  # zero; it keeps an image without any kernel differentiable
+            empty = colors.sum()  # zero; it keeps an image without kernels differentiable
             plane = empty.expand(*views, size[1], size[0])
             return Rendered(plane[..., None] + behind, plane, plane if depth else None)
         image, alpha, _ = rasterization(
@@ -112,7 +112,7 @@ class GsplatRenderer:
             packed=False,
             backgrounds=behind.expand(*views, 3),
             render_mode="RGB+D" if depth else "RGB",
-            # gsplat reads the upper triangle only: of the mean with the transpose, so that the gradient is symmetric.
+            # gsplat reads only the upper triangle; the mean with the transpose makes the loss gradient symmetric.
             covars=0.5 * (covars + covars.mT),
         )
         return Rendered(image[..., :3], alpha[..., 0], image[..., 3] if depth else None)

@@ -1,4 +1,4 @@
-"""The oracle: Gaussian splatting in plain torch, any floating type, differentiated by autograd."""
+"""The reference renderer: Gaussian splatting in plain torch, any floating type, differentiated by autograd."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TILE = 16  # [pixels]
 
 
 def require_options(near: float, alpha_max: float) -> None:
-    """Raises :class:`ConfigError` where the options that renderers share are out of range."""
+    """Raises :class:`ConfigError` where an option common to all renderers is out of range."""
     if not near > 0:
         raise ConfigError(f"render.near: expected more than 0, got {near}.")
     if not 0 < alpha_max < 1:
@@ -27,7 +27,7 @@ class ReferenceRenderer:
     """EWA splatting after gsplat, sorted by depth and composited front to back (core.Renderer).
 
     Works in the type and on the device of its inputs. Kernels are culled per tile only where alpha < 1/255 at every
-    pixel, so the result is that of the sum over all kernels. Memory grows with the kernels of the fullest tile.
+    pixel, so the result equals the sum over all kernels. Memory grows with the kernels of the fullest tile.
     """
 
     def __init__(self, *, near: float = 0.01, alpha_max: float = 0.999) -> None:
@@ -104,7 +104,7 @@ class ReferenceRenderer:
     def _tile(self, kernels: Float[Tensor, "n 10"], hit: Int[Tensor, " m"], left: int, top: int) -> Tensor:
         """Colour, depth and remaining transmittance of one tile's pixels, (TILE * TILE, 5)."""
         if hit.numel() == 0:
-            # The empty sum keeps an image without any kernel differentiable (its gradients are zero).
+            # The empty sum keeps an image without kernels differentiable (its loss gradients are zero).
             return kernels.new_tensor((0.0, 0.0, 0.0, 0.0, 1.0)).expand(TILE * TILE, 5) + kernels[:0].sum()
         k = kernels[hit]
         axis = torch.arange(TILE, dtype=k.dtype, device=k.device) + 0.5
@@ -130,8 +130,8 @@ def project(
 ) -> tuple[Float[Tensor, "K 2"], Float[Tensor, "K 2 2"]]:
     """Image mean [pixels] and dilated image covariance [pixels^2] of kernels in camera space.
 
-    EWA: the projection is linearised at the kernel's centre, which gsplat pulls into a slightly widened field of view
-    so that kernels far outside do not blow up.
+    EWA: the projection is linearised at the kernel's centre, which as in gsplat is clamped to a slightly widened field
+    of view, so that covariances of kernels far outside stay small.
     """
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x, y, z = camera.unbind(-1)
@@ -163,8 +163,8 @@ def _reach(covar2d: Float[Tensor, "K 2 2"], opacities: Float[Tensor, " K"]) -> F
 def _tile_hits(
     mean2d: Float[Tensor, "K 2"], reach: Float[Tensor, "K 2"], columns: int, rows: int
 ) -> list[Int[Tensor, " m"]]:
-    """For every tile, row by row, the kernels whose ellipse's box touches it, in the order given."""
-    margin = 0.01  # [pixels], far above the rounding of float32
+    """For every tile, row by row, the kernels whose ellipse's bounding box touches it, in the given order."""
+    margin = 0.01  # [pixels], far above the rounding error of float32
     low, high = mean2d - reach - margin, mean2d + reach + margin
 
     def overlap(axis: int, tiles: int) -> Bool[Tensor, "tiles K"]:

@@ -1,4 +1,4 @@
-"""Particles of a scene that are simulated, and the kernels that follow them (PhysDreamer, PhysGaussian)."""
+"""Particles that represent a scene in the simulation, and the kernels that follow them (PhysDreamer, PhysGaussian)."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from gausim.core import GaussianScene, SceneError
 from gausim.ops.clustering import k_means
 from gausim.ops.deformation import bounded_deformation, polar_rotation
 
-# Kernels follow so many particles (PhysDreamer).
+# Number of particles that a kernel follows (PhysDreamer).
 FOLLOWED = 8
-# A gradient that shrinks volume below this fraction would turn a kernel inside out; the kernel keeps its shape then.
+# A kernel keeps its shape where its deformation gradient shrinks volume below this fraction.
 LEAST_VOLUME = 0.05
 
 
@@ -26,10 +26,10 @@ class Driven:
 
     Attributes:
         rest: particles at rest.
-        pinned: those that never move.
-        followed: the n particles that every kernel follows.
-        weights: how much each counts; they sum to 1.
-        means: kernels at rest.
+        pinned: particles that never move.
+        followed: indices of the n particles that every kernel follows.
+        weights: of those particles; they sum to 1 for every kernel.
+        means: positions of the kernels at rest.
         held: kernels that never move: pinned ones and those that are not simulated.
     """
 
@@ -41,27 +41,27 @@ class Driven:
     held: Bool[Tensor, " K"]
 
     def carried(
-        self, x: Float[Tensor, "P 3"], gradient: Float[Tensor, "P 3 3"]
+        self, x: Float[Tensor, "P 3"], deformation_gradients: Float[Tensor, "P 3 3"]
     ) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3 3"], Float[Tensor, "K 3 3"]]:
-        """Positions, gradients and rotations of kernels that each particle p would map to x_p + F_p (X - X_p).
+        """Positions, deformation gradients and rotations of the kernels.
 
-        A kernel follows the weighted mean of the maps of its particles; its gradient is the mean of theirs.
+        Particle p maps X to x_p + F_p (X - X_p); a kernel follows the weighted mean of its particles' maps.
 
         Args:
-            x: where the particles are now.
-            gradient: F of the particles.
+            x: positions of the particles.
+            deformation_gradients: F of the particles.
         """
-        middle = self.rest.mean(0)  # maps about a point nearby: less rounding
-        offset = x - middle - (gradient @ (self.rest - middle)[..., None])[..., 0]
-        values = torch.cat((gradient.flatten(1), offset), 1)
+        middle = self.rest.mean(0)  # maps about a nearby point have less rounding error
+        offset = x - middle - (deformation_gradients @ (self.rest - middle)[..., None])[..., 0]
+        values = torch.cat((deformation_gradients.flatten(1), offset), 1)
         gathered = values.index_select(0, self.followed.flatten()).unflatten(0, self.followed.shape)
         mean = torch.einsum("kn,knc->kc", self.weights, gathered)
-        own, shift = mean[:, :9].unflatten(1, (3, 3)), mean[:, 9:]
-        positions = middle + shift + (own @ (self.means - middle)[..., None])[..., 0]
-        identity = torch.eye(3).to(own)
-        own = torch.where(self.held[:, None, None], identity, own)
-        own = bounded_deformation(own, LEAST_VOLUME, unit=False)
-        return torch.where(self.held[:, None], self.means, positions), own, polar_rotation(own)
+        found, shift = mean[:, :9].unflatten(1, (3, 3)), mean[:, 9:]
+        positions = middle + shift + (found @ (self.means - middle)[..., None])[..., 0]
+        identity = torch.eye(3).to(found)
+        found = torch.where(self.held[:, None, None], identity, found)
+        found = bounded_deformation(found, LEAST_VOLUME, unit=False)
+        return torch.where(self.held[:, None], self.means, positions), found, polar_rotation(found)
 
 
 def clustered(
@@ -69,7 +69,7 @@ def clustered(
 ) -> Driven:
     """At most ``most`` driving particles by k-means of the simulated kernels and of ``interior`` points [scene units].
 
-    Pinned kernels and points make clusters of their own, in proportion.
+    Pinned kernels and points form separate clusters, in proportion.
 
     Raises:
         SceneError: fewer simulated kernels than the particles that each kernel follows.
@@ -78,7 +78,7 @@ def clustered(
     points = points.astype(np.float64)
     if len(points) < followed:
         raise SceneError(
-            f"{scene.name}: expected at least {followed} simulated kernels (each follows so many particles), got "
+            f"{scene.name}: expected at least {followed} simulated kernels (each follows that many particles), got "
             f"{len(points)}. Widen the mask 'simulated'."
         )
     most = max(followed, min(most, len(points)))
@@ -103,7 +103,7 @@ def opaque(scene: GaussianScene, least: float, interior: Float[Tensor, "M 3"] | 
 def _with_interior(
     scene: GaussianScene, chosen: Bool[Tensor, " K"], interior: Float[Tensor, "M 3"] | None
 ) -> tuple[Float[Tensor, "P 3"], Bool[Tensor, " P"]]:
-    """Chosen kernels and interior points, and which of them are pinned: a point is where its nearest kernel is."""
+    """Chosen kernels with interior points, and their pins: a point is pinned if its nearest kernel is."""
     points, pinned = scene.means[chosen], scene.pinned[chosen]
     if interior is None:
         return points, pinned

@@ -1,4 +1,4 @@
-"""Scenes moved by the material point method with fitted velocities, and perhaps moduli: what the methods share.
+"""Base of the methods that move scenes by the material point method, with fitted velocities and perhaps moduli.
 
 Units. A scene is scaled to ``side`` simulation units along its longest side, frames last 1 / fps seconds, and Young's
 modulus E and density rho are in simulation units. Nothing depends on them but sqrt(E / rho) / side, the speed of waves
@@ -36,7 +36,7 @@ from gausim.nn.mlp import mlp, zero_output
 from gausim.nn.planes import SUM, Planes
 from gausim.ops.covariance import covariance_from_scales
 
-# Range of Young's modulus in PhysDreamer [simulation units]; outside nothing sensible is simulated.
+# Range of Young's modulus in PhysDreamer [simulation units].
 LEAST_MODULUS, GREATEST_MODULUS = 1e3, 5e8
 
 
@@ -45,7 +45,7 @@ class TriPlaneField(nn.Module):
 
     Attributes:
         planes: the features, ``resolution`` numbers along both axes of each.
-        network: what makes numbers of them.
+        network: maps the features to the outputs.
     """
 
     def __init__(self, resolution: int, *, features: int = 32, hidden: int = 32, outputs: int = 1) -> None:
@@ -63,11 +63,11 @@ class TriPlaneField(nn.Module):
 
 @dataclass(frozen=True)
 class SceneMapping:
-    """x_sim = scale x + offset: no rotation, so that gradients and rotations are the same in both.
+    """x_sim = scale x + offset: deformation gradients and rotations are the same in both.
 
     Attributes:
         scale: simulation units per scene unit.
-        offset: where the scene's origin goes [simulation units].
+        offset: position of the scene's origin [simulation units].
     """
 
     scale: float
@@ -84,13 +84,13 @@ class SceneMapping:
 
 @dataclass(frozen=True)
 class Discretisation:
-    """The grid and the substeps, as a configuration gives them.
+    """Options of the grid, the substeps and the filling.
 
     Attributes:
         cells: per axis of the method's unit of length.
         damping: rate at which the grid loses velocity [1 / s].
         substeps: per frame; None derives them from the bound of the time step.
-        courant: c of that bound, dt < c dx / sqrt(E / rho); measured, 0.5 is stable up to nu = 0.4.
+        courant: c of the bound, dt < c dx / sqrt(E / rho); measured, 0.5 is stable up to nu = 0.4.
         filling: thresholds by which the interior gets particles; None leaves it empty.
     """
 
@@ -103,7 +103,7 @@ class Discretisation:
 
 @dataclass(frozen=True)
 class Domain:
-    """How scenes are simulated.
+    """The cubic domain in which scenes are simulated.
 
     Attributes:
         side: longest side of the scene in the simulation [simulation units].
@@ -123,7 +123,7 @@ class Domain:
         return Grid(cells=self.cells, size=self.size, damping=self.settings.damping)
 
     def mapping(self, scene: GaussianScene) -> SceneMapping:
-        """From a scene to the simulation."""
+        """The mapping from a scene to the simulation."""
         low, high = extent(scene)
         scale = self.side / float((high - low).amax())
         x, y, z = (self.size / 2 - scale * (low + high) / 2).tolist()
@@ -140,7 +140,7 @@ class Domain:
 
 
 def extent(scene: GaussianScene) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-    """Least and greatest corner of the simulated kernels [scene units]."""
+    """Lower and upper corner of the bounding box of the simulated kernels [scene units]."""
     x = scene.means[scene.simulated].double()
     return x.amin(0), x.amax(0)
 
@@ -152,7 +152,7 @@ class Body:
     Attributes:
         driven: particles and kernels [scene units].
         mapping: to the simulation.
-        places: particles in [-1, 1]^3, where fields are looked up; the longest side of the scene has length 2.
+        places: coordinates of the particles in the fields, in [-1, 1]^3; the longest side of the scene has length 2.
         solver: moves the particles.
     """
 
@@ -163,10 +163,10 @@ class Body:
 
 
 class MaterialPoints(Fitted):
-    """A velocity field per sequence, and the material point method from there on: a base for methods.
+    """Base of the methods with a velocity field per sequence, which the material point method carries on.
 
-    The field gives ``velocity_scale`` times its output in longest sides per second; pinned particles have none. Before
-    anything is fitted all are at rest.
+    A velocity is ``velocity_scale`` times the field's output [longest sides / s], and 0 for pinned particles. Before
+    fitting all velocities are 0.
     """
 
     def __init__(
@@ -181,8 +181,8 @@ class MaterialPoints(Fitted):
         """Places the particles.
 
         Args:
-            material: of all particles; their E where :meth:`modulus` does not say otherwise.
-            domain: how they are simulated.
+            material: of all particles; :meth:`modulus` overrides its E.
+            domain: in which they are simulated.
             velocity_resolution: of the planes of the velocity fields.
             velocity_scale: of their outputs [longest sides / s].
 
@@ -196,13 +196,13 @@ class MaterialPoints(Fitted):
                 "model.method: expected velocity_resolution >= 2 and velocity_scale > 0, got "
                 f"{velocity_resolution} and {velocity_scale}."
             )
-        warp()  # says what to install before anything is made
+        warp()  # raises early where it is not installed
         self.material, self.domain, self.velocity_scale = material, domain, velocity_scale
         self._bodies = [self._body(i, self.drive(scene)) for i, scene in enumerate(self.scenes)]
         self.velocity = nn.ModuleList(TriPlaneField(velocity_resolution, outputs=3) for _ in self.scene_of_sequence)
 
     def drive(self, scene: GaussianScene) -> Driven:
-        """Which particles carry which kernels of a scene."""
+        """The particles of a scene and the kernels that follow them."""
         raise NotImplementedError
 
     def modulus(self, scene_id: int) -> Float[Tensor, " P"]:
@@ -221,7 +221,7 @@ class MaterialPoints(Fitted):
 
     @staticmethod
     def places(scene: GaussianScene, points: Float[Tensor, "P 3"]) -> Float[Tensor, "P 3"]:
-        """Points of a scene as fields know them: the same whatever the particles and the domain."""
+        """Coordinates of a scene's points in the fields; they depend neither on the particles nor on the domain."""
         low, high = (corner.to(points) for corner in extent(scene))
         return (points - (low + high) / 2) / ((high - low).amax() / 2)
 
@@ -259,7 +259,7 @@ class MaterialPoints(Fitted):
         )
 
     def speed(self, scene_id: int) -> Float[Tensor, " P"]:
-        """The speed sqrt(E / rho) of waves in longest sides per frame: what a modulus means for the motion."""
+        """The speed sqrt(E / rho) of waves [longest sides / frame], on which the motion depends."""
         fast = torch.sqrt(self.modulus(scene_id) / self.material.density)
         return fast / (self.domain.side * self.fps[scene_id])
 
@@ -268,11 +268,11 @@ class MaterialPoints(Fitted):
         with torch.no_grad():
             return self.body(scene_id).solver.substeps(self.modulus(scene_id))
 
-    def said(self, scene_id: int) -> str:
-        """One scene's particles, moduli and substeps in words."""
+    def description(self, scene_id: int) -> str:
+        """One scene's particles, moduli and substeps in a sentence."""
         with torch.no_grad():
-            own, speed = self.modulus(scene_id), float(self.speed(scene_id).log().mean().exp())
-        least, mean, most = (f"{float(e):.3g}" for e in (own.amin(), own.log().mean().exp(), own.amax()))
+            moduli, speed = self.modulus(scene_id), float(self.speed(scene_id).log().mean().exp())
+        least, mean, most = (f"{float(e):.3g}" for e in (moduli.amin(), moduli.log().mean().exp(), moduli.amax()))
         spread = "" if least == most else f" ({least} to {most})"
         return (
             f"{self.scenes[scene_id].name}: {len(self._bodies[scene_id].driven.rest)} particles, Young's modulus "
@@ -291,10 +291,10 @@ class MaterialPoints(Fitted):
 
 
 def require_modulus(value: float) -> float:
-    """``value`` if it can be Young's modulus.
+    """``value``, if it is within the range of Young's modulus.
 
     Raises:
-        ConfigError: it is out of range.
+        ConfigError: the value is out of range.
     """
     if not (math.isfinite(value) and LEAST_MODULUS <= value <= GREATEST_MODULUS):
         raise ConfigError(

@@ -1,7 +1,7 @@
 """Young's modulus and velocities from video by a differentiable material point method: PhysDreamer (Zhang et al. 2024).
 
-The original lets a video diffusion model dream the motion that it is fitted to; here calibrated videos take its place.
-Fitted are a velocity field per sequence and a field of Young's modulus per object, which its sequences share.
+The original is fitted to videos that a diffusion model generates; here it is fitted to the calibrated videos. The
+fitted parameters are a velocity field per sequence and a field of Young's modulus per object.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from gausim.baselines.mpm import Material
 from gausim.baselines.mpm.config import COVERED_POISSON_RATIO, pressure_wave
 from gausim.core import ConfigError, GaussianScene
 
-# What the original takes: the scene's longest side is 1 / 1.8, cells of 1 / 64, 768 substeps per frame.
+# Values of the original: the scene's longest side is 1 / 1.8, cells of 1 / 64, 768 substeps per frame.
 SIDE, CELLS, SUBSTEPS = 1 / 1.8, 64, 768
-# Edge of the domain; the original's is 1, which large motions leave. Only nodes round the particles cost anything.
+# Edge of the domain; the original's is 1, which large motions leave. Only nodes near the particles cost time.
 SIZE = 2.0
 
 
 @dataclass(frozen=True)
 class ModulusField:
-    """How Young's modulus varies over an object: E_0 exp(s f); the original's is E_0 + 1000 f.
+    """Young's modulus over an object: E_0 exp(s f); the original's is E_0 + 1000 f.
 
     Attributes:
         scale: s.
@@ -58,7 +58,7 @@ class ModulusField:
 class PhysDreamer(MaterialPoints):
     """Driving particles by k-means, fixed corotated elasticity, and fields of velocity and Young's modulus.
 
-    Kernels follow the affine maps of their particles; the original's turn, but keep their shape.
+    Kernels follow the affine maps of their particles; in the original they turn, but keep their shape.
     """
 
     name = "physdreamer (no diffusion prior)"
@@ -78,11 +78,11 @@ class PhysDreamer(MaterialPoints):
         """Places the driving particles.
 
         Args:
-            particles: at most so many per object.
+            particles: maximum number per object.
             material: E_0, nu and rho [simulation units].
             discretisation: ``cells`` per simulation unit; the longest side has ``cells`` / 1.8.
-            most_substeps: E is kept below what would need more.
-            modulus: how E varies over the object.
+            most_substeps: E stays below values that need more substeps.
+            modulus: the field of E.
             velocity_resolution: of the planes of the velocity fields.
             velocity_scale: of their outputs [longest sides / s]; 0.18 is the original's 0.1 simulation units.
 
@@ -115,7 +115,7 @@ class PhysDreamer(MaterialPoints):
 
     @staticmethod
     def _bound(fps: float, substeps: int, material: Material, domain: Domain) -> float:
-        """The greatest E that so many substeps per frame allow, a little less: (c dx substeps fps)^2 rho."""
+        """The largest E for this number of substeps per frame, with a small margin: (c dx substeps fps)^2 rho."""
         faster = max(1.0, pressure_wave(material.poisson_ratio) / pressure_wave(COVERED_POISSON_RATIO))
         speed = 0.999 * domain.settings.courant * domain.grid.dx * substeps * fps / faster
         return min(GREATEST_MODULUS, speed**2 * material.density)
@@ -129,7 +129,7 @@ class PhysDreamer(MaterialPoints):
         return self.modulus_at(scene_id, self.body(scene_id).places)
 
     def modulus_at(self, scene_id: int, places: Float[Tensor, "P 3"]) -> Float[Tensor, " P"]:
-        """The same anywhere.
+        """Young's modulus at any points [simulation units].
 
         Args:
             scene_id: the object.
@@ -139,12 +139,12 @@ class PhysDreamer(MaterialPoints):
         return (self.initial * torch.exp(f)).clamp(LEAST_MODULUS, self.greatest[scene_id])
 
     def notes(self) -> tuple[str, ...]:
-        """What differs from the original, and what was found."""
+        """Differences from the original, and the fitted moduli."""
         smaller = f" on {self.cells} cells per unit instead of {CELLS}" if self.cells < CELLS else ""
         return (
             f"PhysDreamer without its diffusion prior: fitted to the calibrated videos{smaller}; the original takes "
             f"{SUBSTEPS} substeps per frame and has a particle for 10 to 25 kernels.",
-            *(f"{self.said(i)}; it began with {self.initial:.3g}." for i in range(len(self.scenes))),
+            *(f"{self.description(i)}; it began with {self.initial:.3g}." for i in range(len(self.scenes))),
         )
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:

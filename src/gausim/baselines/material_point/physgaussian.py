@@ -1,9 +1,8 @@
 """Forward simulation by the material point method with a given elastic material: PhysGaussian (Xie et al., CVPR 2024).
 
-Every opaque kernel is a particle and deforms with it: S = F S_0 F^T. The material is not identified: Young's modulus is
-the configuration's, or what a run of physdreamer has found (``init_from``). Nor does the original know how a recorded
-sequence begins; here a velocity field per sequence is fitted to its first frames, or taken over from that run, or left
-at zero.
+Every opaque kernel is a particle and deforms with it: S = F S_0 F^T. The material is not identified: Young's modulus
+comes from the configuration, or from a run of physdreamer (``init_from``). The original has no initial velocity of a
+recorded sequence; here a velocity field per sequence is fitted to its first frames, taken over from that run, or zero.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ from gausim.baselines.material_point.physdreamer import PhysDreamer
 from gausim.baselines.mpm import Material
 from gausim.core import ConfigError, GaussianScene
 
-# What the original takes: the scene's longest side is 1, 50 cells over a domain of edge 2, 100 substeps per frame.
+# Values of the original: the scene's longest side is 1, 50 cells over a domain of edge 2, 100 substeps per frame.
 SIDE, SIZE, CELLS, SUBSTEPS = 1.0, 2.0, 50, 100
-OPACITY = 0.02  # kernels below it are no particles
+OPACITY = 0.02  # kernels of less opacity are no particles
 
 
 class PhysGaussian(MaterialPoints):
@@ -46,7 +45,7 @@ class PhysGaussian(MaterialPoints):
         Args:
             material: E, nu and rho [simulation units].
             discretisation: ``cells`` per axis of the domain, whose edge is twice the longest side.
-            opacity: above which a kernel is a particle.
+            opacity: threshold above which a kernel is a particle.
             velocity_resolution: of the planes of the velocity fields.
             velocity_scale: of their outputs [longest sides / s].
 
@@ -77,45 +76,45 @@ class PhysGaussian(MaterialPoints):
 
     @torch.no_grad()
     def take_over(self, other: object) -> None:
-        """The moduli and velocities that PhysDreamer has found for the same scenes and sequences.
+        """Copies the moduli and velocities that PhysDreamer fitted to the same scenes and sequences.
 
         Raises:
-            ConfigError: it is another method, of other scenes or sequences, or its velocity fields differ in shape.
+            ConfigError: ``other`` is no PhysDreamer, or has other scenes, sequences or shapes of velocity fields.
         """
         if not isinstance(other, PhysDreamer):
             raise ConfigError(
                 "init_from: physgaussian takes over what physdreamer has found, but that run is of "
                 f"{getattr(other, 'name', 'a simulator')}. Name a run of model=physdreamer."
             )
-        self._require_alike(other)
+        self._require_same_data(other)
         self.velocity.load_state_dict(other.velocity.state_dict())
         for scene_id in range(len(self.scenes)):
             found = other.modulus_at(scene_id, self.body(scene_id).places)
             stretched = self.domain.side / other.domain.side
             self.modulus(scene_id).copy_(found * stretched**2 * self.material.density / other.material.density)
 
-    def _require_alike(self, other: PhysDreamer) -> None:
+    def _require_same_data(self, other: PhysDreamer) -> None:
         """Raises ConfigError where the velocities of ``other`` do not belong to the same scenes and sequences."""
-        own, its = (
+        here, there = (
             ([s.name for s in m.scenes], m.scene_of_sequence, m.velocity_scale, _shapes(m.velocity))
             for m in (self, other)
         )
-        same = own == its and all(
+        same = here == there and all(
             a.count == b.count and torch.equal(a.means, b.means) for a, b in zip(self.scenes, other.scenes, strict=True)
         )
         if not same:
             raise ConfigError(
                 "init_from: expected a run on the same scenes and sequences with the same velocity_resolution and "
-                f"velocity_scale, got {its[0]} with {len(its[1])} sequences (here {own[0]} with {len(own[1])}). "
+                f"velocity_scale, got {there[0]} with {len(there[1])} sequences (here {here[0]} with {len(here[1])}). "
                 "Train both with the same data and model.method.velocity_*."
             )
 
     def notes(self) -> tuple[str, ...]:
-        """That nothing of the material is identified."""
+        """The note that the material is not identified, and differences from the original."""
         return (
             "PhysGaussian with a given modulus, which it does not identify; the original does not fit how a "
             f"sequence begins either, and takes {CELLS} cells (here {self.domain.cells}) and {SUBSTEPS} substeps.",
-            *(f"{self.said(i)}." for i in range(len(self.scenes))),
+            *(f"{self.description(i)}." for i in range(len(self.scenes))),
         )
 
 

@@ -1,4 +1,4 @@
-"""One frame, many substeps, as one differentiable function of torch."""
+"""One frame of substeps as a differentiable function of torch."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ STATE = 4  # tensors of a particle state
 class Frame(torch.autograd.Function):
     """(x, v, C, F, E) at the start of a frame -> (x, v, C, F) at its end, after ``count`` substeps of ``dt`` [s].
 
-    With gradients wanted (``keep``), the state of every substep is kept until the backward pass, 24 numbers per
-    particle; grids and stresses are computed again there. Otherwise two states are kept.
+    With ``keep``, for loss gradients, the state of every substep is kept until the backward pass, 24 numbers per
+    particle; grids and stresses are recomputed there. Otherwise two states are kept.
     """
 
     @staticmethod
     def forward(
         ctx: Any, substeps: Substeps, count: int, dt: float, dx: float, keep: bool, *given: Tensor
     ) -> tuple[Tensor, ...]:
-        """Makes the frame; again on the whole grid if a particle leaves the window round where they began."""
+        """Computes the frame, and once more on the whole grid if a particle leaves the window."""
         given = tuple(t.detach().contiguous() for t in given)
         slots = count + 1 if keep else 2
         window = substeps.window(given[0])
@@ -40,7 +40,7 @@ class Frame(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *adjoints: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        """Goes through the substeps backwards."""
+        """The adjoints of the substeps in reverse order."""
         substeps, count = ctx.substeps, ctx.count
         young, *history = ctx.saved_tensors
         tensors = tuple(a.float().contiguous().clone() for a in adjoints)

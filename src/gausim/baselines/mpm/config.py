@@ -1,4 +1,4 @@
-"""What a simulation is made of: material, grid, and the bound of the time step."""
+"""Options of a simulation: material, grid, and time step with its bound."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Material:
     """A fixed corotated elastic material; Young's modulus may vary over the particles.
 
     Attributes:
-        young_modulus: E of every particle that is not given its own [mass / (length s^2), simulation units].
+        young_modulus: E of the particles for which no other is given [mass / (length s^2), simulation units].
         poisson_ratio: nu, in (-1, 0.5).
         density: mass per volume [simulation units].
     """
@@ -61,23 +61,23 @@ class Grid:
         return self.size / self.cells
 
 
-COVERED_POISSON_RATIO = 0.45  # up to which the bound of the time step needs no factor
+COVERED_POISSON_RATIO = 0.45  # the bound of the time step needs no factor up to this
 
 
 def pressure_wave(poisson_ratio: float) -> float:
-    """Speed of waves of pressure over sqrt(E / rho): sqrt((1 - nu) / ((1 + nu) (1 - 2 nu)))."""
+    """Speed of pressure waves over sqrt(E / rho): sqrt((1 - nu) / ((1 + nu) (1 - 2 nu)))."""
     nu = poisson_ratio
     return math.sqrt((1 - nu) / ((1 + nu) * (1 - 2 * nu)))
 
 
 @dataclass(frozen=True)
 class TimeStep:
-    """How a frame is divided into substeps.
+    """Division of a frame into substeps.
 
     Attributes:
         frame_time: duration of a frame [s].
-        substeps: substeps per frame; None derives the least number that keeps the bound.
-        courant: c of the bound dt < c dx / sqrt(E / rho). 0.3 leaves room for nu up to 0.45, where waves of pressure
+        substeps: substeps per frame; None derives the smallest number within the bound.
+        courant: c of the bound dt < c dx / sqrt(E / rho). 0.3 is safe for nu up to 0.45, where pressure waves
             are 1.9 times as fast as sqrt(E / rho); measured, 0.5 is stable up to 0.4 and 0.7 up to 0.3.
     """
 
@@ -96,9 +96,9 @@ class TimeStep:
     def count(
         self, dx: float, young_modulus: Float[Tensor, " N"], density: Float[Tensor, " N"], poisson_ratio: float
     ) -> int:
-        """Substeps per frame: the given number, or the least that keeps dt < c dx / sqrt(E / rho) for all particles.
+        """Substeps per frame: the given number, or the smallest with dt < c dx / sqrt(E / rho) for all particles.
 
-        For nu > 0.45 sqrt(E / rho) is multiplied by how much faster waves of pressure are than at 0.45.
+        For nu > 0.45, sqrt(E / rho) is multiplied by the speed of pressure waves relative to that at 0.45.
 
         Raises:
             ConfigError: the given number violates the bound, or a modulus is not a positive number.

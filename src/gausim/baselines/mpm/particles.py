@@ -1,4 +1,4 @@
-"""Particles: what stays (mass, volume, which are held) and what moves."""
+"""Particles: constants (mass, volume, pins) and the state that moves."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from gausim.baselines.mpm.config import Grid
 from gausim.core import DivergenceError
 
-HALF = 0.999  # a node half way between held and free matter is held, whatever rounding makes of it
+HALF = 0.999  # below 1, so that a node half way between pinned and free matter is pinned despite rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,21 +47,21 @@ class ParticleState:
         return self.positions, self.velocities, self.affine, self.deformation_gradients
 
     def detach(self) -> ParticleState:
-        """The same numbers without history (gradients stop here)."""
+        """The same state without history; loss gradients stop here."""
         return ParticleState(*(getattr(self, f.name).detach() for f in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """What does not change during a simulation.
+    """Constants of a simulation.
 
     Attributes:
         mass: m [simulation units].
         volume: V at rest [simulation units^3].
-        pinned: particles that stay where they are. Their F takes part: the layer between the last pinned node and
-            the first free one would be soft without it.
-        pinned_nodes: nodes that hold pinned particles: the nearest of each, and those whose mass at rest is theirs by
-            half or more; their velocity is 0.
+        pinned: particles that keep their position. Their F still changes: without it the layer between the last pinned
+            node and the first free one would be soft.
+        pinned_nodes: nodes of velocity 0: the nearest of each pinned particle, and those of whose mass at rest at
+            least half belongs to pinned particles.
     """
 
     mass: Float[Tensor, " N"]
@@ -78,7 +78,7 @@ class Particles:
         volume: Float[Tensor, " N"] | None = None,
         pinned: Bool[Tensor, " N"] | None = None,
     ) -> Particles:
-        """Particles at rest at these positions; without ``volume`` a cell is shared by the particles in it.
+        """Particles at rest; without ``volume`` the particles in a cell divide its volume equally.
 
         Raises:
             DivergenceError: a particle lies outside the domain.
@@ -98,7 +98,7 @@ class Particles:
 
 
 def node_volumes(positions: Float[Tensor, "N 3"], volume: Float[Tensor, " N"], grid: Grid) -> Float[Tensor, "n n n"]:
-    """Volume that every node has of the particles, by quadratic B-splines [simulation units^3]."""
+    """Volume of the particles at every node, by quadratic B-splines [simulation units^3]."""
     n = grid.cells + 1
     base = (positions / grid.dx - 0.5).floor()
     f = positions / grid.dx - base
@@ -125,7 +125,7 @@ def require_inside(positions: Float[Tensor, "N 3"], grid: Grid, when: str) -> No
     Args:
         positions: positions [simulation units].
         grid: the grid; the allowed region is half a cell less than the domain on each side.
-        when: what the message says about the time, e.g. 'frame 12'.
+        when: the time, for the message, e.g. 'frame 12'.
     """
     low, high = 0.5 * grid.dx, grid.size - 0.5 * grid.dx
     outside = ~((positions >= low) & (positions < high)).all(-1)

@@ -14,7 +14,7 @@ def warp() -> Any:
     """The module ``warp``, initialised without its banner.
 
     Raises:
-        ConfigError: it is not installed.
+        ConfigError: Warp is not installed.
     """
     try:
         import warp as wp
@@ -29,7 +29,7 @@ def warp() -> Any:
 
 
 def on_stream_of(device: torch.device) -> AbstractContextManager[Any]:
-    """Runs a block on torch's stream of a CUDA device, so that both libraries see each other's results in order."""
+    """Runs a block on torch's stream of a CUDA device, so that the work of both libraries stays in order."""
     wp = warp()
     if device.type != "cuda":
         return nullcontext()

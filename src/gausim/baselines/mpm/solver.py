@@ -17,8 +17,7 @@ class MPMSolver:
     """MLS-MPM/APIC on quadratic B-splines, explicit (Hu et al. 2018, Jiang et al. 2015).
 
     All quantities are in simulation units and float32, on the device of the particles. A frame is differentiable with
-    respect to the state at its start and Young's modulus; whoever calls decides by
-    :meth:`ParticleState.detach` whether gradients go on to the frame before.
+    respect to the state at its start and Young's modulus; :meth:`ParticleState.detach` stops loss gradients there.
 
     Args:
         particles: mass, volume and pins.
@@ -32,7 +31,7 @@ class MPMSolver:
         self._substeps = Substeps(particles, material, grid)
 
     def substeps(self, young_modulus: Float[Tensor, " N"]) -> int:
-        """Substeps that a frame takes with these moduli.
+        """Substeps per frame for these moduli.
 
         Raises:
             ConfigError: the configured number violates the bound of the time step.
@@ -51,7 +50,7 @@ class MPMSolver:
 
         Args:
             state: the state at its start.
-            frame: its number, counted from 0, for what errors say.
+            frame: its number, counted from 0, for error messages.
             young_modulus: E per particle; the material's if not given.
 
         Raises:

@@ -1,4 +1,4 @@
-"""Substeps and their adjoint as Warp launches on arrays that the caller owns."""
+"""Substeps and their adjoint as Warp launches on the caller's arrays."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ MARGIN = 4  # cells that particles may move within a frame before a larger windo
 
 
 def views(tensors: Sequence[Tensor]) -> list[Any]:
-    """Contiguous float32 tensors of a particle state (x, v, C, F) as Warp sees them; no copies."""
+    """Warp arrays on the memory of a particle state's contiguous float32 tensors (x, v, C, F)."""
     wp = warp()
     kinds = (wp.vec3, wp.vec3, wp.mat33, wp.mat33)
     return [wp.from_torch(t.detach(), dtype=kind) for t, kind in zip(tensors, kinds, strict=True)]
 
 
 class Window:
-    """The nodes that a frame computes on: a block round the particles, or the whole grid.
+    """The nodes of one frame: a block around the particles, or the whole grid.
 
     Attributes:
         origin: number of its first node per axis.
@@ -35,14 +35,14 @@ class Window:
     """
 
     def __init__(self, origin: Sequence[int], shape: Sequence[int], device: Any, *, adjoint: bool = False) -> None:
-        """Zeros, with more of them for the ``adjoint`` if wanted."""
+        """Arrays of zeros; ``adjoint`` adds those of the adjoint."""
         wp = warp()
         self.origin, self.shape = tuple(origin), tuple(shape)
         self.momentum = wp.zeros(self.shape, dtype=wp.vec4, device=device, requires_grad=adjoint)
         self.velocity = wp.zeros(self.shape, dtype=wp.vec3, device=device, requires_grad=adjoint)
 
     def holds(self, positions: Float[Tensor, "N 3"], dx: float) -> bool:
-        """Whether all nodes of all particles are in the window."""
+        """True if all nodes of all particles are in the window."""
         x = positions / dx - positions.new_tensor(self.origin)
         return bool(((x >= 0.5) & (x < positions.new_tensor(self.shape) - 1.5)).all())
 
@@ -50,8 +50,8 @@ class Window:
 class Substeps:
     """Launches the four kernels of a substep forwards and backwards.
 
-    A window and one array of stresses are all it works on: the adjoint of a substep computes them again from the state
-    at its start.
+    The working memory is a window and one array of stresses: the adjoint of a substep recomputes both from the state at
+    its start.
 
     Args:
         particles: mass, volume and pins, on the device to compute on.
@@ -65,17 +65,17 @@ class Substeps:
 
         self._wp, self._kernels, self._grid, self._material = wp, transfer, grid, material
         self.device = wp.device_from_torch(particles.mass.device)
-        with announced("the material point method", keeper="Warp"):
+        with announced("the material point method", compiler="Warp"):
             wp.load_module(transfer.__name__, device=self.device)
         self.count = len(particles.mass)
-        # Warp's views do not own the memory of the tensors they look at.
+        # Warp's views do not own the memory of their tensors.
         held, pinned = particles.pinned.to(torch.uint8), particles.pinned_nodes.to(torch.uint8)
         self._alive = [t.contiguous() for t in (particles.mass, particles.volume, held, pinned)]
         self._mass, self._volume, self._held, self._pinned_nodes = (wp.from_torch(t) for t in self._alive)
         self._stress = wp.zeros(self.count, dtype=wp.mat33, device=self.device, requires_grad=True)
 
     def window(self, positions: Float[Tensor, "N 3"] | None = None) -> Window:
-        """The nodes round these particles and :data:`MARGIN` more on each side; all nodes without particles."""
+        """The nodes around the particles and :data:`MARGIN` more on each side; all nodes without particles."""
         last = self._grid.cells
         if positions is None or not len(positions) or not torch.isfinite(positions).all():
             return Window((0, 0, 0), (last + 1,) * 3, self.device)
@@ -99,7 +99,7 @@ class Substeps:
             array.grad.zero_()
         window.momentum.zero_()
         launches = self._launches(window, state, following, young, dt)
-        for launch in launches[:-1]:  # ``following`` is there already
+        for launch in launches[:-1]:  # ``following`` is known already
             self._wp.launch(*launch, device=self.device)
         for kernel, size, inputs, outputs in reversed(launches):
             adjoints: Any = {

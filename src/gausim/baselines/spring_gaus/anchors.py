@@ -1,4 +1,4 @@
-"""Anchors: few points that carry the motion of all kernels (Spring-Gaus), by displacement and gradient."""
+"""Anchors: few points whose displacements move and deform all kernels (Spring-Gaus)."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from torch import Tensor
 from gausim.core import GaussianScene, SceneError
 from gausim.ops.deformation import bounded_deformation, polar_rotation
 
-# A kernel follows so many anchors, with weights proportional to 1 / sqrt(distance) (Spring-Gaus).
+# Number of anchors that a kernel follows, with weights proportional to 1 / sqrt(distance) (Spring-Gaus).
 FOLLOWED = 16
-# A gradient that shrinks volume below this fraction is taken for a failure of the fit and replaced by the identity.
+# A deformation gradient that shrinks volume below this fraction is replaced by the identity: the fit has failed there.
 LEAST_VOLUME = 0.05
-# Share of the trace that is added to the moment matrix: anchors in a plane say nothing about the third direction.
+# Fraction of the trace added to the moment matrix, which is singular where anchors lie in a plane.
 RIDGE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Anchors:
-    """A anchors of one scene and the kernels that follow them. Their lengths are in diagonals of the scene.
+    """A anchors of one scene and the kernels that follow them; lengths of anchors are in diagonals of the scene.
 
     Attributes:
         rest: rest positions [diagonals].
-        pinned: those that never move.
+        pinned: anchors that never move.
         followed: the n nearest anchors of every kernel.
-        weights: of their displacements; 0 for held kernels, else they sum to 1.
-        slopes: of their displacements in the gradient [1 / diagonals].
+        weights: of the anchors' displacements; 0 for held kernels, else they sum to 1.
+        slopes: factors g_a of the anchors' displacements in the deformation gradient [1 / diagonals].
         means: rest positions of the kernels [scene units].
         diagonal: of the scene [scene units].
     """
@@ -44,16 +44,17 @@ class Anchors:
 
     @staticmethod
     def of(scene: GaussianScene, most: int) -> Anchors:
-        """The occupied cells of the finest cubic grid over the simulated kernels that occupies at most ``most``.
+        """Anchors at the centres of the occupied cells of a cubic grid over the simulated kernels.
 
-        An anchor stands at the centre of its cell and is pinned where at least half of the cell's kernels are.
+        The grid is the finest of which at most ``most`` cells are occupied. An anchor is pinned where at least half
+        of its cell's kernels are.
 
         Raises:
             SceneError: fewer than four anchors.
         """
         points = scene.means[scene.simulated].double() / scene.diagonal
         cells, cell_of = _grid(points, most)
-        share = torch.zeros(len(cells), dtype=torch.float64).index_add_(
+        pinned_fraction = torch.zeros(len(cells), dtype=torch.float64).index_add_(
             0, cell_of, scene.pinned[scene.simulated].double()
         ) / torch.bincount(cell_of, minlength=len(cells))
         if len(cells) < 4:
@@ -61,9 +62,9 @@ class Anchors:
                 f"{scene.name}: expected at least 4 occupied grid cells as anchors, got {len(cells)} of {most} allowed "
                 f"and {len(points)} simulated kernels. Raise model.method.anchors."
             )
-        pinned = share >= 0.5
+        pinned = pinned_fraction >= 0.5
         if bool(scene.pinned.any()) and not bool(pinned.any()):
-            pinned = share > 0
+            pinned = pinned_fraction > 0
         held = scene.pinned | ~scene.simulated
         followed, weights, slopes = _follow(scene.means.double() / scene.diagonal, cells, held)
         single = [x.to(scene.means.dtype) for x in (cells, weights, slopes)]
@@ -71,11 +72,11 @@ class Anchors:
 
     @property
     def free(self) -> Float[Tensor, "A 1"]:
-        """1 for anchors that move, else 0."""
+        """1 for anchors that may move, 0 for pinned ones."""
         return (~self.pinned).to(self.rest)[:, None]
 
     def positions(self, displacement: Float[Tensor, "A 3"]) -> Float[Tensor, "K 3"]:
-        """Kernels that follow displaced anchors [scene units]; ``displacement`` is in diagonals."""
+        """Positions of the kernels [scene units] from the displacements of the anchors [diagonals]."""
         moved = torch.einsum("kn,kni->ki", self.weights.to(displacement), self._gather(displacement))
         return self.means.to(displacement) + self.diagonal * moved
 
@@ -85,21 +86,21 @@ class Anchors:
         """Deformation gradients and rotations of the kernels.
 
         F minimises sum_a w_a |F (X_a - X) - (x_a - x)|^2 with X, x the weighted means of the followed anchors:
-        F = I + sum_a u_a g_a^T, g_a = w_a M^-1 (X_a - X), M = sum_a w_a (X_a - X)(X_a - X)^T. The rotation is F's polar
-        one.
+        F = I + sum_a u_a g_a^T, g_a = w_a M^-1 (X_a - X), M = sum_a w_a (X_a - X)(X_a - X)^T. The rotation is that of
+        the polar decomposition of F.
         """
         slopes = self.slopes.to(displacement)
         identity = torch.eye(3).to(slopes)
-        gradient = identity + torch.einsum("kni,knj->kij", self._gather(displacement), slopes)
-        gradient = bounded_deformation(gradient, LEAST_VOLUME, unit=False)
-        return gradient, polar_rotation(gradient)
+        found = identity + torch.einsum("kni,knj->kij", self._gather(displacement), slopes)
+        found = bounded_deformation(found, LEAST_VOLUME, unit=False)
+        return found, polar_rotation(found)
 
     def _gather(self, displacement: Tensor) -> Tensor:
         return displacement.index_select(0, self.followed.flatten()).unflatten(0, self.followed.shape)
 
 
 def _grid(points: Tensor, most: int) -> tuple[Tensor, Tensor]:
-    """Centres of the occupied cells of the finest grid with at most ``most`` of them, and the cell of every point."""
+    """Centres of the occupied cells of the finest grid that has at most ``most``, and the cell of every point."""
     low = points.amin(0)
     fine, coarse = 1e-3, 1.0  # of a diagonal; the coarsest grid has at most eight cells
     for _ in range(30):

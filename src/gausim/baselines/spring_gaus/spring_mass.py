@@ -1,8 +1,8 @@
-"""A net of springs fitted to videos: Spring-Gaus (Zhong et al., ECCV 2024), for objects that are held somewhere.
+"""A net of springs fitted to videos: Spring-Gaus (Zhong et al., ECCV 2024), for objects with pinned parts.
 
-Anchors on a grid are joined by springs; kernels follow their nearest anchors. Fitted are an initial velocity per anchor
-and sequence, and of every object a stiffness per anchor and one number that attenuates far springs. Sequences of one
-object share what is the object's, which the original (one sequence, one object) leaves open.
+Anchors on a grid are joined by springs; kernels follow their nearest anchors. The fitted parameters are an initial
+velocity per anchor and sequence and, per object, a stiffness per anchor, an attenuation of far springs and a damping.
+All sequences of an object have the same object parameters; the original has one sequence per object.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from gausim.baselines.spring_gaus.anchors import Anchors
 from gausim.baselines.spring_gaus.springs import Net, move
 from gausim.core import ConfigError, DivergenceError, FittedState
 
-# What the original takes.
+# Values of the original.
 ANCHORS, NEIGHBOURS, SUBSTEPS, DAMPING = 2048, 256, 100, 0.1
-# Beyond so many times the substeps that were asked for, a fit has made its springs absurdly stiff.
+# Limit of the substeps per frame, in multiples of the configured number; stiffer springs are an error.
 MOST_SUBSTEPS = 16
 
 
 class AnchoredMotion(Fitted):
-    """Kernels that follow anchors, and a velocity per anchor and sequence: a base for what moves anchors.
+    """Base of the methods that move anchors: kernels follow the anchors, which have a velocity in every sequence.
 
-    A velocity is in diagonals of the scene per frame; anchors of pinned kernels have none. Kernels turn and stretch
-    with their anchors; those of the original keep their shape.
+    Velocities are in diagonals of the scene per frame and 0 for pinned anchors. Kernels turn and stretch with their
+    anchors; in the original they keep their shape.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class AnchoredMotion(Fitted):
         """Places the anchors.
 
         Args:
-            anchors: at most so many per scene.
+            anchors: maximum number per scene.
 
         Raises:
             ConfigError: fewer than four anchors are allowed.
@@ -67,12 +67,12 @@ class AnchoredMotion(Fitted):
         return self._anchors[scene_id]
 
     def begin(self, sequence_id: int) -> FittedState:
-        """The rest state and the fitted velocity."""
+        """The rest state with the fitted velocity."""
         anchors = self.anchors(sequence_id)
         return self.state(sequence_id, 0, anchors.rest, self.velocity[sequence_id] * anchors.free)
 
     def state(self, sequence_id: int, frame: int, x: Float[Tensor, "A 3"], v: Float[Tensor, "A 3"]) -> FittedState:
-        """The kernels that follow anchors at ``x``."""
+        """The state of the kernels for anchors at ``x`` with velocities ``v``."""
         anchors = self.anchors(sequence_id)
         displacement = x - anchors.rest
         turned = anchors.deformation_gradients(displacement)
@@ -84,26 +84,25 @@ class AnchoredMotion(Fitted):
 
 
 class ConstantVelocity(AnchoredMotion):
-    """Every anchor keeps the velocity that the first frames show; no forces, nothing to foresee with."""
+    """Every anchor keeps the velocity that was fitted to the first frames; there are no forces."""
 
     name = "constant_velocity"
 
     def notes(self) -> tuple[str, ...]:
-        """Which velocity."""
-        return ("Keeps for ever the velocity per anchor that was fitted to the frames of its one stage.",)
+        """The origin of the velocity."""
+        return ("Every anchor keeps the velocity that was fitted to the frames of the only stage.",)
 
     def advance(self, state: FittedState) -> FittedState:
-        """One frame further on the same straight line."""
+        """The next frame: x + v."""
         x, v = state.inner
         return self.state(state.sequence_id, state.frame + 1, x + v, v)
 
 
 class SpringMass(AnchoredMotion):
-    """Spring-Gaus: anchors of mass 1 joined by springs, without gravity, held where the object is.
+    """Spring-Gaus: anchors of mass 1 joined by springs, without gravity, pinned where the object is.
 
     A spring between a and b has kappa = att 10^((k_a + k_b) / 2) / L_0 and drag att damping / L_0 (lengths in
-    diagonals of the scene, times in seconds); the law and att
-    are those of :mod:`gausim.baselines.spring_gaus.springs`.
+    diagonals of the scene, times in seconds); :mod:`gausim.baselines.spring_gaus.springs` has the law and att.
     """
 
     name = "spring_mass"
@@ -122,9 +121,9 @@ class SpringMass(AnchoredMotion):
         """Places anchors and springs.
 
         Args:
-            anchors: at most so many per scene.
-            neighbours: springs from an anchor to so many of its nearest.
-            substeps: per frame, at least; stiff springs get more.
+            anchors: maximum number per scene.
+            neighbours: number of nearest anchors to which an anchor has springs.
+            substeps: minimum per frame; stiff springs get more.
             damping: of the closing speed of a spring's ends, times its rest length [diagonals / s].
             stiffness: k at the start; None derives it from ``period``.
             period: of the slowest vibration at the start [frames].
@@ -144,21 +143,21 @@ class SpringMass(AnchoredMotion):
         self.attenuation = nn.ParameterList(torch.zeros(()) for _ in self.scenes)
         self.damping = nn.ParameterList(torch.tensor(math.log10(damping)) for _ in self.scenes)
         self.stiffness = nn.ParameterList(torch.zeros(len(a.rest)) for a in self._anchors)
-        for scene_id, own in enumerate(self.stiffness):
-            nn.init.constant_(own, self._matching(scene_id, period) if stiffness is None else stiffness)
+        for scene_id, values in enumerate(self.stiffness):
+            nn.init.constant_(values, self._matching(scene_id, period) if stiffness is None else stiffness)
 
     def _matching(self, scene_id: int, period: float) -> float:
-        """The k with which the slowest vibration has a period [frames]."""
+        """The k with which the slowest vibration has the given period [frames]."""
         kappa = self.springs(scene_id)[0].detach()
         slowest = slowest_vibration(self._nets[scene_id], self._anchors[scene_id], kappa)
         return math.log10((2 * math.pi / period) ** 2 / slowest)
 
     def notes(self) -> tuple[str, ...]:
-        """Where it is smaller than the original."""
+        """Sizes that are smaller than the original's."""
         smaller = [
-            f"{own} {what} instead of {full}"
-            for own, full, what in ((self.most, ANCHORS, "anchors"), (self.neighbours, NEIGHBOURS, "neighbours"))
-            if own < full
+            f"{here} {name} instead of {full}"
+            for here, full, name in ((self.most, ANCHORS, "anchors"), (self.neighbours, NEIGHBOURS, "neighbours"))
+            if here < full
         ]
         return (f"Spring-Gaus with at most {', '.join(smaller)}.",) if smaller else ()
 
@@ -177,7 +176,7 @@ class SpringMass(AnchoredMotion):
         """One frame of semi-implicit Euler.
 
         Raises:
-            DivergenceError: the springs have become too stiff for any sensible number of substeps.
+            DivergenceError: the springs need more than :data:`MOST_SUBSTEPS` times the configured substeps.
         """
         scene_id = self.scene_of_sequence[state.sequence_id]
         kappa, drag = self.springs(scene_id)
@@ -187,7 +186,7 @@ class SpringMass(AnchoredMotion):
         return self.state(state.sequence_id, state.frame + 1, x, v)
 
     def _count(self, scene_id: int, kappa: Tensor, drag: Tensor) -> int:
-        """Substeps per frame: semi-implicit Euler needs omega dt < 2 (half of it is taken), and drag dt < 1."""
+        """Substeps per frame: semi-implicit Euler needs omega dt < 2 (the bound here is 1) and drag dt < 1."""
         net = self._nets[scene_id]
         needed = max(math.sqrt(net.stiffest(kappa)), 2 * net.stiffest(drag))
         if not needed <= MOST_SUBSTEPS * self.substeps:
@@ -209,7 +208,7 @@ class SpringMass(AnchoredMotion):
 
 
 def slowest_vibration(net: Net, anchors: Anchors, kappa: Float[Tensor, " E"]) -> float:
-    """Squared angular frequency of the slowest vibration about rest [1 / frames^2], rigid motions left out."""
+    """Squared angular frequency of the slowest vibration about rest [1 / frames^2], without rigid motions."""
     d = ((anchors.rest[net.second] - anchors.rest[net.first]) / net.length[:, None]).double()
     blocks = (kappa.double()[:, None, None] * d[:, :, None] * d[:, None, :]).numpy()
     rows, columns, values = [], [], []
@@ -224,7 +223,7 @@ def slowest_vibration(net: Net, anchors: Anchors, kappa: Float[Tensor, " E"]) ->
     free = np.repeat(~anchors.pinned.numpy(), 3)
     stiff = whole[free][:, free]
     largest = float(abs(stiff).sum(0).max())
-    wanted = min(7, stiff.shape[0] - 1)  # six of them may be rigid
-    start = np.ones(stiff.shape[0])  # a random one would make runs differ
-    found = np.sort(eigsh(stiff, k=wanted, sigma=-1e-9 * largest, v0=start, return_eigenvectors=False))
+    count = min(7, stiff.shape[0] - 1)  # six of them may be rigid
+    start = np.ones(stiff.shape[0])  # a random vector would make runs differ
+    found = np.sort(eigsh(stiff, k=count, sigma=-1e-9 * largest, v0=start, return_eigenvectors=False))
     return float(next((value for value in found if value > 1e-7 * largest), largest))

@@ -5,7 +5,7 @@ r = x_b - x_a, L = |r|, d = r / L and e = L / L_0 - 1 pulls a with
 
     f = (kappa L_0 e sqrt(1 + |e|) + c (v_b - v_a) . d) d,
 
-and b with -f: both ends alike, so that momentum is kept and, without damping, energy is.
+and b with -f, so that momentum is conserved and, without damping, energy.
 """
 
 # Annotations would be checked by beartype in the tests, around functions that numba has to compile.
@@ -25,7 +25,7 @@ from torch import Tensor
 from gausim.kernels.announce import announced
 from gausim.kernels.jit import FINITE_MATH_OFF, HELPER, KERNEL
 
-# Springs to so many nearest anchors are never attenuated (Spring-Gaus).
+# Springs to this number of nearest anchors are never attenuated (Spring-Gaus).
 FIRM = 16
 
 
@@ -38,8 +38,8 @@ class Net:
         second: the other end, of a higher number.
         starts: first spring of every anchor, then E.
         length: rest length L_0 [diagonals].
-        rank: how many nearer neighbours the end that has fewer has: 0 for its nearest.
-        reach: neighbours that were asked for.
+        rank: number of nearer neighbours at an end, 0 for its nearest; the smaller of both ends.
+        reach: neighbours per anchor.
     """
 
     first: Int[Tensor, " E"]
@@ -56,9 +56,9 @@ class Net:
         reach = min(neighbours, count - 1)
         _, index = cKDTree(rest.double().numpy()).query(rest.double().numpy(), k=reach + 1)
         near = torch.from_numpy(index[:, 1:]).long()
-        own = torch.arange(count)[:, None].expand_as(near)
+        anchor = torch.arange(count)[:, None].expand_as(near)
         rank = torch.arange(reach).expand_as(near)
-        code = (torch.minimum(own, near) * count + torch.maximum(own, near)).flatten()
+        code = (torch.minimum(anchor, near) * count + torch.maximum(anchor, near)).flatten()
         pairs, place = torch.unique(code, return_inverse=True)
         best = torch.full((len(pairs),), reach).scatter_reduce_(0, place, rank.flatten(), "amin")
         first, second = pairs // count, pairs % count
@@ -74,7 +74,7 @@ class Net:
         return fade.clamp(0, 1)
 
     def stiffest(self, stiffness: Float[Tensor, " E"]) -> float:
-        """Upper bound of the squared angular frequency of any motion [1 / frames^2], from the rows' sums."""
+        """Upper bound of the squared angular frequency of any motion [1 / frames^2], from row sums (Gershgorin)."""
         total = torch.zeros(len(self.starts) - 1).to(stiffness)
         total = total.index_add(0, self.first, stiffness).index_add(0, self.second, stiffness)
         return 2 * float(total.max())
@@ -83,7 +83,7 @@ class Net:
 def forces(
     net: Net, x: Float[Tensor, "A 3"], v: Float[Tensor, "A 3"], stiffness: Float[Tensor, " E"], drag: Tensor
 ) -> Float[Tensor, "A 3"]:
-    """Force on every anchor, in plain torch."""
+    """Force on every anchor (plain torch)."""
     r = x[net.second] - x[net.first]
     length = r.norm(dim=1)
     d = r / length[:, None]
@@ -96,7 +96,7 @@ def forces(
 def move_plain(
     net: Net, x: Tensor, v: Tensor, stiffness: Tensor, drag: Tensor, free: Tensor, substeps: int
 ) -> tuple[Tensor, Tensor]:
-    """:func:`move` in plain torch: the oracle, and what other devices use."""
+    """:func:`move` in plain torch: the reference, and the form for other devices."""
     dt = 1 / substeps
     for _ in range(substeps):
         v = v + dt * free * forces(net, x, v, stiffness, drag)
@@ -131,7 +131,7 @@ def move(
 
 
 class _Move(torch.autograd.Function):
-    """One frame as one node: the states of its substeps are kept, forces are computed once more on the way back."""
+    """One frame as one node of the graph: substep states are kept, forces are recomputed in the backward pass."""
 
     @staticmethod
     def forward(
@@ -203,7 +203,7 @@ def _forward(xs, vs, starts, second, rest, kappa, drag, moving, dt):
 
 @numba.njit(fastmath=FINITE_MATH_OFF, **KERNEL)
 def _backward(xs, vs, starts, second, rest, kappa, drag, moving, dt, gx, gv, by_kappa, by_drag):
-    """Takes gradients with respect to the last state to the first, in place, and adds those of the springs."""
+    """Turns the loss gradients of the last state into those of the first, in place, and adds those of the springs."""
     count, one = xs.shape[1], dt / dt
     gf = np.empty_like(gx)
     for step in range(xs.shape[0] - 2, -1, -1):

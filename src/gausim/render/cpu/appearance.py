@@ -14,9 +14,9 @@ from gausim.render.cpu.shading import shade, shade_adjoint
 from gausim.render.cpu.simd import LANES
 from gausim.render.draw import deformed_appearance as operation
 
-# Cuts of one call, independent of the number of threads, so that gradients are too.
+# Tasks of one call: constants, so that loss gradients do not depend on the number of threads.
 FORWARD_TASKS = 8
-BACKWARD_TASKS = 4  # each has gradients of all units of its own
+BACKWARD_TASKS = 4  # each has a separate array of the loss gradients of all units
 
 
 def deformed_appearance(
@@ -28,9 +28,9 @@ def deformed_appearance(
     sh: Tensor,
     centers: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """:func:`gausim.render.draw.deformed_appearance`, divided over torch's number of threads without effect on bits.
+    """:func:`gausim.render.draw.deformed_appearance`, on torch's number of threads, which does not change a bit.
 
-    Gradients of the rest scene's covariances and coefficients are left to the plain form.
+    The plain form computes loss gradients of the rest scene's covariances and coefficients.
     """
     if torch.is_grad_enabled() and (covars.requires_grad or sh.requires_grad):
         return operation.plain(positions, deformation_gradients, rotations, unit_of_kernel, covars, sh, centers)

@@ -1,4 +1,4 @@
-"""One call of the renderer: B states in V views, cut into tasks for the pool."""
+"""One call of the renderer: B states in V views, divided into tasks for the pool."""
 
 from __future__ import annotations
 
@@ -23,27 +23,27 @@ from gausim.render.cpu.raster import BLOCKS, PIXELS, SUMS, backward_band, forwar
 
 Array = NDArray[Any]
 
-# A call is cut into at least about this many tasks. A constant, not the number of threads, because the cut decides
-# the order of summation and gradients must not depend on the number of threads.
+# A call is divided into at least about this many tasks. A constant, not the number of threads, because the division
+# determines the order of summation, and loss gradients must not depend on the number of threads.
 TASKS = 12
-# [tiles] Picking a tile's kernels looks at all of its strip in the band: high bands would make that quadratic.
+# [tiles] Selecting a tile's kernels reads all kernels of its strip in the band: the cost is quadratic in the height.
 BAND_TILES = 8
 
 
 class Images(NamedTuple):
-    """What is drawn, or the gradients of it."""
+    """Drawn images, or their loss gradients."""
 
     rgb: Array  # (B, V, H, W, 3)
     alpha: Array  # (B, V, H, W)
     depth: Array | None  # (B, V, H, W)
 
     def of(self, b: int, v: int) -> tuple[Array, Array, Array | None]:
-        """Those of one view."""
+        """The images of one view."""
         return self.rgb[b, v], self.alpha[b, v], None if self.depth is None else self.depth[b, v]
 
 
 class Gradients(NamedTuple):
-    """With respect to the inputs; the background's is None unless it was asked for."""
+    """Loss gradients of the inputs; that of the background only if requested."""
 
     means: Array
     covars: Array
@@ -54,7 +54,7 @@ class Gradients(NamedTuple):
 
 @dataclass(slots=True)
 class Band:
-    """What the backward pass needs of one band of one view."""
+    """Results for one band of one view that the backward pass needs."""
 
     row_low: int
     records: Array
@@ -67,7 +67,7 @@ class Band:
 
 @dataclass(slots=True)
 class View:
-    """The kernels of one state as one view sees them, indexed by the kernel, and the view's bands."""
+    """The kernels of one state projected into one view, indexed by the kernel, and the view's bands."""
 
     depth: Array
     spans: Array  # (K, 2): first and last pixel row
@@ -80,13 +80,13 @@ class View:
     sums: Array | None = None
 
     def make_sums(self) -> None:
-        """Makes room for what the backward pass sums up, all bands in one array."""
+        """Allocates the sums of the backward pass, all bands in one array."""
         rows = [0 if band is None else band.records.shape[0] for band in self.bands]
         self.offsets = np.cumsum([0, *rows])
         self.sums = np.empty((self.offsets[-1], SUMS), np.float32)
 
     def forget(self) -> None:
-        """Lets go of what only the forward pass needs."""
+        """Frees arrays that only the forward pass needs."""
         self.records = self.extents = self.order = None
 
 
@@ -127,7 +127,7 @@ class Batch:
         return np.repeat(np.arange(len(self.band_rows)), [last - first + 1 for first, last in self.band_rows])
 
     def forward(self, pool: WorkerPool, *, keep: bool, depth: bool) -> Images:
-        """Draws everything. ``keep`` holds on to what backward needs."""
+        """Draws all images; ``keep`` stores the bands for the backward pass."""
         shape = (*self.viewmats.shape[:2], self.height, self.width)
         images = Images(
             np.empty((*shape, 3), np.float32),
@@ -162,7 +162,7 @@ class Batch:
         return images
 
     def backward(self, pool: WorkerPool, grads: Images, *, background: bool) -> Gradients:
-        """Gradients of the inputs from those of the images."""
+        """Loss gradients of the inputs from those of the images."""
         states, views = self.viewmats.shape[:2]
         count, bands = self.means.shape[1], range(len(self.band_rows))
         result = self.make_gradients(background=background)
@@ -182,7 +182,7 @@ class Batch:
                 self.project_adjoint(v, (b, 0, count), result)
                 self.views[b, v].sums = None
 
-        if states >= TASKS:  # what is summed up stays in the cache
+        if states >= TASKS:  # the sums stay in the cache
             pool.run(state, range(states))
         else:
             for view in self.views.values():
@@ -196,7 +196,7 @@ class Batch:
         return result._replace(background=result.background.sum((0, 1, 2)).astype(np.float32))
 
     def make_gradients(self, *, background: bool) -> Gradients:
-        """Zeros to add to; the background's are of each band."""
+        """Loss gradients of zero, to be added to; that of the background has one row per band."""
         (states, views), count = self.viewmats.shape[:2], self.means.shape[1]
         return Gradients(
             np.zeros((states, count, 3), np.float32),
@@ -206,14 +206,14 @@ class Batch:
             np.zeros((states, views, len(self.band_rows), 3), np.float64) if background else None,
         )
 
-    def kernel_ranges(self, shared_by: int) -> list[tuple[int, int]]:
-        """Cuts the kernels of one view or state so that all of them make about TASKS tasks."""
-        count, parts = self.means.shape[1], _parts(shared_by)
+    def kernel_ranges(self, images: int) -> list[tuple[int, int]]:
+        """Ranges of the kernels of each of ``images`` views or states; all of them together make about TASKS tasks."""
+        count, parts = self.means.shape[1], _parts(images)
         cuts = [i * count // parts for i in range(parts + 1)]
         return [(low, high) for low, high in zip(cuts, cuts[1:], strict=False) if high > low]
 
     def make_views(self) -> None:
-        """Makes room for what the forward pass finds."""
+        """Allocates the results of the forward pass."""
         count, bands = self.means.shape[1], len(self.band_rows)
         for item in self.pairs:
             self.views[item] = View(
@@ -229,7 +229,7 @@ class Batch:
         """Projects kernels ``low .. high - 1`` of state b into view v; ``part`` = (b, v, low, high).
 
         Raises:
-            DivergenceError: one of them is not finite or its opacity lies outside 0..1.
+            DivergenceError: a kernel is not finite or its opacity lies outside 0..1.
         """
         b, v, low, high = part
         view = self.views[b, v]
@@ -268,7 +268,7 @@ class Batch:
         )  # fmt: skip
 
     def composite_adjoint(self, item: tuple[int, int, int], grads: Images, background: Array | None) -> None:
-        """Sums up what the gradients of a band's pixels say about its kernels; ``item`` = (b, v, band)."""
+        """Sums the loss gradients of a band's pixels for each of its kernels; ``item`` = (b, v, band)."""
         b, v, index = item
         view = self.views[b, v]
         band, sums, offsets = view.bands[index], view.sums, view.offsets
@@ -281,7 +281,7 @@ class Batch:
         )  # fmt: skip
 
     def project_adjoint(self, v: int, part: tuple[int, int, int], grads: Gradients) -> None:
-        """Takes the sums of a view's bands back to kernels ``low .. high - 1``; ``part`` = (b, low, high)."""
+        """Adds the loss gradients of kernels ``low .. high - 1`` from a view's sums; ``part`` = (b, low, high)."""
         b, low, high = part
         view = self.views[b, v]
         project_adjoint(
@@ -291,5 +291,5 @@ class Batch:
         )  # fmt: skip
 
 
-def _parts(shared_by: int) -> int:
-    return max(1, -(-TASKS // shared_by))
+def _parts(images: int) -> int:
+    return max(1, -(-TASKS // images))

@@ -12,7 +12,7 @@ import numpy as np
 from gausim.kernels.jit import FINITE_MATH_OFF, HELPER, KERNEL
 from gausim.render.cpu.projection import RECORD
 
-# numba freezes constants into its cached code and looks only at the file that holds the function: after changing a
+# numba compiles constants into its cached code and checks only the file of the function for changes: after changing a
 # constant that other files import, delete their cache (__pycache__/*.nb?).
 TILE_WIDTH = 8  # [pixels]: half a vector of float32
 TILE_HEIGHT = 16  # [pixels]
@@ -34,7 +34,7 @@ def strip_rows(extent, strip, low_row, high_row):
     high = math.sqrt(max(extent[6] - extent[7] * at * at, ZERO)) - extent[4] * at
     at = min(max(left, -extent[5]), right)
     low = ZERO - math.sqrt(max(extent[6] - extent[7] * at * at, ZERO)) - extent[4] * at
-    # Clamped before they become integers, which hold no row of a huge ellipse.
+    # Clamped before the conversion to integers, which overflow for a huge ellipse.
     first = min(max(low + (extent[1] - slack), np.float32(low_row)), np.float32(high_row) + ONE)
     last = max(min(high + (extent[1] + slack - ONE), np.float32(high_row)), np.float32(low_row) - ONE)
     return math.ceil(first), math.floor(last)
@@ -44,7 +44,7 @@ def strip_rows(extent, strip, low_row, high_row):
 def collect_band(records, extents, order, spans, row_of, row_low, row_high, strips):
     """Copies the records of the kernels that may touch a band, near to far; ``order`` and ``spans`` by depth_order.
 
-    ``row_of`` (K,) receives the band-local row of the kernels that are copied.
+    ``row_of`` (K,) receives the rows of the copied kernels in the band.
 
     Returns:
         band records (m, RECORD); their kernels (m,); the first and one past the last column strip of each (m, 2); and
@@ -54,7 +54,7 @@ def collect_band(records, extents, order, spans, row_of, row_low, row_high, stri
     m = 0
     for i in range(order.shape[0]):
         chosen[m] = order[i]
-        m += (spans[i, 0] <= row_high) & (spans[i, 1] >= row_low)  # without a branch, which nothing could predict
+        m += (spans[i, 0] <= row_high) & (spans[i, 1] >= row_low)  # without a branch, which would be unpredictable
     band_records, reach = np.empty((m, RECORD), np.float32), np.empty((m, 2), np.int32)
     begins = np.zeros(strips + 2, np.int64)
     for i in range(m):
@@ -79,8 +79,8 @@ def collect_band(records, extents, order, spans, row_of, row_low, row_high, stri
 def bin_band(records, extents, order, spans, row_of, row_low, row_high, strips):
     """Lists for every tile of a band the kernels that touch it, near to far.
 
-    First every column strip lists its kernels with their rows, then each tile picks from its strip's list. The picking
-    looks at every kernel of the strip but takes no branch, which pays while a band is a few tiles high.
+    First every column strip lists its kernels with their rows, then each tile selects from its strip's list. The
+    selection reads every kernel of the strip without a branch, which is faster while a band is a few tiles high.
 
     Returns:
         band records (m, RECORD); entries (E,), each ``row << 8 | first pair of pixel rows in the

@@ -22,8 +22,8 @@ EXTENT = 8
 SLACK = 0.002  # [pixels] added to every extent, far above the rounding error of extents up to some thousand pixels,
 RELATIVE_SLACK = 2e-6  # and in proportion to the extent above that
 
-# Where in a row of sums those of s, s dx, s dx^2, s dy, s dx dy, s dy^2, w v (3) and w v_depth over pixels stand: in
-# the order in which raster.add_sums folds them.
+# Positions in a row of sums of s, s dx, s dx^2, s dy, s dx dy, s dy^2, w v (3) and w v_depth over pixels: in the
+# order in which raster.add_sums folds them.
 S, S_X, S_XX, S_Y, S_XY, S_YY = 0, 4, 2, 8, 12, 6
 S_RED, S_GREEN, S_BLUE, S_DEPTH = 1, 9, 14, 5
 AT_ONCE = 64  # kernels whose sums are gathered before they are used
@@ -31,7 +31,7 @@ AT_ONCE = 64  # kernels whose sums are gathered before they are used
 
 @numba.njit(**KERNEL)
 def count_unusable(means, covars, colors, opacities, low, high):
-    """Number of kernels that are not finite or whose opacity lies outside 0..1 (no fastmath: it would see no NaN)."""
+    """Number of kernels that are not finite or whose opacity lies outside 0..1 (no fastmath, which ignores NaN)."""
     unusable = 0
     for k in range(low, high):
         total = means[k, 0] + means[k, 1] + means[k, 2] + (colors[k, 0] + colors[k, 1] + colors[k, 2])
@@ -94,7 +94,7 @@ def project_kernels(
     """Projects the kernels ``low .. high - 1`` of one state into one view; arrays are indexed by the kernel.
 
     ``spans`` (K, 2) receives the first and last pixel row of a kernel's ellipse, ``depth`` (K,) its depth, or -1 where
-    it cannot touch a pixel, which leaves its other rows unwritten.
+    it touches no pixel; its other rows are then not written.
     """
     frame = np.empty(22, np.float64)
     for k in range(low, high):
@@ -171,9 +171,9 @@ def depth_order(depth, spans):
 
 @numba.njit(fastmath=True, **HELPER)
 def gather_sums(low, high, depth, spans, band_of, row_of, offsets, sums, totals):
-    """Adds up the bands' sums of the kernels ``low .. high - 1``, in the order of the bands, into ``totals``.
+    """Sums of the kernels ``low .. high - 1`` over the bands, in the order of the bands, written to ``totals``.
 
-    A loop of its own, because its reads are scattered over more than the caches hold: many are under way at a time.
+    A separate loop, because its reads are scattered over more memory than the caches have: many can overlap.
     """
     rows, flat = sums.reshape(-1), totals.reshape(-1)
     for k in range(low, high):
@@ -189,9 +189,9 @@ def project_adjoint(
     means, covars, opacities, viewmat, K, width, height, low, high, depth, spans, band_of, row_of, offsets, sums,
     grad_means, grad_covars, grad_opacities, grad_colors,
 ):  # fmt: skip
-    """Takes one view's image-space sums back to the kernels ``low .. high - 1`` and adds them to their gradients.
+    """Adds one view's part to the loss gradients of the kernels ``low .. high - 1``, from its sums over pixels.
 
-    ``depth`` (K,) and ``spans`` (K, 2) are those of project_kernels; pixel row y lies in band ``band_of[y]``. In band i
+    ``depth`` (K,) and ``spans`` (K, 2) come from project_kernels; pixel row y lies in band ``band_of[y]``. In band i
     kernel k has the row ``offsets[i] + row_of[i, k]`` of ``sums``. ``grad_colors`` are of this view alone and are
     overwritten.
 

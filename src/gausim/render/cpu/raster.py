@@ -1,9 +1,9 @@
 """Compositing of one band's tiles, and its adjoint: the two hot loops.
 
-A tile is 8 x 16 pixels, eight blocks of two rows. The kernels of a tile are handed out to its blocks, and each block is
-composited with all that is known of its sixteen pixels in vector registers. Validity is decided on the exponent: the
-polynomial is meaningless outside its range. ``depth`` is an image or None; numba compiles the two cases apart, so that
-images without depth do not pay for it. ``records`` are those of projection.py in one row.
+A tile is 8 x 16 pixels, eight blocks of two rows. The kernels of a tile are distributed to its blocks, each of which is
+composited with the state of its sixteen pixels in vector registers. Validity is decided on the exponent, because the
+polynomial is invalid outside its range. ``depth`` is an image or None; numba compiles both cases separately, so that
+images without depth cost no more. ``records`` are those of projection.py, flattened.
 """
 
 # Annotations would be checked by beartype in the tests, around functions that numba has to compile.
@@ -33,10 +33,10 @@ from gausim.render.cpu.simd import (
 
 PIXELS = TILE_WIDTH * TILE_HEIGHT
 BLOCKS = PIXELS // LANES
-SUMS = LANES  # per kernel; projection.S .. S_DEPTH say which is where
+SUMS = LANES  # per kernel; their positions are projection.S .. S_DEPTH
 T_STOP = np.float32(1e-4)  # a kernel that would leave less transmittance than this ends its pixel (3DGS)
-CHECK_EVERY = 8  # kernels between two looks at whether any pixel of the block is still open
-CHUNK = 128  # kernels of a tile that are handed out to its blocks at a time
+CHECK_EVERY = 8  # kernels between two checks whether a pixel of the block is still open
+CHUNK = 128  # kernels of a tile that are distributed to its blocks at a time
 
 # e^u = p(u)^8 with p the minimax polynomial of e^(u) on [-0.7, 0]; relative error 6e-7 after the eighth power.
 P0, P1, P2 = np.float32(0.999999921), np.float32(0.999992539), np.float32(0.499882588)
@@ -46,7 +46,7 @@ ZERO, ONE = np.float32(0), np.float32(1)
 ORDER = {"contract", "arcp", "nsz", "afn", "nnan", "ninf"}
 
 # Arithmetic per pixel and kernel, a fused multiply-add counted as two; comparisons, selections, loads and stores not at
-# all. For the share of the machine's peak in ``gausim benchmark render``.
+# all. ``gausim benchmark render`` divides them by the machine's peak.
 EXPONENTIAL = 1 + 1 + 1 + 2 + 4 + 10 + 3 + 1  # dx, dy, B dx, A dx dx, u, p, p^8, o p
 FORWARD_FLOPS = EXPONENTIAL + 2 + 6  # w = t alpha and t - w, three colours
 # t / (1 - alpha), w, gap, behind, s; five products with dx and dy, three with v, nine additions
@@ -54,11 +54,11 @@ BACKWARD_FLOPS = EXPONENTIAL + 2 + 1 + 6 + 2 + 1 + 5 + 3 + 9
 
 
 @numba.njit(fastmath=ORDER, **HELPER)
-def hand_out(entries, begin, end, lists, stride, counts):
-    """Lists for each block of a tile those of the entries ``begin .. end - 1`` that reach it, near to far.
+def distribute(entries, begin, end, lists, stride, counts):
+    """Lists for each block of a tile the kernels of the entries ``begin .. end - 1`` that touch it, near to far.
 
-    List p starts at ``lists[p * stride]`` and gets ``counts[p]`` rows. Every entry is written to every list and counts
-    where it belongs: branches would be guessed wrong half of the time.
+    List p starts at ``lists[p * stride]`` and gets ``counts[p]`` rows. Every entry is written to every list, but only
+    counted where it belongs: a branch would be mispredicted half of the time.
     """
     for p in range(BLOCKS):
         counts[p] = p * stride
@@ -75,7 +75,7 @@ def hand_out(entries, begin, end, lists, stride, counts):
 
 @numba.njit(fastmath=ORDER, **HELPER)
 def opacity(records, at, x, y):
-    """Of the kernel whose record starts at ``at``: o e^u at sixteen pixels and whether it is at least 1/255 there."""
+    """Opacity times e^u of the kernel with its record at ``at`` in sixteen pixels, and where it is at least 1/255."""
     dx = (x - spread(records, at)) - spread(records, at + 1)
     dy = (y - spread(records, at + 2)) - spread(records, at + 3)
     u = dy * spread(records, at + 6) + dx * spread(records, at + 5)
@@ -91,11 +91,11 @@ def opacity(records, at, x, y):
 def forward_block(records, rows, begin, end, done, x, y, alpha_max, buf, at, depth):
     """Composites the kernels ``rows[begin:end]``, after ``done`` others, over sixteen pixels with the centres x, y.
 
-    Their state is ``buf[at:]`` = [T | final | last | R | G | B | D]. T goes on falling where a pixel is closed (a
-    product never grows, so it stays closed); final is T before that, last the number of the last kernel before that.
+    Their state is ``buf[at:]`` = [T | final | last | R | G | B | D]. T continues to fall after a pixel is closed (a
+    product never grows, so it stays closed); final is T and last the number of the last kernel before the closing.
 
     Returns:
-        One past the last kernel that was looked at: the block ends early when all its pixels are closed.
+        One past the last kernel that was read: the block ends early when all its pixels are closed.
     """
     t, final, last = load(buf, at), load(buf, at + LANES), load(buf, at + 2 * LANES)
     red, green, blue = load(buf, at + 3 * LANES), load(buf, at + 4 * LANES), load(buf, at + 5 * LANES)
@@ -130,8 +130,8 @@ def forward_block(records, rows, begin, end, done, x, y, alpha_max, buf, at, dep
 def forward_tile(records, entries, begin, end, left, top, alpha_max, buf, lists, counts, used, depth):
     """Composites the entries ``begin .. end - 1`` over the blocks of a tile, into their states in ``buf``.
 
-    ``used`` (BLOCKS + 1,) receives how many kernels of its list each block looked at, and one past the last entry that
-    was handed out.
+    ``used`` (BLOCKS + 1,) receives the number of kernels of its list that each block read, and one past the last entry
+    that was distributed.
     """
     used[BLOCKS] = end
     for p in range(BLOCKS):
@@ -143,7 +143,7 @@ def forward_tile(records, entries, begin, end, left, top, alpha_max, buf, lists,
             store(buf, at + j * LANES, splat(ZERO))
         used[p] = 0
     for first in range(begin, end, CHUNK):
-        hand_out(entries, first, min(first + CHUNK, end), lists, CHUNK, counts)
+        distribute(entries, first, min(first + CHUNK, end), lists, CHUNK, counts)
         open_ = splat(ZERO)
         for p in range(BLOCKS):
             x, y = column_centres() + left, row_centres() + (top + np.float32(2 * p))
@@ -158,11 +158,11 @@ def forward_tile(records, entries, begin, end, left, top, alpha_max, buf, lists,
 
 @numba.njit(fastmath=ORDER, **HELPER)
 def backward_block(records, rows, begin, end, x, y, alpha_max, buf, sums, depth):
-    """Adds what the kernels ``rows[begin:end]`` do to sixteen pixels to ``sums`` (rows * SUMS).
+    """Adds the sums of the kernels ``rows[begin:end]`` over sixteen pixels to ``sums`` (rows * SUMS).
 
-    ``buf`` = [T | last | vr | vg | vb | vd | behind]. Runs back to front: ``behind`` is the derivative with respect to
-    what lies behind the current kernel, by the recursion B <- B + alpha (d - B) with d = v . colour of the kernel; T is
-    the transmittance in front of it.
+    ``buf`` = [T | last | vr | vg | vb | vd | behind]. Runs back to front: ``behind`` is the derivative B with respect
+    to the transmittance behind the current kernel, by the recursion B <- B + alpha (d - B) with d = v . colour of the
+    kernel; T is the transmittance in front of it.
     """
     t, last, behind = load(buf, 0), load(buf, LANES), load(buf, 6 * LANES)
     vr, vg, vb, vd = load(buf, 2 * LANES), load(buf, 3 * LANES), load(buf, 4 * LANES), load(buf, 5 * LANES)
@@ -185,7 +185,7 @@ def backward_block(records, rows, begin, end, x, y, alpha_max, buf, sums, depth)
 
 @numba.njit(fastmath=ORDER, **HELPER)
 def add_sums(records, g, x, y, vr, vg, vb, vd, s, w, sums, depth):
-    """Adds the sums over sixteen pixels to row g; the two rows of pixels share dx, so theirs are taken first."""
+    """Adds the sums over sixteen pixels to row g; both rows of pixels have the same dx and are added first."""
     at = g * RECORD
     dx = (x - spread(records, at)) - spread(records, at + 1)
     dy = (y - spread(records, at + 2)) - spread(records, at + 3)
@@ -204,7 +204,7 @@ def add_sums(records, g, x, y, vr, vg, vb, vd, s, w, sums, depth):
 
 @numba.njit(fastmath=ORDER, **HELPER)
 def write_block(buf, at, x, y, background, rgb, alpha, depth):
-    """Writes sixteen finished pixels from (y, x) on; those beyond the image's edge are left out."""
+    """Writes sixteen finished pixels from (y, x) on, without those beyond the image's edge."""
     through = load(buf, at + LANES)
     for c in range(3):
         store(buf, at + (3 + c) * LANES, load(buf, at + (3 + c) * LANES) + through * background[c])
@@ -221,7 +221,7 @@ def write_block(buf, at, x, y, background, rgb, alpha, depth):
 
 @numba.njit(fastmath=ORDER, **HELPER)
 def read_block(grad_rgb, grad_alpha, grad_depth, x, y, buf):
-    """Fills [vr | vg | vb | vd | v alpha] of ``buf`` with the gradients of sixteen pixels, zero beyond the edge."""
+    """Fills [vr | vg | vb | vd | v alpha] of ``buf`` with the loss gradients of sixteen pixels, 0 beyond the edge."""
     height, width = grad_alpha.shape
     for j in range(2, 7):
         store(buf, j * LANES, splat(ZERO))
@@ -239,9 +239,8 @@ def read_block(grad_rgb, grad_alpha, grad_depth, x, y, buf):
 def forward_band(records, entries, start, row_low, background, alpha_max, rgb, alpha, depth, final, last, used):
     """Draws one band into ``rgb`` (H, W, 3), ``alpha`` (H, W) and, unless it is None, ``depth`` (H, W).
 
-    ``final`` and ``last`` (tiles, PIXELS) keep the remaining transmittance and the number of the last kernel
-    that contributed; ``used``
-    (tiles, BLOCKS + 1) how much of the entries was looked at (forward_tile).
+    ``final`` and ``last`` (tiles, PIXELS) receive the remaining transmittance and the number of the last kernel that
+    contributed, ``used`` (tiles, BLOCKS + 1) the numbers of entries read (forward_tile).
     """
     strips = (alpha.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     flat, buf = records.reshape(-1), np.empty(7 * PIXELS, np.float32)
@@ -266,8 +265,7 @@ def backward_band(
 ):  # fmt: skip
     """Adjoint of :func:`forward_band`: writes the band's ``sums`` (rows, SUMS).
 
-    ``grad_depth`` is None without depth; ``behind`` (3,) in float64 receives the background's gradient unless it is
-    None.
+    ``grad_depth`` is None without depth; ``behind`` (3,), float64 or None, receives the background's loss gradient.
     """
     strips = (grad_alpha.shape[1] + TILE_WIDTH - 1) // TILE_WIDTH
     flat, buf = sums.reshape(-1), np.zeros(7 * LANES, np.float32)
@@ -281,7 +279,7 @@ def backward_band(
         if behind is None and used[tile, BLOCKS] == start[tile]:
             continue
         top, left = row_low + tile // strips * TILE_HEIGHT, tile % strips * TILE_WIDTH
-        hand_out(entries, start[tile], used[tile, BLOCKS], lists, most, counts)
+        distribute(entries, start[tile], used[tile, BLOCKS], lists, most, counts)
         for p in range(BLOCKS):
             if behind is None and used[tile, p] == 0:
                 continue

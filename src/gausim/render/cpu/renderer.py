@@ -1,4 +1,4 @@
-"""The CPU renderer as a torch operation."""
+"""The CPU renderer as a differentiable operation of torch."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class _Render(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, grad_rgb: Tensor | None, grad_alpha: Tensor | None, grad_depth: Tensor | None) -> Any:
-        _ = ctx.saved_tensors  # raises if an input was changed in place since: the batch shares their memory
+        _ = ctx.saved_tensors  # raises if an input was changed in place since then: the batch uses the same memory
         batch, needed = ctx.batch, ctx.needs_input_grad[:5]
         shape = (*batch.viewmats.shape[:2], batch.height, batch.width)
         images = Images(
@@ -66,8 +66,8 @@ class _Render(torch.autograd.Function):
 class CpuRenderer:
     """Gaussian splatting compiled by numba for the processor at hand (core.Renderer, float32).
 
-    Tile-based EWA splatting with analytic gradients. Results do not depend on the number of threads, bit for bit.
-    The first call compiles for some seconds; the result is kept in numba's cache.
+    Tile-based EWA splatting with analytic loss gradients. Results are the same to the bit for any number of threads.
+    The first call compiles for some seconds; numba's cache keeps the compiled code.
     """
 
     def __init__(self, *, threads: int | None = None, near: float = 0.01, alpha_max: float = 0.999) -> None:

@@ -1,8 +1,8 @@
 """Covariances and view-dependent colours of deformed kernels, sixteen at a time, and their adjoints.
 
-Per-kernel numbers stand in ``lanes``, one vector for each: the mean (P), gradient (G) and rotation (Q) of the kernel's
-unit, then room for results. ``rest`` (blocks, 9, 16) and ``coefficients`` (blocks, 3 basis, 16) hold rest covariances
-and colour coefficients of blocks of sixteen kernels in the same form; the last block is padded.
+``lanes`` has one vector for each number of sixteen kernels: the mean (P), the deformation gradient (G) and rotation (Q)
+of the kernel's unit, then results. ``rest`` (blocks, 9, 16) and ``coefficients`` (blocks, 3 basis, 16) are the rest
+covariances and colour coefficients of blocks of sixteen kernels in the same form; the last block is padded.
 """
 
 # Annotations would be checked by beartype in the tests, around functions that numba has to compile.
@@ -16,7 +16,7 @@ from gausim.kernels.jit import HELPER, KERNEL
 from gausim.ops import spherical_harmonics
 from gausim.render.cpu.simd import LANES, load, maximum, select, splat, square_root, store
 
-P, G, Q, OUT = 0, 3 * LANES, 12 * LANES, 21 * LANES  # where in ``lanes`` the parts start
+P, G, Q, OUT = 0, 3 * LANES, 12 * LANES, 21 * LANES  # positions in ``lanes`` where the parts start
 LANES_SIZE = OUT + 21 * LANES
 ZERO, HALF, ONE, TWO = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
 THREE, FOUR, SIX, EIGHT = np.float32(3), np.float32(4), np.float32(6), np.float32(8)
@@ -28,7 +28,7 @@ C30, C31, C32, C33, C34, C35, C36 = (np.float32(c) for c in spherical_harmonics.
 
 @numba.njit(fastmath=True, **HELPER)
 def gather(base, positions, deformation_gradients, rotations, unit, lanes):
-    """Fills P, G and Q with those of the sixteen kernels from ``base`` on; beyond the last it is repeated."""
+    """Fills P, G and Q for the sixteen kernels from ``base`` on; the last kernel is repeated beyond the end."""
     for j in range(LANES):
         k = min(base + j, positions.shape[0] - 1)
         for i in range(3):
@@ -65,7 +65,7 @@ def write_basis(x, y, z, degree, basis):
 
 @numba.njit(fastmath=True, **HELPER)
 def basis_adjoint(x, y, z, degree, w):
-    """Gradient with respect to the direction from that with respect to the basis, ``w``."""
+    """Loss gradient of the direction from that of the basis, ``w``."""
     gx, gy, gz = splat(ZERO), splat(ZERO), splat(ZERO)
     if degree > 0:
         gy = load(w, LANES) * -C1
@@ -166,7 +166,7 @@ def shade(
 
 @numba.njit(fastmath=True, **HELPER)
 def view_adjoint(lanes, center, degree, block, basis, grad_color):
-    """Adds one view's gradients to those of P and Q, which stand from OUT on; ``block`` as for :func:`colours`."""
+    """Adds one view's loss gradients of P and Q to those from OUT on; ``block`` as for :func:`colours`."""
     dx, dy, dz, x, y, z, inverse = direction(lanes, center)
     write_basis(x, y, z, degree, basis)
     count = (degree + 1) ** 2
@@ -213,9 +213,9 @@ def covariance_adjoint(lanes, covar, grad_covar, work):
 @numba.njit(fastmath=True, **KERNEL)
 def shade_adjoint(
     first, end, positions, deformation_gradients, rotations, unit, rest, coefficients, degree, centers,
-    grad_covars, grad_colors, grad_positions, grad_gradients, grad_rotations,
+    grad_covars, grad_colors, grad_positions, grad_deformation_gradients, grad_rotations,
 ):  # fmt: skip
-    """Adjoint of :func:`shade`: writes ``grad_positions`` and adds to the gradients of the units."""
+    """Adjoint of :func:`shade`: writes ``grad_positions`` and adds to the loss gradients of the units."""
     lanes, basis = np.empty(LANES_SIZE, np.float32), np.empty(16 * LANES, np.float32)
     grad, work = np.empty(9 * LANES, np.float32), np.empty(18 * LANES, np.float32)
     for block in range(first, end):
@@ -240,4 +240,4 @@ def shade_adjoint(
                 grad_positions[base + j, i] = lanes[OUT + i * LANES + j]
             for i in range(9):
                 grad_rotations[c, i // 3, i % 3] += lanes[OUT + (3 + i) * LANES + j]
-                grad_gradients[c, i // 3, i % 3] += lanes[OUT + (12 + i) * LANES + j]
+                grad_deformation_gradients[c, i // 3, i % 3] += lanes[OUT + (12 + i) * LANES + j]

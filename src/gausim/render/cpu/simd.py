@@ -1,10 +1,10 @@
 """Vectors of sixteen float32 as values inside numba kernels, with Python's operators.
 
-LLVM maps them onto what the processor has: one AVX-512 register, two of AVX, four of NEON. Loops written with them do
-not depend on the mood of the automatic vectoriser, and compile faster because it has nothing left to do.
+LLVM maps them onto the processor's registers: one of AVX-512, two of AVX, four of NEON. Loops written with them do not
+depend on the automatic vectoriser, and compile faster.
 """
 
-# Lowering rules of numba take what numba gives them; none of it has published types.
+# The arguments of numba's lowering rules have no published types.
 # mypy: allow-untyped-defs, allow-untyped-calls, allow-incomplete-defs, disable-error-code="misc, call-arg"
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def _spread(builder, kind, value):
 
 
 def _shuffle(builder, a, b, picks):
-    """The lanes ``picks`` of a and, counted on, of b."""
+    """The lanes ``picks`` of the concatenation of a and b."""
     return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_I32, len(picks)), list(picks)))
 
 
 def _binary(symbol, result, emit) -> None:
-    """Teaches numba ``symbol`` between two vectors, or one of them and a float32."""
+    """Registers the operator ``symbol`` between two vectors, or a vector and a float32."""
     pairs = (vector, vector), (vector, types.float32), (types.float32, vector)
 
     @infer_global(symbol)
@@ -93,7 +93,7 @@ def _pointer(context, builder, kind, array, index):
 
 
 def _member(context, builder, kind, array, name):
-    """A field of an array's structure; numba's own proxies would first write all of it to memory, which LLVM undoes."""
+    """A field of an array's structure; numba's proxies would first write all of it to memory, which LLVM removes."""
     return context.data_model_manager[kind].get(builder, array, name)
 
 
@@ -140,13 +140,13 @@ def _constant(values):
 
 @intrinsic
 def column_centres(typing):
-    """Of two rows of eight pixels: 0.5, 1.5, .. 7.5, twice."""
+    """Columns of the centres of two rows of eight pixels: 0.5, 1.5, .. 7.5, twice."""
     return _constant([i % 8 + 0.5 for i in range(LANES)])
 
 
 @intrinsic
 def row_centres(typing):
-    """Of two rows of eight pixels: eight times 0.5, eight times 1.5."""
+    """Rows of the centres of two rows of eight pixels: eight times 0.5, eight times 1.5."""
     return _constant([i // 8 + 0.5 for i in range(LANES)])
 
 
@@ -219,9 +219,9 @@ def largest(typing, a):
 
 @intrinsic
 def folded(typing, a, b, half):
-    """Halves each block of 2 ``half`` lanes of a and of b by addition; the block of a goes before that of b.
+    """Halves each block of 2 ``half`` lanes of a and of b by addition; the block of a precedes that of b.
 
-    After ``folded`` with 8, 4, 2 and 1 a vector holds the sums of sixteen. ``half`` is a literal.
+    After ``folded`` with 8, 4, 2 and 1 the lanes of a vector are sums of sixteen. ``half`` is a literal.
     """
     if not isinstance(half, types.IntegerLiteral):
         return None

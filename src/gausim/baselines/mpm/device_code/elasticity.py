@@ -1,7 +1,6 @@
 """The Kirchhoff stress tau = J sigma of the elastic energy, and the polar rotation in it with its derivative.
 
-The latter does not go through the derivative of a singular value decomposition, which is undefined where stretches are
-equal, that is at rest.
+The derivative is not that of a singular value decomposition, which is undefined where stretches are equal, as at rest.
 """
 
 import warp as wp
@@ -19,7 +18,7 @@ def identity() -> wp.mat33:
 
 @wp.func
 def _polar_by_newton(F: wp.mat33) -> wp.mat33:
-    """R <- (R + R^-T) / 2 until it stands still (Higham 1986)."""
+    """R <- (R + R^-T) / 2 until convergence (Higham 1986)."""
     R = F
     steps = int(POLAR_STEPS)
     for _ in range(steps):
@@ -33,7 +32,7 @@ def _polar_by_newton(F: wp.mat33) -> wp.mat33:
 
 @wp.func
 def _polar_by_svd(F: wp.mat33) -> wp.mat33:
-    """U V^T of matter turned inside out; the smallest axis is turned round where that is a reflection."""
+    """U V^T, for det F that is tiny or negative; a reflection is mended along the axis of the smallest stretch."""
     U, _s, V = wp.svd3(F)
     R = U * wp.transpose(V)
     if wp.determinant(R) < 0.0:

@@ -2,8 +2,8 @@
 
 MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015) and quadratic B-splines, whose inertia tensor is dx^2 / 4. Nodes
 lie at multiples of dx from the origin of the domain; the arrays of nodes hold a window of them, which begins at node
-``origin``. Every kernel reads its inputs and writes or adds to its outputs only, so that Warp's adjoint of it is exact.
-The loops over nodes run to a length that is no constant: unrolled, each kernel would be compiled 27 times.
+``origin``. Every kernel reads its inputs and writes or adds to its outputs only, so that Warp's adjoint is exact.
+The loops over nodes have a length that is no constant, so that Warp does not unroll them into 27 copies.
 """
 
 import warp as wp
@@ -24,7 +24,7 @@ def spline_weights(f: wp.vec3) -> wp.mat33:
 
 @wp.func
 def inside(x: wp.vec3, nodes: wp.vec3i) -> bool:
-    """Whether the 27 nodes of a particle are nodes of the window, x in cells from its first node; false for NaN."""
+    """True if the window has the 27 nodes of a particle, x in cells from its first node; false for NaN."""
     result = wp.isfinite(x[0]) and wp.isfinite(x[1]) and wp.isfinite(x[2])
     for axis in range(3):
         result = result and x[axis] >= 0.5 and x[axis] < float(nodes[axis]) - 1.5
