@@ -162,13 +162,13 @@ def test_an_open_scene_grows_from_its_points(stills: ImageSet, monkeypatch: pyte
         reconstruct([train], renderer, options, cloud=PointCloud(shell().points))
 
 
-def test_error_is_blamed_on_the_kernels_under_it(stills: ImageSet) -> None:
+def test_error_is_attributed_to_the_kernels_under_it(stills: ImageSet) -> None:
     """Against the sum over pixels of the kernel's weight times the error, its weight found by drawing it alone."""
     run = Reconstruction([stills], CpuRenderer(threads=1), TINY, cloud=None, name="balls")
     error, black = torch.zeros(SIZE, SIZE), torch.zeros(3)
     error[18:22, 18:22] = 0.5
     drawable = run.splats.drawable(stills.cameras.centers[0])
-    run._blame(stills, 0, black, drawable, error)
+    run._attribute(stills, 0, black, drawable, error)
     means, covars, colors, opacities = (x.detach() for x in drawable)
     for k in run.splats.error.topk(3).indices.tolist():
         lit = torch.zeros_like(colors)
@@ -220,8 +220,8 @@ def test_options_out_of_range_are_refused(change: dict[str, Any]) -> None:
 
 
 def test_reduced_images_show_the_same_scene(stills: ImageSet) -> None:
-    half = reduced(stills, (SIZE // 2, SIZE // 2), share=0.3)
-    assert half.images.shape == (24, SIZE // 2, SIZE // 2, 4) and half.share == 0.3
+    half = reduced(stills, (SIZE // 2, SIZE // 2), weight=0.3)
+    assert half.images.shape == (24, SIZE // 2, SIZE // 2, 4) and half.weight == 0.3
     renderer, scene = CpuRenderer(threads=1), true_scene()
     large = draw_rest(scene, renderer, stills.cameras).reshape(24, SIZE // 2, 2, SIZE // 2, 2, 3).mean((2, 4))
     alpha = half.images[..., 3:].float() / 255

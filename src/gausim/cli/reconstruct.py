@@ -169,7 +169,7 @@ def _inputs(
                 "--extent scene: a data set's sequences show an object. Take the transforms.json of stills."
             )
         data = ObjectData(source.parent)
-        return data.name, gather_object(data, video_share=arguments.video_share), _cloud(arguments.points)
+        return data.name, gather_object(data, video_fraction=arguments.video_share), _cloud(arguments.points)
     material = gather_stills(
         source, every=arguments.leave_out, opaque=opaque, longest=arguments.longest, coarse=arguments.coarse
     )

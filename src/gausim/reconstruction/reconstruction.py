@@ -18,25 +18,25 @@ from gausim.reconstruction.splat_start import PointCloud, Start, start_object, s
 from gausim.reconstruction.splats import LearningRates, Splats
 from gausim.reconstruction.stills import ImageSet
 
-# Adam's step sizes fall to these shares of their start, exponentially: positions as in 3DGS, the rest less.
+# Fractions to which Adam's step sizes fall exponentially: positions as in 3DGS, the others less.
 FINAL_MEANS_RATE = 0.01
 FINAL_RATE = 0.1
 SSIM_WINDOW = 11
 # Weights of D-SSIM against L1 (3DGS), of the L1 error of alpha against the mask, and of long kernels.
 SSIM_WEIGHT, ALPHA_WEIGHT, ANISOTROPY_WEIGHT = 0.2, 0.2, 0.02
-# Share of an object's kernels placed at the start; splitting adds the rest. An open scene starts with all its points.
-START_SHARE = 0.6
-# Times that kernels are pruned and split.
+# Fraction of an object's kernels at the start; splitting adds the others. An open scene starts with all its points.
+START_FRACTION = 0.6
+# Number of times that kernels are pruned and split.
 ROUNDS = {"object": 8, "scene": 16}
-# Pixels around the masks' bounding box that the structural loss sees as well.
+# Margin of the structural loss around the masks' bounding box [pixels].
 CROP_MARGIN = 6
-# Steps between two looks at the largest sizes that kernels may have.
+# Steps between two limitations of the kernels' sizes.
 LIMIT_EVERY = 10
-# Steps of which one asks what kernels the image's error lies under; it costs another rendering.
-BLAME_EVERY = 4
-# Looks at the mean loss over a whole run that early stopping makes.
-LOOKS = 20
-# A look is better if the loss fell by this share.
+# Steps between two attributions of the image's error to kernels, each of which costs another rendering.
+ATTRIBUTE_EVERY = 4
+# Number of intervals of a run whose mean losses early stopping compares.
+INTERVALS = 20
+# Fraction by which the mean loss must fall to count as better.
 BETTER = 2e-3
 
 # Means, covariances, colours and opacities of all kernels.
@@ -45,20 +45,20 @@ Drawable = tuple[Tensor, Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True)
 class ReconstructionOptions:
-    """What a reconstruction is made with.
+    """Options of a reconstruction.
 
     Attributes:
-        kernels: number of kernels aimed at (pruning may leave fewer).
+        kernels: target number of kernels (pruning may leave fewer).
         iterations: optimiser steps, one image each.
-        extent: ``object``: what the masks show, within their visual hull; ``scene``: everything in the images.
+        extent: ``object``: the foreground of the masks, within their visual hull; ``scene``: everything in the images.
         sh_degree: degree of the spherical harmonics, 0..3.
         hull_resolution: voxels along the longest side of the visual hull.
-        missing_masks: share of the views whose masks may miss a part that all others show.
-        minimum_opacity: kernels below are pruned.
+        missing_masks: fraction of the views whose masks may lack a part that all others show.
+        minimum_opacity: kernels of less opacity are pruned.
         anisotropy_limit: r of the penalty mean(max(s_max / s_min, r) - r) (PhysGaussian).
         random_background: composite over a random colour in every step instead of black.
-        patience: stop early where the mean loss over a twentieth of the steps was not better so many times in a row,
-            after the last round; 0 never stops.
+        patience: number of successive twentieths of the steps, after the last round, without a better mean loss
+            before an early stop; 0 never stops.
         seed: of everything random.
         rates: Adam's step sizes.
     """
@@ -89,7 +89,7 @@ class ReconstructionOptions:
 
     @property
     def round_steps(self) -> tuple[int, ...]:
-        """Steps after which kernels are pruned and split: between 10 % and 70 % of the way."""
+        """Steps after which kernels are pruned and split: between 10 % and 70 % of the iterations."""
         first, last = 0.1 * self.iterations, 0.7 * self.iterations
         rounds = ROUNDS[self.extent]
         return tuple(sorted({int(first + (last - first) * i / (rounds - 1)) for i in range(rounds)}))
@@ -109,21 +109,21 @@ def reconstruct(
 
     Kernels of an object start on the surface of its visual hull (or on the points in it), those of an open scene on
     the points. They are split where the images' error is largest and pruned where they are transparent, never seen or
-    out of bounds: the dynamics moves every kernel that is left.
+    out of bounds, because the dynamics moves every kernel.
 
     Args:
         sets: training images; the hull is carved from the first set.
         renderer: draws the Gaussians.
-        options: how.
-        cloud: points to start from; an open scene needs them.
+        options: sizes, steps and rates.
+        cloud: points at which kernels start; an open scene needs them.
         name: of the scene, whose kernels are all simulated and foreground, none pinned.
         progress: called after every step.
-        begun: :meth:`Reconstruction.state` of an interrupted one with the same arguments, to go on from.
+        begun: :meth:`Reconstruction.state` of an interrupted reconstruction with the same arguments, to continue.
 
     Raises:
-        ConfigError: an open scene without points.
+        ConfigError: an open scene has no points.
         DataError: no body projects into all masks, no points lie in it, or points of a scene have no colours.
-        DivergenceError: the loss stopped being finite.
+        DivergenceError: the loss is not finite, or pruning left fewer than two kernels.
     """
     run = Reconstruction(sets, renderer, options, cloud=cloud, name=name)
     if begun is not None:
@@ -136,11 +136,11 @@ def reconstruct(
 
 
 class Reconstruction:
-    """A reconstruction under way.
+    """State of an unfinished reconstruction.
 
     Attributes:
         splats: the kernels.
-        done: steps made.
+        done: number of steps so far.
         loss: of the latest step.
     """
 
@@ -168,14 +168,14 @@ class Reconstruction:
 
     @property
     def finished(self) -> bool:
-        """Whether all steps are made, or more would not help."""
+        """True after all steps, or after an early stop."""
         return self.done >= self._options.iterations or self._patience.over
 
     def step(self) -> None:
-        """One image.
+        """One optimiser step on one image.
 
         Raises:
-            DivergenceError: the loss is not finite, or pruning left nothing.
+            DivergenceError: the loss is not finite, or pruning left fewer than two kernels.
         """
         images, i = self._draw()
         random = torch.rand(3, generator=self._generator)
@@ -190,10 +190,10 @@ class Reconstruction:
                 f"{self._name}: reconstruction loss is {self.loss} at step {self.done}. Lower the rates."
             )
         loss.backward()
-        if self.done % BLAME_EVERY == 0 and self.done < self._rounds[-1]:
-            self._blame(images, i, background, drawable, (rgb.detach() - truth).abs().mean(-1))
-        share = self.done / self._options.iterations
-        self.splats.step({"means": FINAL_MEANS_RATE**share, "": FINAL_RATE**share})
+        if self.done % ATTRIBUTE_EVERY == 0 and self.done < self._rounds[-1]:
+            self._attribute(images, i, background, drawable, (rgb.detach() - truth).abs().mean(-1))
+        progress = self.done / self._options.iterations
+        self.splats.step({"means": FINAL_MEANS_RATE**progress, "": FINAL_RATE**progress})
         if self.done % LIMIT_EVERY == 0:
             self._limit()
         if self.done in self._rounds:
@@ -204,13 +204,13 @@ class Reconstruction:
         self.done += 1
 
     def scene(self) -> GaussianScene:
-        """The kernels that are opaque and within bounds."""
+        """The scene of the kernels that are opaque and within bounds."""
         self._limit()
         self.splats.keep(self._lasting())
         return self.splats.scene(self._name)
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that a reconstruction with the same arguments needs to go on bit by bit."""
+        """Tensors from which a reconstruction with the same arguments continues with the same bits."""
         queues = {f"queue_{k}": torch.tensor(queue, dtype=torch.int64) for k, queue in enumerate(self._queues)}
         return {
             **self.splats.state(),
@@ -221,7 +221,7 @@ class Reconstruction:
         }
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Goes on from :meth:`state`."""
+        """Restores :meth:`state`."""
         self.splats.restore(state)
         self._queues = [state[f"queue_{k}"].tolist() for k in range(len(self._queues))]
         self.done = int(state["done"])
@@ -229,10 +229,10 @@ class Reconstruction:
         self._patience.state = state["patience"].tolist()
 
     def _draw(self) -> tuple[ImageSet, int]:
-        """An image: the set by its share, within a set every image once before any comes again."""
+        """A set drawn by its weight, and the index of an image in it; a set shows all images before one is repeated."""
         done = self.done / self._options.iterations
-        shares = torch.tensor([s.share * (s.span[0] <= done < s.span[1]) for s in self._sets])
-        k = int(torch.multinomial(shares, 1, generator=self._generator))
+        weights = torch.tensor([s.weight * (s.span[0] <= done < s.span[1]) for s in self._sets])
+        k = int(torch.multinomial(weights, 1, generator=self._generator))
         if not self._queues[k]:
             self._queues[k] = torch.randperm(len(self._sets[k].images), generator=self._generator).tolist()
         return self._sets[k], self._queues[k].pop()
@@ -249,32 +249,32 @@ class Reconstruction:
         )  # fmt: skip
         return drawn.rgb[0, 0], drawn.alpha[0, 0]
 
-    def _blame(
+    def _attribute(
         self, images: ImageSet, i: int, background: Tensor, drawable: Drawable, error: Float[Tensor, "H W"]
     ) -> None:
-        """Notes the share of every kernel in the image's error: the sum over pixels of its weight times the error.
+        """Records every kernel's part of the image's error: the sum over pixels of its weight times the error.
 
-        That is the gradient of sum(error * rgb) with respect to a gray kernel's colour. Unlike the gradient of its
-        position it does not cancel within a large kernel (Rota Bulo et al., Revising Densification, 2024).
+        This is the derivative of sum(error * rgb) with respect to the kernel's grey value. Unlike the loss gradient of
+        the position it does not cancel within a large kernel (Rota Bulo et al., Revising Densification, 2024).
         """
         means, covars, colors, opacities = (x.detach() for x in drawable)
         gray = torch.zeros_like(colors).requires_grad_()
         rgb, _ = self._render(images, i, background, (means, covars, gray, opacities))
-        (share,) = torch.autograd.grad(rgb, gray, error[..., None].expand_as(rgb))
-        self.splats.blame(share.mean(-1))
+        (derivative,) = torch.autograd.grad(rgb, gray, error[..., None].expand_as(rgb))
+        self.splats.note_error(derivative.mean(-1))
 
     def _loss(self, rgb: Tensor, alpha: Tensor, truth: Tensor, mask: Tensor) -> Tensor:
         rows, columns = _crop(mask > 0)
         first, second = (x[rows, columns].contiguous()[None, None] for x in (rgb, truth))
-        share = first.shape[2] * first.shape[3] / mask.numel()  # outside both are background: D-SSIM is zero there
-        similarity = SSIM_WEIGHT * share * self._similarity(first, second)[0]
+        area = first.shape[2] * first.shape[3] / mask.numel()  # outside both are background, where D-SSIM is zero
+        similarity = SSIM_WEIGHT * area * self._similarity(first, second)[0]
         ratio = (self.splats["log_scales"].amax(-1) - self.splats["log_scales"].amin(-1)).exp()
         long = (ratio - self._options.anisotropy_limit).clamp_min(0).mean()
         color, alphas = (rgb - truth).abs().mean(), (alpha - mask).abs().mean()
         return (1 - SSIM_WEIGHT) * color + ALPHA_WEIGHT * alphas + similarity + ANISOTROPY_WEIGHT * long
 
     def _lasting(self) -> Bool[Tensor, " K"]:
-        """Kernels that are opaque and within bounds."""
+        """Mask of the kernels that are opaque and within bounds."""
         opaque = torch.sigmoid(self.splats["opacity"].detach()) > self._options.minimum_opacity
         return opaque & self._start.bounds.contains(self.splats["means"].detach())
 
@@ -295,7 +295,7 @@ class Reconstruction:
         self.splats.keep(keep)
 
     def _densify(self, done: int, rounds: int) -> None:
-        """Splits kernels that cover most of the images' error, so that the last round but one reaches the budget."""
+        """Splits the kernels with the largest errors; the last round but one reaches the number of kernels."""
         missing = self._options.kernels - self.splats.count
         count = min(math.ceil(missing / max(1, rounds - 1 - done)), self.splats.count)
         if count > 0 and done < rounds - 1:
@@ -303,14 +303,14 @@ class Reconstruction:
 
 
 class _Patience:
-    """Tells when the mean loss over a stretch of steps has stopped falling.
+    """Early stopping when the mean loss over an interval of steps no longer falls.
 
     Attributes:
-        state: sum and number of the losses of this stretch, the best mean so far, stretches since that were not better.
+        state: sum and number of the losses of this interval, the best mean, and the intervals since the best one.
     """
 
     def __init__(self, options: ReconstructionOptions) -> None:
-        self._allowed, self._length = options.patience, max(1, options.iterations // LOOKS)
+        self._allowed, self._length = options.patience, max(1, options.iterations // INTERVALS)
         self._first = options.round_steps[-1] + 1
         self.state = [0.0, 0.0, math.inf, 0.0]
 
@@ -334,7 +334,7 @@ def _start(images: ImageSet, options: ReconstructionOptions, cloud: PointCloud |
         if cloud is None:
             raise ConfigError(f"{name}: an open scene starts from points. Give those that `poses` found (points.npz).")
         return start_open(images, cloud, name=name)
-    count = round(START_SHARE * options.kernels)
+    count = round(START_FRACTION * options.kernels)
     resolution, missing = options.hull_resolution, options.missing_masks
     return start_object(images, count, resolution=resolution, missing=missing, cloud=cloud, name=name)
 

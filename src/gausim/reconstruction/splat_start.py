@@ -1,4 +1,4 @@
-"""Where Gaussians begin, and where they may be: on the visual hull of the masks, or on points of the open scene."""
+"""Initial Gaussians and their bounds: on the visual hull of the masks, or on the points of an open scene."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from gausim.core import DataError
 from gausim.ops.visual_hull import VoxelHull, carve, farthest_points, project
 from gausim.reconstruction.stills import ImageSet
 
-# Opaque foreground is what initial colours are read from; the rim mixes in what lies behind.
+# Least alpha (of 255) of pixels from which initial colours are read; the rim is mixed with the background.
 OPAQUE = 200
-# Neighbours whose mean distance is the size of a kernel at the start.
+# Number of neighbours whose mean distance determines the size of a kernel at the start.
 NEIGHBOURS = 3
-# Voxels by which a kernel's centre may leave the hull.
+# Distance by which a kernel's centre may leave the hull [voxels].
 MARGIN = 1
 # Largest standard deviation of an object's kernels [mean distances between neighbours at the start].
 OBJECT_CEILING = 1.5
 # Smallest standard deviation at the start of an open scene [mean distances of the cameras].
 SMALLEST = 1e-4
-# A kernel of an open scene has at most this share of its distance to the nearest camera as standard deviation.
+# Largest standard deviation of a kernel of an open scene [distances to the nearest camera].
 OPEN_CEILING = 0.2
 
 
@@ -33,25 +33,25 @@ class WithinHull:
     """Bounds of an object.
 
     Attributes:
-        hull: body that holds the centres.
-        ceiling: of a standard deviation [scene units].
+        hull: the body within which the centres are.
+        ceiling: largest standard deviation [scene units].
     """
 
     hull: VoxelHull
     ceiling: float
 
     def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
-        """True within the hull."""
+        """True for points within the hull."""
         return self.hull.contains(points)
 
     def largest(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """The same everywhere."""
+        """Largest standard deviation at points: a constant [scene units]."""
         return torch.full_like(points[:, 0], self.ceiling)
 
 
 @dataclass(frozen=True, eq=False)
 class BeforeCameras:
-    """Bounds of an open scene: no kernel is so large that it reaches a camera, where it would fill the image.
+    """Bounds of an open scene: kernels are too small to reach a camera, where they would fill the image.
 
     Attributes:
         centers: of the cameras [scene units].
@@ -60,21 +60,21 @@ class BeforeCameras:
     centers: Float[Tensor, "V 3"]
 
     def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
-        """True for every point that is a number."""
+        """True for finite points."""
         return torch.isfinite(points).all(-1)
 
     def largest(self, points: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """A share of the distance to the nearest camera."""
+        """Largest standard deviation at points: a fraction of the distance to the nearest camera [scene units]."""
         return OPEN_CEILING * torch.cdist(points, self.centers).amin(-1)
 
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points to start from.
+    """Points at which kernels start.
 
     Attributes:
         points: their positions [scene units].
-        colors: RGB in [0, 1]; None reads those of an object from the images.
+        colors: RGB in [0, 1]; None reads the colours of an object from the images.
     """
 
     points: Float[Tensor, "P 3"]
@@ -91,14 +91,14 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """K balls to begin with.
+    """K initial balls.
 
     Attributes:
         points: centres [scene units].
         colors: RGB in [0, 1].
         scales: standard deviations [scene units].
-        bounds: where kernels may be.
-        extent: length that steps of the positions are measured in [scene units].
+        bounds: of positions and sizes.
+        extent: unit of the positions' learning rate [scene units].
     """
 
     points: Float[Tensor, "K 3"]
@@ -114,10 +114,10 @@ def start_object(
     """``count`` balls evenly over the surface of the visual hull of the masks, or over the points that lie in it.
 
     Args:
-        images: whose alpha > 0 is the object.
-        count: balls.
+        images: their alpha > 0 is the object.
+        count: number of balls.
         resolution: voxels along the longest side of the hull.
-        missing: share of the views whose masks may miss a part that all others show.
+        missing: fraction of the views whose masks may lack a part that all others show.
         cloud: points instead of the surface.
         name: of the scene, for errors.
 
@@ -155,8 +155,8 @@ def start_object(
 def start_open(images: ImageSet, cloud: PointCloud, *, name: str) -> Start:
     """Balls on all points of an open scene, as large as the distances to their neighbours.
 
-    The points bring their colours: that of a point that something may hide cannot be read from the images, and kernels
-    that begin with the colour of what is before or behind them grow into fog.
+    Colours come from the points. They cannot be read from the images, where a point may be occluded, and kernels that
+    start with the colour of another surface become fog.
 
     Raises:
         DataError: the points have no colours.

@@ -17,9 +17,9 @@ from gausim.ops.spherical_harmonics import C0, evaluate_sh
 
 # 3DGS divides a split kernel's scales by 1.6; along the axis of the split only, that keeps the covered area.
 SPLIT_SHRINK = 1.6
-# Halves move this many standard deviations apart from the old centre.
+# Distance of both halves from the old centre [standard deviations].
 SPLIT_OFFSET = 0.6
-# What torch.optim.Adam keeps for a parameter.
+# Entries of torch.optim.Adam's state of a parameter.
 ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")
 
 
@@ -45,12 +45,12 @@ class LearningRates:
 
 
 class Splats:
-    """K Gaussians as leaf tensors, their optimiser and what densification needs to know about them.
+    """K Gaussians as leaf tensors, their optimiser, and the records for densification.
 
     Attributes:
         optimizer: Adam, one group per parameter.
-        error: the largest error (K,) noted by :meth:`blame` since :meth:`forget`.
-        seen: kernels (K,) that received any gradient since :meth:`forget`.
+        error: the largest error (K,) from :meth:`note_error` since :meth:`forget`.
+        seen: kernels (K,) with a loss gradient other than 0 since :meth:`forget`.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class Splats:
         rates: LearningRates,
         extent: float,
     ) -> None:
-        """Starts as balls at ``points`` of the standard deviations ``scale``; ``extent`` is the unit of their steps."""
+        """Balls at ``points`` with standard deviations ``scale``; ``extent`` is the unit of the positions' rate."""
         count = points.shape[0]
         quats = torch.zeros(count, 4)
         quats[:, 0] = 1
@@ -107,27 +107,27 @@ class Splats:
         )
 
     def drawable(self, center: Float[Tensor, " 3"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Means, covariances, colours seen from a camera centre, and opacities, with gradients."""
+        """Means, covariances, colours seen from a camera centre, and opacities; differentiable."""
         directions = torch.nn.functional.normalize(self["means"].detach() - center, dim=-1)
         covars = covariance_from_scales(self["log_scales"], self["quats"])
         return self["means"], covars, evaluate_sh(self.sh(), directions), torch.sigmoid(self["opacity"])
 
-    def blame(self, error: Float[Tensor, " K"]) -> None:
-        """Notes how much of an image's error lies under each kernel."""
+    def note_error(self, error: Float[Tensor, " K"]) -> None:
+        """Records each kernel's part of an image's error."""
         self.error = torch.maximum(self.error, error)
 
     def step(self, decay: dict[str, float]) -> None:
         """One Adam step with the base step sizes times ``decay`` (by name, "" for all others)."""
-        gradient = self["means"].grad
-        if gradient is not None:
-            self.seen |= (gradient != 0).any(-1)
+        loss_gradient = self["means"].grad
+        if loss_gradient is not None:
+            self.seen |= (loss_gradient != 0).any(-1)
         for group in self.optimizer.param_groups:
             group["lr"] = group["base"] * decay.get(group["name"], decay[""])
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
 
     def state(self) -> dict[str, Tensor]:
-        """Parameters, Adam's moments and what has been noted: everything that changes."""
+        """Parameters, Adam's moments and the records for densification."""
         state = {"error": self.error, "seen": self.seen}
         for group in self.optimizer.param_groups:
             (value,), name = group["params"], group["name"]
@@ -136,7 +136,7 @@ class Splats:
         return {name: value.clone() for name, value in state.items()}
 
     def restore(self, state: Mapping[str, Tensor]) -> None:
-        """Goes on from :meth:`state`."""
+        """Restores :meth:`state`."""
         for group in self.optimizer.param_groups:
             self.optimizer.state.pop(group["params"][0], None)
             value, name = state[group["name"]].clone().requires_grad_(), group["name"]
@@ -148,7 +148,7 @@ class Splats:
 
     @torch.no_grad()
     def keep(self, mask: Bool[Tensor, " K"]) -> None:
-        """Drops the other kernels; what has been noted of those that stay is kept."""
+        """Drops the kernels outside the mask; the others keep their records."""
         error, seen = self.error[mask], self.seen[mask]
         if not mask.all():
             self._change(lambda value: value[mask])
@@ -183,5 +183,5 @@ class Splats:
         self.forget()
 
     def forget(self) -> None:
-        """Starts afresh to gather what is seen and where errors are."""
+        """Resets the records of errors and of seen kernels."""
         self.error, self.seen = torch.zeros(self.count), torch.zeros(self.count, dtype=torch.bool)

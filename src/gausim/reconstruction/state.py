@@ -1,4 +1,4 @@
-"""A reconstruction on the way, on disk, so that the same command goes on where it was interrupted."""
+"""File of an unfinished reconstruction, from which the same command continues."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from gausim.reconstruction.reconstruction import ReconstructionOptions
 from gausim.reconstruction.splat_start import PointCloud
 from gausim.reconstruction.stills import ImageSet
 
-# Raise when the same arguments give another reconstruction than before.
+# Increase it when the same arguments give another reconstruction than before.
 REVISION = 1
 
 
 def identity(sets: Sequence[ImageSet], options: ReconstructionOptions, cloud: PointCloud | None) -> str:
-    """SHA-256 of everything that a reconstruction depends on: images, cameras, options and points."""
+    """SHA-256 of the inputs of a reconstruction: images, cameras, options and points."""
     digest = hashlib.sha256(json.dumps([REVISION, asdict(options)], sort_keys=True).encode())
     tensors = [x for s in sets for x in (s.images, s.cameras.viewmats, s.cameras.Ks)]
     if cloud is not None:
@@ -31,19 +31,19 @@ def identity(sets: Sequence[ImageSet], options: ReconstructionOptions, cloud: Po
         digest.update(repr((tensor.dtype, tuple(tensor.shape))).encode())
         digest.update(tensor.contiguous().numpy().tobytes())
     for images in sets:
-        digest.update(repr((images.share, images.span, images.cameras.width, images.cameras.height)).encode())
+        digest.update(repr((images.weight, images.span, images.cameras.width, images.cameras.height)).encode())
     return digest.hexdigest()
 
 
 class Partial:
-    """The file of an unfinished reconstruction, beside the scene that it will write."""
+    """The file of an unfinished reconstruction, beside the file of its scene."""
 
     def __init__(self, scene: Path, key: str) -> None:
-        """Names the file of the scene that is being made; ``key`` is the :func:`identity` of its reconstruction."""
+        """Path beside the file ``scene``; ``key`` is the :func:`identity` of the reconstruction."""
         self.path, self._key = scene.with_name(f".{scene.name}.partial"), key
 
     def read(self) -> dict[str, Tensor] | None:
-        """What an interrupted reconstruction of the same arguments left; None where there is nothing of use."""
+        """State of an interrupted reconstruction with the same arguments; None if there is no such file."""
         try:
             with safe_open(str(self.path), framework="pt") as file:
                 if (file.metadata() or {}).get("key") != self._key:
@@ -58,5 +58,5 @@ class Partial:
         write_durably(self.path, save(tensors, metadata={"key": self._key}))
 
     def remove(self) -> None:
-        """The scene is there: the file is not needed any more."""
+        """Deletes the file, once the scene is written."""
         self.path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""What a static reconstruction is made from and measured on: posed RGBA images in sets of one size."""
+"""Images of a static reconstruction for training and measuring: posed RGBA images in sets of one size."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gausim.metrics.psnr import PSNR, ForegroundPSNR
 from gausim.metrics.ssim import SSIM
 from gausim.render.draw import draw
 
-# Images that are drawn and compared together: photos of several megapixels fill memory.
+# Number of images drawn and compared together, limited because photos have several megapixels.
 MEASURED_AT_ONCE = 4
 
 
@@ -28,17 +28,17 @@ class ImageSet:
     """N posed images of one size.
 
     Attributes:
-        name: what they are, for tables.
+        name: name of the set in tables.
         images: straight-alpha RGBA.
         cameras: one per image.
-        share: weight of the set when training draws images.
-        span: part of the steps in which training draws from it, from and to [shares of all steps].
+        weight: probability of the set when training draws images, up to a factor.
+        span: first and last step in which training draws from the set [fractions of all steps].
     """
 
     name: str
     images: UInt8[Tensor, "N H W 4"]
     cameras: Cameras
-    share: float = 1.0
+    weight: float = 1.0
     span: tuple[float, float] = (0.0, 1.0)
 
     def select(self, index: Sequence[int]) -> ImageSet:
@@ -48,7 +48,7 @@ class ImageSet:
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Training sets (the first one is carved for the hull) and the sets that the result is measured on."""
+    """Training sets (the hull is carved from the first one) and the sets on which the result is measured."""
 
     train: tuple[ImageSet, ...]
     measure: tuple[ImageSet, ...]
@@ -62,14 +62,14 @@ def gather_stills(
     longest: int | None = None,
     coarse: float = 0.0,
 ) -> Material:
-    """The stills of the ``transforms.json`` at ``path``; some are left out and measured.
+    """The stills of the ``transforms.json`` at ``path``; some are not used in training but only measured.
 
     Args:
         path: the file.
-        every: one still in so many is left out.
-        opaque: everything in the images counts, not only what their alpha shows.
-        longest: reduce them to at most so many pixels along the longer side.
-        coarse: share of the steps, the first ones, on stills of half that size: a quarter of the work.
+        every: one of this number of stills is left out of training.
+        opaque: every pixel is foreground, whatever its alpha.
+        longest: maximum length of the longer side, to which larger stills are reduced [pixels].
+        coarse: fraction of the steps, from the first, on stills of half that size, which cost a quarter.
 
     Raises:
         DataError: fewer than two stills, or an image or pose is unusable.
@@ -91,41 +91,41 @@ def gather_stills(
 
 def _scaled(images: ImageSet, factor: float) -> ImageSet:
     width, height = (max(1, round(length * factor)) for length in (images.cameras.width, images.cameras.height))
-    return replace(reduced(images, (width, height), share=images.share), name=images.name)
+    return replace(reduced(images, (width, height), weight=images.weight), name=images.name)
 
 
-def gather_object(data: ObjectData, *, video_share: float = 0.5) -> Material:
+def gather_object(data: ObjectData, *, video_fraction: float = 0.5) -> Material:
     """The stills of an object and the first frames of its training views, which show the same rest state.
 
     Training compares renderings with the video frames, which are often smaller than the stills, and splats are not
-    scale-free (their pixel filter is 0.3 pixels^2 at every size). So ``video_share`` of all steps are spent at the
-    size of the video: one quarter of them on the first frames themselves, the rest on the stills reduced to that
+    scale-free (their pixel filter is 0.3 pixels^2 at every size). So the fraction ``video_fraction`` of the
+    steps is at the size of the video: a quarter of it on the first frames, the others on the stills reduced to that
     size. Views that are held out are only measured.
 
     Args:
         data: the object.
-        video_share: share of the steps at the video's size, 0 for stills only.
+        video_fraction: fraction of the steps at the video's size, 0 for stills only.
     """
     stills = data.stills()
-    train = _part(stills, stills.train, "stills", share=1 - video_share)
+    train = _part(stills, stills.train, "stills", weight=1 - video_fraction)
     measured = list(_left_out(stills))
     if not (data.root / "sequences").is_dir():
         return Material((train,), tuple(measured))
     first, heldout = first_frames(data, data.train_views), first_frames(data, data.heldout_views)
     measured += [s for s in (first, heldout) if s is not None]
-    if first is None or video_share <= 0:
+    if first is None or video_fraction <= 0:
         return Material((train,), tuple(measured))
     factor = first.cameras.width / train.cameras.width
     sets = [train]
     if factor < 1:
         size = first.cameras.width, max(1, round(train.cameras.height * factor))
-        sets.append(reduced(train, size, share=0.75 * video_share))
-    sets.append(ImageSet(first.name, first.images, first.cameras, video_share * (0.25 if factor < 1 else 1.0)))
+        sets.append(reduced(train, size, weight=0.75 * video_fraction))
+    sets.append(ImageSet(first.name, first.images, first.cameras, video_fraction * (0.25 if factor < 1 else 1.0)))
     return Material(tuple(sets), tuple(measured))
 
 
 def first_frames(data: ObjectData, views: Sequence[str]) -> ImageSet | None:
-    """Frame 0 of these views over all sequences, cameras that stand at the same place taken once."""
+    """Frame 0 of these views in all sequences; of cameras in the same place only the first."""
     images, cameras, places = [], [], set()
     for sequence in data.sequences if views else []:
         here = sequence.cameras_of(views)
@@ -148,8 +148,8 @@ def first_frames(data: ObjectData, views: Sequence[str]) -> ImageSet | None:
     return ImageSet(kind, torch.stack(images), joined)
 
 
-def reduced(images: ImageSet, size: tuple[int, int], *, share: float) -> ImageSet:
-    """The set at a smaller ``size`` = (width, height): area means of the premultiplied colours, cameras to match."""
+def reduced(images: ImageSet, size: tuple[int, int], *, weight: float) -> ImageSet:
+    """The set at a smaller ``size`` = (width, height), by area means of premultiplied colours, with its cameras."""
     values = images.images.permute(0, 3, 1, 2).float()
     premultiplied = torch.cat((values[:, :3] * values[:, 3:] / 255, values[:, 3:]), 1)
     mean = functional.adaptive_avg_pool2d(premultiplied, (size[1], size[0]))
@@ -157,7 +157,7 @@ def reduced(images: ImageSet, size: tuple[int, int], *, share: float) -> ImageSe
     pixels = straight.round().clamp(0, 255).to(torch.uint8).permute(0, 2, 3, 1).contiguous()
     factor = torch.tensor([size[0] / images.cameras.width, size[1] / images.cameras.height, 1.0])
     cameras = Cameras(images.cameras.viewmats, images.cameras.Ks * factor[:, None], *size, images.cameras.names)
-    return ImageSet(f"{images.name} reduced", pixels, cameras, share)
+    return ImageSet(f"{images.name} reduced", pixels, cameras, weight)
 
 
 @torch.no_grad()
@@ -180,9 +180,9 @@ def measure(scene: GaussianScene, renderer: Renderer, images: ImageSet) -> dict[
     return {metric.key: float(metric.compute()) for metric in metrics}
 
 
-def _part(stills: Stills, index: Sequence[int], name: str, *, share: float = 1.0) -> ImageSet:
-    # Sets below ten stills have none to leave out; then all are used and the measured ones are among them.
-    return ImageSet(name, stills.images, stills.cameras, share).select(index)
+def _part(stills: Stills, index: Sequence[int], name: str, *, weight: float = 1.0) -> ImageSet:
+    # Of fewer than ten stills none is left out: all are used in training and measured.
+    return ImageSet(name, stills.images, stills.cameras, weight).select(index)
 
 
 def _left_out(stills: Stills) -> tuple[ImageSet, ...]:
