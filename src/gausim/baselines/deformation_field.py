@@ -27,7 +27,7 @@ class Field(nn.Module):
     Attributes:
         planes: features.
         trunk: the layer before the heads.
-        heads: of position, scales and quaternion.
+        heads: layers for the offsets of position, scales and quaternion.
     """
 
     def __init__(self, resolution: Sequence[int], features: int, hidden: int) -> None:
@@ -73,7 +73,7 @@ class DeformationField(Fitted):
         """Makes the fields.
 
         Args:
-            resolution: of the planes along each axis of space; along time they have a row for every seen frame.
+            resolution: numbers of the planes along each axis of space; along time they have a row for every seen frame.
             features: channels of the planes.
             hidden: width of the layers behind them.
         """

@@ -197,7 +197,7 @@ def compare(x, y, shape, taps, slots, by_error, by_ssim, gradient):
         x: the prediction, H W 3 floats in a row.
         y: the truth, likewise.
         shape: (H, W), each at least the window.
-        taps: of the window along one axis, a tuple of float32 of odd length.
+        taps: weights of the window along one axis, a tuple of float32 of odd length.
         slots: a tuple of as many uint64 (numba compiles for the length in its type).
         by_error: twice the factor of the squared errors in the loss.
         by_ssim: factor of SSIM in the loss.

@@ -59,7 +59,7 @@ class ReconstructionOptions:
         random_background: composite over a random colour in every step instead of black.
         patience: number of successive twentieths of the steps, after the last round, without a better mean loss
             before an early stop; 0 never stops.
-        seed: of everything random.
+        seed: seed of all random numbers.
         rates: Adam's step sizes.
     """
 
@@ -116,7 +116,7 @@ def reconstruct(
         renderer: draws the Gaussians.
         options: sizes, steps and rates.
         cloud: points at which kernels start; an open scene needs them.
-        name: of the scene, whose kernels are all simulated and foreground, none pinned.
+        name: name of the scene, whose kernels are all simulated and foreground, none pinned.
         progress: called after every step.
         begun: :meth:`Reconstruction.state` of an interrupted reconstruction with the same arguments, to continue.
 
@@ -141,7 +141,7 @@ class Reconstruction:
     Attributes:
         splats: the kernels.
         done: number of steps so far.
-        loss: of the latest step.
+        loss: loss of the latest step.
     """
 
     def __init__(

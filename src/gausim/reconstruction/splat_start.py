@@ -54,7 +54,7 @@ class BeforeCameras:
     """Bounds of an open scene: kernels are too small to reach a camera, where they would fill the image.
 
     Attributes:
-        centers: of the cameras [scene units].
+        centers: centres of the cameras [scene units].
     """
 
     centers: Float[Tensor, "V 3"]
@@ -73,7 +73,7 @@ class PointCloud:
     """Points at which kernels start.
 
     Attributes:
-        points: their positions [scene units].
+        points: positions [scene units].
         colors: RGB in [0, 1]; None reads the colours of an object from the images.
     """
 
@@ -97,7 +97,7 @@ class Start:
         points: centres [scene units].
         colors: RGB in [0, 1].
         scales: standard deviations [scene units].
-        bounds: of positions and sizes.
+        bounds: bounds of positions and sizes.
         extent: unit of the positions' learning rate [scene units].
     """
 
@@ -114,12 +114,12 @@ def start_object(
     """``count`` balls evenly over the surface of the visual hull of the masks, or over the points that lie in it.
 
     Args:
-        images: their alpha > 0 is the object.
+        images: posed images; alpha > 0 is the object.
         count: number of balls.
         resolution: voxels along the longest side of the hull.
         missing: fraction of the views whose masks may lack a part that all others show.
         cloud: points instead of the surface.
-        name: of the scene, for errors.
+        name: name of the scene, for errors.
 
     Raises:
         DataError: no body projects into all masks, or no point lies in it.

@@ -138,7 +138,7 @@ def deformed_appearance(
         unit_of_kernel: the unit of each kernel.
         covars: rest covariances S [scene units^2].
         sh: colour coefficients of degree 0..3.
-        centers: of V cameras [scene units].
+        centers: centres of V cameras [scene units].
     """
     deformed = transport_covariance(covars, deformation_gradients.index_select(1, unit_of_kernel))
     away = torch.nn.functional.normalize(positions[:, None] - centers[:, None], dim=-1)

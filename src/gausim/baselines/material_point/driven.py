@@ -28,7 +28,7 @@ class Driven:
         rest: particles at rest.
         pinned: particles that never move.
         followed: indices of the n particles that every kernel follows.
-        weights: of those particles; they sum to 1 for every kernel.
+        weights: weights of those particles, with sum 1 for every kernel.
         means: positions of the kernels at rest.
         held: kernels that never move: pinned ones and those that are not simulated.
     """

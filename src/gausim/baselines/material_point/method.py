@@ -1,9 +1,9 @@
 """Base of the methods that move scenes by the material point method, with fitted velocities and perhaps moduli.
 
 Units. A scene is scaled to ``side`` simulation units along its longest side, frames last 1 / fps seconds, and Young's
-modulus E and density rho are in simulation units. Nothing depends on them but sqrt(E / rho) / side, the speed of waves
-in sides per second: periods scale with side sqrt(rho / E), and a factor common to E and rho changes nothing. So E in
-PhysDreamer (side 1 / 1.8, rho 2000) equals 0.324 times as much in PhysGaussian (side 1, rho 200).
+modulus E and density rho are in simulation units. The motion depends only on sqrt(E / rho) / side, the speed of
+waves in sides per second: periods scale with side sqrt(rho / E), and a factor common to E and rho has no effect. So E
+in PhysDreamer (side 1 / 1.8, rho 2000) corresponds to 0.324 E in PhysGaussian (side 1, rho 200).
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Domain:
         side: longest side of the scene in the simulation [simulation units].
         size: edge of the cubic domain, in whose middle the scene is [simulation units].
         cells: cells per axis over the whole domain.
-        settings: damping, substeps and filling.
+        settings: damping, substeps and filling of the interior.
     """
 
     side: float
@@ -151,9 +151,9 @@ class Body:
 
     Attributes:
         driven: particles and kernels [scene units].
-        mapping: to the simulation.
+        mapping: mapping to the simulation.
         places: coordinates of the particles in the fields, in [-1, 1]^3; the longest side of the scene has length 2.
-        solver: moves the particles.
+        solver: solver that moves the particles.
     """
 
     driven: Driven
@@ -181,10 +181,10 @@ class MaterialPoints(Fitted):
         """Places the particles.
 
         Args:
-            material: of all particles; :meth:`modulus` overrides its E.
-            domain: in which they are simulated.
-            velocity_resolution: of the planes of the velocity fields.
-            velocity_scale: of their outputs [longest sides / s].
+            material: material of all particles; :meth:`modulus` overrides its E.
+            domain: domain of the simulation.
+            velocity_resolution: resolution of the planes of the velocity fields.
+            velocity_scale: factor on the velocity fields' outputs [longest sides / s].
 
         Raises:
             ConfigError: Warp is not installed, or a number is out of range.

@@ -42,7 +42,7 @@ class ModulusField:
 
     Attributes:
         scale: s.
-        resolution: of the planes of f.
+        resolution: resolution of the planes of f.
     """
 
     scale: float = 1.0
@@ -83,8 +83,8 @@ class PhysDreamer(MaterialPoints):
             discretisation: ``cells`` per simulation unit; the longest side has ``cells`` / 1.8.
             most_substeps: E stays below values that need more substeps.
             modulus: the field of E.
-            velocity_resolution: of the planes of the velocity fields.
-            velocity_scale: of their outputs [longest sides / s]; 0.18 is the original's 0.1 simulation units.
+            velocity_resolution: resolution of the planes of the velocity fields.
+            velocity_scale: factor on their outputs [longest sides / s]; 0.18 is the original's 0.1 simulation units.
 
         Raises:
             ConfigError: a number out of range, or Warp is not installed.
@@ -133,7 +133,7 @@ class PhysDreamer(MaterialPoints):
 
         Args:
             scene_id: the object.
-            places: as :meth:`MaterialPoints.places` gives them.
+            places: coordinates from :meth:`MaterialPoints.places`.
         """
         f = self.field.scale * self.modulus_field[scene_id](places)[:, 0]
         return (self.initial * torch.exp(f)).clamp(LEAST_MODULUS, self.greatest[scene_id])

@@ -46,8 +46,8 @@ class PhysGaussian(MaterialPoints):
             material: E, nu and rho [simulation units].
             discretisation: ``cells`` per axis of the domain, whose edge is twice the longest side.
             opacity: threshold above which a kernel is a particle.
-            velocity_resolution: of the planes of the velocity fields.
-            velocity_scale: of their outputs [longest sides / s].
+            velocity_resolution: resolution of the planes of the velocity fields.
+            velocity_scale: factor on the velocity fields' outputs [longest sides / s].
 
         Raises:
             ConfigError: a number out of range, or Warp is not installed.

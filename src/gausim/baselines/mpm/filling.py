@@ -27,7 +27,7 @@ class Filling:
         ray_axis: axis along which walls are counted; an odd number means inside.
         open_side: side on which no wall is required, as [axis, +1 or -1], for example [2, -1] for an object that was
             not seen from below; None requires walls on all sides.
-        seed: of the particles' positions within their cells.
+        seed: seed of the particles' positions within their cells.
     """
 
     cells: int = 50

@@ -23,7 +23,7 @@ class MPMSolver:
         particles: mass, volume and pins.
         material: the material of all particles.
         grid: the background grid.
-        step: how frames are divided into substeps.
+        step: division of frames into substeps.
     """
 
     def __init__(self, particles: Particles, material: Material, grid: Grid, step: TimeStep) -> None:

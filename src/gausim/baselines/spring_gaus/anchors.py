@@ -28,10 +28,10 @@ class Anchors:
         rest: rest positions [diagonals].
         pinned: anchors that never move.
         followed: the n nearest anchors of every kernel.
-        weights: of the anchors' displacements; 0 for held kernels, else they sum to 1.
+        weights: weights of the anchors' displacements; 0 for held kernels, else they sum to 1.
         slopes: factors g_a of the anchors' displacements in the deformation gradient [1 / diagonals].
         means: rest positions of the kernels [scene units].
-        diagonal: of the scene [scene units].
+        diagonal: diagonal of the scene [scene units].
     """
 
     rest: Float[Tensor, "A 3"]

@@ -124,9 +124,9 @@ class SpringMass(AnchoredMotion):
             anchors: maximum number per scene.
             neighbours: number of nearest anchors to which an anchor has springs.
             substeps: minimum per frame; stiff springs get more.
-            damping: of the closing speed of a spring's ends, times its rest length [diagonals / s].
+            damping: force per closing speed of a spring's ends, times its rest length [diagonals / s].
             stiffness: k at the start; None derives it from ``period``.
-            period: of the slowest vibration at the start [frames].
+            period: period of the slowest vibration at the start [frames].
 
         Raises:
             ConfigError: a number out of range.
