@@ -1,4 +1,4 @@
-"""The viewer: a simulation, its page and the stages between them, which overlap and never queue up."""
+"""The viewer: a simulation, its page and the concurrent stages between them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from gausim.viewer.sights import Sights
 from gausim.viewer.splats import SIZE, Placing, add_splats, pack
 from gausim.viewer.subject import Subject
 
-# Colours follow the camera so often while time stands [times per second].
+# Update rate of view-dependent colours while time is stopped [1 / s].
 _VIEWS = 10.0
 
 
@@ -35,22 +35,22 @@ class _Painted:
 
 
 class Viewer:
-    """Serves one subject until it is stopped.
+    """Server of one :class:`Subject`.
 
     Attributes:
-        server: the guarded viser server.
-        live: the simulating thread.
+        server: the viser server.
+        live: the simulation thread.
         hands: selections and drags.
-        page: the panel.
+        page: the control panel.
         eye: position of the camera that moved last [page units].
         workers: the stages after the simulation.
 
     Raises:
-        ConfigError: the door's settings are unsafe or wrong, or the address cannot be bound.
+        ConfigError: the access settings are unsafe or invalid, or the address cannot be bound.
     """
 
     def __init__(self, subject: Subject, door: Door) -> None:
-        """Starts to listen; :meth:`start` begins to simulate."""
+        """Starts to listen; :meth:`start` begins the simulation."""
         scene = subject.interaction.scene
         self.server = GuardedServer(door, label="gausim")
         self.placing = Placing.of(scene)
@@ -91,11 +91,11 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """What to open in the browser."""
+        """Address of the page."""
         return self.server.url
 
     def start(self) -> None:
-        """Begins to simulate."""
+        """Starts all threads."""
         for thread in (self.live, *self.workers):
             thread.start()
 
@@ -110,7 +110,7 @@ class Viewer:
         self.server.stop()
 
     def repaint(self) -> None:
-        """Has the shown frame painted anew, also while time stands."""
+        """Requests new colours of the shown frame, also while time is stopped."""
         if self.live.is_alive():
             self.live.do(lambda: None)
 
@@ -158,7 +158,7 @@ class Viewer:
                 if painted.beside is not None:
                     self._beside.buffer = painted.beside
             self.hands.follow(painted.shown)
-        paused = not self.live.playing  # then this may be the last frame for long
+        paused = not self.live.playing  # this frame must be displayed, as no other may follow
         displayed = 0.0 if paused else self.server.displayed
         self.page.refresh(painted.shown, painted.legend, displayed, now=paused)
         self.sights.refresh(painted.shown, now=paused)

@@ -1,4 +1,4 @@
-"""The panel beside the picture: every control, and what it does. Values from the browser are checked here again."""
+"""The control panel of the page. Values from the browser are validated again here."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from gausim.viewer.live import Live
 from gausim.viewer.shown import LIVE, Shown
 
 AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
-# Said while forces act in part only.
+# Message while forces are reduced.
 _AT_LIMIT = "At the limit of what was learned: the forces act only in part. Pull less for what would really happen."
-# The panel is brought up to date so often [times per second].
+# Largest refresh rate of the panel [1 / s].
 _REFRESHES = 4.0
 
 
@@ -28,9 +28,9 @@ class Page:
     """The controls of one viewer.
 
     Attributes:
-        mode: what kernels are coloured by.
+        mode: colour mode of the kernels.
         highlight: whether the selection is shown in orange.
-        saved: sessions written, in order.
+        saved: paths of the saved sessions, in order.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class Page:
         repaint: Callable[[], None],
         forget_scales: Callable[[], None],
     ) -> None:
-        """Builds the panel; gravity pulls along ``down`` at first, and sessions are saved in a folder."""
+        """Builds the panel; ``down`` is the initial direction of gravity, ``sessions`` the folder of saved sessions."""
         self._live, self._hands, self._sessions = live, hands, sessions
         self._repaint, self._forget_scales, self._down, self._title = repaint, forget_scales, down, title
         self.mode, self.highlight, self.saved = VIEW, True, list[Path]()
@@ -135,7 +135,7 @@ class Page:
 
     @staticmethod
     def _on_change(handle: Any, known: tuple[Any, ...], work: Callable[[Any], None]) -> None:
-        """Does something with a value from the browser that is one of the known, or a number between two of them."""
+        """Calls ``work`` with a valid value from the browser: one of ``known``, or a number between the two given."""
         good = [handle.value]
 
         async def changed(event: Any) -> None:
@@ -171,7 +171,7 @@ class Page:
         self._calm()
 
     def _calm(self) -> None:
-        """Sliders show that nothing acts."""
+        """Sets the sliders of wind and gravity to zero and restarts the colour scales."""
         self._forget_scales()
         for strength in self._strengths:
             strength.value = 0.0
@@ -225,7 +225,7 @@ class Page:
         self._calm()
 
     def refresh(self, shown: Shown, legend: Legend, displayed: float, *, now: bool = False) -> None:
-        """Shows rates, the frame number, messages and the legend; a few times a second is enough."""
+        """Updates rates, frame, messages and legend, at most :data:`_REFRESHES` times a second unless ``now``."""
         moment = time.monotonic()
         if not now and moment - self._refreshed < 1 / _REFRESHES:
             return

@@ -1,8 +1,8 @@
-"""A viser server that only its own page can talk to.
+"""A viser server with access control, which communicates with its own page only.
 
-viser 1.1.1 binds every interface, answers any Host and Origin, reads any file name below its client and decodes any
-message. What is served here is one page and one websocket. The checks sit in the websockets server under viser, which
-viser makes by the name ``serve`` while it is constructed; for so long that name is ours.
+viser 1.1.1 binds every interface, answers any Host and Origin, reads any file below its client and decodes any message.
+This server offers one page and one websocket. The checks are in the underlying websockets server, which viser creates
+by calling ``serve`` in its constructor; that function is replaced during the construction.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from gausim.viewer.guard import Door, answer
 from gausim.viewer.messages import LARGEST_MESSAGE, MessageChecker, MessageError
 from gausim.viewer.pipeline import Rate
 
-# Junk must not fill a log with tracebacks.
+# Invalid messages must not fill a log with tracebacks.
 _silent = logging.getLogger("gausim.viewer.connections")
 _silent.setLevel(logging.CRITICAL)
 
 
 class _Connection(ServerConnection):
-    """A connection whose messages are checked on their way in and whose frames are counted on their way out."""
+    """A connection that validates received messages and counts sent frames."""
 
     def __init__(self, guarded: GuardedServer, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -59,18 +59,18 @@ class GuardedServer(viser.ViserServer):
     """A viser server behind a :class:`Door`.
 
     Attributes:
-        door: the door, with its token.
-        url: what to open in the browser, with the token where there is one.
-        junk: connections closed for a message that the page would not send.
-        failed: messages that viser could not make sense of.
-        sent: per connection the rate of the messages of at least ``frame_bytes`` [bytes] that it takes.
+        door: the access settings, with the token.
+        url: address of the page, with the token if there is one.
+        junk: number of connections closed for invalid messages.
+        failed: number of messages for which a handler of viser raised an error.
+        sent: rate of sent messages of at least ``frame_bytes`` [bytes], per connection.
     """
 
     def __init__(self, door: Door, *, label: str = "gausim") -> None:
         """Starts to listen.
 
         Raises:
-            ConfigError: the address cannot be bound, or viser is another version than the one this was written for.
+            ConfigError: the address cannot be bound, or viser has another version than 1.1.1.
         """
         if viser.__version__ != "1.1.1":
             raise ConfigError(f"viser {viser.__version__}: expected 1.1.1 (`pip install viser==1.1.1`).")
@@ -102,7 +102,7 @@ class GuardedServer(viser.ViserServer):
         loop = self.get_event_loop()
         loop.call_soon_threadsafe(loop.set_exception_handler, self._failed)
         self.gui.configure_theme(show_share_button=False, show_logo=False)
-        # The button is hidden by the theme; the request behind it would open a tunnel to a public server.
+        # The theme hides the button; its request would open a tunnel to a public server.
         for kind in (viser_messages.ShareUrlRequest, viser_messages.ShareUrlDisconnect):
             self._websock_server.unregister_handler(kind)
         shown = "127.0.0.1" if self.door.host in ("localhost", "0.0.0.0", "::") else self.door.host
@@ -110,11 +110,11 @@ class GuardedServer(viser.ViserServer):
         self.url = f"http://{f'[{shown}]' if ':' in shown else shown}:{port}/{query}"
 
     def _failed(self, _: object, context: dict[str, Any]) -> None:
-        """Takes note of what a handler of viser raised at a message of the right form and the wrong meaning."""
+        """Counts and logs errors that handlers of viser raise for well-formed messages."""
         self.failed += 1
         logging.getLogger(__name__).info("a message failed: %s", context.get("exception", context.get("message")))
 
     @property
     def displayed(self) -> float:
-        """Frames per second that the quickest connection takes."""
+        """Frames per second sent on the fastest connection."""
         return max((rate.per_second for rate in list(self.sent.values())), default=0.0)
