@@ -47,14 +47,14 @@ example:
 
 def add_force_options(parser: argparse.ArgumentParser) -> None:
     """Adds the options for forces and sessions."""
-    group = parser.add_argument_group("forces", "Forces in multiples of the weight of what they act on; each may be "
-                                      "given several times. With any, the object starts at rest, or as the one "
+    group = parser.add_argument_group("forces", "Forces in multiples of the weight of their part; each may be given "
+                                      "several times. With any, the object starts at rest, or as the one "
                                       "--sequence does.")  # fmt: skip
     for kind, text in _HELP.items():
         group.add_argument(f"--{kind}", nargs="+", action="append", default=[], metavar="KEY=VALUE", help=text)
     group.add_argument("--session", metavar="FILE", help="replay a session that was recorded (gausim view, --force)")
     group.add_argument("--metre", type=float, default=1.0, metavar="UNITS",
-                       help="scene units in a metre, which say what a weight is (default: 1)")  # fmt: skip
+                       help="scene units per metre, which scale the unit of weight (default: 1)")  # fmt: skip
     group.add_argument("--most-force", type=float, metavar="WEIGHTS", help="the largest force (default: 10)")
 
 

@@ -11,8 +11,8 @@ import torch
 
 from gausim.core import DataError, DivergenceError, GaussianScene, SteppedFrame, Trajectory
 from gausim.io.files import write_durably
+from gausim.viewer.access import Access
 from gausim.viewer.coloring import BASE, VIEW, Painter
-from gausim.viewer.guard import Door
 from gausim.viewer.server import GuardedServer
 from gausim.viewer.splats import SIZE, Placing, add_splats, pack
 
@@ -61,7 +61,7 @@ def record(
         ConfigError: viser has another version than 1.1.1.
     """
     numbers = _frames(scene, trajectory, every)
-    server = GuardedServer(Door(port=0), label=scene.name)
+    server = GuardedServer(Access(port=0), label=scene.name)
     try:
         serializer = _recorded(server, scene, trajectory, numbers, up, VIEW if colors == "view" else BASE)
         page = _sealed(serializer.as_html(dark_mode=dark), scene.name).encode() if kind == "html" else None

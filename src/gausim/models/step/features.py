@@ -60,7 +60,7 @@ class FeatureOptions:
             raise ConfigError(f"model.simulator.features.angle is '{self.angle}'; expected one of {', '.join(ANGLES)}.")
         if not (self.velocities or self.rest_inputs):
             raise ConfigError(
-                "model.simulator.features.velocities=false needs rest_inputs=true: the network would see nothing."
+                "model.simulator.features.velocities=false needs rest_inputs=true, else no input depends on the motion."
             )
 
     @property

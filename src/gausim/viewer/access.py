@@ -36,7 +36,7 @@ _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
 
 
 @dataclass(frozen=True)
-class Door:
+class Access:
     """Address and access settings of the viewer.
 
     Attributes:
@@ -53,7 +53,7 @@ class Door:
     names: tuple[str, ...] = ()
     token: str | None = None
 
-    def checked(self) -> Door:
+    def checked(self) -> Access:
         """Returns the settings, with a generated token where one is required.
 
         Raises:
@@ -84,21 +84,21 @@ class Door:
 
 
 def answer(
-    door: Door, cookie: str, serve_page: Callable[..., Any], connection: ServerConnection, request: Request
+    access: Access, cookie: str, serve_page: Callable[..., Any], connection: ServerConnection, request: Request
 ) -> Response | None:
     """The answer to a request: a refusal, a cookie in exchange for a token, viser's page, or None for a websocket."""
     websocket = "upgrade" in request.headers
     # A cookie replaces the token, so that the token does not stay in the address bar.
     given = "" if websocket else parse_qs(urlsplit(request.path).query).get("token", [""])[0]
-    refusal = _refusal(door, given or _cookie(request, cookie), connection, request)
+    refusal = _refusal(access, given or _cookie(request, cookie), connection, request)
     if refusal is not None:
         response: Response = connection.respond(refusal[0], f"{refusal[1]}\n")
     elif websocket:
         return None
-    elif door.token is not None and given:
+    elif access.token is not None and given:
         response = connection.respond(303, "")
         response.headers["Location"] = "/"
-        response.headers["Set-Cookie"] = f"{cookie}={door.token}; HttpOnly; SameSite=Strict; Path=/"
+        response.headers["Set-Cookie"] = f"{cookie}={access.token}; HttpOnly; SameSite=Strict; Path=/"
     else:
         response = serve_page(connection, request)
     for name, value in _HEADERS.items():
@@ -106,13 +106,13 @@ def answer(
     return response
 
 
-def _refusal(door: Door, token: str, connection: ServerConnection, request: Request) -> tuple[int, str] | None:
+def _refusal(access: Access, token: str, connection: ServerConnection, request: Request) -> tuple[int, str] | None:
     """Status and reason of a refused request; None for an accepted one."""
     websocket, headers = "upgrade" in request.headers, request.headers
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     host = hosts[0].strip().lower() if len(hosts) == 1 else ""
     match = _HOST.fullmatch(host)
-    if match is None or match[1] not in door.host_names():
+    if match is None or match[1] not in access.host_names():
         return 421, "wrong host"
     own = (f"http://{host}", f"https://{host}")
     if (websocket and len(origins) != 1) or any(o.strip().lower() not in own for o in origins):
@@ -121,7 +121,7 @@ def _refusal(door: Door, token: str, connection: ServerConnection, request: Requ
         return 404, "not found"
     if websocket and len(connection.server.connections) >= MOST_CLIENTS:
         return 503, "too many clients"
-    if door.token is not None and not hmac.compare_digest(token.encode(), door.token.encode()):
+    if access.token is not None and not hmac.compare_digest(token.encode(), access.token.encode()):
         return 401, "open the address with ?token=..., as gausim printed it"
     return None
 

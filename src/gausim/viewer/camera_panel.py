@@ -27,7 +27,7 @@ _HEIGHT_OF_VIEW = 0.8
 _APART = 1.25
 
 
-class Sights:
+class CameraPanel:
     """The cameras of one viewer, their frustums and the panel of videos, if the subject has any.
 
     Attributes:

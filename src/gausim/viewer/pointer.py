@@ -31,7 +31,7 @@ _FOLLOWS = 8.0
 _FLICK = 0.1
 
 
-class Hands:
+class Pointer:
     """Pointer input; its callbacks run in the server's loop and only queue commands for the simulation.
 
     Attributes:
