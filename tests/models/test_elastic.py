@@ -198,9 +198,9 @@ def test_springs_pull_by_the_gradient_of_their_energy_and_not_at_all_to_first_or
     # It takes part in the step with its trained gain.
     basis = phi.flatten(0, 1)
     now, before = (s * (basis @ z).view(1, -1, 3) for s in (1.0, 0.9))
-    a, b, h = scene.matrices()
+    a, b, e = scene.matrices()
     stiff = torch.tensor(scene.initial_log_stiffness).exp()
-    torch.testing.assert_close(_step(scene, now, before)[0], a @ z - b @ (0.9 * z) + h @ (stiff * springs(z[None])[0]),
+    torch.testing.assert_close(_step(scene, now, before)[0], a @ z - b @ (0.9 * z) + e @ (stiff * springs(z[None])[0]),
                                rtol=1e-4, atol=1e-8)  # fmt: skip
 
 

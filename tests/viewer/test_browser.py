@@ -25,8 +25,8 @@ from gausim.interaction.session import Force, Impulse, load_session, save_sessio
 from gausim.io.ply import load_scene
 from gausim.ops.orbit import orbit_cameras
 from gausim.ops.selection import apply_masks, parse_half_space
+from gausim.viewer.access import Access
 from gausim.viewer.app import Subject, Viewer
-from gausim.viewer.guard import Door
 from gausim.viewer.recording import record
 
 pytestmark = needs_chromium
@@ -36,7 +36,7 @@ SIZE = (1280, 800)
 @contextmanager
 def opened(subject: Subject, folder: Path) -> Iterator[tuple[Viewer, Page]]:
     """A viewer and a browser that shows it; nothing may have gone wrong at the end."""
-    viewer = Viewer(subject, Door(port=0))
+    viewer = Viewer(subject, Access(port=0))
     viewer.live.pace = 0.2  # a browser that draws by software answers the mouse between frames
     viewer.start()
     try:
@@ -64,9 +64,9 @@ def on_screen(viewer: Viewer, point: torch.Tensor) -> tuple[float, float]:
 
 def play(viewer: Viewer, page: Page) -> None:
     """Drags the part that is farthest from what is pinned to the right, saves, replays and resets."""
-    hands, live, interaction = viewer.hands, viewer.live, viewer.live.interaction
+    pointer, live, interaction = viewer.pointer, viewer.live, viewer.live.interaction
     scene = interaction.scene
-    centres = hands._centres(scene.means)
+    centres = pointer._centres(scene.means)
     root = viewer.placing.to_page(scene.means[scene.pinned]).mean(0)
     start = on_screen(viewer, centres[(centres - root).norm(dim=-1).argmax()])
     end = (start[0] + 160, start[1])
@@ -77,12 +77,12 @@ def play(viewer: Viewer, page: Page) -> None:
     force = next(e.event for e in reversed(interaction.session().entries) if isinstance(e.event, Force))
     moved = interaction.trajectory().positions[-40:].mean(0) - scene.means  # it swings about where the pull holds it
     along = torch.tensor(force.direction) / torch.tensor(force.direction).norm()
-    mean = (moved[hands.mask] @ along).mean() / scene.diagonal
+    mean = (moved[pointer.mask] @ along).mean() / scene.diagonal
     assert float(mean) > 1e-4, f"moved {float(mean):.2e} diagonals along the drag"
-    across = (moved[hands.mask].mean(0) / scene.diagonal - mean * along).norm()
+    across = (moved[pointer.mask].mean(0) / scene.diagonal - mean * along).norm()
     assert float(mean) > float(across), "moved more across the drag than along it"
     seen, rest = (
-        on_screen(viewer, viewer.placing.to_page(at[hands.mask].mean(0))) for at in (scene.means + moved, scene.means)
+        on_screen(viewer, viewer.placing.to_page(at[pointer.mask].mean(0))) for at in (scene.means + moved, scene.means)
     )
     assert seen[0] > rest[0], "did not move to the right on the screen"
     live.pace = 0.2
@@ -133,12 +133,12 @@ def test_real_splats_are_dragged_reset_and_replayed(data_root: Path, tmp_path: P
 def test_page_brushes_flicks_and_takes_a_session(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
     interaction = make_interaction(keep=None)
     with opened(Subject("a column", interaction, sessions=tmp_path), tmp_path) as (viewer, page):
-        hands, live = viewer.hands, viewer.live
+        pointer, live = viewer.pointer, viewer.live
         centre = on_screen(viewer, viewer.placing.to_page(interaction.scene.means).mean(0))
         page.drag((centre[0] - 200, centre[1] - 200), (centre[0] + 200, centre[1] + 200), modifiers=SHIFT)
-        page.wait(lambda: isinstance(hands.selection, Kernels), 10, "a brushed region")
-        assert int(hands.mask.sum()) > 1
-        start = on_screen(viewer, hands._centres(interaction.scene.means)[0])
+        page.wait(lambda: isinstance(pointer.selection, Kernels), 10, "a brushed region")
+        assert int(pointer.mask.sum()) > 1
+        start = on_screen(viewer, pointer._centres(interaction.scene.means)[0])
         end = (start[0] + 160, start[1])
         page.drag(start, end, modifiers=CTRL, hold=True)
         assert not interaction.acting, "a flick pulls before it is released"
@@ -168,8 +168,8 @@ def test_page_looks_from_a_camera_of_the_data_set(make_interaction: Callable[...
         page.press_text("Cameras of the data set", "div, legend, span, p")
         time.sleep(2.0)  # the folder opens slowly
         page.press_input("Show them")
-        page.wait(lambda: all(frustum.visible for frustum in viewer.sights._frustums), 10, "frustums")
-        expected = viewer.sights._pose(cameras, 1)[0]
+        page.wait(lambda: all(frustum.visible for frustum in viewer.camera_panel._frustums), 10, "frustums")
+        expected = viewer.camera_panel._pose(cameras, 1)[0]
         assert np.linalg.norm(client.camera.position - expected) > 0.5
         page.press_input("Look from")
         page.press_text(cameras.names[1], "[role=option]")

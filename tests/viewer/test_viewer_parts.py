@@ -27,10 +27,10 @@ from gausim.ops.covariance import covariance_from_scales
 from gausim.ops.spherical_harmonics import spherical_harmonics_basis
 from gausim.viewer.coloring import BASE, MASS, SPEED, STRAIN, VIEW, Painter, highlighted, hues
 from gausim.viewer.companion import Companion
-from gausim.viewer.hands import first_hit, in_rectangle
 from gausim.viewer.live import Live
 from gausim.viewer.messages import MessageChecker, MessageError
 from gausim.viewer.pipeline import Rate, Worker
+from gausim.viewer.pointer import first_hit, in_rectangle
 from gausim.viewer.recording import record
 from gausim.viewer.shown import LIVE, Shown, Take
 from gausim.viewer.splats import SIZE, Placing, half_covariances, pack, unit_centres

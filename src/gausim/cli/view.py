@@ -22,13 +22,13 @@ def main(argv: list[str]) -> int:
     from gausim.core.errors import ConfigError
 
     try:
+        from gausim.viewer.access import Access
         from gausim.viewer.app import Viewer
-        from gausim.viewer.guard import Door
     except ModuleNotFoundError as error:
         raise ConfigError(f"the viewer needs {error.name}: pip install 'gausim[view]'.") from error
     token = os.environ.get("GAUSIM_VIEW_TOKEN")
-    door = Door(arguments.host, arguments.port, arguments.allow_remote, tuple(arguments.name), token).checked()
-    viewer = Viewer(_subject(arguments), door)
+    access = Access(arguments.host, arguments.port, arguments.allow_remote, tuple(arguments.name), token).checked()
+    viewer = Viewer(_subject(arguments), access)
     viewer.start()
     print(f"open  {viewer.url}", flush=True)
     if arguments.allow_remote:

@@ -1,4 +1,4 @@
-"""Forces as arrows: where they act, and drawn into pictures."""
+"""Arrows for forces, in the scene and drawn into pictures."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from torch import Tensor
 from gausim.interaction.interaction import Interaction
 
 _COLOR, _OUTLINE = (255, 170, 40), (20, 20, 20)
-# Length of an arrow [diagonals]: of the smallest force, and of the largest that is allowed.
+# Length of an arrow [diagonals]: for the smallest and for the largest allowed force.
 _SHORT, _LONG = 0.08, 0.35
 
 
 @dataclass(frozen=True, eq=False)
 class Arrow:
-    """A force as an arrow from the middle of its kernels to its tip [scene units], with its size in words."""
+    """An arrow from the centre of a force's kernels along the force [scene units], labelled with its size."""
 
     start: Float[Tensor, " 3"]
     end: Float[Tensor, " 3"]
@@ -28,7 +28,7 @@ class Arrow:
 
 
 def arrows_of(live: Interaction) -> list[Arrow]:
-    """The forces that act before the next step, longer the stronger they are."""
+    """Arrows of the forces on the next step, of length increasing with the force."""
     found = []
     for amount, acceleration, name in live.pushes():
         vector = torch.tensor(acceleration)
@@ -44,14 +44,14 @@ def arrows_of(live: Interaction) -> list[Arrow]:
 def draw_arrows(
     image: np.ndarray, arrows: Sequence[Arrow], viewmat: Float[Tensor, "4 4"], K: Float[Tensor, "3 3"]
 ) -> np.ndarray:
-    """A copy of a (H, W, 3) uint8 picture of one camera with arrows over it; those behind the camera are left out."""
+    """A copy of a camera's picture (H, W, 3, uint8) with arrows drawn over it, except those behind the camera."""
     drawn = np.ascontiguousarray(image).copy()
     for arrow in arrows:
         ends = torch.stack((arrow.start, arrow.end)).double() @ viewmat[:3, :3].double().T + viewmat[:3, 3].double()
         if float(ends[:, 2].min()) <= 1e-6:
             continue
         pixels = (ends / ends[:, 2:]) @ K.double().T
-        # OpenCV takes 32-bit coordinates; nothing so far outside is seen.
+        # OpenCV takes 32-bit coordinates; the bound lies far outside the picture.
         a, b = ([int(v) for v in p[:2].clamp(-1e4, 1e4)] for p in pixels)
         for color, width in ((_OUTLINE, 5), (_COLOR, 2)):
             drawn = cv2.arrowedLine(drawn, a, b, color, width, cv2.LINE_AA, tipLength=0.3)

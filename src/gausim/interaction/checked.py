@@ -1,4 +1,4 @@
-"""Records whose fields are checked against their annotations, whether a file or Python makes them."""
+"""Records whose fields are validated against their annotations at construction, from files or from Python."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ Natural = Annotated[int, Meta(ge=0, le=(1 << 63) - 1)]
 
 
 class Checked(Struct, frozen=True):
-    """A record of values that msgspec knows (numbers, texts, tuples of them) and of other such records.
+    """A validated record of types that msgspec supports (numbers, strings, tuples of them) and of other such records.
 
     Raises:
-        ConfigError: a value is of another type or out of its range; names the field, what is expected and what is
-            there.
+        ConfigError: a value has another type or is out of range; the message names the field, the expected and the
+            given value.
     """
 
     def __post_init__(self) -> None:
@@ -31,15 +31,15 @@ class Checked(Struct, frozen=True):
                 converted = value if known else msgspec.convert(value, hint)
             except (msgspec.ValidationError, TypeError) as error:
                 raise ConfigError(f"field '{name}': {_lowered(error)}, got {str(value)[:80]!r}.") from error
-            if converted is not value:  # a list that is a tuple here, a whole number that is a float
+            if converted is not value:  # a list converted to a tuple, or an integer to a float
                 msgspec.structs.force_setattr(self, name, converted)
 
 
 def made(kind: type[Any], fields: Any) -> Any:
-    """A record of the fields of a file or a command line, which must be those that it has.
+    """Constructs a record from the fields of a file or a command line.
 
     Raises:
-        ConfigError: a field is missing, unknown or wrong, or there are no fields.
+        ConfigError: ``fields`` is no dictionary, a field is missing or unknown, or a value is invalid.
     """
     if not isinstance(fields, dict):
         raise ConfigError("expected an object.")

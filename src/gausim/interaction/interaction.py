@@ -1,4 +1,4 @@
-"""A live simulation: forces, wind, gravity and pins on an object, step by step, and the session that they make."""
+"""Interactive simulation: forces, wind, gravity and pins on an object, step by step, recorded as a session."""
 
 from __future__ import annotations
 
@@ -42,29 +42,29 @@ from gausim.interaction.session import (
 )
 from gausim.ops.deformation import determinant
 
-# One metre is one scene unit, unless it is said otherwise.
+# In scene units / s^2 for a scene unit of one metre, the default.
 STANDARD_GRAVITY = 9.81
 # The largest force, and the largest sum of forces on a kernel [weights].
 MOST_FORCE = 10.0
-# A kernel this far from rest has left [diagonals].
+# Distance of a kernel from rest at which a simulation has diverged [diagonals].
 FARTHEST = 10.0
-# |det G| / |G|^3 (Frobenius) of a flattened unit; 0.19 is none, and below this G S G^T is singular in float32.
+# |det G| / |G|^3 (Frobenius norm) below which a unit is flattened: G S G^T is singular in float32. Of G = I it is 0.19.
 FLATTEST = 1e-6
 # Gusts are a sum of waves of these frequencies [Hz].
 _GUSTS = (0.35, 0.8, 1.7)
-# A trajectory that takes more memory is not built [bytes].
+# Largest memory of a replayed trajectory [bytes].
 _MOST_BYTES = 8 << 30
 
 
 class Interaction:
-    """One object that is pushed about. Not for several threads at once.
+    """Simulation of one object under forces and pins, with a record of all events; not thread-safe.
 
     Attributes:
-        tick: steps since the session began; events are recorded at it.
+        tick: steps since the session began, the time stamp of recorded events.
         frame_number: steps since the last reset.
         frame: the latest frame.
-        held: kernels that are pinned by hand.
-        broken: why the simulation stopped; None while it goes on.
+        held: mask of the kernels pinned by events.
+        broken: error message of a diverged simulation; None otherwise.
     """
 
     def __init__(
@@ -82,20 +82,20 @@ class Interaction:
         seed: int = 0,
         keep: int | None = 0,
     ) -> None:
-        """Begins at ``initial`` with nothing acting.
+        """Begins at ``initial`` without forces.
 
         Args:
             scene: the rest scene.
-            dynamics: moves it.
-            masses: of the kernels, up to a common factor, as the dynamics know them.
-            initial: where it starts, and where a reset leads.
-            made_with: what sessions say of all this.
-            units: the unit of every kernel at levels 1, 2, ... of the hierarchy; -1 for kernels of none.
-            gravity: acceleration that makes a weight of a mass [scene units / s^2].
-            most_force: the largest force, and the largest sum of them on a kernel [weights].
-            farthest: a kernel this far from rest stops the simulation [diagonals].
-            seed: of the gusts of wind.
-            keep: so many of the latest frames are kept for :meth:`trajectory`; None keeps all.
+            dynamics: the simulator of the scene.
+            masses: masses of the kernels in the dynamics, up to a common factor.
+            initial: the initial state, also after a reset.
+            made_with: header of sessions: names and hashes of scene, method and initial state.
+            units: the unit of every kernel at levels 1, 2, ... of the hierarchy; -1 for kernels of no unit.
+            gravity: ratio of weight to mass [scene units / s^2].
+            most_force: the largest force, and the largest sum of forces on a kernel [weights].
+            farthest: distance of a kernel from rest at which the simulation stops [diagonals].
+            seed: seed of the gusts of wind.
+            keep: number of latest frames kept for :meth:`trajectory`; None keeps all.
 
         Raises:
             ConfigError: a number is not positive and finite.
@@ -115,7 +115,7 @@ class Interaction:
         self.restart()
 
     def restart(self) -> None:
-        """A new session from the initial state; what was recorded is forgotten."""
+        """Begins a new session from the initial state and discards the recorded events."""
         self.tick, self._entries = 0, list[Entry]()
         phases = random.Random(self.seed)
         self._phases = [phases.uniform(0, 2 * math.pi) for _ in _GUSTS]
@@ -124,7 +124,7 @@ class Interaction:
         self._frames.append(self.frame)
 
     def reset(self) -> None:
-        """Back to the initial state, with no force, wind, gravity or pin; the session goes on."""
+        """Returns to the initial state without forces, wind, gravity or pins, as an event of the session."""
         self.act(Reset())
 
     def _rest_all(self) -> None:
@@ -143,9 +143,9 @@ class Interaction:
         """The next frame.
 
         Raises:
-            DivergenceError: a position is not finite, a covariance no longer positive definite, or a kernel too far
-                away; names the kernel and the frame. The simulation stands until :meth:`reset`.
-            ConfigError: the session has become too long.
+            DivergenceError: a position is not finite, a covariance not positive definite, or a kernel too far from
+                rest; the message names the kernel and the frame. Only :meth:`reset` continues the simulation.
+            ConfigError: the session has the largest number of steps.
         """
         if self.broken is not None:
             raise DivergenceError(self.broken)
@@ -178,7 +178,7 @@ class Interaction:
 
     @property
     def unit_of_kernel(self) -> Int[Tensor, " K"]:
-        """The unit of each kernel, a row of the frames' gradients and rotations."""
+        """The unit of each kernel, a row of the frames' deformation gradients and rotations."""
         return self._stepper.unit_of_kernel
 
     @property
@@ -188,29 +188,29 @@ class Interaction:
 
     @property
     def limited(self) -> int:
-        """Frames since the last reset in which forces acted in part only (:attr:`gausim.core.Stepper.limited`)."""
+        """Frames since the last reset in which forces were reduced (:attr:`gausim.core.Stepper.limited`)."""
         return self._stepper.limited
 
     @property
     def resisting(self) -> bool:
-        """Whether one of them was within the last second."""
+        """Whether forces were reduced within the last second."""
         return self._limited_at is not None and self.frame_number - self._limited_at < self.fps
 
     def trajectory(self) -> Trajectory:
-        """The frames that were kept, the initial one first if no newer ones have displaced it."""
+        """The kept frames, from the initial one or from the oldest that is kept."""
         return trajectory_of(self._frames or [self.frame], self._stepper)
 
     def session(self) -> ForceSession:
-        """What was done so far."""
+        """The session so far, with all recorded events."""
         return ForceSession(self.made_with, self.fps, self.tick, tuple(self._entries), self.gravity, self.seed)
 
     @property
     def acting(self) -> tuple[str, ...]:
-        """Names of the forces that act."""
+        """Names of the active forces."""
         return tuple(self._forces)
 
     def pushes(self) -> list[tuple[Float[Tensor, " K"], tuple[float, float, float], str]]:
-        """What acts before the next step: how much on each kernel, acceleration [scene units / s^2] and kind."""
+        """The forces on the next step: weight per kernel, acceleration [scene units / s^2] and kind."""
         found = [(push.mask.to(self._rest), push.acceleration, "force") for push in self._forces.values()]
         found += [(push.mask.to(self._rest), push.acceleration, "impulse") for push in self._impulses]
         if self._steady is not None:
@@ -221,10 +221,11 @@ class Interaction:
         return found
 
     def act(self, event: Event) -> None:
-        """Does something before the next step, and records it.
+        """Applies an event before the next step, and records it.
 
         Raises:
-            ConfigError: it selects nothing that can move, is too strong, or the method takes no forces.
+            ConfigError: no selected kernel is free, the force is too large, the method takes no forces, or the session
+                has the largest number of events.
         """
         if len(self._entries) >= MOST_EVENTS:
             raise ConfigError(f"session: expected at most {MOST_EVENTS} events. Save it and begin another.")
@@ -260,7 +261,7 @@ class Interaction:
                 self._rest_all()
 
     def _allowed(self, name: str, amount: float, *, per: float = 1.0) -> float:
-        """A force in weights, from an amount that is so many weights ``per`` ..."""
+        """``amount * per``, a force in weights, or an error if it exceeds the largest force."""
         if not amount * per <= self.most_force:
             raise ConfigError(
                 f"field '{name}': expected at most {self.most_force / per:g} (a force of {self.most_force:g} weights), "
@@ -280,7 +281,7 @@ class Interaction:
         return Push(self._movable(on), scaled(direction, weights * self.gravity), frames)
 
     def _force(self) -> Float[Tensor, "K 3"] | None:
-        """Sum of all that acts on every kernel [mass scene units / s^2]; None if nothing does."""
+        """Total force on every kernel [mass scene units / s^2]; None without forces."""
         pushes = self.pushes()
         if not pushes:
             return None
@@ -292,7 +293,7 @@ class Interaction:
         return acceleration * (self.masses * (self._free & ~self.held))[:, None]
 
     def _wind_strength(self) -> float:
-        """Of the wind now, gusts included [weights]."""
+        """Current strength of the wind, gusts included [weights]."""
         assert self._wind is not None
         seconds = self.tick / self.fps
         waves = (math.sin(2 * math.pi * f * seconds + p) for f, p in zip(_GUSTS, self._phases, strict=True))
@@ -328,18 +329,18 @@ def replay(
     other_model: bool = False,
     watch: Callable[[Interaction], None] | None = None,
 ) -> Trajectory:
-    """Does what a session says, from the initial state; the result has all its frames, bit for bit those recorded.
+    """Replays a session from the initial state; all frames equal the recorded ones bit for bit.
 
     Args:
-        interaction: begins anew.
-        session: what to do.
-        other_model: the method or the initial state may differ from the recorded ones; then so do the numbers.
-        watch: is shown the interaction before every step, with what acts in it, and after the last.
+        interaction: the simulation, which begins a new session.
+        session: the events to replay.
+        other_model: accept another method or initial state than those of the session; results then differ.
+        watch: called with the interaction before every step, after its events, and after the last step.
 
     Raises:
-        DataError: the session is of another scene, frame rate, method or initial state, or too long for the memory.
-        ConfigError: an event cannot be done.
-        DivergenceError: the simulation went wrong where the recorded one did not.
+        DataError: the session is of another scene, frame rate, method or initial state, or its frames exceed 8 GiB.
+        ConfigError: an event cannot be applied.
+        DivergenceError: the simulation diverges where the recorded one did not.
     """
     wrong = differences(interaction, session)
     if wrong and not (other_model and all(allowed for _, allowed in wrong)):
@@ -362,7 +363,7 @@ def replay(
 
 
 def differences(interaction: Interaction, session: ForceSession) -> list[tuple[str, bool]]:
-    """What a session was made with and this is not, in words; and whether it can be replayed all the same."""
+    """Differences between a session's header and an interaction: text, and whether a replay can accept it."""
     made, here = session.made_with, interaction.made_with
     found = [
         (made.scene_hash != here.scene_hash, f"it is of another scene, '{made.scene}' and not '{here.scene}'", False),

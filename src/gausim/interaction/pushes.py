@@ -1,4 +1,4 @@
-"""Forces as accelerations of kernels: what an interaction adds up."""
+"""Forces as accelerations of kernels, the terms of an interaction's sum."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from torch import Tensor
 from gausim.core import GaussianScene
 from gausim.ops.covariance import kernel_volumes
 
-# The exposure of a kernel to wind over the mean one stays within this factor.
+# Largest factor by which a kernel's exposure to wind differs from the mean.
 _EXPOSURE = 4.0
 
 
 @dataclass(eq=False)
 class Push:
-    """A force that acts: acceleration vector of the kernels of a mask, and how many more steps."""
+    """An active force: a mask of kernels, their acceleration [scene units / s^2], and the steps left (None: no end)."""
 
     mask: Bool[Tensor, " K"]
     acceleration: tuple[float, float, float]
@@ -26,7 +26,7 @@ class Push:
 
 
 def exposure(scene: GaussianScene, masses: Tensor, free: Tensor) -> Float[Tensor, " K"]:
-    """Acceleration of a kernel by wind over the mean one of the object: cross-section over mass, V^(2/3) / m."""
+    """Acceleration of kernels by wind relative to the object's mean: cross-section over mass, V^(2/3) / m."""
     volume = kernel_volumes(scene.log_scales, scene.volume_scale).to(masses)
     over_mass = torch.where(free, volume.pow(2 / 3) / masses.clamp_min(torch.finfo(masses.dtype).tiny), 0.0)
     mean = (over_mass * masses).sum() / (masses * free).sum()
@@ -35,7 +35,7 @@ def exposure(scene: GaussianScene, masses: Tensor, free: Tensor) -> Float[Tensor
 
 
 def scaled(direction: tuple[float, float, float], length: float) -> tuple[float, float, float]:
-    """A vector in a direction, so long."""
+    """The vector of the given direction and length."""
     x, y, z = direction
     factor = length / math.hypot(x, y, z)
     return x * factor, y * factor, z * factor

@@ -1,4 +1,4 @@
-"""What an event acts on: a unit of the hierarchy, listed kernels, a ball, or the whole object."""
+"""Selections that events act on: a unit of the hierarchy, listed kernels, a ball, or the whole object."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torch import Tensor
 from gausim.core import ConfigError, GaussianScene
 from gausim.interaction.checked import Checked, Natural, Vector
 
-# Kernels that a list may name; more is a defect of the file, not a scene.
+# Largest number of kernels in a list; larger ones are taken for defects of the file.
 MOST_KERNELS = 10_000_000
 
 
@@ -33,17 +33,17 @@ class Unit(Checked, frozen=True):
 
     Attributes:
         level: 1 for the finest clusters, 2 for those of clusters, and so on; 0 for a kernel.
-        index: of the unit within its level.
+        index: index of the unit within its level.
     """
 
     level: Natural
     index: Natural
 
     def mask(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]]) -> Bool[Tensor, " K"]:
-        """True for the kernels of the unit; ``units`` are those of every kernel at levels 1, 2, ..., -1 for none.
+        """True for the kernels of the unit; ``units`` has the unit of every kernel at levels 1, 2, ..., or -1.
 
         Raises:
-            ConfigError: there is no such level or unit.
+            ConfigError: the level or unit does not exist.
         """
         if self.level == 0:
             return Kernels((self.index,)).mask(scene, units)
@@ -66,7 +66,7 @@ class Kernels(Checked, frozen=True):
     """Listed kernels.
 
     Attributes:
-        numbers: of the kernels in the scene, ascending.
+        numbers: indices of the kernels in the scene, ascending.
     """
 
     numbers: Annotated[tuple[Natural, ...], Meta(min_length=1, max_length=MOST_KERNELS)]
@@ -79,7 +79,7 @@ class Kernels(Checked, frozen=True):
         """True for these kernels.
 
         Raises:
-            ConfigError: the scene has not so many.
+            ConfigError: an index exceeds the scene's kernels.
         """
         if self.numbers[-1] >= scene.count:
             raise ConfigError(
@@ -105,7 +105,7 @@ class Ball(Checked, frozen=True):
         """True for the kernels inside.
 
         Raises:
-            ConfigError: there are none.
+            ConfigError: no kernel lies in the ball.
         """
         away = (scene.means.double() - scene.means.new_tensor(self.centre, dtype=torch.float64)).norm(dim=-1)
         chosen = scene.simulated & (away <= self.radius * scene.diagonal)
@@ -122,7 +122,7 @@ Selected = Whole | Unit | Kernels | Ball
 
 
 def selection_to_json(on: Selected) -> dict[str, Any]:
-    """As a session's file says it; listed kernels as ranges, both ends included."""
+    """The JSON value of a selection in session files; listed kernels as ranges, both ends included."""
     match on:
         case Whole():
             return {"whole": True}
@@ -135,10 +135,10 @@ def selection_to_json(on: Selected) -> dict[str, Any]:
 
 
 def selection_from_json(value: Any) -> Selected:
-    """Reads what :func:`selection_to_json` wrote.
+    """Parses the JSON value of :func:`selection_to_json`.
 
     Raises:
-        ConfigError: it is something else; names the field.
+        ConfigError: the value has another form; the message names the field.
     """
     match value:
         case {"whole": True, **more} if not more:
@@ -156,10 +156,10 @@ def selection_from_json(value: Any) -> Selected:
 
 
 def parse_kernels(text: Any) -> Kernels:
-    """Reads kernels as ``0-9, 12``.
+    """Parses a list of kernels such as ``0-9, 12``.
 
     Raises:
-        ConfigError: the text is of another form, or names too many.
+        ConfigError: the text has another form, or lists too many kernels.
     """
     expected, numbers = "field 'kernels': expected numbers and ranges, e.g. \"0-9, 12\"", list[int]()
     for part in str(text).split(","):

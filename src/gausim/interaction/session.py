@@ -1,7 +1,7 @@
-"""What can be done to an object, and force sessions: all that was done to one, as a file to read, edit and replay.
+"""Events that act on an object, and force sessions: recorded events as a file to read, edit and replay.
 
-JSON, one event a line. Forces are multiples of the weight of what they act on, a weight being its mass times the
-acceleration ``gravity`` of the header; frames count steps since the session began.
+JSON, one event a line. Forces are multiples of the weight of the part that they act on, its mass times the acceleration
+``gravity`` of the header; frames count steps since the session began.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _Name = Annotated[str, Meta(min_length=1, max_length=200)]
 _Text = Annotated[str, Meta(max_length=200)]
 
 
-class _Done(Checked, frozen=True):
-    """Something that is done ``on`` a selection, in a ``direction`` of any length but zero.
+class _EventBase(Checked, frozen=True):
+    """Base of events, with a ``direction`` of any non-zero length if they have one.
 
-    The size of a force, ``weights``, counts weights of the free kernels that it acts on; pinned ones feel nothing.
+    The size of a force, ``weights``, is in weights of the free kernels that it acts on; it does not act on pinned ones.
     """
 
     def __post_init__(self) -> None:
@@ -46,8 +46,8 @@ class _Done(Checked, frozen=True):
             raise ConfigError(f"field 'direction': expected a vector that is not zero, got {direction}.")
 
 
-class Force(_Done, frozen=True):
-    """A force that lasts until it is released, or some frames; one of the same name takes the place of the last."""
+class Force(_EventBase, frozen=True):
+    """A force until its release, or for some frames; it replaces an earlier force of the same name."""
 
     on: Selected
     direction: Vector
@@ -56,33 +56,33 @@ class Force(_Done, frozen=True):
     name: _Name = "force"
 
 
-class Release(_Done, frozen=True):
-    """Ends the force of a name, or all forces."""
+class Release(_EventBase, frozen=True):
+    """Ends the force with a name, or all forces."""
 
     name: _Name | None = None
 
 
-class Impulse(_Done, frozen=True):
-    """A push within one frame; one weight second gives the speed that weight gives in a second."""
+class Impulse(_EventBase, frozen=True):
+    """An impulse within one frame; one weight second gives the speed that the weight gives in one second."""
 
     on: Selected
     direction: Vector
     weight_seconds: _Amount
 
 
-class Gravity(_Done, frozen=True):
-    """Gravity besides that in which the object was recorded, until the next one; 0 weights for none."""
+class Gravity(_EventBase, frozen=True):
+    """Gravity in addition to that of the recording, until the next such event; 0 weights for none."""
 
     direction: Vector
     weights: _Amount
 
 
-class Wind(_Done, frozen=True):
-    """A wind, until the next one: a force on every kernel that goes with its cross-section.
+class Wind(_EventBase, frozen=True):
+    """A wind, until the next such event: a force on every kernel in proportion to its cross-section.
 
     Attributes:
-        weights: its force on the whole object, in the mean over time [weights of the object]; 0 for none.
-        gusts: how much it rises and falls, in 0..1.
+        weights: force on the whole object, averaged over time [weights of the object]; 0 for none.
+        gusts: relative amplitude of gusts, in 0..1.
     """
 
     direction: Vector
@@ -90,20 +90,20 @@ class Wind(_Done, frozen=True):
     gusts: Annotated[float, Meta(ge=0, le=1)] = 0.0
 
 
-class Pin(_Done, frozen=True):
-    """Holds kernels where they are."""
+class Pin(_EventBase, frozen=True):
+    """Pins kernels at their current positions."""
 
     on: Selected
 
 
-class Unpin(_Done, frozen=True):
-    """Lets go of kernels that were pinned by hand; those that the scene pins stay so."""
+class Unpin(_EventBase, frozen=True):
+    """Releases kernels pinned by events; pinned kernels of the scene stay pinned."""
 
     on: Selected = Whole()
 
 
-class Reset(_Done, frozen=True):
-    """Back to the initial state, with no force, wind, gravity or pin."""
+class Reset(_EventBase, frozen=True):
+    """Returns to the initial state without forces, wind, gravity or pins."""
 
 
 Event = Force | Release | Impulse | Gravity | Wind | Pin | Unpin | Reset
@@ -111,11 +111,11 @@ KINDS: dict[str, type] = {t.__name__.lower(): t for t in (Force, Release, Impuls
 
 
 class Entry(Checked, frozen=True):
-    """An event and when it happens.
+    """An event and its time.
 
     Attributes:
-        at: steps that were made before it.
-        event: what happens.
+        at: number of steps before it.
+        event: the event.
     """
 
     at: Natural
@@ -123,14 +123,14 @@ class Entry(Checked, frozen=True):
 
 
 class MadeWith(Checked, frozen=True):
-    """What a session was recorded with; hashes tell whether a replay gives the same bits.
+    """Provenance of a session; a replay with equal hashes is bit-identical.
 
     Attributes:
         scene: name of the scene.
-        scene_hash: of its Gaussians and masks.
-        model_hash: of the method's numbers.
-        initial_hash: of the initial state.
-        initial: what the initial state is called: a sequence, or ``rest``.
+        scene_hash: hash of its Gaussians and masks.
+        model_hash: hash of the method's weights and settings.
+        initial_hash: hash of the initial state.
+        initial: name of the initial state: a sequence, or ``rest``.
         run: name of the run.
     """
 
@@ -151,10 +151,10 @@ class MadeWith(Checked, frozen=True):
         name: str = "rest",
         run: str = "",
     ) -> MadeWith:
-        """Hashes what the numbers of a simulation depend on: the rest scene, the method and the initial state.
+        """Hashes the inputs of a simulation: the rest scene, the method and the initial state called ``name``.
 
-        Of a method counts its state dict if it is a torch module, else its type; ``settings`` is whatever they do not
-        say. The initial state is called ``name``.
+        A method is identified by its type, by its state dict if it is a torch module, and by ``settings``, a text of
+        its other parameters.
         """
         masks = (scene.simulated, scene.pinned)
         gaussians = (scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh)
@@ -170,15 +170,15 @@ class MadeWith(Checked, frozen=True):
 
 
 class ForceSession(Checked, frozen=True):
-    """What was done to an object, and for how long.
+    """The events on an object and the number of frames.
 
     Attributes:
-        made_with: with what.
+        made_with: provenance.
         fps: frames per second.
         steps: frames after the initial one.
-        entries: what happened, in its order.
-        gravity: the acceleration that makes a weight of a mass [scene units / s^2].
-        seed: of the gusts of wind.
+        entries: the events, in order of time.
+        gravity: ratio of weight to mass [scene units / s^2].
+        seed: seed of the gusts of wind.
     """
 
     made_with: MadeWith
@@ -216,8 +216,8 @@ def load_session(path: Path | str) -> ForceSession:
     """Reads a session.
 
     Raises:
-        DataError: the file is missing, too large, no JSON, of another format, or a field is wrong, unknown, missing or
-            not finite; names the file, the event and the field.
+        DataError: the file is missing, too large, no JSON, of another format, or a field is invalid, unknown, missing
+            or not finite; the message names the file, the event and the field.
     """
     path = Path(path)
     try:
@@ -232,10 +232,10 @@ def load_session(path: Path | str) -> ForceSession:
 
 
 def parse_session(text: str | bytes, source: str = "session") -> ForceSession:
-    """Reads a session from its text, in UTF-8; ``source`` names it in errors.
+    """Parses a session from its UTF-8 text; error messages call it ``source``.
 
     Raises:
-        DataError: as :func:`load_session`.
+        DataError: the text is invalid, see :func:`load_session`.
     """
     try:
         value = msgspec.json.decode(text)

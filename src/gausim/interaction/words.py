@@ -1,4 +1,4 @@
-"""Forces as words on the command line: `--force on=tip weights=3 direction=x frames=12`."""
+"""Command-line syntax of forces: `--force on=tip weights=3 direction=x frames=12`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 # Radius of the ball about the tip [diagonals].
 _TIP = 0.15
-# What each kind of event needs to be told, and what it may be told besides.
+# Required and optional keys of each kind of event.
 _WORDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "force": (("weights", "direction"), ("on", "at", "frames")),
     "impulse": (("weight_seconds", "direction"), ("on", "at")),
@@ -47,27 +47,27 @@ example:
 
 def add_force_options(parser: argparse.ArgumentParser) -> None:
     """Adds the options for forces and sessions."""
-    group = parser.add_argument_group("forces", "Forces in multiples of the weight of what they act on; each may be "
-                                      "given several times. With any, the object starts at rest, or as the one "
+    group = parser.add_argument_group("forces", "Forces in multiples of the weight of their part; each may be given "
+                                      "several times. With any, the object starts at rest, or as the one "
                                       "--sequence does.")  # fmt: skip
     for kind, text in _HELP.items():
         group.add_argument(f"--{kind}", nargs="+", action="append", default=[], metavar="KEY=VALUE", help=text)
     group.add_argument("--session", metavar="FILE", help="replay a session that was recorded (gausim view, --force)")
     group.add_argument("--metre", type=float, default=1.0, metavar="UNITS",
-                       help="scene units in a metre, which say what a weight is (default: 1)")  # fmt: skip
+                       help="scene units per metre, which scale the unit of weight (default: 1)")  # fmt: skip
     group.add_argument("--most-force", type=float, metavar="WEIGHTS", help="the largest force (default: 10)")
 
 
 def has_forces(arguments: argparse.Namespace) -> bool:
-    """Whether any was given."""
+    """Whether any option for forces was given."""
     return any(getattr(arguments, kind) for kind in _WORDS)
 
 
 def entries_of(arguments: argparse.Namespace, scene: GaussianScene) -> list[Entry]:
-    """The events of the command line in the order of their time; forces last beside each other by names of their own.
+    """The events of the command line, sorted by time; distinct names let all forces act at the same time.
 
     Raises:
-        ConfigError: a word is unknown, missing or wrong; names the option.
+        ConfigError: a key is unknown or missing, or a value is invalid; the message names the option.
     """
     given = [(kind, words) for kind in _WORDS for words in getattr(arguments, kind)]
     entries = [entry_of(kind, words, scene, name=f"force {number}") for number, (kind, words) in enumerate(given)]
@@ -75,10 +75,10 @@ def entries_of(arguments: argparse.Namespace, scene: GaussianScene) -> list[Entr
 
 
 def entry_of(kind: str, words: Sequence[str], scene: GaussianScene, *, name: str = "force") -> Entry:
-    """One event of the command line; ``name`` is that of a force.
+    """One event of the command line; ``name`` is used for forces.
 
     Raises:
-        ConfigError: a word is unknown, missing or wrong; names the option.
+        ConfigError: a key is unknown or missing, or a value is invalid; the message names the option.
     """
     from gausim.interaction.session import KINDS, Entry
 
@@ -107,10 +107,10 @@ def entry_of(kind: str, words: Sequence[str], scene: GaussianScene, *, name: str
 
 
 def parse_part(text: str, scene: GaussianScene) -> Selected:
-    """Reads a part of an object, see :data:`EPILOG`.
+    """Parses a part of an object, see :data:`EPILOG`.
 
     Raises:
-        ConfigError: it is of another form.
+        ConfigError: the text has another form.
     """
     from gausim.interaction.selections import Ball, Unit, Whole, parse_kernels
 
@@ -135,10 +135,10 @@ def parse_part(text: str, scene: GaussianScene) -> Selected:
 
 
 def parse_direction(text: str) -> tuple[float, float, float]:
-    """Reads ``x``, ``+x``, ``-z`` or ``X,Y,Z``.
+    """Parses a direction: ``x``, ``+x``, ``-z`` or ``X,Y,Z``.
 
     Raises:
-        ConfigError: it is of another form.
+        ConfigError: the text has another form.
     """
     if (name := text[-1:]) in "xyz" and text in (name, f"+{name}", f"-{name}"):
         x, y, z = ((-1.0 if text[0] == "-" else 1.0) * (name == axis) for axis in "xyz")

@@ -15,10 +15,10 @@ TINY = 1e-12
 
 
 class FreeInitialStates(nn.Module):
-    """x_{-1} = X + free displacement of every kernel, K x 3 numbers per sequence, zero at the start."""
+    """Per-kernel initial states: x_{-1} = X + offset, K x 3 parameters per sequence, initially zero."""
 
     def __init__(self, model: GausSim, scene_of_sequence: Sequence[int]) -> None:
-        """One parameter per sequence; pinned and never-simulated kernels stay at X."""
+        """Creates one parameter per sequence; pinned and never-simulated kernels stay at X."""
         super().__init__()
         self.scene_of_sequence = tuple(scene_of_sequence)
         self._rest = [s.means for s in model.scenes]
@@ -33,24 +33,24 @@ class FreeInitialStates(nn.Module):
         return rest + torch.where(free, offset * self._diagonal[scene], torch.zeros_like(offset))
 
     def reach(self, change: float) -> float:
-        """How far x_{-1} moves when every number of its parameter changes by ``change`` [diagonals]."""
+        """Displacement of x_{-1} when every component of its parameter changes by ``change`` [diagonals]."""
         return change
 
 
 class ModalInitialStates(nn.Module):
-    """x_{-1} = X - sum_m v_m phi_m(X): the motions that the elastic template can carry, M numbers per sequence.
+    """Modal initial states: x_{-1} = X - sum_m v_m phi_m(X), with M amplitudes v_m of template modes per sequence.
 
-    A velocity field of an elastic body is smooth; free offsets leave most of their numbers undetermined by 16 frames.
+    The velocity field of an elastic body is smooth; most per-kernel offsets would remain undetermined by 16 frames.
     """
 
     def __init__(self, model: GausSim, scene_of_sequence: Sequence[int], *, in_diagonals: bool = False) -> None:
-        """One parameter per sequence, zero at the start.
+        """Creates one parameter per sequence, initially zero.
 
         Args:
-            model: its template must offer a basis (:class:`gausim.models.template.elastic.ElasticTemplate`).
-            scene_of_sequence: which scene each sequence shows.
-            in_diagonals: v_m = 1 moves the kernel that moves furthest in phi_m by one diagonal, so that one learning
-                rate means the same motion for every object and template; else v_m is an amplitude of the template's.
+            model: its template must have a basis (:class:`gausim.models.template.elastic.ElasticTemplate`).
+            scene_of_sequence: index of the scene of each sequence.
+            in_diagonals: normalise phi_m to a largest kernel displacement of one diagonal, so that one learning rate
+                means the same motion for every object and template; else v_m is in the template's units.
         """
         super().__init__()
         self.scene_of_sequence = tuple(scene_of_sequence)
@@ -75,6 +75,6 @@ class ModalInitialStates(nn.Module):
         return self._rest[scene].to(velocity) - self._basis[scene].to(velocity) @ velocity
 
     def reach(self, change: float) -> float:
-        """How far x_{-1} moves when v_0 changes by ``change``, in the scene where that is least [diagonals]."""
+        """Displacement of x_{-1} when v_0 changes by ``change``, smallest over the scenes [diagonals]."""
         moved = [float(basis[..., 0].norm(dim=1).max()) for basis in self._basis]
         return change * min(most / diagonal for most, diagonal in zip(moved, self._diagonal, strict=True))

@@ -1,4 +1,4 @@
-"""How a simulator sees its scenes and how it is rolled out: what a configuration of it states besides its parts."""
+"""Settings of a simulator's hierarchy and of its rollouts."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ EDGES = ("rest", "current", "union", "intersection")
 
 @dataclass(frozen=True)
 class HierarchySettings:
-    """Which units a scene's kernels form, and which of them are neighbours (METHOD section 1).
+    """Settings of the hierarchy of units and of the graphs between them (METHOD section 1).
 
     Attributes:
         levels: the predicted levels, coarse to fine: `diameter` of the clusters and `edge_length` of the graph, both as
-            fractions of the object's diagonal. The last may have diameter 0: the kernels themselves. That one alone is
-            "without hierarchy".
+            fractions of the object's diagonal. The last level may have diameter 0: its units are the kernels. A single
+            level of diameter 0 means "without hierarchy".
         clustering: as in :func:`gausim.models.hierarchy.clusters.build_hierarchy`.
         max_neighbours: edges per unit.
         edges: neighbours in ``rest`` space, in the ``current`` state, or the ``union`` / ``intersection`` of both.
-        share_network: one network serves every predicted level; else each has its own (normalisers are shared).
-        body_frame: work in the body's own axes, so that a scene that is turned or moved moves likewise.
+        share_network: one network for all predicted levels; else one per level (normalisers are common to all).
+        body_frame: predict in body axes, so that the motion is equivariant to rotations and translations of the scene.
 
     Raises:
-        ConfigError: no level, an unknown key, diameters that do not fall, or an unknown rule of edges.
+        ConfigError: no level, an unknown key, diameters that do not decrease, or an unknown rule of edges.
     """
 
     levels: Sequence[Mapping[str, float]] = (
@@ -60,7 +60,7 @@ class HierarchySettings:
 
     @property
     def predicted(self) -> tuple[int, ...]:
-        """Levels of the hierarchy for which F is predicted, coarse to fine; 0 is that of the kernels."""
+        """Levels of the hierarchy for which F is predicted, coarse to fine; level 0 are the kernels."""
         first = len(self.diameters)
         return tuple(first - position for position in range(len(self.levels)))
 
@@ -72,12 +72,12 @@ class HierarchySettings:
 
 @dataclass(frozen=True)
 class RolloutSettings:
-    """How predictions without gradients are made.
+    """Settings of rollouts without loss gradients.
 
     Attributes:
-        cuda_graph: on a CUDA device the step is replayed as one graph; of no effect elsewhere.
-        energy_guard_frames: the network may not raise the template's energy beyond the largest of so many frames before
-            (:class:`gausim.models.rollout.energy_guard.EnergyGuard`); 0, or a template without energy: no limit.
+        cuda_graph: on a CUDA device the step is replayed as one graph; no effect on other devices.
+        energy_guard_frames: number of past frames whose largest energy (in the template's terms) the network may not
+            exceed (:class:`gausim.models.rollout.energy_guard.EnergyGuard`); 0, or a template without energy: no limit.
     """
 
     cuda_graph: bool = False

@@ -1,4 +1,4 @@
-"""Clusters of bounded diameter (how kernels become centre-of-mass systems, METHOD section 1), and k-means."""
+"""Clustering of kernels into units of bounded diameter (METHOD section 1), and k-means."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from scipy.spatial import cKDTree
 from gausim.kernels import agglomeration, kdtree
 from gausim.kernels.announce import announced
 
-# Above this the pairwise distances of complete linkage alone take more than 1.6 GB.
+# Above this number of points the pairwise distances of complete linkage take more than 1.6 GB.
 MAX_COMPLETE_LINKAGE = 20_000
 LLOYD_ITERATIONS = 8
-# Agglomeration keeps every pair within the diameter in memory, 48 bytes each. Where there are more than this, points
-# are merged beforehand into groups of at most these fractions of the diameter, the finest that fits.
+# Agglomeration keeps every pair within the diameter in memory, 48 bytes each. With more pairs than this, points are
+# first merged into groups of at most these fractions of the diameter, the smallest that fits.
 MAX_PAIRS = 8_000_000
 GROUP_FRACTIONS = (0.0, 1 / 24, 1 / 16, 1 / 12, 1 / 8, 1 / 6, 1 / 4, 1 / 3, 1 / 2)
 
 
 def _canonical_order(points: np.ndarray) -> np.ndarray:
-    """An order that depends on the positions only, so that permuting kernels permutes the result."""
+    """Lexicographic order of the positions, by which results are equivariant to permutations of the kernels."""
     return np.lexsort((points[:, 2], points[:, 1], points[:, 0]))
 
 
 def _relabel(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Numbers the clusters 0.. in the order in which their first member stands in the canonical order."""
+    """Numbers the clusters 0.. by the canonical order of their first members."""
     order = _canonical_order(points)
     _, first, inverse = np.unique(labels[order], return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
@@ -38,8 +38,8 @@ def _relabel(points: np.ndarray, labels: np.ndarray) -> np.ndarray:
 def ball_clusters(points: Float[np.ndarray, "N 3"], diameter: float) -> Int[np.ndarray, " N"]:
     """Near-linear clustering: every member lies within ``diameter`` / 2 of its cluster's centre.
 
-    A greedy ball cover seeds the centres; Lloyd iterations then move each centre to its members' mean as long as
-    all of them stay inside the ball, so the diameter bound holds by construction.
+    A greedy ball cover seeds the centres; Lloyd iterations then move each centre to its members' mean unless a member
+    would leave the ball, so the diameter bound holds by construction.
 
     Args:
         points: positions [scene units].
@@ -73,7 +73,7 @@ def complete_linkage_clusters(points: Float[np.ndarray, "N 3"], diameter: float)
     """Complete-linkage agglomerative clustering cut at ``diameter``; the reference, O(N^2) memory.
 
     Raises:
-        ValueError: above 20,000 points, where the distances no longer fit; use :func:`agglomerative_clusters`.
+        ValueError: more than 20,000 points; use :func:`agglomerative_clusters`.
     """
     if len(points) > MAX_COMPLETE_LINKAGE:
         raise ValueError(
@@ -88,9 +88,9 @@ def complete_linkage_clusters(points: Float[np.ndarray, "N 3"], diameter: float)
 def agglomerative_clusters(points: Float[np.ndarray, "N 3"], diameter: float) -> Int[np.ndarray, " N"]:
     """Near-linear complete linkage cut at ``diameter``: no two members of a cluster are farther apart.
 
-    The clusters are those of :func:`complete_linkage_clusters` (but for ties) as long as at most 8 million pairs of
-    points lie within the diameter. Beyond that, neighbouring points are first merged into groups much smaller than
-    the diameter; the distance of two groups stays that of their farthest points, so the bound holds exactly.
+    The clusters are those of :func:`complete_linkage_clusters` (except for ties) if at most 8 million pairs of points
+    lie within the diameter. With more pairs, neighbouring points are first merged into groups much smaller than the
+    diameter; the distance of two groups is that of their farthest points, so the bound holds exactly.
 
     Args:
         points: positions [scene units].
@@ -117,11 +117,11 @@ def agglomerative_clusters(points: Float[np.ndarray, "N 3"], diameter: float) ->
 def _close_groups(
     depth: int, x: np.ndarray, boxes: np.ndarray, diameter: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Groups (``kdtree.compact_nodes``) and the pairs of them that one point of each brings within the diameter."""
+    """Groups (``kdtree.compact_nodes``) and pairs of groups with representative points within the diameter."""
     capacity = MAX_PAIRS
     for fraction in GROUP_FRACTIONS:
         ends, nodes = kdtree.compact_nodes(depth, x.shape[1], boxes, fraction * diameter)
-        # Any point of a group will do: the farthest points of two groups are at least as far apart as these.
+        # Any point may represent a group: the farthest points of two groups are at least as far apart.
         some = np.ascontiguousarray(x[:, (ends[:-1] + ends[1:]) // 2])
         some_depth, order, some, some_boxes = kdtree.build(some, 8)
         pairs, complete = kdtree.close_pairs(some_depth, some, some_boxes, diameter * diameter, capacity)
@@ -141,11 +141,11 @@ CLUSTERINGS = {
 
 
 def k_means(points: Float[np.ndarray, "N 3"], count: int) -> Float[np.ndarray, "count 3"]:
-    """Centres of ``count`` clusters by Lloyd's iterations, which begin at points that are far from each other.
+    """Centres of ``count`` clusters by Lloyd's iterations, initialised by farthest-point sampling.
 
     Args:
-        points: at least ``count`` of them.
-        count: clusters, at least 1; with as many as points, the points themselves in their own order.
+        points: positions.
+        count: number of clusters, at least 1; if not below the number of points, the points are returned in order.
     """
     if count >= len(points):
         return np.array(points, np.float64)

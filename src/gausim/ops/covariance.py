@@ -1,4 +1,4 @@
-"""Covariances of Gaussians and what a deformation does to them."""
+"""Covariances of Gaussians and their transport by deformations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Deformation gradients: from network outputs, and their rotations."""
+"""Deformation gradients: their construction from network outputs, bounds and rotations."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def deformation_gradient_from_output(
     with ``conserve_mass`` their mean is subtracted, so that det F = 1 (METHOD section 2).
     """
     one = torch.zeros(4, dtype=output.dtype, device=output.device)
-    one[:1] = 1  # made on the device: a copy from the host would end a graph capture
+    one[:1] = 1  # created on the device: a copy from the host would break the capture of a CUDA graph
     u, v = quaternion_to_matrix(output[:, :8].unflatten(1, (2, 4)) + one).unbind(1)
     stretch = torch.clamp(output[:, 8:11], -MAX_LOG_STRETCH, MAX_LOG_STRETCH)
     if conserve_mass:
@@ -32,22 +32,22 @@ def deformation_gradient_from_output(
 def bounded_deformation(
     deformation_gradient: Float[Tensor, "N 3 3"], least: float, *, unit: bool
 ) -> Float[Tensor, "N 3 3"]:
-    """G where its determinant is at least ``least`` > 0, else the identity: matter is not turned inside out.
+    """Deformation gradients with determinants of at least ``least`` > 0; others are replaced by the identity.
 
     Args:
-        deformation_gradient: G of N units.
+        deformation_gradient: deformation gradients of N units.
         least: smallest determinant.
-        unit: whether to scale them to determinant 1 (volume kept).
+        unit: whether to scale them to determinant 1 (constant volume).
     """
     det = determinant(deformation_gradient)
-    kept = ~(det < least)  # so that NaN stays NaN
+    kept = ~(det < least)  # keeps NaN
     identity = torch.eye(3, dtype=deformation_gradient.dtype, device=deformation_gradient.device)
     bounded = torch.where(kept[:, None, None], deformation_gradient, identity)
     return bounded * torch.where(kept, det, 1.0).pow(-1 / 3)[:, None, None] if unit else bounded
 
 
 def determinant(a: Float[Tensor, "*N 3 3"]) -> Float[Tensor, " *N"]:
-    """Det of 3x3 matrices, written out: several times faster than LU on the CPU and exact to rounding."""
+    """Determinant of 3x3 matrices, written out: several times faster than LU on the CPU and exact to rounding."""
     return (a[..., 0, :] * torch.linalg.cross(a[..., 1, :], a[..., 2, :])).sum(-1)
 
 

@@ -1,4 +1,4 @@
-"""One frame of a trajectory as a scene of its own, so that any 3DGS viewer can show it."""
+"""Export of one frame of a trajectory as a scene for any 3DGS viewer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gausim.ops.spherical_harmonics import spherical_harmonics_basis
 
 # Directions in which rotated colours are sampled; twice the 16 unknowns of degree 3.
 _DIRECTIONS = 32
-# Matrices this close to the identity leave a kernel's stored fields as they are.
+# Largest deviation of G and Q from the identity at which a kernel's fields are copied unchanged.
 _UNMOVED = 1e-7
 _KERNELS_AT_ONCE = 8192
 
@@ -27,11 +27,10 @@ def deformed_scene(
     rotations: Float[Tensor, "N 3 3"],
     unit_of_kernel: Int[Tensor, " K"],
 ) -> GaussianScene:
-    """The scene whose Gaussians are those of a deformed state.
+    """The scene in a deformed state.
 
-    Covariances G S G^T are taken apart into axes and lengths, and the spherical harmonics are rotated by Q, so that the
-    result looks in every viewer as the trajectory does here. Kernels of units that did not deform keep their fields
-    bit for bit.
+    Covariances G S G^T are decomposed into axes and lengths, and spherical harmonics are rotated by Q, so that other
+    viewers show the same image as this package. Kernels of undeformed units keep their fields bit for bit.
     """
     identity = torch.eye(3, dtype=deformation_gradients.dtype, device=deformation_gradients.device)
     change = torch.maximum(
@@ -43,7 +42,7 @@ def deformed_scene(
         deformation_gradient = deformation_gradients[unit_of_kernel[index]].double()
         covars = covariance_from_scales(scene.log_scales[index].double(), scene.quats[index].double())
         lengths, axes = torch.linalg.eigh(deformation_gradient @ covars @ deformation_gradient.mT)
-        # A reflection is no rotation; turning one axis round leaves the covariance as it is.
+        # Reflections are turned into rotations by the sign of one axis, which leaves the covariance unchanged.
         axes = torch.cat((axes[..., :2], axes[..., 2:] * torch.det(axes)[:, None, None]), -1)
         log_scales[index] = (0.5 * lengths.clamp_min(1e-30).log()).to(log_scales)
         quats[index] = matrix_to_quaternion(axes).to(quats)

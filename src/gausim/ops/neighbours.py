@@ -1,8 +1,8 @@
-"""Neighbour edges within a radius: for several disjoint objects at once, on the CPU and without leaving a GPU.
+"""Neighbour edges within a radius, for several disjoint objects at once, on the CPU or entirely on a GPU.
 
-Everything here measures in float32: two points are neighbours if their squared distance, in float32, is below the
-squared radius, and of two points at the same distance the one with the lower index is nearer. So the search in a k-d
-tree (:func:`batched_radius_edges`) and the one of torch operations (:func:`neighbour_codes`) agree to the last tie.
+Distances are compared in float32: two points are neighbours if their squared distance in float32 is below the squared
+radius, and of two points at the same distance the one with the lower index counts as nearer. Hence the search in a k-d
+tree (:func:`batched_radius_edges`) and that by torch operations (:func:`neighbour_codes`) agree, ties included.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 NONE = torch.iinfo(torch.int64).max
-SLACK = 1 + 1e-5  # of distances in the tree, where those of float32 decide, which are good to 3e-7
-TABLE_ELEMENTS = 1 << 24  # distances that neighbour_codes holds at a time: 128 MiB of int64 keys
+SLACK = 1 + 1e-5  # factor on the tree's search radius; distances in float32, accurate to 3e-7, decide afterwards
+TABLE_ELEMENTS = 1 << 24  # distances that neighbour_codes computes at a time: 128 MiB of int64 keys
 
 
 def radius_edges(points: Float[Tensor, "N 3"], radius: float, max_neighbours: int) -> Int[Tensor, "2 E"]:
@@ -46,8 +46,8 @@ def batched_radius_edges(
 ) -> Int[Tensor, "2 E"]:
     """:func:`radius_edges` of every member of a disjoint union, with indices into the union.
 
-    The search runs on the CPU; tensors of another device are copied there and back. Nothing there waits for the
-    host with :func:`neighbour_codes`.
+    The search runs on the CPU; tensors of another device are copied there and back. :func:`neighbour_codes` avoids
+    this synchronisation.
 
     Args:
         points: positions of all members, one member after the other [scene units].
@@ -72,12 +72,12 @@ def batched_radius_edges(
 
 
 def _nearest(x: Float[Tensor, "N 3"], square: float, most: int) -> Int[Tensor, "2 E"]:
-    """Edges into every point from the at most ``most`` nearest below a squared distance, by destination and source."""
+    """Edges into every point from its ``most`` nearest below a squared distance, sorted by destination and source."""
     count, k = len(x), min(most, len(x) - 1)
     if k < 1:
         return torch.zeros(2, 0, dtype=torch.int64)
     tree, limit, asked = cKDTree(x.numpy()), SLACK * math.sqrt(square), min(count, k + 9)
-    # The point itself is one of the k + 1 nearest; more are asked for until none is as far as the last that counts.
+    # The point itself is one of the k + 1 nearest; the query grows until it has all points tied with the last of them.
     distance, found = tree.query(x.numpy(), asked, distance_upper_bound=limit)
     while asked < count and (distance[:, -1] <= SLACK * np.minimum(distance[:, k], limit)).any():
         asked = min(count, 2 * asked)
@@ -90,7 +90,7 @@ def _nearest(x: Float[Tensor, "N 3"], square: float, most: int) -> Int[Tensor, "
 
 
 def _squares(offsets: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
-    """Written out, so that every product and sum is rounded alike in every search."""
+    """Squared lengths, written out so that rounding is the same in every search."""
     dx, dy, dz = offsets.unbind(-1)
     return dx * dx + dy * dy + dz * dz
 
@@ -98,8 +98,8 @@ def _squares(offsets: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N"]:
 def _first(
     squares: Float[Tensor, "R C"], near: Bool[Tensor, "R C"], index: Int[Tensor, "... C"], k: int
 ) -> Int[Tensor, "R k"]:
-    """The indices of the k nearest candidates of each row, ascending; larger than any index where there are none."""
-    # The bits of a float32 >= 0 order as the number does: one key holds the distance and, for ties, the index.
+    """Ascending indices of the k nearest candidates of each row, padded with ``NONE``."""
+    # The bits of a float32 >= 0 are ordered as the numbers are: one key combines the distance and, for ties, the index.
     key = (squares.view(torch.int32).long() << 32) | index
     found = key.masked_fill(~near, NONE).topk(k, largest=False, sorted=False).values
     return torch.where(found == NONE, NONE, found & 0xFFFFFFFF).sort().values
@@ -110,12 +110,12 @@ def neighbour_codes(
 ) -> Int[Tensor, " N_times_k"]:
     """The edges of :func:`batched_radius_edges` as N k codes (:func:`edge_codes`), from torch operations alone.
 
-    No shape depends on the positions and nothing is read back to the host, so it can be captured in a CUDA graph.
-    All N^2 distances are computed, some rows at a time.
+    Shapes do not depend on the positions and the host is not synchronised, so a CUDA graph can capture it. All N^2
+    distances are computed, in blocks of rows.
 
     Args:
         points: positions of all members [scene units].
-        member_of_point: which member each point belongs to; only points of one member are neighbours.
+        member_of_point: the member of each point; only points of the same member are neighbours.
         radii: per member, edges are shorter than this [scene units].
         k: cap of incoming edges per point.
     """
@@ -144,21 +144,21 @@ def edge_codes(edges: Int[Tensor, "2 E"], count: int) -> Int[Tensor, " E"]:
 
 
 def coded_edges(codes: Int[Tensor, " E"], count: int) -> Int[Tensor, "2 E"]:
-    """The edges of :func:`edge_codes`."""
+    """Edges from their codes, the inverse of :func:`edge_codes`."""
     return torch.stack((codes % (count + 1), codes // (count + 1)))
 
 
 def no_edge(count: int) -> int:
-    """The code that fills up a fixed number of codes: of an edge from a dummy node N to itself, behind all others."""
+    """The code that pads to a fixed number: an edge from a dummy node N to itself, larger than all others."""
     return count * (count + 2)
 
 
 def combine_codes(a: Int[Tensor, " A"], b: Int[Tensor, " B"], count: int, *, rule: str) -> Int[Tensor, " A_and_B"]:
-    """Union or intersection of two sets of edges over ``count`` nodes, as A + B ascending codes; no shape is read.
+    """Union or intersection of two sets of edges over ``count`` nodes, as A + B ascending codes, padded.
 
     Args:
-        a: codes without repeats but for :func:`no_edge`.
-        b: others.
+        a: codes without repetitions, except of :func:`no_edge`.
+        b: likewise.
         count: number of nodes.
         rule: ``union`` or ``intersection``.
     """

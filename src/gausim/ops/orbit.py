@@ -1,4 +1,4 @@
-"""Cameras around a scene, for looking at it."""
+"""Cameras on a circle around a scene."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gausim.core import Cameras
 
-# Share of the kernels that must fit into the picture; captures have stray kernels far away.
+# Fraction of the kernels within the picture; captures have outlying kernels.
 _WITHIN = 0.98
 _FIELD_OF_VIEW = math.radians(40)
 
@@ -24,7 +24,7 @@ def orbit_cameras(
     up: str = "z",
     size: tuple[int, int] = (480, 480),
 ) -> Cameras:
-    """Cameras on a circle that look at the middle of a scene from far enough to see it.
+    """Cameras on a circle about the middle of a scene, at a distance at which the scene fits into the picture.
 
     Args:
         means: positions of the kernels [scene units].

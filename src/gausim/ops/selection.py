@@ -1,4 +1,4 @@
-"""Selections of kernels by place, to be combined with ``&``, ``|`` and ``~`` and stored as masks."""
+"""Selections of kernels by position, combined by ``&``, ``|`` and ``~`` and stored as masks."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from gausim.core.errors import SceneError
 from gausim.core.scene import GaussianScene
 
 AXES = {"x": 0, "y": 1, "z": 2}
-# Distances of this many pairs are held at once (float32: 64 MiB).
+# Pairs whose distances are computed at once (float32: 64 MiB).
 _PAIRS_AT_ONCE = 1 << 24
-# More kernels within one step than this say that the radius is that of the object, not of its gaps.
+# Largest mean number of kernels within one step; more indicate a radius of the object's size, not of its gaps.
 _STEPS_PER_KERNEL, _FEW_STEPS = 400, 1 << 22
 
 
 class Selection(ABC):
-    """What is selected in a scene; calling it gives one bool per kernel."""
+    """A rule that selects kernels of a scene; calling it gives one bool per kernel."""
 
     @abstractmethod
     def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
         """True for the kernels that are selected."""
 
     def __and__(self, other: Selection) -> Selection:
-        """Selected by both."""
+        """Intersection with another selection."""
         return _Made(lambda scene: self(scene) & other(scene))
 
     def __or__(self, other: Selection) -> Selection:
-        """Selected by either."""
+        """Union with another selection."""
         return _Made(lambda scene: self(scene) | other(scene))
 
     def __invert__(self) -> Selection:
-        """Selected exactly where this one does not select."""
+        """Complement of this selection."""
         return _Made(lambda scene: ~self(scene))
 
 
@@ -110,10 +110,10 @@ class NearPoints(Selection):
 
 @dataclass(frozen=True)
 class Component(Selection):
-    """The kernels that hang together: steps from mean to mean no longer than a radius lead from one to the other.
+    """A connected component of the graph that links kernels whose means are within a radius.
 
     Attributes:
-        radius: longest step [scene units].
+        radius: largest distance of linked kernels [scene units].
         seed: the component of the kernel nearest to this point; the largest one when None.
     """
 
@@ -124,7 +124,7 @@ class Component(Selection):
         """True for the kernels of that component.
 
         Raises:
-            SceneError: the radius is not positive, or so large that far too many kernels are within one step.
+            SceneError: the radius is not positive, or so large that too many kernels are linked to each.
         """
         means = scene.means.detach().double().cpu().numpy()
         tree = cKDTree(means)
@@ -147,7 +147,7 @@ def parse_half_space(text: str, *, above: bool = False) -> HalfSpace:
     """Reads ``AXIS=VALUE``, e.g. ``z=0.33``, as the half-space below (or above) that value.
 
     Raises:
-        SceneError: if the text is of another form.
+        SceneError: the text has another form.
     """
     match = re.fullmatch(r"\s*([xyz])\s*=\s*([-+0-9.eE]+)\s*", text)
     try:
@@ -158,10 +158,10 @@ def parse_half_space(text: str, *, above: bool = False) -> HalfSpace:
 
 
 def require_pinned(scene: GaussianScene) -> GaussianScene:
-    """Returns the scene if something holds it and something of it may move.
+    """Returns the scene if it has both pinned and free simulated kernels.
 
     Raises:
-        SceneError: no kernel is simulated, none is pinned (says how to pin some), or every simulated one is.
+        SceneError: no kernel is simulated, none is pinned (with instructions to pin some), or no simulated one is free.
     """
     if not scene.simulated.any():
         raise SceneError(f"{scene.name}: mask 'simulated' marks no kernel; expected those of the object that moves.")
@@ -186,10 +186,10 @@ def apply_masks(
     pinned: Selection | Bool[Tensor, " K"] | None = None,
     foreground: Selection | Bool[Tensor, " K"] | None = None,
 ) -> GaussianScene:
-    """The scene with these masks replaced; what is left out stays. Kernels not simulated cannot be pinned.
+    """The scene with the given masks replaced; kernels that are not simulated lose their pins.
 
     Raises:
-        SceneError: if a selection given here selects no kernel at all.
+        SceneError: a given selection selects no kernel.
     """
     given = {"simulated": simulated, "pinned": pinned, "foreground": foreground}
     masks: dict[str, Any] = {n: v(scene) if isinstance(v, Selection) else v for n, v in given.items() if v is not None}

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-# Corners of the search cube that few cameras see say nothing; the body must be in the image of this share of views.
+# Fraction of the views in whose image a point must lie; few cameras see the corners of the search cube.
 _MINIMUM_SEEN = 0.5
 _COARSE_RESOLUTION = 48
 
@@ -74,15 +74,15 @@ def project(
 def search_cube(
     viewmats: Float[Tensor, "V 4 4"], Ks: Float[Tensor, "V 3 3"], size: tuple[int, int]
 ) -> tuple[Float[Tensor, " 3"], float]:
-    """Centre and half edge of a cube that holds what all cameras look at.
+    """Centre and half edge of a cube around the region viewed by all cameras.
 
-    The centre is the point nearest to all optical axes in the least-squares sense; the half edge covers what the
-    widest view sees at its distance.
+    The centre is the point nearest to all optical axes in the least-squares sense; the half edge is the largest extent
+    of a camera's view at the centre.
     """
     forward = viewmats[:, 2, :3].double()
     centers = -(viewmats[:, :3, :3].double().mT @ viewmats[:, :3, 3, None].double())[..., 0]
     across = torch.eye(3, dtype=torch.float64) - forward[:, :, None] * forward[:, None, :]
-    # A touch of damping keeps parallel axes (one camera, or a row of them) solvable.
+    # Regularisation, for parallel axes (one camera, or a row of them).
     normal = across.sum(0) + 1e-6 * torch.eye(3, dtype=torch.float64)
     middle = torch.linalg.solve(normal, (across @ centers[..., None]).sum(0)[:, 0])
     focal = torch.stack((Ks[:, 0, 0] / size[0], Ks[:, 1, 1] / size[1]), -1).amin(-1).double()
@@ -98,16 +98,16 @@ def carve(
     *,
     missing: float = 0.0,
 ) -> VoxelHull | None:
-    """Visual hull with about ``resolution`` voxels along its longest side; None if nothing is left.
+    """Visual hull with about ``resolution`` voxels along its longest side; None if it is empty.
 
-    Pixels outside an image veto nothing, so an object that leaves some images survives.
+    Points outside an image are not carved by it, so that an object may lie partly outside some images.
 
     Args:
         masks: foreground.
         viewmats: world to camera (OpenCV).
         Ks: intrinsics [pixels].
         resolution: voxels along the longest side.
-        missing: share of the views whose masks may miss a part; 0: one mask that misses it removes it.
+        missing: fraction of the views whose masks may miss a part; 0: one mask that misses it removes it.
     """
     middle, half = search_cube(viewmats, Ks, (masks.shape[2], masks.shape[1]))
     vetoes = int(missing * len(masks))
@@ -145,7 +145,7 @@ def _inside_masks(
     height, width = masks.shape[1:]
     alive, seen = torch.arange(points.shape[0]), torch.zeros(points.shape[0])
     against = torch.zeros(points.shape[0], dtype=torch.int32)
-    # View by view, each on what the earlier ones left over: ten times less work than all points in all views.
+    # View by view, each on the points left by earlier ones: ten times less work than all points in all views.
     for view in range(masks.shape[0]):
         pixels, depth = project(points[alive], viewmats[view : view + 1], Ks[view : view + 1])
         x, y = pixels[0].floor().long().unbind(-1)  # the centre of pixel i is at i + 0.5
@@ -160,7 +160,7 @@ def _inside_masks(
 
 
 def farthest_points(points: Float[Tensor, "N 3"], count: int, *, start: int = 0) -> Tensor:
-    """Indices of ``count`` points, each the farthest from those before it: an even cover of the cloud."""
+    """Indices of ``count`` points by farthest-point sampling."""
     count = min(count, points.shape[0])
     chosen = torch.zeros(count, dtype=torch.long)
     distance = torch.full((points.shape[0],), float("inf"))

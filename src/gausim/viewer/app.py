@@ -1,4 +1,4 @@
-"""The viewer: a simulation, its page and the stages between them, which overlap and never queue up."""
+"""The viewer: a simulation, its page and the concurrent stages between them."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 import torch
 from jaxtyping import UInt32
 
+from gausim.viewer.access import Access
+from gausim.viewer.camera_panel import CameraPanel
 from gausim.viewer.coloring import VIEW, Legend, Painter, highlighted
-from gausim.viewer.guard import Door
-from gausim.viewer.hands import Hands
 from gausim.viewer.live import Live
 from gausim.viewer.page import Page
 from gausim.viewer.pipeline import Worker
+from gausim.viewer.pointer import Pointer
 from gausim.viewer.server import GuardedServer
 from gausim.viewer.shown import Shown
-from gausim.viewer.sights import Sights
 from gausim.viewer.splats import SIZE, Placing, add_splats, pack
 from gausim.viewer.subject import Subject
 
-# Colours follow the camera so often while time stands [times per second].
+# Update rate of view-dependent colours while time is stopped [1 / s].
 _VIEWS = 10.0
 
 
@@ -35,24 +35,24 @@ class _Painted:
 
 
 class Viewer:
-    """Serves one subject until it is stopped.
+    """Server of one :class:`Subject`.
 
     Attributes:
-        server: the guarded viser server.
-        live: the simulating thread.
-        hands: selections and drags.
-        page: the panel.
+        server: the viser server.
+        live: the simulation thread.
+        pointer: selections and drags.
+        page: the control panel.
         eye: position of the camera that moved last [page units].
         workers: the stages after the simulation.
 
     Raises:
-        ConfigError: the door's settings are unsafe or wrong, or the address cannot be bound.
+        ConfigError: the access settings are unsafe or invalid, or the address cannot be bound.
     """
 
-    def __init__(self, subject: Subject, door: Door) -> None:
-        """Starts to listen; :meth:`start` begins to simulate."""
+    def __init__(self, subject: Subject, access: Access) -> None:
+        """Starts to listen; :meth:`start` begins the simulation."""
         scene = subject.interaction.scene
-        self.server = GuardedServer(door, label="gausim")
+        self.server = GuardedServer(access, label="gausim")
         self.placing = Placing.of(scene)
         self._painter = Painter(scene, subject.interaction.units, subject.interaction.masses)
         self.workers = (Worker("paint", self._paint), Worker("send", self._send))
@@ -62,14 +62,16 @@ class Viewer:
         )  # fmt: skip
         self.server.scene.set_up_direction(f"{'' if subject.up.startswith('-') else '+'}{subject.up}")  # type: ignore[arg-type]
         self.server.scene.world_axes.visible = False
-        self.hands = Hands(self.server, self.live, self.placing, subject.interaction.units, subject.interaction.masses)
+        self.pointer = Pointer(
+            self.server, self.live, self.placing, subject.interaction.units, subject.interaction.masses
+        )
         self.page = Page(
-            self.server, self.live, self.hands, modes=self._painter.modes, title=subject.title,
+            self.server, self.live, self.pointer, modes=self._painter.modes, title=subject.title,
             down=f"+{subject.up[1:]}" if subject.up.startswith("-") else f"-{subject.up}", sessions=subject.sessions,
             repaint=self.repaint, forget_scales=self._painter.forget,
         )  # fmt: skip
-        self.sights = Sights(self.server, self.placing, subject)
-        self.eye = torch.tensor(self.sights.first_position, dtype=torch.float32)
+        self.camera_panel = CameraPanel(self.server, self.placing, subject)
+        self.eye = torch.tensor(self.camera_panel.first_position, dtype=torch.float32)
         self._viewed = 0.0
         self._place_beside(subject)
         first = self._paint_now(self.live.shown())
@@ -81,21 +83,21 @@ class Viewer:
     def _place_beside(self, subject: Subject) -> None:
         if subject.companion is None:
             return
-        other, offset = subject.companion.interaction, self.sights.aside
+        other, offset = subject.companion.interaction, self.camera_panel.aside
         x, y, z = map(float, offset)
         self._other_placing = Placing(self.placing.centre, self.placing.scale, (x, y, z))
         self._other_painter = Painter(other.scene, other.units, other.masses)
-        top = float((self._other_placing.to_page(other.scene.means.float()).numpy() @ self.sights.up).max())
-        above = offset + (top + 0.06 * SIZE) * self.sights.up
+        top = float((self._other_placing.to_page(other.scene.means.float()).numpy() @ self.camera_panel.up).max())
+        above = offset + (top + 0.06 * SIZE) * self.camera_panel.up
         self.server.scene.add_label("/name_beside", subject.companion.name, position=above, anchor="bottom-center")
 
     @property
     def url(self) -> str:
-        """What to open in the browser."""
+        """Address of the page."""
         return self.server.url
 
     def start(self) -> None:
-        """Begins to simulate."""
+        """Starts all threads."""
         for thread in (self.live, *self.workers):
             thread.start()
 
@@ -110,7 +112,7 @@ class Viewer:
         self.server.stop()
 
     def repaint(self) -> None:
-        """Has the shown frame painted anew, also while time stands."""
+        """Requests new colours of the shown frame, also while time is stopped."""
         if self.live.is_alive():
             self.live.do(lambda: None)
 
@@ -143,8 +145,8 @@ class Viewer:
         eye = placing.to_scene(self.eye)
         covars, rgb, legend = painter(shown.frame, shown.unit_of_kernel, shown.speed, mode, eye)
         if highlight:
-            held = torch.zeros_like(self.hands.mask) if shown.held is None else shown.held.cpu()
-            rgb = highlighted(rgb, self.hands.mask, held)
+            held = torch.zeros_like(self.pointer.mask) if shown.held is None else shown.held.cpu()
+            rgb = highlighted(rgb, self.pointer.mask, held)
         return legend, pack(shown.frame.positions.cpu(), covars, rgb, painter.opacities, placing)
 
     def _paint(self, shown: Shown) -> None:
@@ -157,8 +159,8 @@ class Viewer:
                 self._beside.visible = painted.beside is not None
                 if painted.beside is not None:
                     self._beside.buffer = painted.beside
-            self.hands.follow(painted.shown)
-        paused = not self.live.playing  # then this may be the last frame for long
+            self.pointer.follow(painted.shown)
+        paused = not self.live.playing  # this frame must be displayed, as no other may follow
         displayed = 0.0 if paused else self.server.displayed
         self.page.refresh(painted.shown, painted.legend, displayed, now=paused)
-        self.sights.refresh(painted.shown, now=paused)
+        self.camera_panel.refresh(painted.shown, now=paused)

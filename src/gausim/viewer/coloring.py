@@ -1,4 +1,4 @@
-"""What the kernels are coloured by: their own look, the hierarchy, strain, speed or mass."""
+"""Colour modes of the kernels: appearance, hierarchy, strain, speed or mass."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SELECTED, _HELD = (1.0, 0.55, 0.1), (0.25, 0.5, 1.0)
 
 @dataclass(frozen=True)
 class Legend:
-    """What the colours say: one line, and the values at both ends of the scale where there is one."""
+    """Meaning of the colours: one line, and the values at both ends of the scale if there is one."""
 
     text: str
     low: float | None = None
@@ -45,11 +45,11 @@ class Painter:
 
     @property
     def modes(self) -> tuple[str, ...]:
-        """What can be shown."""
+        """Names of the colour modes."""
         return (VIEW, BASE, *self._levels, STRAIN, SPEED, MASS)
 
     def forget(self) -> None:
-        """Scales begin anew."""
+        """Restarts the scales, which otherwise extend to the largest value so far."""
         self._highest.clear()
 
     def __call__(
@@ -60,14 +60,14 @@ class Painter:
         mode: str,
         eye: Float[Tensor, " 3"],
     ) -> tuple[Float[Tensor, "K 3 3"], Float[Tensor, "K 3"], Legend]:
-        """Covariances [scene units^2], colours in [0, 1] and what they say.
+        """Covariances [scene units^2], colours in [0, 1] and their legend.
 
         Args:
-            frame: what is painted.
-            unit_of_kernel: rows of its deformation gradients.
-            speed: of the kernels [scene units / s].
+            frame: the frame to colour.
+            unit_of_kernel: the unit of each kernel, a row of the frame's deformation gradients.
+            speed: speeds of the kernels [scene units / s].
             mode: one of :attr:`modes`.
-            eye: where the camera is [scene units].
+            eye: position of the camera [scene units].
         """
         positions, unit = frame.positions.cpu(), unit_of_kernel.cpu()
         deformation_gradients, look = frame.deformation_gradients.cpu(), self._look.to(positions)
@@ -101,15 +101,15 @@ class Painter:
 
 
 def highlighted(rgb: Float[Tensor, "K 3"], selected: Bool[Tensor, " K"], held: Bool[Tensor, " K"]) -> Tensor:
-    """Colours with what is selected in orange and what is pinned by hand in blue."""
+    """Colours, blended with orange for selected kernels and with blue for those pinned by events."""
     rgb = rgb.clone()
-    for mask, color, share in ((selected, _SELECTED, 0.45), (held, _HELD, 0.6)):
-        rgb[mask] = rgb[mask] * (1 - share) + rgb.new_tensor(color) * share
+    for mask, color, weight in ((selected, _SELECTED, 0.45), (held, _HELD, 0.6)):
+        rgb[mask] = rgb[mask] * (1 - weight) + rgb.new_tensor(color) * weight
     return rgb
 
 
 def hues(units: Int[Tensor, " K"]) -> Float[Tensor, "K 3"]:
-    """Colours that tell neighbouring numbers apart: hues by the golden ratio; grey for -1."""
+    """Distinct colours of neighbouring indices, hues by the golden ratio; grey for -1."""
     number = units.clamp_min(0).double()
     hue, light = (number * 0.61803398875) % 1, 0.75 + 0.25 * ((number * 0.41421356) % 1)
     offset = torch.tensor([5.0, 3.0, 1.0], dtype=torch.float64)
@@ -119,9 +119,9 @@ def hues(units: Int[Tensor, " K"]) -> Float[Tensor, "K 3"]:
     return rgb.float()
 
 
-def _ramp(share: Float[Tensor, " K"]) -> Float[Tensor, "K 3"]:
+def _ramp(fraction: Float[Tensor, " K"]) -> Float[Tensor, "K 3"]:
     table = torch.from_numpy(_table())
-    return table[(share.clamp(0, 1) * (len(table) - 1)).round().long()]
+    return table[(fraction.clamp(0, 1) * (len(table) - 1)).round().long()]
 
 
 @cache

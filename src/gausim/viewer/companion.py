@@ -1,4 +1,4 @@
-"""Another run or baseline beside the first: the same is done to both."""
+"""A second method beside the first, under the same events."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from gausim.interaction.session import Event
 
 
 class Companion:
-    """An interaction that follows another one.
+    """An interaction that repeats the events of another one.
 
     Attributes:
-        name: what it is called on the page.
-        interaction: what is simulated.
-        message: why it stands still or does not follow; empty while it does.
+        name: name on the page.
+        interaction: the simulation.
+        message: error that stopped it or rejected an event; empty without an error.
     """
 
     def __init__(self, name: str, interaction: Interaction) -> None:
         self.name, self.interaction, self.message = name, interaction, ""
 
     def act(self, event: Event, leader: Interaction) -> None:
-        """Does what was done to the leader; units become lists of kernels, as the hierarchies differ."""
+        """Applies an event of the leader; units become lists of kernels, as the hierarchies differ."""
         on = getattr(event, "on", None)
         if isinstance(on, Unit):
             chosen = on.mask(leader.scene, leader.units).nonzero()[:, 0].tolist()
@@ -35,7 +35,7 @@ class Companion:
             self.message = str(error)
 
     def step(self) -> None:
-        """One frame on, unless it broke."""
+        """Simulates one frame, unless the simulation has diverged."""
         try:
             if self.interaction.broken is None:
                 self.interaction.step()

@@ -1,4 +1,4 @@
-"""The recorded videos beside the simulation: the true frame, and the shown one drawn by the same camera."""
+"""Comparison with recorded videos: the true frame and the shown frame, rendered from the same camera."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gausim.data.records import SequenceRecord
 from gausim.render.draw import SceneAppearance, draw, to_bytes
 from gausim.viewer.shown import Shown
 
-# True frames kept decoded.
+# Number of decoded frames in the cache.
 _KEPT = 64
 
 
@@ -27,14 +27,14 @@ class Films:
     """
 
     def __init__(self, records: Mapping[str, SequenceRecord], scene: GaussianScene, renderer: Renderer) -> None:
-        """Takes the sequences by name, the rest scene and what draws it."""
+        """Takes the sequences by name, the rest scene and its renderer."""
         self._records, self._renderer = dict(records), renderer
         self._look = SceneAppearance.of(scene, scene.foreground)
         self._decoded = lru_cache(_KEPT)(self._decode)
         self.views: tuple[str, ...] = tuple(next(iter(self._records.values())).views)
 
     def truth(self, sequence: str, view: str, number: int) -> UInt8[np.ndarray, "H W 3"] | None:
-        """The recorded frame over black; None after the recording's end."""
+        """The recorded frame on black; None after the end of the recording."""
         return self._decoded(sequence, view, number) if number < self._records[sequence].count else None
 
     def _decode(self, sequence: str, view: str, number: int) -> np.ndarray:
@@ -44,7 +44,7 @@ class Films:
 
     @torch.no_grad()
     def drawn(self, sequence: str, view: str, shown: Shown) -> UInt8[np.ndarray, "H W 3"]:
-        """The shown frame as that camera sees it, over black."""
+        """The shown frame rendered from the camera ``view``, on black."""
         frame = shown.frame
         image = draw(
             self._renderer, self._look, frame.positions[None], frame.deformation_gradients[None], frame.rotations[None],

@@ -1,4 +1,4 @@
-"""The thread that simulates: commands from the page, play and pause, the timeline, sessions played back."""
+"""The simulation thread: commands from the page, playback, the timeline and replayed sessions."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from gausim.viewer.companion import Companion
 from gausim.viewer.pipeline import Rate
 from gausim.viewer.shown import LIVE, Shown, Take, shown_frame
 
-# Commands that wait; more at once come from no hand.
+# Largest number of waiting commands, beyond any manual input.
 _MOST_COMMANDS = 1024
-# Frames of the timeline of the live simulation take at most so much memory [bytes].
+# Largest memory of the live simulation's timeline [bytes].
 _HISTORY_BYTES = 128 << 20
 _log = logging.getLogger(__name__)
 
 
 class Live(threading.Thread):
-    """Runs an interaction, or plays takes; the only thread that touches either.
+    """Thread that runs an interaction or plays takes; no other thread accesses them.
 
     Attributes:
-        interaction: what is simulated.
-        takes: what can be played besides.
-        message: what went wrong last, for the page; empty if nothing did.
-        playing: whether time goes on.
-        pace: speed of time; 1 is real time.
-        source: what is shown.
+        interaction: the simulation.
+        takes: recordings that can be played.
+        message: last message for the page, empty without one.
+        playing: whether time advances.
+        pace: speed relative to real time.
+        source: the shown source: :data:`LIVE` or the name of a take.
         rate: simulated steps per second.
     """
 
@@ -46,7 +46,7 @@ class Live(threading.Thread):
         companion: Companion | None = None,
         watched: Callable[[], bool] = lambda: True,
     ) -> None:
-        """Begins to simulate with :meth:`start`; ``publish`` takes every frame; time stands unless ``watched()``."""
+        """Simulates after :meth:`start`; ``publish`` receives every frame; time advances only while ``watched()``."""
         super().__init__(name="gausim-simulate", daemon=True)
         self.interaction, self.takes, self.companion = interaction, tuple(takes), companion
         self._publish, self._watched = publish, watched
@@ -56,13 +56,13 @@ class Live(threading.Thread):
         self.rate = Rate()
         size = 4 * 2 * (interaction.frame.positions.numel() + interaction.frame.deformation_gradients.numel())
         self._history: deque[Shown] = deque(maxlen=max(32, min(3000, _HISTORY_BYTES // size)))
-        self._place: int | None = None  # on the timeline; None: its end, where the live simulation goes on
-        self._script: ForceSession | None = None  # a session that is played back
+        self._place: int | None = None  # index on the timeline; None: its end, where the live simulation continues
+        self._script: ForceSession | None = None  # the session being replayed
         self._loaded: dict[str, tuple[Trajectory, Trajectory | None]] = {}
         self._remember()
 
     def do(self, command: Callable[[], None]) -> None:
-        """Has the simulating thread run something; when far too much waits, all forces are let go instead."""
+        """Queues a command for this thread; if the queue is full, all forces are released instead."""
         try:
             self._commands.put_nowait(command)
         except queue.Full:
@@ -89,7 +89,7 @@ class Live(threading.Thread):
             self._take_commands(due - time.monotonic())
 
     def _take_commands(self, wait: float) -> None:
-        """Runs what waits, for at least so many seconds."""
+        """Runs queued commands, for at least ``wait`` seconds."""
         end = time.monotonic() + wait
         while not self._stopping:
             left = end - time.monotonic()
@@ -113,13 +113,13 @@ class Live(threading.Thread):
             self.message = f"The simulation stopped: {error}"
         except GausSimError as error:
             self.message = str(error)
-        except Exception as error:  # a defect of ours must not end the page
+        except Exception as error:  # a defect of gausim must not end the page
             self.playing = False
             self.message = f"An error of gausim itself: {error!r}. The simulation is paused."
             _log.exception("the simulation was paused")
 
     def advance(self) -> None:
-        """One frame on."""
+        """Advances the shown source by one frame."""
         if self.source != LIVE:
             self._place = ((self._place or 0) + 1) % self._loaded[self.source][0].frames
             return
@@ -143,10 +143,10 @@ class Live(threading.Thread):
             self.companion.act(event, self.interaction)
 
     def act(self, event: Event) -> None:
-        """Does an event now.
+        """Applies an event before the next step.
 
         Raises:
-            ConfigError: a session is being played back, a take is shown, or the event cannot be done.
+            ConfigError: a session is being replayed, a take is shown, or the event cannot be applied.
         """
         if self._script is not None:
             raise ConfigError("A session is being played back. Reset to end it, then act.")
@@ -155,10 +155,10 @@ class Live(threading.Thread):
         self._act(event)
 
     def play(self) -> None:
-        """Time goes on.
+        """Lets time advance.
 
         Raises:
-            DivergenceError: the simulation broke; only a reset helps.
+            DivergenceError: the simulation has diverged and needs a reset.
         """
         if self.source == LIVE:
             if self.interaction.broken is not None:
@@ -167,22 +167,22 @@ class Live(threading.Thread):
         self.playing = True
 
     def pause(self) -> None:
-        """Time stands."""
+        """Stops time."""
         self.playing = False
 
     def step_once(self) -> None:
-        """One frame, then time stands."""
+        """Advances by one frame, then stops time."""
         self.playing = False
         self.advance()
 
     def reset(self) -> None:
-        """Back to the beginning of what is shown; ends a session that is played back."""
+        """Returns to the beginning of the shown source and ends a replay."""
         self.message, self._script, self._place = "", None, None
         if self.source == LIVE:
             self._begin(Interaction.reset)
 
     def begin(self) -> None:
-        """A new session: what was recorded is forgotten."""
+        """Begins a new session and discards the recorded events."""
         self.message, self._script, self.source = "", None, LIVE
         self._begin(Interaction.restart)
 
@@ -196,10 +196,10 @@ class Live(threading.Thread):
         self._remember()
 
     def replay(self, session: ForceSession) -> None:
-        """Plays a session back from the initial state.
+        """Replays a session from the initial state.
 
         Raises:
-            ConfigError: it is of another scene or frame rate, or takes longer than is recorded.
+            ConfigError: the session is of another scene or frame rate.
         """
         wrong = differences(self.interaction, session)
         if any(not allowed for _, allowed in wrong):
@@ -211,14 +211,14 @@ class Live(threading.Thread):
         self.message = "Playing a session back" + "".join(f"; {text}, so the motion differs" for text, _ in wrong) + "."
 
     def choose(self, source: str) -> None:
-        """Shows the live simulation or a take, which is made when it is first asked for."""
+        """Shows the live simulation or a take, which is computed at its first use."""
         if source != LIVE and source not in self._loaded:
             take = next(t for t in self.takes if t.name == source)
             self._loaded[source] = take.load(), take.beside() if take.beside is not None else None
         self.source, self._place, self._script, self.message = source, None, None, ""
 
     def scrub(self, number: int) -> None:
-        """Shows a frame of the timeline; time stands."""
+        """Shows a frame of the timeline and stops time."""
         frames = len(self._history) if self.source == LIVE else self._loaded[self.source][0].frames
         self.playing, self._place = False, max(0, min(number, frames - 1))
 
@@ -227,7 +227,7 @@ class Live(threading.Thread):
         self._history.append(Shown.of(self.interaction, beside))
 
     def shown(self) -> Shown:
-        """The frame that is shown."""
+        """The shown frame."""
         if self.source != LIVE:
             first, second = self._loaded[self.source]
             place = self._place or 0

@@ -1,7 +1,7 @@
-"""Messages that a browser may send over the websocket: kinds, types, sizes and ranges, checked before viser sees them.
+"""Validation of websocket messages from a browser by kind, types, sizes and ranges, before viser receives them.
 
-viser decodes whatever arrives and sets the attributes that a message names. Here every message is one of the few that
-the page sends, has exactly its fields, and holds no NaN; anything else raises and costs the sender its connection.
+viser decodes any message and sets the attributes that it names. Here only the message kinds of the page are accepted,
+with exactly their fields and finite numbers; any other message raises, and its connection is closed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ LARGEST_MESSAGE = 1 << 20
 LARGEST_UPLOAD = 8 << 20
 UPLOADS_AT_ONCE = 2
 
-_Real = Annotated[float, Meta(ge=-1e30, le=1e30)]  # a range holds neither NaN nor infinity
+_Real = Annotated[float, Meta(ge=-1e30, le=1e30)]  # the range excludes NaN and infinity
 _Vector = tuple[_Real, _Real, _Real]
 _Pixel = tuple[_Real, _Real]
 _Natural = Annotated[int, Meta(ge=0, le=1 << 31)]
@@ -30,7 +30,7 @@ _Scalar = bool | _Real | Annotated[str, Meta(max_length=4096)] | None
 
 
 def _kind(kind: str, /, tag: bool = True, **fields: Any) -> Any:
-    """A message with these fields, each a type or (type, default)."""
+    """A message type with the given fields, each a type or (type, default)."""
     given = [(field, *(of if isinstance(of, tuple) else (of,))) for field, of in fields.items()]
     return msgspec.defstruct(kind, given, tag=tag or None, forbid_unknown_fields=True)
 
@@ -72,21 +72,21 @@ _KINDS = (
 
 
 class MessageError(ValueError):
-    """A message that the page would never send."""
+    """A message that the page never sends."""
 
 
 class MessageChecker:
-    """Checks the messages of one connection; it remembers which uploads are under way."""
+    """Validates the messages of one connection and tracks its uploads."""
 
     def __init__(self) -> None:
         self._decoder = msgspec.msgpack.Decoder(Union[_KINDS])  # noqa: UP007 - of a tuple
         self._parts_left: dict[str, int] = {}
 
     def check(self, raw: object) -> bytes:
-        """Returns the message if the page could have sent it.
+        """Returns the message if it is valid.
 
         Raises:
-            MessageError: it is no binary message, of another kind or form, or holds a number that is not finite.
+            MessageError: the message is not binary, of another kind or form, or has a number that is not finite.
         """
         if not isinstance(raw, bytes):
             raise MessageError("expected a binary message")

@@ -1,4 +1,4 @@
-"""The panel beside the picture: every control, and what it does. Values from the browser are checked here again."""
+"""The control panel of the page. Values from the browser are validated again here."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from gausim.interaction.selections import Selected
 from gausim.interaction.session import Event, Gravity, Impulse, Pin, Release, Unpin, Wind, parse_session, save_session
 from gausim.interaction.words import parse_direction
 from gausim.viewer.coloring import VIEW, Legend, gradient_css
-from gausim.viewer.hands import Hands
 from gausim.viewer.live import Live
+from gausim.viewer.pointer import Pointer
 from gausim.viewer.shown import LIVE, Shown
 
 AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
-# Said while forces act in part only.
+# Message while forces are reduced.
 _AT_LIMIT = "At the limit of what was learned: the forces act only in part. Pull less for what would really happen."
-# The panel is brought up to date so often [times per second].
+# Largest refresh rate of the panel [1 / s].
 _REFRESHES = 4.0
 
 
@@ -28,16 +28,16 @@ class Page:
     """The controls of one viewer.
 
     Attributes:
-        mode: what kernels are coloured by.
+        mode: colour mode of the kernels.
         highlight: whether the selection is shown in orange.
-        saved: sessions written, in order.
+        saved: paths of the saved sessions, in order.
     """
 
     def __init__(
         self,
         server: Any,
         live: Live,
-        hands: Hands,
+        pointer: Pointer,
         *,
         modes: tuple[str, ...],
         title: str,
@@ -46,8 +46,8 @@ class Page:
         repaint: Callable[[], None],
         forget_scales: Callable[[], None],
     ) -> None:
-        """Builds the panel; gravity pulls along ``down`` at first, and sessions are saved in a folder."""
-        self._live, self._hands, self._sessions = live, hands, sessions
+        """Builds the panel; ``down`` is the initial direction of gravity, ``sessions`` the folder of saved sessions."""
+        self._live, self._pointer, self._sessions = live, pointer, sessions
         self._repaint, self._forget_scales, self._down, self._title = repaint, forget_scales, down, title
         self.mode, self.highlight, self.saved = VIEW, True, list[Path]()
         self._refreshed, self._modes = 0.0, modes
@@ -58,7 +58,7 @@ class Page:
         for name, build in works.items():
             with tabs.add_tab(name):
                 build(gui)
-        hands.notice = self._selected
+        pointer.notice = self._selected
 
     def _play_tab(self, gui: Any) -> None:
         live = self._live
@@ -74,14 +74,14 @@ class Page:
         self._on_change(self._timeline, (0, 1 << 20), lambda value: live.do(lambda: live.scrub(int(value))))
 
     def _push_tab(self, gui: Any) -> None:
-        hands = self._hands
+        pointer = self._pointer
         gui.add_html(_small("Drag a part to pull at it; with Ctrl to flick it. Shift and drag brushes a region."))
-        level = gui.add_dropdown("Picks", hands.level_names, initial_value=hands.level)
-        self._on_change(level, hands.level_names, hands.choose_level)
+        level = gui.add_dropdown("Picks", pointer.level_names, initial_value=pointer.level)
+        self._on_change(level, pointer.level_names, pointer.choose_level)
         self._chosen = gui.add_html("")
         self._selected()
-        gain = gui.add_slider("Pull", 0.5, 20.0, 0.5, hands.gain, hint="Weights of the part per diagonal of drag")
-        self._on_change(gain, (0.5, 20.0), lambda value: setattr(hands, "gain", value))
+        gain = gui.add_slider("Pull", 0.5, 20.0, 0.5, pointer.gain, hint="Weights of the part per diagonal of drag")
+        self._on_change(gain, (0.5, 20.0), lambda value: setattr(pointer, "gain", value))
         works = {"Pin": lambda: self._on_selection(Pin), "Unpin": lambda: self._on_selection(Unpin)}
         self._on_press_of(gui.add_button_group("Selection", tuple(works)), works)
         self._on_press(gui.add_button("Let go of everything"), self._let_go)
@@ -109,7 +109,7 @@ class Page:
         self._on_change(choice, self._modes, self._recolour)
         self._legend = gui.add_html("")
         handles = gui.add_checkbox("Show the handles", False, hint="What is picked: one per part")
-        self._on_change(handles, (False, True), self._hands.show_handles)
+        self._on_change(handles, (False, True), self._pointer.show_handles)
         self._on_change(gui.add_checkbox("Selection in orange", True), (False, True), self._mark)
 
     def _session_tab(self, gui: Any) -> None:
@@ -135,7 +135,7 @@ class Page:
 
     @staticmethod
     def _on_change(handle: Any, known: tuple[Any, ...], work: Callable[[Any], None]) -> None:
-        """Does something with a value from the browser that is one of the known, or a number between two of them."""
+        """Calls ``work`` with a valid value from the browser: one of ``known``, or a number between the two given."""
         good = [handle.value]
 
         async def changed(event: Any) -> None:
@@ -171,16 +171,16 @@ class Page:
         self._calm()
 
     def _calm(self) -> None:
-        """Sliders show that nothing acts."""
+        """Sets the sliders of wind and gravity to zero and restarts the colour scales."""
         self._forget_scales()
         for strength in self._strengths:
             strength.value = 0.0
 
     def _on_selection(self, kind: Callable[[Selected], Event]) -> None:
-        if self._hands.selection is None:
+        if self._pointer.selection is None:
             self._live.message = "Nothing is selected: click a part first."
         else:
-            self._live.act(kind(self._hands.selection))
+            self._live.act(kind(self._pointer.selection))
 
     def _impulse(self, on: Selected) -> Impulse:
         most = self._live.interaction.most_force / self._live.interaction.fps
@@ -196,7 +196,7 @@ class Page:
         self._repaint()
 
     def _selected(self) -> None:
-        self._chosen.content = _small(f"Selected: {self._hands.described()}.")
+        self._chosen.content = _small(f"Selected: {self._pointer.described()}.")
         self._repaint()
 
     async def _save(self, event: Any) -> None:
@@ -225,7 +225,7 @@ class Page:
         self._calm()
 
     def refresh(self, shown: Shown, legend: Legend, displayed: float, *, now: bool = False) -> None:
-        """Shows rates, the frame number, messages and the legend; a few times a second is enough."""
+        """Updates rates, frame, messages and legend, at most :data:`_REFRESHES` times a second unless ``now``."""
         moment = time.monotonic()
         if not now and moment - self._refreshed < 1 / _REFRESHES:
             return

@@ -1,4 +1,4 @@
-"""Stages that overlap: each works in its own thread on the newest input, and what comes too fast is dropped."""
+"""Concurrent stages: each processes its newest input in a separate thread and drops older inputs."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ class Rate:
         self._window, self._times = window, deque[float](maxlen=4096)
 
     def count(self) -> None:
-        """Something happened."""
+        """Counts one event."""
         self._times.append(time.monotonic())
 
     @property
     def per_second(self) -> float:
-        """How often it happens."""
+        """Mean rate over the window [1 / s]."""
         since = time.monotonic() - self._window
         return sum(moment > since for moment in self._times.copy()) / self._window
 
 
 class Worker(threading.Thread):
-    """Calls a function on the newest item that it was given until it is stopped; an error does not end it.
+    """Thread that calls a function on the newest item until it is stopped, also after errors.
 
     Attributes:
-        failures: errors that the function raised; they are logged.
+        failures: number of errors of the function, which are logged.
     """
 
     def __init__(self, name: str, work: Callable[[Any], None]) -> None:
@@ -42,13 +42,13 @@ class Worker(threading.Thread):
         self._stopping, self.failures = False, 0
 
     def put(self, item: Any) -> None:
-        """Offers an item in the place of the last one, and never waits."""
+        """Replaces the waiting item, without blocking."""
         with self._ready:
             self._newest.append(item)
             self._ready.notify()
 
     def run(self) -> None:
-        """Works until :meth:`stop`."""
+        """Processes items until :meth:`stop`."""
         while True:
             with self._ready:
                 self._ready.wait_for(lambda: self._newest or self._stopping)
@@ -62,7 +62,7 @@ class Worker(threading.Thread):
                 _log.exception("%s: a frame was lost", self.name)
 
     def stop(self) -> None:
-        """Ends after the item at hand."""
+        """Ends the thread after the current item."""
         with self._ready:
             self._stopping = True
             self._ready.notify()

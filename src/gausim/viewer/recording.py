@@ -1,4 +1,4 @@
-"""A trajectory as a `.viser` recording, or as one HTML page that plays it offline."""
+"""Export of a trajectory as a `.viser` recording or as one HTML page that plays it offline."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ import torch
 
 from gausim.core import DataError, DivergenceError, GaussianScene, SteppedFrame, Trajectory
 from gausim.io.files import write_durably
+from gausim.viewer.access import Access
 from gausim.viewer.coloring import BASE, VIEW, Painter
-from gausim.viewer.guard import Door
 from gausim.viewer.server import GuardedServer
 from gausim.viewer.splats import SIZE, Placing, add_splats, pack
 
-# Buffers of all frames are held at once, and a page holds them in base64 [bytes].
+# Largest size of the buffers of all frames, which are in memory at once and in a page as base64 [bytes].
 _LARGEST = 1 << 30
 _EYE = {"x": (0.3, 1.0, 0.4), "y": (0.4, 0.3, 1.0), "z": (0.4, -1.0, 0.3)}
-# The page may load nothing from anywhere: all of it is in the file.
+# Forbids all requests: the page is complete in one file.
 _POLICY = (
     "default-src 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' data: blob:; connect-src data: blob:; "
     "worker-src data: blob:; form-action 'none'; base-uri 'none'"
@@ -37,20 +37,20 @@ def record(
     colors: Literal["base", "view"] = "base",
     dark: bool = False,
 ) -> Path:
-    """Writes a trajectory that plays in a browser, in its own time, and starts again at its end.
+    """Writes a trajectory that plays in a browser at its frame rate, in a loop.
 
-    Kept: positions (float32), covariances (float16, after the object was scaled to :data:`SIZE` units), colours and
+    Kept: positions (float32), covariances (float16, with the object scaled to :data:`SIZE` units), colours and
     opacities (8 bit). Lost: view-dependent colours (one colour per kernel and frame), masks, masses, the hierarchy.
 
     Args:
         scene: the rest scene.
-        trajectory: what is played.
-        path: the file, which is replaced.
-        kind: ``viser`` (for viser's own player) or ``html`` (opens from a disk, without a network).
-        every: take every so many frames.
+        trajectory: the trajectory to play.
+        path: the file; an existing one is replaced.
+        kind: ``viser`` (for viser's player) or ``html`` (a local file that needs no network).
+        every: interval of the exported frames [frames].
         up: vertical axis: x, y, z, -x, -y or -z.
-        colors: ``base`` (the same from every side) or ``view`` (as the first camera sees them).
-        dark: a dark page.
+        colors: ``base`` (independent of the view) or ``view`` (as seen from the initial camera).
+        dark: use a dark theme.
 
     Returns:
         The path.
@@ -58,10 +58,10 @@ def record(
     Raises:
         DataError: the trajectory is of another scene or too long, or ``every`` is not positive.
         DivergenceError: a frame is not finite.
-        ConfigError: viser is of another version.
+        ConfigError: viser has another version than 1.1.1.
     """
     numbers = _frames(scene, trajectory, every)
-    server = GuardedServer(Door(port=0), label=scene.name)
+    server = GuardedServer(Access(port=0), label=scene.name)
     try:
         serializer = _recorded(server, scene, trajectory, numbers, up, VIEW if colors == "view" else BASE)
         page = _sealed(serializer.as_html(dark_mode=dark), scene.name).encode() if kind == "html" else None
@@ -97,7 +97,7 @@ def _frames(scene: GaussianScene, trajectory: Trajectory, every: int) -> range:
 def _recorded(
     server: GuardedServer, scene: GaussianScene, trajectory: Trajectory, numbers: range, up: str, mode: str
 ) -> Any:
-    """The recording, to be serialised: the first frame is the scene, every later one a new buffer after a pause."""
+    """Serialiser of the recording: the first frame is the scene, every later one a new buffer after a pause."""
     placing, sign = Placing.of(scene), -1.0 if up.startswith("-") else 1.0
     axis = up.removeprefix("-")
     vertical = np.array([name == axis for name in "xyz"])
@@ -127,7 +127,7 @@ def _recorded(
 
 
 def _sealed(page: str, name: str) -> str:
-    """The page with its title, and a policy by which the browser refuses it any request."""
+    """The page with its title and a policy that forbids all requests."""
     policy = f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}" />'
     head, _, rest = page.partition("<head>")
     before, _, titled = rest.partition("<title>")

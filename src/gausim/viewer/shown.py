@@ -1,4 +1,4 @@
-"""What is shown: a frame on its way from the simulation to the page, and recordings that can be played."""
+"""Frames for display, and recordings that can be played."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from torch import Tensor
 from gausim.core import DivergenceError, SteppedFrame, Trajectory
 from gausim.interaction.interaction import Interaction
 
-# The source that can be acted on; the others are recordings.
+# Name of the interactive source; the others are recordings.
 LIVE = "Live simulation"
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A frame and what belongs to it.
+    """A frame with the data for its display.
 
     Attributes:
-        unit_of_kernel: rows of the frame's deformation gradients.
-        speed: of the kernels [scene units / s].
-        held: kernels pinned by hand; None for none.
-        number: its place on the timeline.
-        last: the timeline's last place.
+        unit_of_kernel: the unit of each kernel, a row of the frame's deformation gradients.
+        speed: speeds of the kernels [scene units / s].
+        held: mask of the kernels pinned by events; None without any.
+        number: index of the frame on the timeline.
+        last: last index of the timeline.
         source: :data:`LIVE` or the name of a take.
-        beside: the other method's frame, or None.
+        beside: the frame of the second method, or None.
     """
 
     frame: SteppedFrame
@@ -48,13 +48,13 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """A trajectory that can be played: what a method foresees of a sequence.
+    """A trajectory that can be played: a method's prediction of a sequence.
 
     Attributes:
-        name: what it is called on the page.
-        load: makes it, when it is first asked for.
-        sequence: the recorded sequence that it foresees, or None.
-        beside: makes what the other method foresees of the same, or None.
+        name: name on the page.
+        load: computes the trajectory, called at its first use.
+        sequence: the predicted sequence, or None.
+        beside: computes the second method's prediction of the same sequence, or None.
     """
 
     name: str
@@ -64,10 +64,10 @@ class Take:
 
 
 def shown_frame(trajectory: Trajectory, number: int, name: str, beside: Shown | None = None) -> Shown:
-    """A frame of a recording.
+    """A frame of a recording for display.
 
     Raises:
-        DivergenceError: it is not finite.
+        DivergenceError: a position of the frame is not finite.
     """
     frame = SteppedFrame(
         trajectory.positions[number], trajectory.deformation_gradients[number], trajectory.rotations[number]

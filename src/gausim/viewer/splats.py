@@ -1,4 +1,4 @@
-"""From a frame to what viser draws: placed, sized, coloured and packed into 32 bytes a kernel."""
+"""Conversion of frames to viser's buffers: placement, scale and packing into 32 bytes per kernel."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from torch import Tensor
 
 from gausim.core import GaussianScene
 
-# Diagonal of the simulated kernels on the page. Covariances travel as float16, whose smallest step is 6e-8: at this
-# size a kernel of a thousandth of the diagonal keeps its variance to 1 %.
+# Diagonal of the simulated kernels on the page. Covariances are float16, whose smallest step is 6e-8: at this size the
+# variance of a kernel of a thousandth of the diagonal is accurate to 1 %.
 SIZE = 4.0
 # Half a unit in the last place of float16, relative and for subnormal numbers.
 _ROUNDING, _SMALLEST = 2.0**-11, 2.0**-25
@@ -23,12 +23,12 @@ _LARGEST = 6e4
 
 @dataclass(frozen=True, eq=False)
 class Placing:
-    """Where the scene stands on the page: (x - centre) * scale + offset.
+    """Map from the scene to the page: (x - centre) * scale + offset.
 
     Attributes:
-        centre: middle of the simulated kernels' box at rest [scene units].
+        centre: centre of the simulated kernels' bounding box at rest [scene units].
         scale: page units per scene unit.
-        offset: of a scene beside another one [page units].
+        offset: displacement of a scene shown beside another one [page units].
     """
 
     centre: Float[Tensor, " 3"]
@@ -37,16 +37,16 @@ class Placing:
 
     @staticmethod
     def of(scene: GaussianScene) -> Placing:
-        """Puts the simulated kernels into the middle, their diagonal :data:`SIZE` long."""
+        """Centres the simulated kernels and scales their diagonal to :data:`SIZE`."""
         moving = scene.means[scene.simulated].float().cpu()
         return Placing((moving.amax(0) + moving.amin(0)) / 2, SIZE / scene.diagonal)
 
     def to_page(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Scene points on the page."""
+        """Maps points from the scene to the page."""
         return (points.cpu() - self.centre.to(points.dtype)) * self.scale + points.new_tensor(self.offset).cpu()
 
     def to_scene(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Points of the page in the scene."""
+        """Maps points from the page to the scene."""
         return (points - points.new_tensor(self.offset)) / self.scale + self.centre.to(points.dtype)
 
 
@@ -57,10 +57,10 @@ def pack(
     opacities: Float[Tensor, " K"],
     placing: Placing,
 ) -> UInt32[np.ndarray, "K 8"]:
-    """Kernels as viser's buffer has them: centre (float32), nothing, covariance (6 float16), RGBA (uint8).
+    """Kernels in viser's layout: centre (3 float32), 4 bytes unused, covariance (6 float16), RGBA (4 uint8).
 
-    A covariance rounded to float16 may lose its positive definiteness; so much is added to its diagonal that it
-    cannot: twice the bound 3 * 2^-11 max(S) of the rounding's spectral norm is 0.3 % of the largest variance.
+    Rounding to float16 may make a covariance indefinite. To prevent this, its diagonal is increased by twice the bound
+    3 * 2^-11 max(S) of the rounding error's spectral norm, 0.3 % of the largest variance.
     """
     buffer = np.zeros((len(positions), 8), np.uint32)
     buffer[:, :3] = placing.to_page(positions).contiguous().float().numpy().view(np.uint32)
@@ -71,7 +71,7 @@ def pack(
 
 
 def add_splats(scene: Any, name: str, buffer: UInt32[np.ndarray, "K 8"]) -> Any:
-    """Adds packed kernels to a viser scene; setting the ``buffer`` of what is returned shows others."""
+    """Adds packed kernels to a viser scene; setting ``buffer`` of the returned node replaces them."""
     count = len(buffer)
     node = scene.add_gaussian_splats(
         name, centers=np.zeros((count, 3)), covariances=np.tile(np.eye(3), (count, 1, 1)), rgbs=np.zeros((count, 3)),
@@ -94,7 +94,7 @@ def half_covariances(covars: Float[Tensor, "K 3 3"]) -> np.ndarray:
 def unit_centres(
     positions: Float[Tensor, "K 3"], units: Int[Tensor, " K"], masses: Float[Tensor, " K"], count: int
 ) -> Float[Tensor, "N 3"]:
-    """Centres of mass of the units of a level; kernels of unit -1 belong to none."""
+    """Centres of mass of the units of a level; -1 marks kernels of no unit."""
     inside = units >= 0
     index, mass = units[inside], masses[inside].to(positions)
     total = positions.new_zeros(count).index_add(0, index, mass)

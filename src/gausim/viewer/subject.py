@@ -1,4 +1,4 @@
-"""What the viewer is about."""
+"""The contents of a viewer."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from gausim.viewer.shown import Take
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What the viewer is about.
+    """The contents of a viewer.
 
     Attributes:
-        title: one line for the page.
-        interaction: what is simulated.
+        title: heading of the page, one line.
+        interaction: the simulation.
         takes: recordings that can be played.
-        companion: another method beside it, or None.
+        companion: a second method shown beside the first, or None.
         films: the recorded videos, or None.
-        cameras: of the data set, or None.
+        cameras: cameras of the data set, or None.
         up: vertical axis: x, y, z, -x, -y or -z.
-        sessions: folder that saved sessions go to.
+        sessions: folder of saved sessions.
     """
 
     title: str

@@ -1,4 +1,4 @@
-"""Several sequences, of one or several scenes, as one disjoint graph."""
+"""Batches of sequences, of one or several scenes, as one disjoint graph."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from gausim.ops.neighbours import radius_edges
 
 @dataclass(frozen=True, eq=False)
 class Inheritance:
-    """Which kernel inherits from which unit of the finest predicted level."""
+    """Assignment of kernels to the units of the finest predicted level whose motion they inherit."""
 
     rest: Float[Tensor, "K 3"]  # rest positions of all kernels [scene units]
     unit: Int[Tensor, " K"]  # the unit of each kernel, -1 for kernels that never move
-    # where each unit stands among the `padded` rows of deformation gradients; the other rows are identities
+    # row of each unit among the `padded` rows of deformation gradients; the other rows are identities
     rows: Int[Tensor, " N"]
-    padded: int  # number of these rows
+    padded: int  # number of rows, identities included
 
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """Where one sequence stands in the disjoint union."""
+    """Rows of one sequence in the disjoint union."""
 
-    scene_id: int  # which scene it is of
+    scene_id: int  # index of its scene
     kernels: slice  # its rows of the state (all kernels of the scene)
     units: slice  # its rows of a :class:`Step`; the last of them is the identity unit
     # unit of every kernel, counted from `units.start`; pinned and never-simulated kernels point to the identity unit
@@ -47,14 +47,14 @@ class LevelBatch:
     # unit of the coarser predicted level, or at the coarsest one the simulated kernel that is the root
     parent: Int[Tensor, " N"]
     pinned: Bool[Tensor, " N"]  # units that never move
-    free: Float[Tensor, "N 1"]  # 0 for these, 1 for all others; as a number, to multiply with
+    free: Float[Tensor, "N 1"]  # 0 for pinned units, 1 for the others
     rest_edges: Int[Tensor, "2 E"]  # neighbours in rest space, sorted by destination
     spans: tuple[slice, ...]  # rows of each member
     length: Float[Tensor, "N 1"]  # bounding-box diagonal of the unit's scene [scene units]
     dt: Float[Tensor, "N 1"]
     volume: Float[Tensor, " N"]  # volumes V_c
     radii: Float[Tensor, " S"]  # largest edge length of each member [scene units], on the CPU
-    max_neighbours: int  # edges into a unit, at rest and in the current state each
+    max_neighbours: int  # largest number of edges into a unit, separately at rest and in the current state
 
     @property
     def count(self) -> int:
@@ -73,7 +73,7 @@ class LevelBatch:
 
     @cached_property
     def device_radii(self) -> Float[Tensor, " S"]:
-        """``radii`` where the units are."""
+        """``radii`` on the device of the units."""
         return self.radii.to(self.pinned.device)
 
 
@@ -85,12 +85,12 @@ class SceneBatch:
     levels: tuple[LevelBatch, ...]  # the predicted levels, coarse to fine
     rest: Float[Tensor, "K 3"]  # rest positions of all kernels [scene units]
     simulated: Int[Tensor, " M"]  # rows of `rest` that the dynamics may move (level 0)
-    pinned: Bool[Tensor, " M"]  # which of the simulated kernels are held
+    pinned: Bool[Tensor, " M"]  # mask of the pinned among the simulated kernels
     volume: Float[Tensor, " M"]  # volumes of the simulated kernels
     dt: Float[Tensor, "M 1"]  # frame interval of each simulated kernel's sequence [s]
-    # unit of the finest predicted level of every kernel; 0 for never-simulated ones, which weigh nothing
+    # unit of the finest predicted level of every kernel; 0 for never-simulated kernels, whose mass fraction is 0
     finest: Int[Tensor, " K"]
-    kernels: Inheritance  # which kernel inherits from which unit
+    kernels: Inheritance  # units whose motion the kernels inherit
 
     @property
     def scene_ids(self) -> tuple[int, ...]:
@@ -99,7 +99,7 @@ class SceneBatch:
 
 
 def rows_by_scene(batch: SceneBatch) -> Iterator[tuple[int, Int[Tensor, " R"], list[int]]]:
-    """Each scene of a batch, the rows of its members' finest units and the members."""
+    """Iterates over the scenes of a batch: scene index, rows of its members' finest units, and the members."""
     spans = batch.levels[-1].spans
     for scene_id in sorted(set(batch.scene_ids)):
         members = [i for i, s in enumerate(batch.scene_ids) if s == scene_id]
@@ -117,7 +117,7 @@ class BatchBuilder:
         fps: Sequence[float],
         settings: HierarchySettings,
     ) -> None:
-        """Finds the neighbours at rest."""
+        """Computes the edges at rest of every scene."""
         self.scenes, self.hierarchies, self.fps, self.settings = scenes, hierarchies, fps, settings
         self._edges = [
             [
@@ -187,17 +187,17 @@ class BatchBuilder:
 
 
 def _starts(counts: list[int]) -> list[int]:
-    """Where each member begins, and where the last one ends."""
+    """First row of each member, then the total number of rows."""
     return [0, *itertools.accumulate(counts)]
 
 
 def _joined(parts: list[Tensor], starts: list[int], device: torch.device) -> Tensor:
-    """Indices of the members as indices of the union, along the last axis."""
+    """Concatenation along the last axis of member indices, shifted to indices of the union."""
     return torch.cat([p + start for p, start in zip(parts, starts, strict=False)], -1).to(device)
 
 
 def _inheritance(rest: Tensor, simulated: Tensor, pinned: Tensor, finest: LevelBatch) -> Inheritance:
-    """Free kernels follow their unit; behind the units of every member stands the identity of its held kernels."""
+    """Kernel inheritance: free kernels from their unit; an identity row after each member's units serves its pins."""
     unit = torch.where(pinned, -1, finest.unit_of_kernel)
     held = torch.full((len(rest),), -1, device=rest.device)
     rows = torch.cat([torch.arange(span.start, span.stop) + i for i, span in enumerate(finest.spans)]).to(rest.device)

@@ -1,4 +1,4 @@
-"""Levels as data: kernels, centre-of-mass systems, their parents and roots (METHOD section 1)."""
+"""The hierarchy of kernels and centre-of-mass systems, with their parents and roots (METHOD section 1)."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class Level:
 
     rest: Float[Tensor, "N 3"]  # centres of mass at rest with unit density [scene units]
     volume: Float[Tensor, " N"]  # volumes V_c = sum of V_i
-    # units made of pinned kernels; they never move. Clusters never mix pinned and free kernels.
+    # units of pinned kernels, which never move; no cluster has both pinned and free kernels
     pinned: Bool[Tensor, " N"]
-    parent: Int[Tensor, " M"]  # the unit of the next level that holds each unit; empty at the top level
+    parent: Int[Tensor, " M"]  # the unit of the next level that contains each unit; empty at the top level
     root: Int[Tensor, " N"]  # the nearest pinned kernel (index into the simulated kernels), the parent of a top unit
 
     @property
@@ -43,14 +43,14 @@ class Hierarchy:
     diagonal: float  # bounding-box diagonal of the simulated kernels [scene units]; see :func:`build_hierarchy`
 
     def ancestor(self, fine: int, coarse: int) -> Int[Tensor, " N"]:
-        """The unit of level ``coarse`` that holds each unit of level ``fine``."""
+        """The unit of level ``coarse`` that contains each unit of level ``fine``."""
         index = torch.arange(self.levels[fine].count)
         for level in range(fine, coarse):
             index = self.levels[level].parent[index]
         return index
 
     def predictions(self, predicted: Sequence[int]) -> int:
-        """N_F: how many deformation gradients a step predicts (pinned units need none)."""
+        """N_F: number of deformation gradients that a step predicts (none for pinned units)."""
         return sum(int((~self.levels[level].pinned).sum()) for level in predicted)
 
 
@@ -68,11 +68,11 @@ def build_hierarchy(
         radii: largest cluster diameter per level 1..L, as fractions of the bounding-box diagonal.
         clustering: ``agglomerative`` (complete linkage in near-linear memory), ``ball`` (a greedy cover; more clusters)
             or ``complete_linkage`` (of all pairs; the reference).
-        axes: (3, 3) along whose rows the bounding box lies whose diagonal all lengths are stated in; the scene's when
-            None. With the body's own axes a turned scene has the same units.
+        axes: (3, 3), rows are the axes of the bounding box whose diagonal is the unit of length; the scene's axes when
+            None. With body axes the units do not depend on the orientation of the scene.
 
     Raises:
-        SceneError: no pinned kernel, or no simulated kernel that is free.
+        SceneError: no pinned kernel, or no free simulated kernel.
         ConfigError: unknown clustering.
     """
     if clustering not in CLUSTERINGS:
@@ -99,7 +99,7 @@ def build_hierarchy(
 
 
 def _cluster_by_group(rest: Tensor, pinned: Tensor, diameter: float, clustering: str) -> Tensor:
-    """Labels of the free units first, then of the pinned ones; no cluster mixes the two."""
+    """Labels of separate clusters of free units (numbered first) and of pinned units."""
     labels = torch.zeros(len(rest), dtype=torch.int64)
     offset = 0
     for mask in (~pinned, pinned):

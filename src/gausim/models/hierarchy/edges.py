@@ -1,4 +1,4 @@
-"""The edges of a step: neighbours at rest and in the current state, with shapes that may stay fixed."""
+"""The edges of a step: neighbours at rest and in the current state, in exact number or padded to a fixed shape."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def exact_edges(rule: str, level: LevelBatch, positions: Float[Tensor, "N 3"]) -
     Args:
         rule: neighbours at ``rest``, those of the ``current`` state, or the ``union`` or ``intersection`` of both.
         level: the units.
-        positions: where they are now.
+        positions: their current positions.
     """
     if rule == "rest":
         return level.rest_edges
@@ -35,9 +35,9 @@ def exact_edges(rule: str, level: LevelBatch, positions: Float[Tensor, "N 3"]) -
 
 
 def fixed_edges(rule: str, level: LevelBatch, positions: Float[Tensor, "N 3"]) -> Int[Tensor, "2 E"]:
-    """The same edges, and as many N -> N of a dummy node N as there might be more; not for the rule ``rest``.
+    """The same edges, padded to the largest possible number by edges N -> N of a dummy node; not for rule ``rest``.
 
-    E is the same for all positions, and nothing is read back to the host.
+    E does not depend on the positions, and the host is not synchronised.
     """
     codes = neighbour_codes(positions, level.member, level.device_radii, level.max_neighbours)
     if rule != "current":

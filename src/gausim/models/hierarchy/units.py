@@ -1,4 +1,4 @@
-"""Units of the predicted levels between two updates of the parameters (METHOD section 1)."""
+"""Constants of the units of the predicted levels between two updates of the parameters (METHOD section 1)."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from gausim.ops.aggregation import weighted_sum
 
 @dataclass(frozen=True, eq=False)
 class FixedUnits:
-    """What of the units of one level stays between two updates of the parameters."""
+    """Constants of the units of one level between two updates of the parameters."""
 
     rest: Float[Tensor, "N 3"]  # centres of mass X [scene units]
     mass: Float[Tensor, " N"]  # m_c = sum of m_i
-    # m_c over the mass of its parent among the predicted levels; at the top level over itself
+    # m_c over the mass of its parent among the predicted levels; 1 at the top level
     mass_fraction: Float[Tensor, " N"]
     log_density: Float[Tensor, " N"]  # log of m_c / V_c
-    attributes: Float[Tensor, "N A"]  # plain mean over the kernels
+    attributes: Float[Tensor, "N A"]  # unweighted mean over the kernels
     # mass of the whole scene times its diagonal, the unit of momenta per step [mass scene units]
     scale: Float[Tensor, "N 1"]
 
@@ -39,7 +39,7 @@ def per_level(batch: SceneBatch, fractions: Sequence[Tensor], finest: Float[Tens
 def fixed_units(
     batch: SceneBatch, mass: Float[Tensor, " M"], attributes: Float[Tensor, "M A"]
 ) -> tuple[Float[Tensor, " K"], tuple[FixedUnits, ...]]:
-    """Mass of every kernel over that of its finest unit, and constants of every predicted level (METHOD section 1)."""
+    """Mass fraction of every kernel in its finest unit, and constants of every predicted level (METHOD section 1)."""
     levels = batch.levels
     totals = [mass.new_zeros(level.count).index_add(0, level.unit_of_kernel, mass) for level in levels]
     within = mass / totals[-1].index_select(0, levels[-1].unit_of_kernel)

@@ -1,4 +1,4 @@
-"""A step of one batch as a CUDA graph: its thousands of kernels are launched at once."""
+"""A step of one batch as a CUDA graph: thousands of CUDA kernels in one launch."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ StepFunction = Callable[[SimState, Tensor | None], SteppedFrame]
 
 
 class GraphedStep:
-    """A step without gradients that is captured at its first call and replayed at the others.
+    """A step without loss gradients, captured at its first call and replayed at later ones.
 
-    Its inputs are copied into fixed buffers and its results out of them, so that a call is used like the step itself.
-    Steps with and without forces are captured apart. What the step reads besides its arguments (weights, constants of
-    the batch, evaluation mode, autocast) is read where it lay at the capture: it may change in place, but not move.
-    Make a new one for every rollout; the capture costs about four steps.
+    Inputs are copied into fixed buffers and results out of them, so that a call is equivalent to the step. Steps with
+    and without forces are captured separately. Other data that the step reads (weights, constants of the batch,
+    evaluation mode, autocast) is read at its address during the capture: it may change in place, but not be
+    reallocated. Make a new instance for every rollout; the capture costs about four steps.
     """
 
     def __init__(self, step: StepFunction, rest: Float[Tensor, "K 3"]) -> None:
-        """Makes the buffers.
+        """Allocates the buffers.
 
         Args:
-            step: from state and forces to the next frame; no shape and no branch in it may depend on values.
+            step: from state and forces to the next frame; its shapes and branches must not depend on values.
             rest: rest positions of all kernels; the state has their shape, type and CUDA device.
         """
         self._step = step
@@ -39,10 +39,10 @@ class GraphedStep:
 
     @torch.no_grad()
     def __call__(self, state: SimState, force: Float[Tensor, "K 3"] | None = None) -> SteppedFrame:
-        """The next frame, a copy of its own.
+        """The next frame, in newly allocated tensors.
 
         Raises:
-            ConfigError: the step cannot be captured, because something in it waits for the device.
+            ConfigError: the step cannot be captured, because one of its operations waits for the device.
         """
         self._state.positions.copy_(state.positions)
         self._state.previous.copy_(state.previous)
@@ -66,7 +66,7 @@ class GraphedStep:
         torch.cuda.current_stream(device).wait_stream(aside)
         graph = torch.cuda.CUDAGraph()
         try:
-            # thread_local: the thread that pins memory for a data loader may call CUDA meanwhile.
+            # thread_local: the pin-memory thread of a data loader may call CUDA during the capture.
             with torch.cuda.device(device), torch.cuda.graph(graph, capture_error_mode="thread_local"):
                 result = self._step(self._state, force)
         except RuntimeError as error:

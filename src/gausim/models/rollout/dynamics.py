@@ -1,4 +1,4 @@
-"""Rollouts of one scene by the simulator, without gradients: :class:`gausim.core.Steppable`."""
+"""Rollouts of one scene by the simulator, without loss gradients: :class:`gausim.core.Steppable`."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from gausim.models.rollout.energy_guard import EnergyGuard
 from gausim.models.step.simulator import GausSim
 from gausim.nn.mode import evaluating
 
-INTERVAL = 64  # frames on a CUDA device between two questions; each makes the host wait until the device has caught up
+INTERVAL = 64  # frames between two checks for finite values on a CUDA device; each check synchronises the host
 
 
 class SceneDynamics:
-    """Rolls one scene of a :class:`GausSim` out, without gradients and in evaluation mode."""
+    """Rollouts of one scene of a :class:`GausSim`, without loss gradients and in evaluation mode."""
 
     def __init__(self, model: GausSim, scene_id: int = 0, *, energy_ceiling: float | None = None) -> None:
-        """Binds ``model`` to its scene number ``scene_id``; the ceiling is one of :class:`SceneStepper`."""
+        """Binds ``model`` to its scene ``scene_id``; ``energy_ceiling`` as for :class:`SceneStepper`."""
         self.model, self.scene_id, self.energy_ceiling = model, scene_id, energy_ceiling
 
     @property
@@ -40,15 +40,12 @@ class SceneDynamics:
             return roll_out(self.stepper(initial), steps, forces)
 
     def stepper(self, initial: SimState) -> SceneStepper:
-        """Begins at a state; every step is one of :meth:`rollout`."""
+        """Stepper from an initial state; its steps are those of :meth:`rollout`."""
         return SceneStepper(self.model, self.scene_id, initial, energy_ceiling=self.energy_ceiling)
 
 
 class SceneStepper:
-    """Steps of one scene from one initial state, the network's correction held back where it would add energy.
-
-    See :class:`gausim.core.Stepper`.
-    """
+    """Steps of one scene from one initial state, with the energy guard if configured (:class:`gausim.core.Stepper`)."""
 
     takes_forces: bool = True
 
@@ -56,9 +53,9 @@ class SceneStepper:
     def __init__(
         self, model: GausSim, scene_id: int, initial: SimState, *, energy_ceiling: float | None = None
     ) -> None:
-        """Begins at ``initial``, a state of the model's scene number ``scene_id``.
+        """Begins at ``initial``, a state of the model's scene ``scene_id``.
 
-        ``energy_ceiling`` is the highest energy that forces can reach, for models that know one; None: any.
+        ``energy_ceiling`` is the highest energy that forces may reach, for models with an energy; None: no limit.
         """
         batch = model.batch((scene_id,))
         member, prepared = batch.members[0], model.prepare(batch)
@@ -76,7 +73,7 @@ class SceneStepper:
         self._guard: EnergyGuard | None = None
         if model.rollout.energy_guard_frames and model.knows_energy:
             self._guard = EnergyGuard(model, prepared, self._step, ceiling=energy_ceiling)
-        # Whether positions and forces were finite since it was asked last: kept on the device, read now and then.
+        # Whether positions and forces were finite since the last check; kept on the device, read every `_interval`.
         self._finite = torch.ones(2, dtype=torch.bool, device=initial.positions.device)
         self._number, self._asked = 0, 0
         self._interval = 1 if initial.positions.device.type == "cpu" else INTERVAL
@@ -84,14 +81,14 @@ class SceneStepper:
 
     @property
     def limited(self) -> int:
-        """Frames so far that the energy's ceiling limited."""
+        """Number of frames so far that the energy ceiling limited."""
         return 0 if self._guard is None else self._guard.limited
 
     @torch.no_grad()
     def step(
         self, force: Float[Tensor, "K 3"] | None = None, *, held: Bool[Tensor, " K"] | None = None
     ) -> SteppedFrame:
-        """The next frame; a kernel that is held stays where it is, the shape of its unit does not.
+        """The next frame; kernels in ``held`` keep their position, while their unit deforms as predicted.
 
         Raises:
             DivergenceError: an earlier position, or the force, is not finite (on the CPU at once, on other devices up

@@ -1,4 +1,4 @@
-"""No energy without a force, in rollouts: the network's correction is held back where it would add some."""
+"""Energy guard of rollouts: scales the network's correction down where it would add energy without a force."""
 
 from __future__ import annotations
 
@@ -13,38 +13,38 @@ from gausim.models.step.prepared import Prepared
 from gausim.models.step.simulator import GausSim
 from gausim.ops.deformation import polar_rotation
 
-# Parts of a force that are tried where all of it would pass the ceiling.
+# Fractions of a force that are tried in turn where the whole force would exceed the ceiling.
 WEAKER = (0.5, 0.25, 0.125, 0.0625, 0.0)
-# Halvings with which a step is cut short: to the thousandth part.
+# Bisections for the fraction of a shortened step: an accuracy of 1/1024.
 BISECTIONS = 10
 
 
 class EnergyGuard:
-    """Keeps the energy E of a rollout, in the template's terms, below the largest of the last frames.
+    """Keeps the energy E of a rollout, in the template's terms, below its maximum over the last frames.
 
-    Frame by frame the network may give back what it took, move energy between vibrations, or make up for damping; the
-    peaks of E over ``frames`` frames can only fall. So a motion that nothing pushes stays bounded for ever, however
-    long it is predicted. Where a step would pass the limit it is made again with the part
+    Within that window the network may return energy it removed, exchange energy between modes, or compensate damping;
+    the maximum of E over ``energy_guard_frames`` frames cannot grow. Motion without forces therefore stays bounded over
+    any number of frames. A step that would exceed the limit is repeated with the correction scale
 
         s = (limit - E_0) / (E_1 - E_0)
 
-    of the network's output, E_0 and E_1 being the energies with none and all of it. E is convex in the state, so that
-    of that part stays below the limit as far as the state is linear in s; where it does not, and where the template
-    alone passes the limit (springs beyond the linear are taken explicitly), the template's own step is taken.
+    on the network's output, where E_0 and E_1 are the energies at s = 0 and s = 1. E is convex in the state, so the
+    repeated step stays below the limit as far as the state is linear in s. If it does not, or if the template alone
+    exceeds the limit (the nonlinear spring forces are integrated explicitly), the step of the template alone is taken.
 
-    Far beyond the motion that training shows those explicit springs are unstable: what forces have carried there would
-    fly apart. A ``ceiling`` ends that. A force that would pass it acts in part only; a step that passes it all the
-    same is cut short, to the longest part of it that does not. So forces bend nothing further than that energy does.
+    Far outside the motion seen in training the explicit springs are unstable, and strong forces could lead there. A
+    ``ceiling`` prevents this: a force that would exceed it is reduced to a fraction, and a step that still exceeds it
+    is shortened to the longest fraction below it. The ceiling thus bounds the deformation that forces can cause.
     """
 
     def __init__(self, model: GausSim, prepared: Prepared, step: StepFunction, *, ceiling: float | None = None) -> None:
         """Begins a rollout of a batch of one scene.
 
         Args:
-            model: whose template has an energy, and whose settings say over how many frames the limit looks back.
-            prepared: of the batch.
-            step: predicts with all of the correction.
-            ceiling: the highest energy that is allowed at all; None: whatever forces make of it.
+            model: a model whose template has an energy; its rollout settings give the number of frames of the window.
+            prepared: constants of the batch.
+            step: predicts with the full correction.
+            ceiling: highest energy allowed, forces included; None: no ceiling.
         """
         self._model, self._prepared, self._step = model, prepared, step
         self._last: deque[float] = deque(maxlen=model.rollout.energy_guard_frames)
@@ -53,10 +53,10 @@ class EnergyGuard:
         self.held, self.limited = 0, 0
 
     def step(self, state: SimState, force: Tensor | None) -> SteppedFrame:
-        """The next frame; the work that a force does raises the limit.
+        """The next frame; the work done by a force raises the limit.
 
-        Counted are those whose correction was held back (:attr:`held`) and those that the ceiling limited, their force
-        weakened or the step itself cut short (:attr:`limited`).
+        :attr:`held` counts the frames whose correction was scaled down, :attr:`limited` those whose force or step the
+        ceiling reduced.
         """
         if not self._last:
             self._last.append(self._model.template.headroom * self._energy(state))
@@ -79,7 +79,7 @@ class EnergyGuard:
         return result
 
     def _weakened(self, state: SimState, force: Tensor, ceiling: float) -> tuple[SteppedFrame, float]:
-        """The template's step with the largest part of the force that stays below the ceiling, or none."""
+        """The template's step with the largest tried fraction of the force below the ceiling, or without the force."""
         for scale in WEAKER:
             made, energy = self._corrected(state, scale * force if scale else None, 0.0)
             if energy <= ceiling:
@@ -87,9 +87,10 @@ class EnergyGuard:
         return made, energy
 
     def _cut_short(self, made: SteppedFrame, state: SimState, ceiling: float) -> tuple[SteppedFrame, float]:
-        """The longest part of a step below the ceiling, by bisection; none where even standing still is above it.
+        """The longest fraction of a step below the ceiling (at least the energy of standing still), by bisection.
 
-        Below means in motion and if it stopped at once: E looks at the middle of a step, which its end may overtop.
+        Both E in motion and E at rest at the end must stay below: E is evaluated at the midpoint of a step, and the
+        potential energy may be larger at its end.
         """
         limit = max(ceiling, self._energy(SimState(state.positions, state.positions)))
         low, high = 0.0, 1.0

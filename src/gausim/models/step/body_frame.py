@@ -1,4 +1,4 @@
-"""A body's own axes: what is computed in them turns with the scene."""
+"""Body axes, in which predictions are equivariant to rotations of the scene."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.step.recursion import Solved
 from gausim.ops.selection import require_pinned
 
-# An axis is told by the pins where the body's centre is further than this from theirs [diagonals].
+# Least distance between the centres of pinned and free kernels for which it defines the first axis [diagonals].
 CLEAR = 1e-2
 
 
 def body_axes(scene: GaussianScene) -> np.ndarray:
-    """Axes of a scene's body (3, 3), as rows: a rotation that only the body's shape and its pins determine.
+    """Axes of a scene's body (3, 3), as rows: a rotation determined by the body's shape and its pins alone.
 
-    The first points from the pinned kernels to the free ones, or along the body where these coincide; the second is the
-    widest direction across it, its sign that of the third moment. A body of perfect symmetry about the first has none.
+    The first points from the centre of the pinned kernels to that of the free ones; where these coincide, it is the
+    longest principal axis. The second is the widest direction perpendicular to it; the sign of principal axes is that
+    of the third moment. The second axis is undefined for a body that is symmetric about the first.
     """
     require_pinned(scene)
     rest = scene.means[scene.simulated].double().cpu().numpy()
@@ -47,7 +48,7 @@ def _signed(axis: np.ndarray, offset: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Axes and origins of the scenes of a batch, for every unit of every predicted level and for every root."""
+    """Body axes and origins of the scenes of a batch, for every unit of every predicted level and for every root."""
 
     # (N, 3, 3) per level, coarse to fine; rows are the body's axes in scene coordinates
     axes: tuple[Float[Tensor, "_ 3 3"], ...]
@@ -55,21 +56,21 @@ class Frames:
 
     @classmethod
     def of(cls, batch: SceneBatch, axes: Float[Tensor, "S 3 3"], origins: Float[Tensor, "S 3"]) -> Frames:
-        """The frames of a batch from those of all scenes."""
+        """Selects the axes and origins of a batch from those of all scenes."""
         scenes = torch.tensor(batch.scene_ids, device=axes.device)
         rows = [scenes.index_select(0, level.member) for level in batch.levels]
         return cls(tuple(axes[r] for r in rows), tuple(origins[r] for r in rows))
 
     def into(self, level: int, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """Positions of the units of a level (counted coarse to fine) in the body's axes."""
+        """Positions of the units of a level (counted coarse to fine) in body axes."""
         return (self.axes[level] @ (positions - self.origins[level])[..., None])[..., 0]
 
     def turned_back(self, level: int, matrices: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 3 3"]:
-        """Matrices of the units of a level in scene coordinates."""
+        """Matrices of the units of a level, from body axes to scene axes."""
         return self.axes[level].mT @ matrices @ self.axes[level]
 
     def back(self, solved: Solved, rest: Float[Tensor, "N 3"]) -> Solved:
-        """The solved finest level in scene coordinates, for the kernels that inherit from it."""
+        """The solved finest level in scene axes, for the kernels that inherit from it."""
         last = len(self.axes) - 1
         after = (self.axes[last].mT @ solved.after[..., None])[..., 0] + self.origins[last]
         turned = self.turned_back(last, solved.deformation_gradient)

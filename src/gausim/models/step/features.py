@@ -1,4 +1,4 @@
-"""What the network sees (METHOD section 3)."""
+"""Input features of the network (METHOD section 3)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from gausim.core import ConfigError
 from gausim.models.step.recursion import Solved, Units
 
-# Lengths are divided by the diagonal of the scene before they get here: 1e-6 of it is nothing.
+# Floor of lengths, which are in diagonals of the scene.
 TINY = 1e-6
 ANGLES = ("cos_sin", "inner")
 
@@ -29,20 +29,20 @@ class UnitState:
 
 @dataclass(frozen=True)
 class FeatureOptions:
-    """Choices among the readings of the paper.
+    """Choice of the network's input features.
 
     Attributes:
         angle: ``cos_sin`` of the difference of the two angles (scale-free), or ``inner``, the difference of products.
-        rest_inputs: also give displacements, rest-space edge vectors and the template's prediction.
-        coarse_inputs: below the top level read positions from the coarse prediction instead of the current state.
-        velocities: give velocities and accelerations; without them levers X_i - X_p, displacements and what the parent
-            did to the template take their place.
+        rest_inputs: add displacements, rest-space edge vectors and the template's prediction.
+        coarse_inputs: below the top level use positions of the coarse prediction instead of the current state.
+        velocities: use velocities and accelerations; without them, levers X_i - X_p, displacements and the parent's
+            displacement of the template position.
         attributes: material attributes per unit.
         gravity: acceleration [scene units / s^2].
         normaliser_floor: smallest standard deviation of a normalised input.
 
     Raises:
-        ConfigError: an unknown angle, or nothing is left to see.
+        ConfigError: an unknown angle, or neither velocities nor rest_inputs.
     """
 
     angle: str = "cos_sin"
@@ -60,12 +60,12 @@ class FeatureOptions:
             raise ConfigError(f"model.simulator.features.angle is '{self.angle}'; expected one of {', '.join(ANGLES)}.")
         if not (self.velocities or self.rest_inputs):
             raise ConfigError(
-                "model.simulator.features.velocities=false needs rest_inputs=true: the network would see nothing."
+                "model.simulator.features.velocities=false needs rest_inputs=true, else no input depends on the motion."
             )
 
     @property
     def node_normalised(self) -> int:
-        """How many leading node features are normalised."""
+        """Number of leading node features that are normalised."""
         if not self.velocities:
             return 9
         return 12 if self.rest_inputs else 6
@@ -77,7 +77,7 @@ class FeatureOptions:
 
     @property
     def edge_normalised(self) -> int:
-        """How many leading edge features are normalised."""
+        """Number of leading edge features that are normalised."""
         return (13 if self.rest_inputs else 7) - (0 if self.velocities else 3)
 
     @property
@@ -87,7 +87,7 @@ class FeatureOptions:
 
 
 def safe_norm(x: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 1"]:
-    """Length, with a finite gradient at zero."""
+    """Length, with a finite derivative at zero."""
     return (x * x).sum(-1, keepdim=True).add(TINY**2).sqrt()
 
 
@@ -105,11 +105,11 @@ def network_inputs(
 ) -> tuple[Float[Tensor, "N Cn"], Float[Tensor, "E Ce"]]:
     """Node and edge features of the units of one level, from their graph and their solved parents.
 
-    ``target`` are template positions of the units, ``size`` diagonals of their scenes [scene units]; with ``coarse``
-    positions are those of the coarse prediction.
+    ``target`` are the units' template positions, ``size`` the diagonals of their scenes [scene units]; ``coarse``
+    selects positions of the coarse prediction instead of the current ones.
     """
     coarsely = above.carry(target)
-    # Stacked and gathered together: on a CPU the number of operations is what costs.
+    # Stacked and gathered together: on a CPU the number of operations dominates the cost.
     own = UnitState(*(torch.stack((unit.rest, unit.now, unit.before, coarsely)) / size).unbind())
     parents = torch.stack((above.rest, above.now, above.before, above.after)).index_select(1, above.index)
     parent = UnitState(*(parents / size).unbind())
@@ -143,9 +143,9 @@ def edge_features(
     *,
     coarse: bool = False,
 ) -> Float[Tensor, "E C"]:
-    """Stretch ratio, direction, relative velocity and relative angle seen from the destination's barycentre.
+    """Stretch ratio, direction, relative velocity and relative angle about the destination's barycentre.
 
-    With ``coarse`` all of them read the coarse prediction and the parent's new position instead of x_t.
+    With ``coarse`` they are computed from the coarse prediction and the parent's new position instead of x_t.
     """
     s, d = edge_index
     current, centre = (unit.after, barycentre.after) if coarse else (unit.now, barycentre.now)
@@ -165,12 +165,12 @@ def edge_features(
 
 
 def _turned(a: Float[Tensor, "E 2 3"], b: Float[Tensor, "E 2 3"], kind: str) -> Float[Tensor, "E C"]:
-    """The angle between two directions now less that at rest; both stand at rest, then now."""
+    """Change of the angle between two vectors from rest to now; axis 1 of both is (rest, now)."""
     dot = (a * b).sum(-1, keepdim=True)
     if kind == "inner":
         return dot[:, 1] - dot[:, 0]
     scale = safe_norm(a) * safe_norm(b)
-    # Floored by the square of the lengths' floor: a unit on its barycentre gives 0, never 1 / length.
+    # The floor is the square of that of lengths: a unit on its barycentre gives 0, not 1 / length.
     across = torch.linalg.cross(a, b).square().sum(-1, keepdim=True).add(TINY**4).sqrt()
     (c0, c1), (s0, s1) = (dot / scale).unbind(1), (across / scale).unbind(1)
     return torch.cat((c1 * c0 + s1 * s0, s1 * c0 - c1 * s0), -1)

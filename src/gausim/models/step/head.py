@@ -1,4 +1,4 @@
-"""The heads: from the network's output to a deformation gradient."""
+"""Heads: the map from the network's output to a deformation gradient."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from torch import Tensor
 
 from gausim.ops.deformation import deformation_gradient_from_output
 
-# Shorter levers move by less than the output says: a deformation about the parent cannot move a unit on it [diagonals].
+# Levers shorter than this shift by less than the output: a deformation about the parent cannot move a unit that
+# coincides with it [diagonals].
 SHORT = 0.03
 # Floor of a lever's length [diagonals].
 TINY = 1e-4
-# Smallest factor by which a lever is shortened along itself before the shape gives way.
+# Floor of a lever's stretch along itself, as it enters the stretch across it.
 MIN_ALONG = 0.2
 
 
@@ -24,14 +25,14 @@ LEVER_OUTPUTS = 3
 
 @dataclass(frozen=True)
 class Head:
-    """How the output of the network is read.
+    """Map from the network's output to deformation gradients.
 
     Attributes:
-        output_scale: factor on the eleven numbers.
-        zero_output: start with zero output (F = I).
-        lever: three more outputs per unit move its lever by so many diagonals each, see :func:`lever_deformation`; 0
-            leaves them out.
-        anchor: take the network's outputs at rest off, so that rest is an equilibrium.
+        output_scale: factor on the eleven outputs of F.
+        zero_output: initialise the network to zero output (F = I).
+        lever: scale [diagonals per unit of output] of three more outputs, which shift a unit's lever
+            (:func:`lever_deformation`); 0: no such outputs.
+        anchor: subtract the network's outputs at rest, so that rest is an equilibrium.
     """
 
     output_scale: float = 1.0
@@ -41,7 +42,7 @@ class Head:
 
     @property
     def outputs(self) -> int:
-        """Numbers per unit."""
+        """Number of network outputs per unit."""
         return OUTPUTS + (LEVER_OUTPUTS if self.lever else 0)
 
     def __call__(
@@ -52,9 +53,9 @@ class Head:
         *,
         conserve_mass: bool,
     ) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, "N 3 3"]]:
-        """F = U diag(lambda) V^T, behind it that of the lever, and its rotation U V^T.
+        """F = U diag(lambda) V^T, followed by the deformation of the lever, and the rotation U V^T.
 
-        ``lever`` is as :func:`lever_deformation` takes it, None without a lever head.
+        ``lever`` is that of :func:`lever_deformation`, None without a lever head.
         """
         deformation_gradient, rotation = deformation_gradient_from_output(
             output[:, :OUTPUTS] * self.output_scale, conserve_mass=conserve_mass
@@ -68,10 +69,10 @@ class Head:
 def lever_deformation(
     shift: Float[Tensor, "N 3"], lever: Float[Tensor, "N 3"], length: Float[Tensor, "N 1"], *, conserve_mass: bool
 ) -> Float[Tensor, "N 3 3"]:
-    """The deformation gradient that takes the lever w from the parent to w + s; zero shift gives the identity.
+    """The deformation gradient that maps the lever w from the parent to w + s; zero shift gives the identity.
 
     F = (w + s) w^T / |w|^2 + d (I - w w^T / |w|^2) with d = (1 + s.w / |w|^2)^(-1/2), so that det F = 1; d = 1 without
-    mass conservation. A translation of a unit is linear in s, where a rotation about the parent would be needed else.
+    mass conservation. The unit's translation is linear in s; without it, it would take a rotation about the parent.
 
     Args:
         shift: s [scene units]; it is scaled by |w|^2 / (|w|^2 + (SHORT length)^2).

@@ -19,7 +19,7 @@ from gausim.nn.normaliser import RunningNormaliser
 
 
 class DeformationPredictor(nn.Module):
-    """F of every unit from its own state, that of its parent and of its neighbours."""
+    """Predictor of F of every unit from the states of the unit, its parent and its neighbours."""
 
     gravity: Tensor
 
@@ -33,7 +33,7 @@ class DeformationPredictor(nn.Module):
         edges: str,
         conserve_mass: bool,
     ) -> None:
-        """Builds the networks, one for all predicted levels or one each, and the normalisers of their inputs.
+        """Builds the networks (one, or one per predicted level) and the normalisers of their inputs.
 
         ``network`` is called with node_features=, edge_features= and outputs=.
         """
@@ -54,13 +54,13 @@ class DeformationPredictor(nn.Module):
     ) -> Float[Tensor, "N O"]:
         """The network's raw output for each unit of the level at ``position``, coarse to fine.
 
-        The units' parents are solved, ``target`` are their template positions [scene units].
+        ``above`` are the solved parents, ``target`` the units' template positions [scene units].
         """
         network = self.network[position] if isinstance(self.network, nn.ModuleList) else self.network
         coarse = self.features.coarse_inputs and position > 0
         fixed = self._fixes_shapes(unit.now)
         edge_index = (fixed_edges if fixed else exact_edges)(self.edges, level, unit.now)
-        # Edges of the dummy node stand behind all others; their features are never seen, those of any node will do.
+        # Edges of the dummy node come last; their features reach no unit, so those of any node serve.
         present = edge_index.clamp_max(level.count - 1) if fixed else edge_index
         nodes, edges = network_inputs(
             unit, target, above, present, level.length, level.dt, self.gravity, self.features, coarse=coarse
@@ -79,5 +79,5 @@ class DeformationPredictor(nn.Module):
         return self.head(output, lever, level.length, conserve_mass=self._conserve_mass)
 
     def _fixes_shapes(self, positions: Tensor) -> bool:
-        """Whether the number of edges must not depend on the state: where steps may be captured in a CUDA graph."""
+        """Whether the number of edges must not depend on the state, as steps may be captured in a CUDA graph."""
         return self.edges != "rest" and positions.device.type == "cuda" and not self.training

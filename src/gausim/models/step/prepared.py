@@ -1,4 +1,4 @@
-"""What a step needs and only parameters change: computed once for all steps between two updates of the parameters."""
+"""Constants of a step, computed once for all steps between two updates of the parameters."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from gausim.ops.aggregation import weighted_sum
 class Prepared:
     """Constants of a batch between two updates of the parameters.
 
-    Gradients flow through them, so one that was made with gradients serves the steps of one backward pass.
+    Loss gradients flow through them, so an instance made with gradients serves the steps of one backward pass.
     """
 
-    batch: SceneBatch  # what it was made for
+    batch: SceneBatch  # the batch whose constants these are
     mass: Float[Tensor, " M"]  # masses of the simulated kernels
     # mass of every kernel over that of its finest predicted unit; 0 for never-simulated kernels
     mass_fraction: Float[Tensor, " K"]
     levels: tuple[FixedUnits, ...]  # the predicted levels, coarse to fine
-    roots: Solved  # what the top level hangs on
+    roots: Solved  # parents of the top level
     template: PreparedTemplate  # the template of the batch
-    frames: Frames | None  # the bodies' axes in which levels, roots and template are; None where these are the scene's
-    rest: Float[Tensor, "N 3"]  # centres of mass of the finest predicted units in the scene's axes [scene units]
-    # the network's outputs at rest per level, taken off others; None where they are not
+    frames: Frames | None  # body axes of levels, roots and template; None where these are in scene axes
+    rest: Float[Tensor, "N 3"]  # centres of mass of the finest predicted units in scene axes [scene units]
+    # the network's outputs at rest per level, subtracted from every output; None without an anchor
     still: tuple[Tensor, ...] | None
 
     def aggregate(self, positions: Float[Tensor, "K 3"]) -> Float[Tensor, "N 3"]:
@@ -39,7 +39,7 @@ class Prepared:
         return weighted_sum(positions, self.mass_fraction, self.batch.finest, self.batch.levels[-1].count)
 
     def finest(self, positions: Float[Tensor, "K 3"]) -> Float[Tensor, "N 3"]:
-        """The same in the bodies' own axes, where these are used."""
+        """:meth:`aggregate` in body axes, where these are used."""
         found = self.aggregate(positions)
         return found if self.frames is None else self.frames.into(len(self.levels) - 1, found)
 
@@ -50,7 +50,7 @@ class Prepared:
     def in_scene_axes(
         self, finest: Solved, template: Tensor | None, predicted: list[Tensor]
     ) -> tuple[Solved, Tensor | None, list[Tensor]]:
-        """The finest level, the template's P and all F, in the scene's axes."""
+        """The finest level, the template's P and all F in scene axes."""
         frames = self.frames
         if frames is None:
             return finest, template, predicted

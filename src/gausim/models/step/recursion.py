@@ -21,7 +21,7 @@ class Units:
     before: Float[Tensor, "N 3"]  # x_{t-1}
     mass: Float[Tensor, " N"]  # m_c = sum of m_i
     log_density: Float[Tensor, " N"]  # log of m_c / V_c
-    attributes: Float[Tensor, "N A"]  # plain mean over the kernels
+    attributes: Float[Tensor, "N A"]  # unweighted mean over the kernels
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Solved:
 
     @classmethod
     def roots(cls, rest: Float[Tensor, "P 3"]) -> Solved:
-        """The roots of the units of the top level: one each, which never moves."""
+        """The parents of the units of the top level: one immobile root each."""
         identity = torch.eye(3, dtype=rest.dtype, device=rest.device).expand(len(rest), 3, 3).contiguous()
         index = torch.arange(len(rest), device=rest.device)
         return cls(rest, rest, rest, rest, rest, identity, identity, index)
@@ -79,12 +79,12 @@ def advance(
 def inherit(
     finest: Solved, template: Float[Tensor, "N 3 3"] | None, kernels: Inheritance
 ) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
-    """Positions x_c + G_c (X_k - X_c) of all kernels, G and Q of the units, identities among them.
+    """Positions x_c + G_c (X_k - X_c) of all kernels, G and Q of the units and identity rows.
 
     Args:
         finest: the finest predicted level, solved.
-        template: deformation gradients P of the template, G = C P; None for the identity. Their rotations are
-            constants: they only turn colours.
+        template: deformation gradients P of the template, G = C P; None for the identity. Their rotations are detached
+            from the loss gradient, as they only rotate colours.
         kernels: the unit of every kernel.
     """
     deformation_gradient, rotation = finest.deformation_gradient, finest.rotation

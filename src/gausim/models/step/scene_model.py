@@ -1,4 +1,4 @@
-"""What a simulator of scenes has besides its step: its scenes as units, and what of it is whose."""
+"""Base of simulators: the scenes' units and parameters, without the step."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from gausim.nn.normaliser import normalisers_of
 
 
 class SceneModel(nn.Module, ABC):
-    """The scenes, their hierarchies, densities and attributes; a subclass adds the template, the predictor and a step.
+    """Scenes, their hierarchies, densities and attributes; a subclass adds the template, the predictor and a step.
 
     Attributes:
         scenes: the rest scenes.
-        fps: frames per second of each.
-        hierarchies: the units of each.
-        predicted_levels: which levels of them are predicted, coarse to fine.
+        fps: frames per second of each scene.
+        hierarchies: the hierarchy of units of each scene.
+        predicted_levels: indices of the predicted levels, coarse to fine.
     """
 
     axes: Tensor
@@ -44,7 +44,7 @@ class SceneModel(nn.Module, ABC):
 
         Raises:
             ConfigError: no scene, or not one frame rate per scene.
-            SceneError: a scene has nothing pinned, or nothing else.
+            SceneError: a scene has no pinned kernel, or no free one.
         """
         super().__init__()
         if not scenes or len(scenes) != len(fps):
@@ -72,10 +72,10 @@ class SceneModel(nn.Module, ABC):
 
     @abstractmethod
     def prepare(self, batch: SceneBatch) -> Prepared:
-        """What steps of this batch have in common as long as no parameter changes."""
+        """Constants of the steps of this batch between two updates of the parameters."""
 
     def batch(self, scene_ids: Sequence[int]) -> SceneBatch:
-        """The disjoint union for one sequence of each of these scenes (cached)."""
+        """The disjoint union of one sequence per entry of ``scene_ids`` (cached)."""
         device = self.log_density[0].device
         key = (tuple(scene_ids), device)
         if key not in self._batches:
@@ -83,7 +83,7 @@ class SceneModel(nn.Module, ABC):
         return self._batches[key]
 
     def frames(self, batch: SceneBatch) -> Frames | None:
-        """The bodies' own axes for every unit of a batch; None where the scene's are used."""
+        """Body axes for every unit of a batch; None where scene axes are used."""
         return Frames.of(batch, self.axes, self.origins) if self._in_body_frame else None
 
     def units_of_kernels(self, scene_id: int) -> tuple[Int[Tensor, " K"], ...]:
@@ -94,12 +94,12 @@ class SceneModel(nn.Module, ABC):
         return tuple(none.index_copy(0, hierarchy.kernels, hierarchy.ancestor(0, level)) for level in levels)
 
     def masses(self, batch: SceneBatch) -> tuple[Float[Tensor, " M"], Float[Tensor, " M"]]:
-        """Masses m = exp(r) V of the simulated kernels, and r."""
+        """Masses m = exp(r) V of the simulated kernels, and their log density r."""
         log_density = torch.cat([self.log_density[i] for i in batch.scene_ids])
         return log_density.exp() * batch.volume, log_density
 
     def pushed(self, prepared: Prepared, state: SimState, force: Float[Tensor, "K 3"]) -> SimState:
-        """The state that a force makes of a state: f dt^2 / (2 m) further, pinned kernels where they are."""
+        """The state with free kernels displaced by a force: x_t + f dt^2 / (2 m)."""
         batch = prepared.batch
         shift = force.index_select(0, batch.simulated) * batch.dt**2 / (2 * prepared.mass[:, None])
         shift = torch.where(batch.pinned[:, None], torch.zeros_like(shift), shift)
@@ -121,11 +121,11 @@ class SceneModel(nn.Module, ABC):
         return prepared.template.energy(Motion(prepared.levels[-1].rest, now, before))
 
     def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
-        """How far the template has left the body of a scene; None where it learns no body."""
+        """Mode mixing of the template of a scene (:meth:`Template.mixing`); None where it has none."""
         return self.template.mixing(scene_id)
 
     def smooth_motions(self, scene_id: int) -> SmoothMotions | None:
-        """The motions of a scene that the template can carry; None where it carries none."""
+        """The template's modes at every kernel of a scene; None for templates without modes."""
         motions = self.template.basis(scene_id)
         if motions is None:
             return None
@@ -137,7 +137,7 @@ class SceneModel(nn.Module, ABC):
         return smooth_motions(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], own)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Parameters by role: the network, per-scene densities and attributes, and the template."""
+        """Parameters by role: the network, the scenes' densities and attributes, and the template."""
         return {
             "network": list(self.predictor.parameters()),
             "scene": [*self.log_density, *self.attributes],
@@ -145,18 +145,18 @@ class SceneModel(nn.Module, ABC):
         }
 
     def shared(self) -> dict[str, nn.Module]:
-        """What all scenes have in common, by name: the predictor with its statistics, a shared template."""
+        """Modules common to all scenes, by name: the predictor with its statistics, and a shared template."""
         return {"predictor": self.predictor, **({"template": self.template} if self.template.is_shared else {})}
 
     def own(self, scene_id: int) -> tuple[str, ...]:
-        """What a scene has of its own: prefixes of names in the state dict."""
+        """Prefixes of the names of a scene's parameters and buffers in the state dict."""
         return f"log_density.{scene_id}", f"attributes.{scene_id}", *self.template.own(scene_id, "template.")
 
     def freeze(self, *, scenes: bool = False) -> None:
-        """Keeps what :meth:`shared` names as it is: its weights do not learn, its statistics gather nothing more.
+        """Freezes the modules of :meth:`shared`: their weights and the statistics of the normalisers.
 
         Args:
-            scenes: keep what the scenes have of their own, too.
+            scenes: also freeze the parameters of the scenes.
         """
         for module in (self,) if scenes else self.shared().values():
             module.requires_grad_(False)

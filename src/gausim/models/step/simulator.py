@@ -32,8 +32,8 @@ PLAIN_HEAD, PLAIN_ROLLOUT = Head(), RolloutSettings()
 class Step(SteppedFrame):
     """Result of a step: x_{t+1} of a batch, and deformation gradients G and rotations Q of its finest units."""
 
-    # sum over levels and parents of ||m_c x_c - sum m_i x_i||^2, masses over that of the scene and lengths over its
-    # diagonal; zero where it is switched off
+    # sum over levels and parents of ||m_c x_c - sum m_i x_i||^2, in masses and diagonals of the scene; zero without
+    # conserve_momentum
     momentum: Float[Tensor, ""]
     predicted: tuple[Float[Tensor, "_ 3 3"], ...]  # F per predicted level, coarse to fine
 
@@ -55,24 +55,24 @@ class GausSim(SceneModel):
         conserve_momentum: bool = True,
         rollout: RolloutSettings = PLAIN_ROLLOUT,
     ) -> None:
-        """Puts the parts together.
+        """Builds the hierarchies, the template and the predictor.
 
         Args:
             scenes: rest scenes, each with at least one pinned kernel.
             fps: frames per second of each scene's videos.
-            hierarchy: the units and their neighbours.
-            features: what the network sees of them.
+            hierarchy: settings of the units and their neighbours.
+            features: choice of the network's input features.
             network: called with node_features=, edge_features= and outputs=.
-            head: how its output becomes a deformation gradient.
+            head: map from the network's output to deformation gradients.
             template: state that F deforms; called with (hierarchies, finest level, attributes=,
                 frames= (axes of the scenes), conserve_volume=conserve_mass).
-            conserve_mass: det F = 1.
+            conserve_mass: normalise to det F = 1.
             conserve_momentum: compute the momentum loss.
-            rollout: how predictions without gradients are made.
+            rollout: settings of rollouts without loss gradients.
 
         Raises:
-            ConfigError: parts that do not go together.
-            SceneError: a scene has nothing pinned, or nothing else.
+            ConfigError: incompatible settings, or not one frame rate per scene.
+            SceneError: a scene has no pinned kernel, or no free one.
         """
         if hierarchy.body_frame and any(features.gravity):
             raise ConfigError(
@@ -91,9 +91,9 @@ class GausSim(SceneModel):
         )  # fmt: skip
 
     def prepare(self, batch: SceneBatch) -> Prepared:
-        """What steps of this batch have in common as long as no parameter changes.
+        """Constants of the steps of this batch between two updates of the parameters.
 
-        Gradients flow through it: make one for every stretch of steps with a backward pass of its own.
+        Loss gradients flow through them: prepare anew for every stretch of steps between two backward passes.
         """
         mass, _ = self.masses(batch)
         attributes = torch.cat([self.attributes[i] for i in batch.scene_ids])
@@ -123,8 +123,8 @@ class GausSim(SceneModel):
             state: positions and previous positions of all kernels of the batch [scene units].
             force: force per kernel [mass scene units / s^2]; it displaces free kernels by f dt^2 / (2 m) before the
                 step (METHOD section 6).
-            prepared: from :meth:`prepare`, shared by steps between which no parameter changes; made here when None.
-            correction_scale: factor on the network's output; 0 leaves the template alone.
+            prepared: from :meth:`prepare`, for all steps between two updates of the parameters; computed when None.
+            correction_scale: factor on the network's output; 0 gives the step of the template alone.
         """
         prepared = self.prepare(batch) if prepared is None else prepared
         if force is not None:
@@ -137,11 +137,11 @@ class GausSim(SceneModel):
     def _descend(
         self, prepared: Prepared, now: Tensor, before: Tensor, correction_scale: float, outputs: list[Tensor]
     ) -> tuple[Solved, Tensor | None, Tensor, list[Tensor]]:
-        """The predicted levels, coarse to fine: the finest one solved, the template's P, momentum and all F.
+        """Solves the predicted levels, coarse to fine: returns the finest one, the template's P, momentum and all F.
 
-        The network's outputs, before anything is taken off, are appended to ``outputs``.
+        The network's outputs, before those at rest are subtracted, are appended to ``outputs``.
         """
-        # The template moves the finest units; coarser ones are their centres of mass, at all three times.
+        # The template predicts the finest units; coarser ones are their centres of mass, at all three times.
         rest = prepared.levels[-1].rest
         seen = prepared.template.carried(Motion(rest, now, before))
         template = prepared.template(seen)
@@ -167,7 +167,7 @@ class GausSim(SceneModel):
         return above, template.deformation_gradients, momentum, predicted
 
     def _outputs_at_rest(self, prepared: Prepared) -> tuple[Tensor, ...]:
-        """The network's output for every unit of every predicted level where nothing moves."""
+        """The network's output for every unit of every predicted level at rest."""
         rest = prepared.levels[-1].rest
         outputs: list[Tensor] = []
         with gathering_nothing(normalisers_of(self.predictor)):
@@ -176,6 +176,6 @@ class GausSim(SceneModel):
 
 
 def _momentum(level: LevelBatch, unit: Units, after: Tensor, parents: Tensor, above: FixedUnits) -> Tensor:
-    """sum_c ||m_c x_c - sum_{i in c} m_i x_i||^2 over the parents c; masses over the scene's, lengths over its size."""
+    """sum_c ||m_c x_c - sum_{i in c} m_i x_i||^2 over the parents c, in masses and diagonals of the scene."""
     weighted = weighted_sum(after, unit.mass, level.parent, len(parents))
     return ((above.mass[:, None] * parents - weighted) / above.scale).square().sum()

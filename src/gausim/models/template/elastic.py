@@ -5,10 +5,10 @@ z = Phi^T M u obeys z'' + D z' + K z = f(z). One frame is one step of the trapez
 
     (I + K/4 + D/2) z_{t+1} = (2 I - K/2) z_t - (I + K/4 - D/2) z_{t-1} + f(z_t)     [frame units]
 
-which for every positive semi-definite K and D is stable and creates no energy; with D = 0 it keeps it. K and D are
-trained as S L L^T S products around the body's own spectrum, so that the modes may mix. f is the force of springs
-between the units that turn and stretch, beyond its linear part. The mass may differ from the units' volume, too: z
-above is G z, G a trained matrix, which makes the inertia G^T G and leaves every property as it is.
+which is stable for all positive semi-definite K and D and creates no energy; with D = 0 it conserves energy. K and D
+are trained as products S L L^T S around the body's spectrum, so that the modes may mix. f is the nonlinear part of the
+force of springs between the units. Trained inertia allows masses that differ from the units' volumes: z above is
+replaced by H z with a trained matrix H, hence inertia H^T H; stability and energy conservation are unaffected.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.solid import solid_body
-from gausim.models.template.springs import held_below, unit_springs
+from gausim.models.template.springs import limited, unit_springs
 from gausim.models.template.template import ModalScene, PreparedScenes, Template
 
-# Logarithms of stiffness and damping may move ten times faster than the mixing of modes; written as gains on the
-# parameters so that one learning rate serves both.
+# Gains on the parameters: with one learning rate, logarithms of stiffness and damping change faster than the mixing of
+# modes.
 SPECTRUM_GAIN, MIXING_GAIN = 2.0, 0.3
-# Nearly undamped at the start: exp(-4) per frame of the velocity.
+# Logarithm of the initial damping [1 / frame], nearly undamped.
 INITIAL_LOG_DAMPING = -4.0
 
 
 class ElasticScene(nn.Module):
-    """Modes of one scene and the trained matrices that move them."""
+    """Modes of one scene and the trained matrices of their dynamics."""
 
     values: Tensor
     modes: Tensor
@@ -48,7 +48,7 @@ class ElasticScene(nn.Module):
         hierarchy: Hierarchy, finest: int, *,
         modes: int, neighbours: int, period: float, amplitude: float, geometric: float, solid: float,
     ) -> None:  # fmt: skip
-        """``period`` of the lowest mode [frames], ``amplitude`` [diagonals] and ``geometric`` only set the start."""
+        """Initialises from ``period`` of the lowest mode [frames], ``amplitude`` [diagonals] and ``geometric``."""
         super().__init__()
         level = hierarchy.levels[finest]
         rest = level.rest.double().numpy()
@@ -81,11 +81,11 @@ class ElasticScene(nn.Module):
         return (0.5 * log_stiffness).exp() * self.values.sqrt(), self._identity() + MIXING_GAIN * self.mixing
 
     def inertia_root(self) -> Tensor:
-        """G (M, M) of the inertia G^T G."""
+        """H (M, M) of the inertia H^T H."""
         return self._identity() + MIXING_GAIN * self.inertia_mixing
 
     def mixing_size(self) -> Float[Tensor, ""]:
-        """Sum of the squares by which the mixings of modes in stiffness, damping and inertia differ from none."""
+        """Squared Frobenius norm of the mode mixing in stiffness, damping and inertia."""
         mixings = (self.mixing, self.damping_mixing, self.inertia_mixing)
         return torch.stack([(MIXING_GAIN * m).square().sum() for m in mixings]).sum()
 
@@ -99,7 +99,7 @@ class ElasticScene(nn.Module):
         return factor @ factor.mT
 
     def matrices(self) -> tuple[Tensor, Tensor, Tensor]:
-        """A, B and H of z_{t+1} = A z_t - B z_{t-1} + H f."""
+        """A, B and E of z_{t+1} = A z_t - B z_{t-1} + E f."""
         identity = self._identity()
         root, mixing = self.roots()
         factor = root[:, None] * mixing
@@ -112,26 +112,26 @@ class ElasticScene(nn.Module):
 
 
 class PreparedElastic(ModalScene):
-    """An elastic scene while its parameters do not change: the matrices of its step."""
+    """Matrices of a scene's step between two updates of the parameters."""
 
     def __init__(self, scene: ElasticScene) -> None:
-        """Computes the constants; gradients flow through them."""
+        """Computes the constants; loss gradients flow through them."""
         super().__init__(scene.projection, scene.modes, scene.gradients)
         self.scene = scene
-        a, b, h = scene.matrices()
+        a, b, e = scene.matrices()
         self.transition = torch.cat((a.mT, -b.mT))
         self.size = scene.gain * (scene.initial_log_stiffness + SPECTRUM_GAIN * scene.stiffness).exp()
-        self.turned = self.size * h.mT
-        # I - A + B = H K: how the trained stiffness pulls back.
+        self.turned = self.size * e.mT
+        # I - A + B = E H^T K H: the restoring force of the trained stiffness, as it acts in a step.
         self.pull = torch.eye(len(a), dtype=a.dtype, device=a.device) - a.mT + b.mT
 
     def after(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-        """z_{t+1}; what the springs add is held below a share of the stiffness's pull."""
+        """z_{t+1}; the springs' contribution is limited to a fraction of the stiffness's."""
         linear = torch.cat((z, previous), -1) @ self.transition
-        return linear + held_below(self.scene.springs(z) @ self.turned, z @ self.pull)
+        return linear + limited(self.scene.springs(z) @ self.turned, z @ self.pull)
 
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """|G v|^2 / 2 + (G m)^T K G m / 2 and the springs' beyond it; kept exactly without damping and springs."""
+        """|H v|^2 / 2 + (H m)^T K H m / 2 + the springs' nonlinear part; conserved without damping and springs."""
         root, mixing = (x.detach() for x in self.scene.roots())
         step, middle = z - previous, (z + previous) / 2
         heavy = torch.stack((step, middle)) @ self.scene.inertia_root().detach().mT
@@ -140,7 +140,7 @@ class PreparedElastic(ModalScene):
 
 
 class ElasticTemplate(Template):
-    """Proposes the next state by learned elastodynamics, one set of matrices per scene."""
+    """Template with learned elastodynamics, one set of matrices per scene."""
 
     has_energy = True
 
@@ -159,19 +159,19 @@ class ElasticTemplate(Template):
         frames: Sequence[np.ndarray] = (),
         conserve_volume: bool = True,
     ) -> None:
-        """See the module's text.
+        """Builds the scenes; for the equations see the module's docstring.
 
         Args:
             hierarchies: one per scene.
-            finest: level whose units carry the modes.
-            modes: number of vibration modes kept.
+            finest: level whose units the modes move.
+            modes: number of vibration modes.
             neighbours: springs per unit.
             period: initial period of the lowest mode [frames].
             amplitude: typical displacement [diagonals], the size of initial velocities.
-            geometric: how much of the springs' nonlinear force there is at the start, trained.
+            geometric: initial factor on the springs' nonlinear force, trained.
             solid: spacing of the grid on which the modes of the body around the kernels are computed [diagonals].
-            attributes: of the units, not read here: what a scene is made of is in its matrices.
-            frames: axes of the scenes, not read here.
+            attributes: number of attributes per unit, unused: the material of a scene is in its matrices.
+            frames: axes of the scenes, unused.
             conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).
         """
         super().__init__()
@@ -191,21 +191,21 @@ class ElasticTemplate(Template):
         return scene
 
     def mixing(self, scene_id: int) -> Float[Tensor, ""]:
-        """How much the trained matrices mix the modes of the scene's body, a sum of squares."""
+        """Squared Frobenius norm of the mode mixing of a scene's matrices."""
         return self.scene(scene_id).mixing_size()
 
     def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
-        """Everything of the scene's template."""
+        """Prefix of all names of the scene's template."""
         return (f"{prefix}scenes.{scene_id}.",)
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
-        """The template with its matrices computed: positions X + Phi z, deformation gradients I + grad(Phi) z."""
+        """Template with constant matrices: positions X + Phi z, deformation gradients I + grad(Phi) z."""
         return PreparedScenes(
             batch, lambda scene_id, _: PreparedElastic(self.scene(scene_id)), conserve_volume=self.conserve_volume
         )
 
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Modes (N, 3, M), their gradients (N, 3, 3, M) and sizes (M,): motions of equal energy at the start."""
+        """Modes (N, 3, M), displacement gradients (N, 3, 3, M) and sizes (M,), initially of equal energy."""
         scene = self.scene(scene_id)
         sizes = scene.values.rsqrt()
         return scene.modes * (scene.scale * sizes), scene.gradients * (scene.scale * sizes), sizes

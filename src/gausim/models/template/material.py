@@ -1,28 +1,28 @@
-"""The template of the neural simulator: a solid body whose material a shared network reads from its units' attributes.
+"""The template of the neural simulator: a solid body whose material a shared network decodes from units' attributes.
 
-What the geometry tells is computed once per scene: the lowest modes Phi of the solid body around the kernels
-(:mod:`gausim.models.template.solid`) and, between these modes, how much of the elastic energy and of the mass sits at
-each unit i and in each link (i, j) of neighbouring units. What the geometry does not tell is material. One
-decoder, shared by all scenes, reads it from each unit's density rho_i and attributes a_i,
+The geometry is computed once per scene: the lowest modes Phi of the solid body around the kernels
+(:mod:`gausim.models.template.solid`) and the contributions of each unit i and of each link (i, j) of neighbouring units
+to elastic energy and mass, as matrices between these modes. The material is learned: decoders common to all scenes map
+each unit's attributes a_i (its density rho_i enters directly) to logarithms of factors,
 
     s_i, b_i, d_i = decode(a_i)     p_ij, q_ij, g_ij = decode(a_i, a_j, distance)
 
-and with them, in the modes' coordinates z,
+which give, in modal coordinates z,
 
     K = k (sum_i (e^{s_i} K_i + e^{b_i} B_i) + sum_ij (e^{p_ij} + e^{g_ij}) S_ij)  stiffness: shear, volume, links
-    M = sum_i rho_i M_i + sum_ij e^{q_ij} T_ij             inertia: of the units, and of matter between them
+    M = sum_i rho_i M_i + sum_ij e^{q_ij} T_ij             inertia: of units, and of matter between them
     D = c_0 sum_i e^{d_i} rho_i M_i + c_1 K                damping
 
-k, c_0 and c_1 are one trained number each for all scenes. The links of stiffness e^{g_ij} are springs that turn and
-stretch: f is what they pull beyond the linear, J how much stiffer they are at z_t than at rest. One frame is one step
-of the trapezoidal rule, the force linear within it,
+k, c_0 and c_1 are trained numbers common to all scenes. The links of stiffness e^{g_ij} are springs with geometric
+nonlinearity: f is the nonlinear part of their force, J the change of their stiffness from rest to z_t. One frame is one
+step of the trapezoidal rule, with the force linearised within it,
 
     (M + (K + J(z_t))/4 + D/2) (z_{t+1} - 2 z_t + z_{t-1}) = -K z_t - D (z_t - z_{t-1}) + f(z_t)     [frame units]
 
-K, K + J, M and D are positive semi-definite whatever is decoded. Without f this never creates energy, and without
-damping keeps it; f has a potential, too, and a step that is implicit in its slope does not make vibrations grow that
-are too fast for the frames. Distances are the only geometry that the decoder reads: it means the same on every body,
-however it lies.
+K, K + J, M and D are positive semi-definite for all decoded values. Without f a step never creates energy, and without
+damping it conserves energy. f has a potential, too, and a step that is implicit in its derivative does not amplify
+vibrations too fast for the frame rate. The decoders' only geometric input are distances, so that they generalise to
+other bodies and orientations.
 """
 
 from __future__ import annotations
@@ -45,40 +45,40 @@ from gausim.models.template.springs import Springs, neighbour_pairs
 from gausim.models.template.template import ModalScene, PreparedScenes, Template
 from gausim.nn.mlp import mlp
 
-# Decoded logarithms saturate here: a factor of twelve either way.
+# Bound of the decoded logarithms: factors between 1/12 and 12.
 LARGEST_LOG = 2.5
-# Stiffness and inertia of all links together, as shares of the body's own (by trace), before anything is learned.
-LINK_SHARE = 0.3
-# Stiffness of the links that are springs, their linear part in K and the rest in f and J, as the same share.
-LINK_BEYOND = 0.15
-# Units among which a cell's energy and mass are divided, by inverse squared distance.
+# Initial stiffness and inertia of all linear links together, as fractions (of the trace) of the body's.
+LINK_FRACTION = 0.3
+# The same for the stiffness of the nonlinear links, whose linear part is in K and the rest in f and J.
+SPRING_FRACTION = 0.15
+# Number of units among which a cell's energy is divided, by inverse squared distance.
 CELL_UNITS = 4
-# Step of the units per frame that one unit of an initial velocity's coordinate means, at the lowest mode [diagonals].
+# Displacement per frame of the lowest mode at coordinate 1 of an initial velocity [diagonals].
 AMPLITUDE = 0.05
-# The three numbers of all scenes move so much faster than the decoders' weights; one learning rate serves both. Damping
-# is slower: while a body's periods are not learned yet, motion that dies away fits best, and it is slow to come back.
+# Gains of k and of the dampings over the decoders' weights, for one learning rate. That of damping is smaller: as long
+# as a body's periods are wrong, strong damping fits best, and training is slow to reduce it again.
 GAIN, DAMPING_GAIN = 10.0, 2.0
-# Frames per second at which k and the dampings are stated.
+# Frame rate at which k and the dampings are defined [frames / s].
 REFERENCE_FPS = 24.0
 
 
 class BodyModes(nn.Module):
-    """What the geometry of one scene tells, in modal coordinates; nothing in here is trained."""
+    """Constants of one scene's geometry in modal coordinates; without trained parameters."""
 
     modes: Tensor  # Phi (N, 3, M), orthonormal under the units' volumes
-    gradients: Tensor  # of the modes (N, 3, 3, M) [1 / scene units]
+    gradients: Tensor  # displacement gradients of the modes (N, 3, 3, M) [1 / scene units]
     projection: Tensor  # (N, 3, M), z = sum_n projection_n u_n
     values: Tensor  # eigenvalues of the homogeneous body (M,), the first is 1
-    stiffness: Tensor  # K_i of shear and B_i of volume (2, N, M, M), their sum is the homogeneous body's
+    stiffness: Tensor  # K_i of shear and B_i of volume (2, N, M, M); their sum is that of the homogeneous body
     inertia: Tensor  # root of M_i, (N, 3, M)
     links: Tensor  # pairs of units (2, E)
     stretch: Tensor  # root of S_ij, (E, M)
     between: Tensor  # root of T_ij, (E, 3, M)
     distance: Tensor  # logarithm of the links' lengths over their mean (E,)
-    springs: Springs  # the links as springs, their stiffness per unit of S_ij
+    springs: Springs  # the links as springs, with stiffness per unit of S_ij
 
     def __init__(self, hierarchy: Hierarchy, finest: int, frame: np.ndarray, *, modes: int, spacing: float, links: int):
-        """Computes everything in the body's own axes ``frame`` (3, 3); see :class:`MaterialTemplate`."""
+        """Computes the constants in the axes ``frame`` (3, 3) of the body; see :class:`MaterialTemplate`."""
         super().__init__()
         level, kernels = hierarchy.levels[finest], hierarchy.levels[0]
         rest, pinned = level.rest.double().numpy() @ frame.T, level.pinned.numpy()
@@ -116,29 +116,29 @@ class BodyModes(nn.Module):
 
 
 def _links(rest: np.ndarray, pinned: np.ndarray, count: int) -> np.ndarray:
-    """Pairs (2, E) of neighbouring units that have a length, not between pinned ones."""
+    """Pairs (2, E) of neighbouring units at non-zero distance, at least one of them free."""
     pairs = neighbour_pairs(rest, count)
     distinct = np.linalg.norm(rest[pairs[:, 0]] - rest[pairs[:, 1]], axis=1) > 1e-9 * np.abs(rest).max()
     return np.ascontiguousarray(pairs[distinct & ~pinned[pairs].all(1)].T)
 
 
 def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np.ndarray:
-    """K_i and B_i (2, N, M, M): energy of shear and of volume of the cells near each unit, pins included."""
+    """K_i and B_i (2, N, M, M): energy of shear and of volume of the cells near each unit, pinned ones included."""
     _, slope = body.at(body.centres)
     strain = (slope + slope.transpose(0, 2, 1, 3)) / 2
     trace = np.trace(strain, axis1=1, axis2=2)
     first, second = POISSON / ((1 + POISSON) * (1 - 2 * POISSON)), 1 / (2 * (1 + POISSON))
     count = slope.shape[-1]
-    # Numbers per cell and mode whose squares are twice the energy: nine of shear, one of volume.
+    # Components per cell and mode whose squares sum to twice the energy: nine of shear, one of volume.
     parts = math.sqrt(2 * second) * strain.reshape(-1, 9, count), math.sqrt(first) * trace[:, None]
     near, units = cKDTree(rest).query(body.centres, k=min(CELL_UNITS, len(rest)))
     near, units = near.reshape(len(body.centres), -1), units.reshape(len(body.centres), -1)
-    share = 1 / (near**2 + 1e-12)
-    share /= share.sum(1, keepdims=True)
+    weights = 1 / (near**2 + 1e-12)
+    weights /= weights.sum(1, keepdims=True)
     found = np.zeros((2, len(rest), count, count))
     for unit in range(len(rest)):
         cells, place = np.nonzero(units == unit)
-        size = np.sqrt(share[cells, place] * body.weights[cells])[:, None, None]
+        size = np.sqrt(weights[cells, place] * body.weights[cells])[:, None, None]
         for total, roots in zip(found, parts, strict=True):
             part = (roots[cells] * size).reshape(-1, count)
             total[unit] = part.T @ part
@@ -150,19 +150,19 @@ def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np
 
 @dataclass(frozen=True, eq=False)
 class Matrices:
-    """What moves one scene [frame units]."""
+    """Matrices of the dynamics of one scene [frame units]."""
 
     stiffness: Float[Tensor, "M M"]  # K (M, M)
     inertia: Float[Tensor, "M M"]  # M (M, M)
     damping: Float[Tensor, "M M"]  # D (M, M)
-    links: Float[Tensor, " E"]  # factor on every link's stiffness as a spring beyond the linear (E,)
+    links: Float[Tensor, " E"]  # factor on every link's nonlinear spring stiffness (E,)
 
 
 class MaterialTemplate(Template):
-    """Proposes the next state by the dynamics of a solid body, its material decoded from densities and attributes."""
+    """Template with the dynamics of a solid body, its material decoded from densities and attributes."""
 
     has_energy, is_shared = True, True
-    # The network carries part of the motion: how lively it is is known, in the template's terms, from its first swing.
+    # The network contributes to the motion, so the template's energy of the first frame underestimates its peaks.
     headroom = 2.0
 
     def __init__(
@@ -180,15 +180,15 @@ class MaterialTemplate(Template):
         damping: float = 0.02,
         conserve_volume: bool = True,
     ) -> None:
-        """See the module's text.
+        """Builds the scenes and the decoders; for the equations see the module's docstring.
 
         Args:
             hierarchies: one per scene.
-            finest: level whose units carry the modes.
-            attributes: per unit.
+            finest: level whose units the modes move.
+            attributes: number of attributes per unit.
             frames: axes (3, 3) of each scene in which the template works.
-            modes: number of modes kept.
-            spacing: of the solid body's grid [diagonals].
+            modes: number of modes.
+            spacing: spacing of the solid body's grid [diagonals].
             links: neighbours per unit.
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
@@ -215,9 +215,9 @@ class MaterialTemplate(Template):
     def decode(
         self, body: BodyModes, attributes: Float[Tensor, "N A"]
     ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "E 3"]]:
-        """s, b and d of every unit; p, q and g of every link (see the module's text).
+        """s, b and d of every unit; p, q and g of every link (see the module's docstring).
 
-        Without attributes every unit is the same: what the decoder says of zero attributes is taken off.
+        The decoded values at zero attributes are subtracted from those of units, so that zero attributes give zero.
         """
         units = self.unit_decoder(attributes) - self.unit_decoder(torch.zeros_like(attributes[:1]))
         a, b = (attributes.index_select(0, end) for end in body.links)
@@ -232,19 +232,19 @@ class MaterialTemplate(Template):
         units, links = self.decode(body, attributes)
         k = (self.start[0] + GAIN * self.stiffness).exp() * frame**2
         drag, viscosity = (self.start[1] + DAMPING_GAIN * self.damping).exp()
-        beyond = LINK_BEYOND * links[:, 2].exp()
-        stretch = (LINK_SHARE * links[:, 0].exp() + beyond)[:, None] * body.stretch
+        springs = SPRING_FRACTION * links[:, 2].exp()
+        stretch = (LINK_FRACTION * links[:, 0].exp() + springs)[:, None] * body.stretch
         stiffness = torch.einsum("np,pnlm->lm", units[:, :2].exp(), body.stiffness) + body.stretch.mT @ stretch
         density = _saturated(log_density).exp()[:, None, None]
         root, heavy = body.inertia.flatten(0, 1), (density * body.inertia).flatten(0, 1)
-        between = LINK_SHARE * links[:, 1, None, None].exp() * body.between
+        between = LINK_FRACTION * links[:, 1, None, None].exp() * body.between
         inertia = root.mT @ heavy + body.between.flatten(0, 1).mT @ between.flatten(0, 1)
         dragged = root.mT @ (units[:, 2, None, None].exp() * density * body.inertia).flatten(0, 1)
         damping = drag * frame * dragged + viscosity / frame * k * stiffness
-        return Matrices(k * stiffness, inertia, damping, k * beyond)
+        return Matrices(k * stiffness, inertia, damping, k * springs)
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
-        """The template with its matrices computed."""
+        """Template of a batch with constant matrices."""
 
         def made(scene_id: int, rows: Tensor) -> PreparedMaterial:
             density, attributes = (x.index_select(0, rows) for x in (units.log_density, units.attributes))
@@ -254,7 +254,7 @@ class MaterialTemplate(Template):
         return PreparedScenes(batch, made, conserve_volume=self.conserve_volume)
 
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Modes (N, 3, M), their gradients (N, 3, 3, M) and sizes (M,): what initial velocities are made of."""
+        """Modes (N, 3, M), displacement gradients (N, 3, 3, M) and sizes (M,): the basis of initial velocities."""
         body = self.body(scene_id)
         sizes = body.values**-0.25
         return body.modes * (body.scale * sizes), body.gradients * (body.scale * sizes), sizes
@@ -265,18 +265,18 @@ def _saturated(logarithms: Tensor) -> Tensor:
 
 
 class PreparedMaterial(ModalScene):
-    """A scene's body while no parameter changes."""
+    """Matrices of a scene's step between two updates of the parameters."""
 
     def __init__(self, body: BodyModes, matrices: Matrices) -> None:
-        """Computes the constants; gradients flow through them."""
+        """Computes the constants; loss gradients flow through them."""
         super().__init__(body.projection, body.modes, body.gradients)
         self.matrices, self.springs, self.positions = matrices, body.springs, body.modes.flatten(0, 1)
         self.operator = matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2
 
     def change(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-        """z_{t+1} - 2 z_t + z_{t-1} (see the module's text)."""
-        beyond, stiffer = self.springs.linearised(z, self.matrices.links)
-        force = beyond - z @ self.matrices.stiffness - (z - previous) @ self.matrices.damping
+        """z_{t+1} - 2 z_t + z_{t-1} (see the module's docstring)."""
+        nonlinear, stiffer = self.springs.linearised(z, self.matrices.links)
+        force = nonlinear - z @ self.matrices.stiffness - (z - previous) @ self.matrices.damping
         operator = self.operator + stiffer / 4
         return torch.linalg.solve(operator, force[..., None])[..., 0]
 
@@ -285,16 +285,16 @@ class PreparedMaterial(ModalScene):
         return 2 * z - previous + self.change(z, previous)
 
     def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
-        """Its projection onto the modes.
+        """The projection of a displacement onto the modes.
 
-        With it a state is 2 M numbers to the whole step. What the network adds beyond the modes is seen in the frame
-        that it predicts and forgotten in the next; seen again, it could feed itself and grow where no energy tells.
+        It reduces a state to 2 M numbers. The network's displacements outside the modes appear in the predicted frame
+        but not in the input of the next step; fed back, they could grow without a change of the template's energy.
         """
         z = displacement.flatten(1) @ self.projection
         return (z @ self.positions.mT).view_as(displacement)
 
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """v^T M v / 2 + m^T K m / 2 and the links' beyond it: without damping and these it is kept exactly."""
+        """v^T M v / 2 + m^T K m / 2 + the links' nonlinear part; conserved without damping and that part."""
         step, middle = z - previous, (z + previous) / 2
         inertia, stiffness = self.matrices.inertia.detach(), self.matrices.stiffness.detach()
         energy = 0.5 * ((step @ inertia) * step).sum(-1) + 0.5 * ((middle @ stiffness) * middle).sum(-1)

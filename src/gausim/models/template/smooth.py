@@ -1,4 +1,4 @@
-"""Smooth motions of a scene: what its template can carry, at every kernel."""
+"""Smooth motions of a scene: the template's modes at every kernel."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ def smooth_motions(
     finest: int,
     motions: tuple[Float[Tensor, "N 3 M"], Float[Tensor, "N 3 3 M"], Float[Tensor, " M"]],
 ) -> SmoothMotions:
-    """Carries motions of the units of a level to their kernels: the unit's displacement, its gradient times the offset.
+    """Extends motions of units to their kernels: the unit's displacement plus its displacement gradient times offset.
 
-    ``motions`` are displacements and gradients of the units, and sizes (see ``SmoothMotions.sizes``).
+    ``motions`` are displacements and displacement gradients of the units, and sizes (see ``SmoothMotions.sizes``).
     """
     modes, gradients, sizes = motions
     unit = hierarchy.ancestor(0, finest)

@@ -1,10 +1,9 @@
 """Vibration modes of the body that the kernels bound: linear elasticity on a regular grid around them.
 
-Kernels sit on what cameras see, the surface; what moves is solid. The finite cell method (Parvizian, Duester and Rank
-2007) needs no mesh of it: displacements are quadratic B-splines on a coarse grid, and elastic energy is integrated
-over small cells, those inside the body in full and those just around it at a hundredth, which keeps the equations well
-posed; mass is that of the units. Modes found so are smooth across gaps between kernels and in places that no texture
-shows.
+Kernels lie on the visible surface of a solid body. The finite cell method (Parvizian, Duester and Rank 2007) needs no
+mesh of it: displacements are quadratic B-splines on a coarse grid, and elastic energy is integrated over small cells,
+those inside the body with weight 1 and those just around it with weight 0.01, which keeps the equations well posed. The
+mass is that of the units. The resulting modes are smooth across gaps between kernels and across untextured regions.
 """
 
 from __future__ import annotations
@@ -17,20 +16,20 @@ from scipy import ndimage
 from scipy.linalg import eigh
 from scipy.sparse.linalg import LinearOperator, eigsh, factorized
 
-# Stiffness of the cells around the body, as a share of those inside.
+# Stiffness of the cells around the body, as a fraction of that of cells inside.
 OUTSIDE = 0.01
 # Integration cells per grid spacing.
 SUBDIVISIONS = 2
-# Bodies of rubber and of plant tissue hardly change their volume; 0.3 keeps quadratic splines from locking.
+# Poisson's ratio. Rubber and plant tissue are nearly incompressible; 0.3 avoids locking of quadratic splines.
 POISSON = 0.3
-# Pinned kernels are held by springs this much stiffer than a grid cell.
+# Stiffness of the springs that hold pinned kernels, relative to a grid cell.
 PIN_STIFFNESS = 1e3
-# Nodes at the rim with a stiffness below this share of the largest are left out: rounding would move them.
+# Nodes at the rim with a stiffness below this fraction of the largest are left out: they are subject to rounding.
 NO_SUPPORT = 1e-9
-# Everything is held by springs of this share of the median stiffness: parts that nothing connects to a pin could move
-# without any force, and the equations would have no solution.
+# Stiffness of springs on all nodes, as a fraction of the median: parts without a connection to a pin could move freely,
+# and the equations would be singular.
 FOUNDATION = 1e-8
-# Fraction of an integration cell that rounding may cost: the outermost kernels lie on the border of theirs.
+# Tolerance for rounding, as a fraction of an integration cell: the outermost kernels lie on the border of theirs.
 ROUNDING = 1e-6
 # Grid points within the support of a quadratic B-spline, along one axis.
 SUPPORT = 3
@@ -40,7 +39,7 @@ SUPPORT = 3
 class Grid:
     """A regular grid of quadratic B-splines."""
 
-    origin: np.ndarray  # of the first node's cell [scene units]
+    origin: np.ndarray  # corner of the first node's cell [scene units]
     spacing: float  # between nodes [scene units]
     shape: tuple[int, int, int]  # nodes along each axis
 
@@ -50,7 +49,7 @@ class Grid:
         return int(np.prod(self.shape))
 
     def splines(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Nodes (P, 27), weights (P, 27) and gradients (P, 27, 3) [1 / scene units] at points (P, 3)."""
+        """Nodes (P, 27), weights (P, 27) and their derivatives (P, 27, 3) [1 / scene units] at points (P, 3)."""
         place = (points - self.origin) / self.spacing
         first = np.floor(place - 0.5).astype(np.int64)
         x = place - first
@@ -72,7 +71,7 @@ def matrix(nodes: np.ndarray, values: np.ndarray, size: int) -> sp.csr_matrix:
 
 
 def inside(occupied: np.ndarray) -> np.ndarray:
-    """Cells of the body: those with kernels and those that kernels enclose along at least two axes."""
+    """Cells of the body: cells with kernels and cells enclosed by kernels along at least two axes."""
     margin = 2
     padded = np.pad(occupied, margin)
     closed = ndimage.binary_closing(padded, iterations=margin)[(slice(margin, -margin),) * 3] | occupied
@@ -122,27 +121,27 @@ def stiffness(grid: Grid, centres: np.ndarray, weights: np.ndarray) -> list[list
 
 @dataclass(frozen=True, eq=False)
 class SolidBody:
-    """The lowest modes of a body, anywhere in it."""
+    """The lowest modes of a body as a field on a grid."""
 
     grid: Grid  # of the splines
     values: np.ndarray  # eigenvalues (M,), ascending
     field: np.ndarray  # coefficients (3, nodes, M) of the modes, orthonormal under the units' mass
     centres: np.ndarray  # of the integration cells (Q, 3) [scene units]
-    weights: np.ndarray  # their volumes (Q,), those outside the body at :data:`OUTSIDE` of it [scene units^3]
+    weights: np.ndarray  # their volumes (Q,), outside the body times :data:`OUTSIDE` [scene units^3]
 
     def at(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Modes (P, 3, M) and their gradients (P, 3, 3, M) [1 / scene units] at points (P, 3)."""
+        """Modes (P, 3, M) and displacement gradients (P, 3, 3, M) [1 / scene units] at points (P, 3)."""
         nodes, values, gradients = self.grid.splines(points)
         at = self.field[:, nodes]  # (3, P, 27, M)
         modes = np.einsum("nk,ankm->nam", values, at, optimize=True)
         return modes, np.einsum("nkb,ankm->nabm", gradients, at, optimize=True)
 
     def of_units(self, rest: np.ndarray, pinned: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The modes of units at ``rest`` (N, 3), of which ``pinned`` (N,) stay where they are.
+        """The modes of units at ``rest`` (N, 3); ``pinned`` (N,) marks the immobile ones.
 
         Returns:
-            Eigenvalues (M,) relative to the first, modes (N, 3, M), zero at pinned units and of a fixed sign, and their
-            gradients (N, 3, 3, M) [1 / scene units].
+            Eigenvalues (M,) relative to the first, modes (N, 3, M), zero at pinned units and of a fixed sign, and
+            displacement gradients (N, 3, 3, M) [1 / scene units].
         """
         phi, slope = self.at(rest)
         phi[pinned], slope[pinned] = 0, 0
@@ -166,12 +165,12 @@ def solid_body(
 
     Args:
         kernels: rest positions (K, 3) [scene units].
-        held: which kernels are pinned (K,).
+        held: mask of the pinned kernels (K,).
         rest: rest positions of the units (N, 3) [scene units].
-        mass: of the units (N,); the modes are orthonormal under it.
-        pinned: which units are (N,).
-        modes: how many are wanted; at most three per free unit are given.
-        spacing: of the grid [scene units].
+        mass: masses of the units (N,); the modes are orthonormal under them.
+        pinned: mask of the pinned units (N,).
+        modes: number of modes; at most three per free unit are returned.
+        spacing: spacing of the grid [scene units].
     """
     grid, centres, weights = cells(kernels, spacing)
     blocks = stiffness(grid, centres, weights)

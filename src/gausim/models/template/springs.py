@@ -1,4 +1,4 @@
-"""Springs between units: what they do beyond small motions."""
+"""Springs between units: their forces beyond the linear part."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-# Springs keep this share of their stiffness across their direction: a central-force network alone has soft mechanisms.
+# Fraction of a spring's stiffness that acts across its direction: central forces alone leave soft mechanisms.
 TRANSVERSE_STIFFNESS = 0.3
-# The springs' force beyond the linear one stays below this share of the trained stiffness's own (both as they act in a
-# step): it is taken at the beginning of the step, and thin parts that turn far would make it explode.
-LARGEST_BEYOND = 0.5
+# Largest ratio of the springs' nonlinear contribution to a step over that of the trained stiffness: the nonlinear force
+# is integrated explicitly and is unstable for large rotations of thin parts.
+LARGEST_NONLINEAR = 0.5
 
 
 def neighbour_pairs(rest: np.ndarray, neighbours: int) -> np.ndarray:
-    """Pairs (E, 2) of points (N, 3) of which one is among the other's nearest neighbours, each pair once."""
+    """Distinct pairs (E, 2) of points (N, 3), of which one is among the other's nearest neighbours."""
     k = min(neighbours + 1, len(rest))
     near = cKDTree(rest).query(rest, k=k)[1].reshape(len(rest), k)[:, 1:]
     pairs = np.stack((np.repeat(np.arange(len(rest)), k - 1), near.ravel()), 1)
@@ -25,17 +25,17 @@ def neighbour_pairs(rest: np.ndarray, neighbours: int) -> np.ndarray:
 
 
 class Springs(nn.Module):
-    """Springs between units as they turn and stretch by more than a little, in modal coordinates.
+    """Nonlinear forces of springs between units under large rotations and stretches, in modal coordinates.
 
     A spring from d_0 to d = d_0 + Psi z has the energy k (|d| - |d_0|)^2 / 2, linearised k (n . Psi z)^2 / 2 with
-    n = d_0 / |d_0|. The force is minus the gradient of the difference, so it has a potential and vanishes at rest to
-    second order: the linear part is left to the trained matrices.
+    n = d_0 / |d_0|. The force is minus the derivative of their difference, so it has a potential and is of second order
+    in z; the linear part is in the trained matrices.
     """
 
     modes: Tensor  # Psi, differences of the modes between the ends, (3 E, M)
     offset: Tensor  # d_0 (E, 3) [scene units]
     length: Tensor  # |d_0| (E,) [scene units]
-    stiffness: Tensor  # k (E,), up to the factor that the calls take
+    stiffness: Tensor  # k (E,), up to the argument ``factor``
 
     def __init__(self, offset: np.ndarray, difference: np.ndarray, stiffness: np.ndarray) -> None:
         """Springs along ``offset`` (E, 3), between whose ends the modes differ by ``difference`` (E, 3, M)."""
@@ -50,24 +50,24 @@ class Springs(nn.Module):
             self.register_buffer(name, torch.from_numpy(array).float(), persistent=False)
 
     def forward(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, "S M"]:
-        """Modal forces beyond the linear ones; ``factor`` on the stiffness, one of all springs or (E,)."""
+        """Nonlinear part of the modal forces; ``factor`` on the stiffness, one number or one per spring (E,)."""
         return self._force(self._stretched(z), factor)
 
     def linearised(
         self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0
     ) -> tuple[Float[Tensor, "S M"], Float[Tensor, "S M M"]]:
-        """The force at ``z`` and how much stiffer springs are there than at rest.
+        """The nonlinear force at ``z`` and the change of the stiffness from rest to ``z``.
 
-        The second is the change of the second derivative of their energy. A spring in direction n of length |d| has
-        (1 - t) n n^T + t I for n n^T at rest, t = 1 - |d_0| / |d|. Compressed springs (t < 0) buckle; they count as
-        t = 0, so that with what they have at rest it is positive semi-definite.
+        The stiffness is the second derivative of the energy: (1 - t) n n^T + t I with t = 1 - |d_0| / |d| for a spring
+        of length |d| and direction n (at rest n n^T). Compressed springs (t < 0) buckle; for them t is set to 0, so
+        that the stiffness at ``z`` is positive semi-definite.
         """
         stretched = self._stretched(z)
         change, _, _, now, stretch = stretched
         towards, rest = (change + self.offset) / now[..., None], self.offset / self.length[:, None]
-        share = (stretch / now).clamp_min(0)[..., None, None]
-        blocks = (1 - share) * towards[..., :, None] * towards[..., None, :] - rest[:, :, None] * rest[:, None, :]
-        blocks = blocks + share * torch.eye(3, dtype=z.dtype, device=z.device)
+        t = (stretch / now).clamp_min(0)[..., None, None]
+        blocks = (1 - t) * towards[..., :, None] * towards[..., None, :] - rest[:, :, None] * rest[:, None, :]
+        blocks = blocks + t * torch.eye(3, dtype=z.dtype, device=z.device)
         modes = self.modes.unflatten(0, (-1, 3))
         turned = ((factor * self.stiffness)[:, None, None] * blocks) @ modes
         return self._force(stretched, factor), self.modes.mT @ turned.flatten(-3, -2)
@@ -75,12 +75,12 @@ class Springs(nn.Module):
     def _force(self, stretched: tuple[Tensor, ...], factor: Tensor | float) -> Tensor:
         change, squared, along, now, stretch = stretched
         shrink = stretch / now
-        beyond = shrink[..., None] * change + (shrink - along / squared)[..., None] * self.offset
-        beyond = (factor * self.stiffness)[:, None] * beyond
-        return -(beyond.flatten(-2) @ self.modes)
+        nonlinear = shrink[..., None] * change + (shrink - along / squared)[..., None] * self.offset
+        nonlinear = (factor * self.stiffness)[:, None] * nonlinear
+        return -(nonlinear.flatten(-2) @ self.modes)
 
     def potential(self, z: Float[Tensor, "S M"], factor: Tensor | float = 1.0) -> Float[Tensor, " S"]:
-        """Energy of which :meth:`forward` is minus the gradient."""
+        """Potential energy of the force of :meth:`forward`."""
         _, squared, along, _, stretch = self._stretched(z)
         return 0.5 * (factor * self.stiffness * (stretch.square() - along.square() / squared)).sum(-1)
 
@@ -91,13 +91,13 @@ class Springs(nn.Module):
         along = (self.offset * change).sum(-1)
         grown = 2 * along + change.square().sum(-1)  # |d|^2 - |d_0|^2
         now = (squared + grown).clamp_min(1e-6 * squared).sqrt()
-        return change, squared, along, now, grown / (now + self.length)  # no difference of nearly equal numbers
+        return change, squared, along, now, grown / (now + self.length)  # avoids the cancellation of |d| - |d_0|
 
 
 def unit_springs(rest: np.ndarray, phi: np.ndarray, neighbours: int) -> Springs:
-    """Springs between neighbouring units, k ~ 1 / length^2, such that the first mode has the value 1.
+    """Springs between neighbouring units, k ~ 1 / length^2, scaled to eigenvalue 1 of the first mode.
 
-    That value is of springs that keep :data:`TRANSVERSE_STIFFNESS` of their stiffness across their direction.
+    The eigenvalue includes the transverse stiffness, :data:`TRANSVERSE_STIFFNESS`.
     """
     pairs = neighbour_pairs(rest, neighbours)
     offset, difference = rest[pairs[:, 1]] - rest[pairs[:, 0]], phi[pairs[:, 1]] - phi[pairs[:, 0]]
@@ -109,8 +109,8 @@ def unit_springs(rest: np.ndarray, phi: np.ndarray, neighbours: int) -> Springs:
     return Springs(offset, difference, (1 - TRANSVERSE_STIFFNESS) / ((offset**2).sum(1) * lowest))
 
 
-def held_below(added: Float[Tensor, "S M"], pull: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
-    """What springs add to a step, held below :data:`LARGEST_BEYOND` of how the stiffness pulls in it."""
-    bound = LARGEST_BEYOND * torch.linalg.vector_norm(pull, dim=-1, keepdim=True).detach()
+def limited(added: Float[Tensor, "S M"], pull: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
+    """The springs' contribution to a step, limited to :data:`LARGEST_NONLINEAR` times the norm of the stiffness's."""
+    bound = LARGEST_NONLINEAR * torch.linalg.vector_norm(pull, dim=-1, keepdim=True).detach()
     size = torch.linalg.vector_norm(added, dim=-1, keepdim=True).detach()
     return added * (bound / size.clamp_min(1e-30)).clamp_max(1.0)

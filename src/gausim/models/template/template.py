@@ -1,9 +1,9 @@
-"""Template states: the configuration that the predicted deformation gradients deform further.
+"""Templates: the configuration that the predicted deformation gradients deform.
 
 The recursion of METHOD section 2 deforms a template: x_i = x_p + C_i (T_i - T_p), where C_i accumulates the network's
-gradients. In the paper the template is the rest state. An inertial template (:mod:`gausim.models.template.elastic`)
-moves on its own between frames; the network then predicts its correction, and zero output
-keeps the motion instead of the rest pose.
+deformation gradients. In the paper the template is the rest state. A dynamic template
+(:mod:`gausim.models.template.elastic`) predicts the next frame by itself; the network then predicts a correction, and
+zero output continues the motion instead of returning to rest.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.ops.deformation import bounded_deformation
 
-# Below this a gradient is no longer a deformation (matter turned inside out); it is pulled back to it.
+# Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
 MIN_DETERMINANT = 0.2
 
 
@@ -40,18 +40,18 @@ class TemplateState:
     """The template of the finest predicted level."""
 
     positions: Float[Tensor, "N 3"]  # unit positions [scene units]
-    deformation_gradients: Float[Tensor, "N 3 3"] | None  # of each unit, or None for the identity
+    deformation_gradients: Float[Tensor, "N 3 3"] | None  # P of each unit, or None for the identity
 
 
 class PreparedTemplate:
-    """The template of a batch while parameters do not change; this one is the rest state, whatever the motion."""
+    """The template of a batch between two updates of the parameters; in this base class the rest state."""
 
     def __call__(self, motion: Motion) -> TemplateState:
         """The template state at t + 1."""
         return TemplateState(motion.rest, None)
 
     def carried(self, motion: Motion) -> Motion:
-        """The part of the motion that goes on: what the network sees of both states."""
+        """The part of the motion that is input to template and network; here all of it."""
         return motion
 
     def energy(self, motion: Motion) -> Float[Tensor, " S"]:
@@ -64,12 +64,12 @@ class PreparedTemplate:
 
 
 class Template(nn.Module, ABC):
-    """Proposes the next configuration of the finest predicted level from its two latest ones.
+    """Interface of templates: the next configuration of the finest predicted level from the last two.
 
     Attributes:
-        has_energy: whether what :meth:`prepare` makes has an energy, as :class:`PreparedScenes` has.
-        headroom: so many times the energy that a rollout begins with is allowed in its first frames.
-        is_shared: whether its parameters serve all scenes, as the network's do, or are each a scene's own.
+        has_energy: whether the result of :meth:`prepare` has an energy, as that of :class:`PreparedScenes`.
+        headroom: factor on the initial energy of a rollout, the energy guard's limit in its first frames.
+        is_shared: whether the parameters are common to all scenes, like the network's, or separate per scene.
     """
 
     has_energy, is_shared = False, False
@@ -77,7 +77,7 @@ class Template(nn.Module, ABC):
 
     @abstractmethod
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
-        """The template of one batch while parameters do not change: it takes the motion to the template state at t + 1.
+        """The template of one batch between two updates of the parameters, a map from motion to the state at t + 1.
 
         Args:
             batch: the disjoint graph.
@@ -85,15 +85,15 @@ class Template(nn.Module, ABC):
         """
 
     def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
-        """How far the template has left the body it began with, differentiable; None where it learns no body."""
+        """Differentiable measure of the mode mixing relative to the initial body; None for templates without it."""
         return None
 
     def own(self, scene_id: int, prefix: str) -> tuple[str, ...]:
-        """What a scene has of its own in the template: names in its state dict, each behind ``prefix``."""
+        """Prefixes of the names of a scene's parameters and buffers in the state dict, each after ``prefix``."""
         return ()
 
     def basis(self, scene_id: int) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Smooth motions of one scene that the template can carry: (N, 3, M), their gradients (N, 3, 3, M), sizes (M,).
+        """Modes (N, 3, M) of one scene, displacement gradients (N, 3, 3, M), sizes (M,); None without modes.
 
         See :class:`gausim.core.SmoothMotions`.
         """
@@ -101,18 +101,18 @@ class Template(nn.Module, ABC):
 
 
 class ModalScene(ABC):
-    """A template in modal coordinates z of one scene, while its parameters do not change; for S sequences at once."""
+    """Template of one scene in modal coordinates z between two updates of the parameters, for S sequences at once."""
 
     def __init__(
         self, projection: Float[Tensor, "N 3 M"], modes: Float[Tensor, "N 3 M"], gradients: Float[Tensor, "N 3 3 M"]
     ) -> None:
-        """From what gives z of displacements, and what z gives: displacements and their gradients."""
+        """Stores the map from displacements to z, and those from z to displacements and displacement gradients."""
         self.projection = projection.flatten(0, 1)
-        # Positions and gradients of a unit side by side: one product gives both.
+        # Displacements and displacement gradients of a unit side by side: one product gives both.
         self.motions = torch.cat((modes, gradients.flatten(1, 2)), 1).flatten(0, 1)
 
     def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
-        """Displacement and its gradient, row by row, of every unit at t + 1."""
+        """Displacement (3) and displacement gradient (9, row by row) of every unit at t + 1."""
         return (self.after(*self.coordinates(now, before)) @ self.motions.mT).view(*now.shape[:2], 12)
 
     def coordinates(
@@ -123,7 +123,7 @@ class ModalScene(ABC):
         return z, previous
 
     def carried(self, displacement: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 3"]:
-        """The part of a displacement that the network sees, of what the template carries from frame to frame: all."""
+        """The part of a displacement that is input to template and network; here all of it."""
         return displacement
 
     @abstractmethod
@@ -132,14 +132,14 @@ class ModalScene(ABC):
 
     @abstractmethod
     def energy(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, " S"]:
-        """Energy, constants but for the state; v the step, m the middle of both, as the trapezoidal rule has it."""
+        """Energy of v = z_t - z_{t-1} and m = (z_t + z_{t-1}) / 2; only the state receives loss gradients."""
 
 
 class PreparedScenes(PreparedTemplate):
     """The template of a batch, scene by scene."""
 
     def __init__(self, batch: SceneBatch, made: Callable[[int, Tensor], ModalScene], *, conserve_volume: bool) -> None:
-        """Prepares every scene; ``made`` is called with its number and the rows of one member's units."""
+        """Prepares every scene; ``made`` is called with its index and the rows of one member's units."""
         self._conserve_volume = conserve_volume
         self.parts = [
             (made(scene_id, rows[: len(rows) // len(members)]), rows, members)
@@ -165,7 +165,7 @@ class PreparedScenes(PreparedTemplate):
         return TemplateState(motion.rest + moved[:, :3], deformation)
 
     def carried(self, motion: Motion) -> Motion:
-        """The part of the motion that goes on, scene by scene."""
+        """The part of the motion that is input to template and network, scene by scene."""
         made = []
         for part, rows, members in self.parts:
             both = torch.cat(self._displacements(motion, rows, members))
@@ -183,7 +183,7 @@ class PreparedScenes(PreparedTemplate):
 
 
 class RestTemplate(Template):
-    """The paper's template: the rest state, whatever the motion."""
+    """The paper's template: the rest state."""
 
     def __init__(
         self,
@@ -194,9 +194,9 @@ class RestTemplate(Template):
         frames: Sequence[np.ndarray] = (),
         conserve_volume: bool = True,
     ) -> None:
-        """Takes what every template takes; the rest state needs none of it."""
+        """Takes the arguments of every template; all are unused."""
         super().__init__()
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
-        """Rest positions, identity deformation gradients, no energy; the network sees all of the motion."""
+        """Rest positions, identity deformation gradients, no energy; all of the motion is input to the network."""
         return PreparedTemplate()

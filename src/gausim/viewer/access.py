@@ -1,4 +1,4 @@
-"""Who may come in and what may be asked for: address, Host, Origin, token and paths are checked."""
+"""Access control of the viewer: checks of address, Host, Origin, token and path."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from websockets.http11 import Request, Response
 
 from gausim.core.errors import ConfigError
 
-# What the client's build consists of; everything else is not found.
+# Paths of the client's build; all others are answered by 404.
 PATHS = ("/", "/index.html")
-# Nothing but the page itself: no other origin is asked for anything, and no other page may frame this one.
+# No requests to other origins, and no other page may frame this one.
 CONTENT_POLICY = (
     "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:; "
     "style-src 'self' 'unsafe-inline'; connect-src 'self' data: blob:; worker-src 'self' data: blob:; "
@@ -36,15 +36,15 @@ _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
 
 
 @dataclass(frozen=True)
-class Door:
-    """Where the viewer listens and who may come in.
+class Access:
+    """Address and access settings of the viewer.
 
     Attributes:
-        host: address to bind; only a loopback one without ``remote``.
+        host: address to bind; without ``remote`` a loopback address.
         port: TCP port; 0 takes a free one.
-        remote: allow an address that other machines reach; a token is then required.
-        names: further host names by which the page may be asked for.
-        token: what the first request has to carry (``?token=...``); made up when remote, None: not asked for.
+        remote: allow addresses that other machines can reach; a token is then required.
+        names: further host names of the page.
+        token: token of the first request (``?token=...``); generated for remote addresses; None: not required.
     """
 
     host: str = "127.0.0.1"
@@ -53,11 +53,11 @@ class Door:
     names: tuple[str, ...] = ()
     token: str | None = None
 
-    def checked(self) -> Door:
-        """Returns itself with a token where one is needed.
+    def checked(self) -> Access:
+        """Returns the settings, with a generated token where one is required.
 
         Raises:
-            ConfigError: the address is no address, others can reach it and ``remote`` is not set, or a value is wrong.
+            ConfigError: address, port or token is invalid, or other machines can reach it and ``remote`` is not set.
         """
         if not 0 <= self.port <= 65535:
             raise ConfigError(f"--port {self.port}: expected 0..65535 (0 takes a free port).")
@@ -75,7 +75,7 @@ class Door:
         return self if loopback or self.token is not None else replace(self, token=secrets.token_hex(24))
 
     def host_names(self) -> set[str]:
-        """Names that the header Host may carry; its port may be any, as through a tunnel it is another."""
+        """Allowed names in the header Host; any port is allowed, as a tunnel changes it."""
         address = ip_address("127.0.0.1" if self.host == "localhost" else self.host)
         names = {"localhost", *map(str.lower, self.names), f"[{address}]" if address.version == 6 else str(address)}
         if address.is_loopback or address.is_unspecified:
@@ -84,21 +84,21 @@ class Door:
 
 
 def answer(
-    door: Door, cookie: str, serve_page: Callable[..., Any], connection: ServerConnection, request: Request
+    access: Access, cookie: str, serve_page: Callable[..., Any], connection: ServerConnection, request: Request
 ) -> Response | None:
-    """The answer to a request: a refusal, the trade of a token for a cookie, viser's page, or None for a websocket."""
+    """The answer to a request: a refusal, a cookie in exchange for a token, viser's page, or None for a websocket."""
     websocket = "upgrade" in request.headers
-    # The token trades for a cookie, so that it does not stay in the address bar.
+    # A cookie replaces the token, so that the token does not stay in the address bar.
     given = "" if websocket else parse_qs(urlsplit(request.path).query).get("token", [""])[0]
-    refusal = _refusal(door, given or _cookie(request, cookie), connection, request)
+    refusal = _refusal(access, given or _cookie(request, cookie), connection, request)
     if refusal is not None:
         response: Response = connection.respond(refusal[0], f"{refusal[1]}\n")
     elif websocket:
         return None
-    elif door.token is not None and given:
+    elif access.token is not None and given:
         response = connection.respond(303, "")
         response.headers["Location"] = "/"
-        response.headers["Set-Cookie"] = f"{cookie}={door.token}; HttpOnly; SameSite=Strict; Path=/"
+        response.headers["Set-Cookie"] = f"{cookie}={access.token}; HttpOnly; SameSite=Strict; Path=/"
     else:
         response = serve_page(connection, request)
     for name, value in _HEADERS.items():
@@ -106,13 +106,13 @@ def answer(
     return response
 
 
-def _refusal(door: Door, token: str, connection: ServerConnection, request: Request) -> tuple[int, str] | None:
-    """Status and reason if a request is not answered."""
+def _refusal(access: Access, token: str, connection: ServerConnection, request: Request) -> tuple[int, str] | None:
+    """Status and reason of a refused request; None for an accepted one."""
     websocket, headers = "upgrade" in request.headers, request.headers
     hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
     host = hosts[0].strip().lower() if len(hosts) == 1 else ""
     match = _HOST.fullmatch(host)
-    if match is None or match[1] not in door.host_names():
+    if match is None or match[1] not in access.host_names():
         return 421, "wrong host"
     own = (f"http://{host}", f"https://{host}")
     if (websocket and len(origins) != 1) or any(o.strip().lower() not in own for o in origins):
@@ -121,7 +121,7 @@ def _refusal(door: Door, token: str, connection: ServerConnection, request: Requ
         return 404, "not found"
     if websocket and len(connection.server.connections) >= MOST_CLIENTS:
         return 503, "too many clients"
-    if door.token is not None and not hmac.compare_digest(token.encode(), door.token.encode()):
+    if access.token is not None and not hmac.compare_digest(token.encode(), access.token.encode()):
         return 401, "open the address with ?token=..., as gausim printed it"
     return None
 

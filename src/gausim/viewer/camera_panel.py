@@ -1,4 +1,4 @@
-"""Cameras of the data set: where one looks from at first, the list to jump to, and the videos they recorded."""
+"""Cameras of the data set: the initial view, the list of views, and the recorded videos."""
 
 from __future__ import annotations
 
@@ -19,21 +19,22 @@ if TYPE_CHECKING:
     from gausim.viewer.subject import Subject
 
 _FREE = "Free"
-# Video frames are drawn so often at most [times per second].
+# Largest update rate of video frames [1 / s].
 _PICTURES = 6.0
+# Vertical field of view without cameras [rad].
 _HEIGHT_OF_VIEW = 0.8
-# Two objects side by side stand this many widths apart.
+# Distance of two objects side by side, in widths of the object.
 _APART = 1.25
 
 
-class Sights:
-    """The cameras of one viewer, their frustums and the panel of videos, as far as the subject has them.
+class CameraPanel:
+    """The cameras of one viewer, their frustums and the panel of videos, if the subject has any.
 
     Attributes:
         up: vertical direction.
-        forward: where one looks at first.
-        first_position: from where [page units].
-        aside: where a companion stands from the object [page units]; zero without one.
+        forward: direction of the initial view.
+        first_position: camera position of the initial view [page units].
+        aside: offset of a companion from the object [page units]; zero without one.
     """
 
     def __init__(self, server: Any, placing: Placing, subject: Subject) -> None:
@@ -59,7 +60,7 @@ class Sights:
             self._add_films(self._films)
 
     def _aside(self, subject: Subject) -> np.ndarray:
-        """To the right as one looks at first, by a little more than the object is wide."""
+        """Offset to the right of the initial view by slightly more than the object's width."""
         right = np.cross(self.forward, self.up)
         right /= max(float(np.linalg.norm(right)), 1e-9)
         scene = subject.interaction.scene
@@ -67,7 +68,7 @@ class Sights:
         return np.asarray(right * max(_APART * float(np.ptp(across)), 0.3 * SIZE))
 
     def _first(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Position, target and vertical field of view of the first look."""
+        """Position, target and vertical field of view of the initial view."""
         if self._cameras is not None:
             position, _, forward, _, fov = self._pose(self._cameras, 0)
             return position, position + forward * max(float(-position @ forward), 0.1), fov
@@ -108,7 +109,7 @@ class Sights:
         frustums.on_update(switched)
 
     def look_from(self, client: Any, cameras: Cameras, index: int) -> None:
-        """Moves one browser's view to a camera of the data set."""
+        """Moves the view of one browser to a camera of the data set."""
         position, _, forward, up, fov = self._pose(cameras, index)
         with client.atomic():
             client.camera.up_direction = up
@@ -126,7 +127,7 @@ class Sights:
             self._picture = gui.add_image(blank, label="recorded | shown", format="png", visible=False)
 
     def refresh(self, shown: Shown, *, now: bool = False) -> None:
-        """Draws the recorded and the shown frame of the chosen camera, where the shown one was recorded."""
+        """Displays the recorded and the shown frame for the chosen camera, if the shown source has a recording."""
         if self._films is None:
             return
         moment = time.monotonic()

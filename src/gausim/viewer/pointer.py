@@ -1,4 +1,4 @@
-"""Hands in the browser: picking a part, brushing a region, dragging it with a force, letting go."""
+"""Pointer input from the browser: selecting parts by click or rectangle, and forces by dragging."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from gausim.viewer.shown import Shown
 from gausim.viewer.splats import SIZE, Placing, unit_centres
 
 WHOLE = "The whole object"
-# Handles follow their parts so often [times per second].
+# Update rate of the handles' positions [1 / s].
 _FOLLOWS = 8.0
-# A drag with the control key pushes as long as this [s].
+# Duration of the force of which a drag with the control key gives the impulse [s].
 _FLICK = 0.1
 
 
-class Hands:
-    """What pointers do to the object; callbacks run in the server's loop and only queue work for the simulation.
+class Pointer:
+    """Pointer input; its callbacks run in the server's loop and only queue commands for the simulation.
 
     Attributes:
-        selection: what is chosen, or None.
-        mask: its kernels; none of them while nothing is chosen.
-        level: what a click picks, one of :attr:`level_names`; at first the largest parts, if there are any.
-        gain: force of a drag as long as the object's diagonal [weights].
+        selection: the selected part, or None.
+        mask: mask of its free kernels.
+        level: level of the units that a click selects, one of :attr:`level_names`; initially the coarsest.
+        gain: force per diagonal of drag [weights].
         notice: called when the selection changes.
     """
 
     def __init__(
         self, server: Any, live: Live, placing: Placing, units: Sequence[Int[Tensor, " K"]], masses: Float[Tensor, " K"]
     ) -> None:
-        """Puts a handle on every unit of the first level."""
+        """Creates a handle on every unit of the initial level."""
         self._server, self._live, self._placing = server, live, placing
         scene = live.interaction.scene
         self._free = (scene.simulated & ~scene.pinned).cpu()
@@ -60,23 +60,23 @@ class Hands:
         self.notice: Callable[[], None] = lambda: None
         self._label = server.scene.add_label("/weight", "", visible=False)
         self.choose_level(self.level_names[-2 if units else -1])
-        # What a ray may pass a kernel's centre by: the kernel's own size, and a little for the hand [page units].
+        # Largest distance of a ray from a kernel's centre: the kernel's size plus a tolerance [page units].
         self._reach = scene.log_scales.float().cpu().exp().amax(-1) * placing.scale + 0.004 * SIZE
         server.scene.on_rect_select(modifier="shift")(self._brushed)
         server.scene.on_click()(self._clicked)
 
     @property
     def level_names(self) -> tuple[str, ...]:
-        """What a click can pick."""
+        """Names of the levels whose units a click can select."""
         return (*(f"Level {i + 1}: {int(u.max()) + 1} units" for i, u in enumerate(self._units)), WHOLE)
 
     def choose_level(self, name: str) -> None:
-        """Handles for the units of another level, one of :attr:`level_names`."""
+        """Replaces the handles by those of another level, one of :attr:`level_names`."""
         self.level, level = name, self.level_names.index(name)
         rest = self._live.interaction.scene.means
         with self._lock:
             self._level = level if level < len(self._units) else None
-            # The handle of each kernel, and the handles that can move.
+            # The handle of each kernel, and the handles of units with free kernels.
             self._index = self._units[level] if level < len(self._units) else torch.where(self._free, 0, -1)
             self._count = int(self._index.max()) + 1
             self._movable = self._index[self._free & (self._index >= 0)].unique()
@@ -90,7 +90,7 @@ class Hands:
         return self._placing.to_page(centres)[self._movable]
 
     def _handle_radii(self, rest: Tensor) -> Tensor:
-        """Handles as wide as their units, so that a unit is hit where it is seen [page units]."""
+        """Radii of the handles, similar to those of their units [page units]."""
         centres = unit_centres(rest, self._index, self._masses, self._count)
         inside = self._index >= 0
         away = (rest[inside] - centres[self._index[inside]]).norm(dim=-1)
@@ -98,7 +98,7 @@ class Hands:
         return (0.8 * widest * self._placing.scale).clamp(0.008 * SIZE, 0.2 * SIZE)[self._movable]
 
     def _make_handles(self, centres: np.ndarray, radii: np.ndarray) -> None:
-        # What is picked must stand before the old handles are gone: the index an event carries is one of these.
+        # `_movable` is already that of the new handles: their events carry indices into it.
         self._pick = self._server.scene.add_batched_glb(
             "/handles", invisible_handle(), np.tile(np.array([1, 0, 0, 0], np.float32), (len(centres), 1)), centres,
             batched_scales=radii, lod="off", cast_shadow=False, receive_shadow=False,
@@ -107,18 +107,18 @@ class Hands:
             "/dots", centres, (255, 120, 0), point_size=0.012 * SIZE, point_shape="circle",
             visible=self._shown_handles,
         )  # fmt: skip
-        # No click on the handles: viser outlines what can be clicked. Clicks are found along their ray instead.
+        # Clicks are resolved by their ray, not by handles, as viser would outline clickable handles.
         self._pick.on_drag("left")(self._dragged)
         self._pick.on_drag("left", modifier="cmd/ctrl")(self._flicked)
 
     def show_handles(self, visible: bool) -> None:
-        """Makes the handles visible, or invisible as they are."""
+        """Shows or hides the handles' centres."""
         self._shown_handles = visible
         with self._lock:
             self._dots.visible = visible
 
     def follow(self, shown: Shown) -> None:
-        """Moves the handles to their parts."""
+        """Moves the handles to the current centres of their units."""
         self._page = self._placing.to_page(shown.frame.positions.float().cpu())
         now = time.monotonic()
         if now - self._moved < 1 / _FOLLOWS:
@@ -130,14 +130,14 @@ class Hands:
                 self._dots.points = centres
 
     def select(self, on: Selected | None) -> None:
-        """Chooses a part, or nothing."""
+        """Selects a part, or none."""
         scene = self._live.interaction.scene
         self.mask = torch.zeros_like(self._free) if on is None else on.mask(scene, self._units).cpu() & self._free
         self.selection = on
         self.notice()
 
     def described(self) -> str:
-        """The selection in words."""
+        """Description of the selection for the page."""
         count = int(self.mask.sum())
         match self.selection:
             case None:
@@ -168,7 +168,7 @@ class Hands:
         self.select(Kernels(tuple(numbers)) if numbers else None)
 
     def _grasp(self, event: Any) -> None:
-        """A drag that begins on what is not selected selects it."""
+        """Selects the unit under a drag's start unless the selection overlaps it."""
         index = event.instance_index
         if event.phase != "start" or index is None or not 0 <= index < len(self._movable):
             return
@@ -178,7 +178,7 @@ class Hands:
             self.select(chosen)
 
     def pull(self, start: Sequence[float], end: Sequence[float]) -> tuple[tuple[float, float, float], float]:
-        """Direction and size [weights] of the force of a drag between two points of the page."""
+        """Direction and size [weights] of the force for a drag between two points of the page."""
         x, y, z = (float(b) - float(a) for a, b in zip(start, end, strict=True))
         weights = self.gain * math.hypot(x, y, z) / SIZE
         return (x, y, z), min(weights, self._live.interaction.most_force)
@@ -214,10 +214,10 @@ class Hands:
 
 @cache
 def invisible_handle() -> bytes:
-    """A binary glTF of a transparent icosahedron of radius 1, which catches the pointer.
+    """A binary glTF of a transparent icosahedron of radius 1, a target for the pointer.
 
-    A mesh of opacity 0 still hides the splats behind it, which are drawn last and tested against the depth; glTF
-    materials that blend are loaded as ones that leave the depth alone.
+    An ordinary mesh of opacity 0 would still occlude the splats behind it, which are drawn last with a depth test; a
+    glTF material with blending does not write depth.
     """
     mesh = icosahedron()
     clear = PBRMaterial(alphaMode="BLEND", baseColorFactor=[255, 255, 255, 0], doubleSided=True)
@@ -232,7 +232,7 @@ def first_hit(
     direction: Sequence[float],
     among: Bool[Tensor, " K"],
 ) -> int | None:
-    """The first ``among`` some kernels whose centre a ray passes within its ``reach``, or None."""
+    """The first kernel of the mask ``among`` whose centre is within its ``reach`` of a ray, or None."""
     along = torch.nn.functional.normalize(points.new_tensor([float(v) for v in direction]), dim=0)
     away = points - points.new_tensor([float(v) for v in origin])
     depth = away @ along
@@ -244,13 +244,13 @@ def first_hit(
 def in_rectangle(
     points: Float[Tensor, "K 3"], camera: Any, low: Sequence[float], high: Sequence[float]
 ) -> Bool[Tensor, " K"]:
-    """Points that a viser camera sees within a rectangle.
+    """Points within a rectangle of a viser camera's picture.
 
     Args:
-        points: on the page.
+        points: positions on the page.
         camera: a viser camera: world pose (wxyz, position), vertical field of view [rad], aspect (width / height).
-        low: left upper corner of the rectangle, in 0..1 of the picture.
-        high: its right lower corner.
+        low: upper left corner of the rectangle, in 0..1 of the picture.
+        high: its lower right corner.
     """
     rotation = torch.from_numpy(SO3(np.asarray(camera.wxyz, float)).as_matrix()).to(points)
     seen = (points - points.new_tensor([float(v) for v in camera.position])) @ rotation

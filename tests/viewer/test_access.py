@@ -1,4 +1,4 @@
-"""Strangers at the door: wrong hosts and origins, paths, tokens, junk; and clients that are slow, many or rude."""
+"""Access control: wrong hosts and origins, paths, tokens, invalid messages; and clients that are slow or too many."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from websockets.typing import Origin, Subprotocol
 from gausim.core import ConfigError
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.session import Wind
+from gausim.viewer.access import CONTENT_POLICY, MOST_CLIENTS, Access
 from gausim.viewer.app import Subject, Viewer
-from gausim.viewer.guard import CONTENT_POLICY, MOST_CLIENTS, Door
 from gausim.viewer.server import GuardedServer
 
 PROTOCOL = Subprotocol(f"viser-v{viser.__version__}")
@@ -42,7 +42,7 @@ CAMERA = {
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[GuardedServer]:
-    made = GuardedServer(Door(port=0))
+    made = GuardedServer(Access(port=0))
     yield made
     made.stop()
 
@@ -205,7 +205,7 @@ def test_no_client_can_have_the_page_shared_or_upload_without_end(server: Guarde
 
 
 def test_more_clients_than_are_served_are_turned_away() -> None:
-    server = GuardedServer(Door(port=0))
+    server = GuardedServer(Access(port=0))
     try:
         clients = [dial(server) for _ in range(MOST_CLIENTS)]
         with pytest.raises(InvalidStatus, match="503"):
@@ -219,12 +219,12 @@ def test_more_clients_than_are_served_are_turned_away() -> None:
 
 def test_other_machines_are_let_in_only_by_flag_and_token() -> None:
     with pytest.raises(ConfigError, match="--allow-remote"):
-        GuardedServer(Door(host="0.0.0.0", port=0))
+        GuardedServer(Access(host="0.0.0.0", port=0))
     with pytest.raises(ConfigError, match="IP address"):
-        GuardedServer(Door(host="example.org", port=0, remote=True))
-    server = GuardedServer(Door(host="0.0.0.0", port=0, remote=True))
+        GuardedServer(Access(host="example.org", port=0, remote=True))
+    server = GuardedServer(Access(host="0.0.0.0", port=0, remote=True))
     try:
-        token = server.door.token
+        token = server.access.token
         assert token is not None and len(token) >= 32 and token in server.url
         assert get(server)[0] == 401
         assert get(server, "/?token=" + "0" * len(token))[0] == 401
@@ -245,12 +245,12 @@ def test_other_machines_are_let_in_only_by_flag_and_token() -> None:
 @pytest.mark.parametrize("token", ["short", "has spaces in its middle", "ümlaute" * 4])
 def test_weak_tokens_are_refused(token: str) -> None:
     with pytest.raises(ConfigError, match="16 letters"):
-        Door(token=token).checked()
+        Access(token=token).checked()
 
 
 def test_a_port_in_use_is_said(server: GuardedServer) -> None:
     with pytest.raises(ConfigError, match="--port"):
-        GuardedServer(Door(port=server.get_port()))
+        GuardedServer(Access(port=server.get_port()))
 
 
 async def _watch(url: str, ends: float, pause: float) -> int:
@@ -274,7 +274,7 @@ async def _watch(url: str, ends: float, pause: float) -> int:
 @pytest.mark.slow
 def test_several_clients_also_slow_ones_cost_no_memory(make_interaction: Callable[..., Interaction]) -> None:
     seconds = float(os.environ.get("GAUSIM_TEST_CLIENT_SECONDS", "40"))
-    viewer = Viewer(Subject("a column", make_interaction()), Door(port=0))
+    viewer = Viewer(Subject("a column", make_interaction()), Access(port=0))
     viewer.start()
     viewer.live.do(lambda: viewer.live.act(Wind((1.0, 0.0, 0.0), 1.0, gusts=0.5)))  # frames differ, all are sent
 
