@@ -27,7 +27,7 @@ def main(argv: list[str]) -> int:
     from rich.console import Console
     from rich.markdown import Markdown
 
-    from gausim.cli.end import end, told
+    from gausim.cli.end import end, error_sentences
     from gausim.compose.build import load_run
     from gausim.compose.data_paths import data_option
     from gausim.compose.predict import state_of
@@ -52,11 +52,11 @@ def main(argv: list[str]) -> int:
         print((folder / "metrics.json").read_text(), end="")
         return 0
     if arguments.verbose:
-        # Rich would cut columns at 80 characters where the output goes to a file.
+        # Rich would truncate columns at 80 characters in files.
         Console(width=None if sys.stdout.isatty() else 200).print(Markdown((folder / "table.md").read_text()))
         print("\n".join(f"wrote {folder / name}" for name in [*WRITTEN, *drawn]))
     commands = [["report", arguments.run], ["simulate", arguments.run]] if whole else [["evaluate", arguments.run]]
-    end(told(summary["objects"]), "tables", folder / "table.md", *commands)
+    end(error_sentences(summary["objects"]), "tables", folder / "table.md", *commands)
     return 0
 
 
@@ -102,7 +102,7 @@ def _evaluate(run: LoadedRun, arguments: argparse.Namespace) -> list[ObjectCurve
 
 
 def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list[str]:
-    """Writes what long rollouts of each object's first sequence tell; returns the names of the files."""
+    """Evaluates long rollouts of each object's first sequence; returns the names of the written files."""
     from gausim.compose.predict import endurance, run_objects
     from gausim.report.pictures.motion import endurance_figure
 
@@ -110,8 +110,8 @@ def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list
     (folder / "endurance.json").write_text(json.dumps(found, indent=1) + "\n")
     for name, rollouts in found.items():
         endurance_figure(name, rollouts, folder / f"endurance_{name}.png")
-        for kind, told in rollouts.items():
-            growth, late = told["growth"], told["late"]
+        for kind, rollout in rollouts.items():
+            growth, late = rollout["growth"], rollout["late"]
             print(f"{name}, {kind}: highest energy later over before {growth:.3f}, of the last tenth {late:.2g}")
     return ["endurance.json", *(f"endurance_{name}.png" for name in found)]
 
@@ -126,7 +126,7 @@ def _views(data: ObjectData, group: str) -> list[str]:
 
 
 def _folder(run: LoadedRun, arguments: argparse.Namespace) -> tuple[bool, Path]:
-    """Whether this is the run's whole evaluation, which that of a part never overwrites; and where it goes."""
+    """Whether the evaluation covers the whole run (a partial one never overwrites it), and its folder."""
     whole = run.run_dir / "evaluation"
     partial = arguments.object or arguments.sequences or arguments.views != "all"
     folder = arguments.out or (whole / "partial" if partial else whole)

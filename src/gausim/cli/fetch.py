@@ -1,4 +1,4 @@
-"""`gausim fetch NAME`: published runs and data sets, verified before they are unpacked; and how to publish one."""
+"""`gausim fetch NAME`: fetches published runs and data sets, verified before unpacking, or packs one."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def main(argv: list[str]) -> int:
     if arguments.list:
         _print_list(registry)
         return 0
-    entries = [registry.find(name) for name in arguments.names]  # all, before the first is downloaded
+    entries = [registry.find(name) for name in arguments.names]  # check all names before the first download
     for entry in entries:
         _fetch(entry, arguments, registry)
     return 0
@@ -63,8 +63,8 @@ def _parser() -> argparse.ArgumentParser:
     add = packing.add_argument
     add("--pack", metavar="RUN|DIR", type=Path, help="write NAME.tar of a finished run or a data set, and its entry")
     add("--name", metavar="NAME", help="of the entry")
-    add("--licence", metavar="ID", help="under which others may use it, e.g. CC-BY-4.0; default what dataset.json says")
-    add("--title", metavar="TEXT", help="what it is, in one line")
+    add("--licence", metavar="ID", help="under which others may use it, e.g. CC-BY-4.0; default that of dataset.json")
+    add("--title", metavar="TEXT", help="description in one line")
     add("--data", metavar="NAME", default="", help="of a run: the entry of its data set")
     return parser
 
@@ -116,5 +116,5 @@ def _pack(arguments: argparse.Namespace) -> int:
 
 
 def megabytes(count: int) -> str:
-    """A number of bytes for people."""
+    """A number of bytes in MB, as text."""
     return f"{count / 1e6:,.1f} MB" if count < 1e9 else f"{count / 1e9:,.2f} GB"
