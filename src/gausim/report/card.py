@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader
 
 from gausim.report.gather.runs import RunRecord, dig
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import GROUP_TITLES, LEGEND, NO_FORESIGHT, markdown_table, object_tables, said
+from gausim.results.table import GROUP_TITLES, LEGEND, NO_FORESIGHT, footnotes_of, markdown_table, object_tables
 
 # Hugging Face and code hosts show a file of this name.
 CARD = "README.md"
@@ -46,7 +46,7 @@ def card(run: RunRecord, facts: CardFacts) -> str:
     data, trainer = run.config.get("data", {}), run.config.get("trainer", {})
     costs = {name: dig(entry, "efficiency", _method(entry)) for name, entry in objects.items()}
     first = next(iter(objects.values()), None)
-    fit = None if first is None else said(first, _method(first)).get("fit")
+    fit = None if first is None else footnotes_of(first, _method(first)).get("fit")
     return environment.get_template("card.md").render(
         run=run,
         facts=facts,
@@ -62,7 +62,7 @@ def card(run: RunRecord, facts: CardFacts) -> str:
         asked=[f"{key} {trainer[key]}" for key in ("accelerator", "devices", "threads", "precision") if key in trainer],
         fit=fit if isinstance(fit, Mapping) else None,
         headline=_headline,
-        said=lambda entry: said(entry, _method(entry)),
+        footnotes_of=lambda entry: footnotes_of(entry, _method(entry)),
         no_foresight=NO_FORESIGHT,
     )
 

@@ -31,7 +31,7 @@ from gausim.report.tables.sheets import (
 )
 from gausim.results.curves import ERROR_3D
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import plus_minus, said
+from gausim.results.table import footnotes_of, plus_minus
 
 # What ablations are compared by: (metric, views).
 _ABLATED = (
@@ -153,7 +153,7 @@ def _costs(group: Group, name: str) -> tuple[Entry, ...]:
         missing = Entry(states[0] if states else NOT_MEASURED, missing=True, runs=group.of(name))
         return (missing, *map(plain, [""] * (len(_COSTS) - 1)))
     runs, costs = tuple(r for r, _ in found), [cost for _, cost in found]
-    fits = [fit for _, e in entries if number(dig(fit := said(e, group.method).get("fit"), "cpu_seconds"))]
+    fits = [fit for _, e in entries if number(dig(fit := footnotes_of(e, group.method).get("fit"), "cpu_seconds"))]
     levels = dig(costs[0], "levels", "counts")
     predictions, kernels = (number(dig(costs[0], "levels", key)) for key in ("predictions", "kernels"))
     wall, processor = _known(fits, "seconds"), _known(fits, "cpu_seconds")

@@ -11,7 +11,7 @@ from typing import Any
 from gausim.report.gather.runs import dig
 from gausim.results.curves import ERROR_3D, STATIC
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import said
+from gausim.results.table import footnotes_of
 
 # A prediction whose error is at least so much of the static one's is no prediction.
 NO_BETTER = 0.9
@@ -80,7 +80,7 @@ def outcome(entries: Sequence[dict[str, Any]], method: str) -> Outcome:
         still_psnr={views: mean(STATIC, split, views, "psnr", "mean") for views in ("train", "heldout")},
         heldout_views=tuple(entries[0].get("heldout_views", ())),
         seeds=len(entries),
-        repeats=said(entries[0], method).get("extrapolates") is False,
+        repeats=footnotes_of(entries[0], method).get("extrapolates") is False,
     )
 
 
