@@ -45,7 +45,7 @@ def test_what_differs_is_told_and_nothing_else() -> None:
                  still=REST.expand(FRAMES, -1, -1))  # fmt: skip
     found = read_diagnosis(json.loads(json.dumps(made)))  # it is written to a file
     assert found is not None
-    assert len(found.share) == 2 and sum(found.share) == pytest.approx(1, abs=1e-5)
+    assert len(found.fraction) == 2 and sum(found.fraction) == pytest.approx(1, abs=1e-5)
     assert found.frequency_error("same") < 1e-4 and found.damping_ratio("same") == pytest.approx(1, abs=1e-3)
     assert found.phase("same", seen=True) < 0.1 and found.rows["same"].velocity_cosine == pytest.approx(1)
     assert found.frequency_error("slow") == pytest.approx(0.1, abs=0.01)

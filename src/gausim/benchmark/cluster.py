@@ -1,4 +1,4 @@
-"""Benchmark: clusters of bounded diameter against scipy's in the same run."""
+"""Benchmark of clustering with bounded diameter, against scipy in the same run."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ SIZES = {False: (2_000, 12_000, 23_422, 1_000_000), True: (200, 600)}
 
 
 def run(options: Options) -> list[Row]:
-    """Clusters of points spread over a thin bumpy shell, as a reconstruction's kernels are."""
+    """Clusters of points in a thin bumpy shell, similar to a reconstruction's kernels."""
     rows = []
-    agglomerative_clusters(_shell(100).double().numpy(), 0.5)  # compiles, so that no row counts it
+    agglomerative_clusters(_shell(100).double().numpy(), 0.5)  # compiles before the timing
     for count in SIZES[options.quick]:
         rows += _clusters(count, options)
     return rows
 
 
 def _shell(count: int) -> Tensor:
-    """Points (count, 3) around a sphere of radius 1 with bumps, 0.02 thick, with the diagonal 1."""
+    """Points (count, 3) in a bumpy spherical shell of radius 1 and thickness 0.02, scaled to the diagonal 1."""
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(count, 3, generator=generator)
     x = x / x.norm(dim=1, keepdim=True)

@@ -1,6 +1,6 @@
-"""Benchmark: packed frames against decoding images in the same run; opening and streaming a set of the paper's size.
+"""Benchmark of data: packed frames against decoding images in the same run; streaming a set of the paper's size.
 
-The large set is written as sparse files: its bytes are read as any others, but take no space on the disk.
+The large set consists of sparse files, which are read like others but take no space on the disk.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from gausim.io.packed import HEADER, PIXELS, Crop, header, read_packed, write_pa
 from gausim.io.transforms import write_transforms
 
 FPS, FRAMES, VIEWS, CROPPED = 24.0, 16, 4, 0.2
-# READY as the paper has it: sequences, frames, views, width, height.
+# Size of the paper's data set: sequences, frames, views, width, height.
 PAPER = (30, 100, 6, 960, 540)
 EPOCHS = 3
 
@@ -66,7 +66,7 @@ def _throughput(folder: Path, size: int, options: Options) -> list[Row]:
 
 
 def _large(folder: Path, options: Options) -> list[Row]:
-    """Opens a set and reads the training frames of every sequence, several times over."""
+    """Opens a set and reads the training frames of every sequence several times."""
     sequences, frames, views, width, height = (3, 20, 2, 96, 54) if options.quick else PAPER
     cameras = _cameras(views, width, height)
     side = CROPPED**0.5
@@ -106,7 +106,7 @@ def _cameras(views: int, width: int, height: int) -> Cameras:
 
 
 def _images(size: int) -> np.ndarray:
-    """(V, F, H, W, 4): a noisy disc that sways, within a fifth of the image."""
+    """(V, F, H, W, 4): a noisy oscillating disc on a fifth of the image."""
     rng = np.random.default_rng(0)
     images = np.zeros((VIEWS, FRAMES, size, size, 4), np.uint8)
     y, x = np.mgrid[:size, :size] / size - 0.5

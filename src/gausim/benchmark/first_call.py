@@ -1,6 +1,6 @@
-"""The renderer's first call in a process of its own: time to compile or to load, and memory.
+"""Benchmark of the renderer's first call in a new process: time to compile or to load, and memory.
 
-Run by ``gausim benchmark render`` as ``python -m gausim.benchmark.first_call COUNT SIZE``; prints one JSON object.
+``gausim benchmark render`` runs ``python -m gausim.benchmark.first_call COUNT SIZE``, which prints one JSON object.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from gausim.render.draw import deformed_appearance
 
 
 def measure(count: int, size: int) -> dict[str, float]:
-    """Seconds of the first forward and backward pass and bytes of resident memory.
+    """Time of the first forward and backward pass [s] and resident memory [bytes].
 
     ``renderer`` and ``appearance`` are first calls of the renderer and of the colours and covariances of deformed
-    kernels, each with its backward pass; imports are over by then.
+    kernels, each with its backward pass, after all imports.
     """
     torch.set_num_threads(1)
     x, cpu = torch.ones(2, requires_grad=True), torch.device("cpu")
@@ -39,7 +39,7 @@ def in_fresh_process(count: int, size: int, cache: str) -> dict[str, float]:
     """:func:`measure` in a new process with numba's cache in the folder ``cache``.
 
     Raises:
-        subprocess.CalledProcessError: that process failed; what it said is on stderr.
+        subprocess.CalledProcessError: the process failed; its output is on stderr.
     """
     command = [sys.executable, "-m", "gausim.benchmark.first_call", str(count), str(size)]
     environment = os.environ | {"NUMBA_CACHE_DIR": cache}

@@ -1,4 +1,4 @@
-"""What every benchmark shares: rows, interleaved timing and memory."""
+"""Tools of benchmarks: rows, interleaved timing and memory."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from gausim.kernels.operations import plain_forms
 class Row:
     """One measured figure."""
 
-    case: str  # what was run, with its sizes
-    metric: str  # what was measured of it
+    case: str  # the benchmark's case, with its sizes
+    metric: str  # the measured quantity
     value: float
     unit: str  # x for a ratio, 1 for a fraction
-    reference: str | None = None  # what a ratio or fraction compares with, in words
+    reference: str | None = None  # reference of a ratio or fraction, in words
 
 
 @dataclass(frozen=True)
 class Options:
-    """How a benchmark is run."""
+    """Options of a benchmark."""
 
     device: torch.device
-    threads: int = 1  # of torch and of the renderer, unless a case is about threads
-    quick: bool = False  # tiny sizes that take seconds; to see that the command works, not to quote
+    threads: int = 1  # of torch and of the renderer, except in cases about threads
+    quick: bool = False  # tiny sizes for a test of the command, in seconds
     rounds: int = 7  # timed calls of each candidate; the median is reported
 
 
 def seconds_of(call: Callable[[], object], device: torch.device, repeats: int = 1) -> float:
-    """Wall time of one call, its work on the device included; the mean of some calls in a row [s]."""
+    """Wall time of one call, including its work on the device; the mean of ``repeats`` calls [s]."""
     _synchronise(device)
     start = time.perf_counter()
     for _ in range(repeats):
@@ -68,15 +68,15 @@ def medians(
 ) -> dict[str, float]:
     """Median wall time of each candidate [s].
 
-    The candidates are called in turn, A B C A B C ..., so that a drift of the machine's speed meets all of them and
-    their ratios hold where single times do not.
+    The candidates are called in turn, A B C A B C ..., so that a drift of the machine's speed affects all of them and
+    cancels in their ratios.
 
     Args:
-        candidates: what is timed, by name.
-        options: the device to wait for and the number of rounds.
+        candidates: timed functions by name.
+        options: the device to synchronise with and the number of rounds.
         rounds: timed calls of each; ``options.rounds`` when None.
         warmup: calls of each that are not timed.
-        at_least: a shorter call is repeated until about so much time has gone, as the last of the warm-up took [s].
+        at_least: total time to which shorter calls are repeated, judged by the last call of the warm-up [s].
     """
     times: dict[str, list[float]] = {name: [] for name in candidates}
     repeats = dict.fromkeys(candidates, 1)
@@ -91,7 +91,7 @@ def medians(
 
 
 def plainly(call: Callable[[], object], names: Sequence[str] | None = None) -> Callable[[], None]:
-    """The call with these operations in their plain form, with all of them when None."""
+    """The call with the operations ``names`` in their plain form, all of them when None."""
 
     def plain() -> None:
         with plain_forms(names):
@@ -101,15 +101,15 @@ def plainly(call: Callable[[], object], names: Sequence[str] | None = None) -> C
 
 
 class _Kept:
-    """A tensor that the graph holds."""
+    """A tensor that the graph keeps."""
 
     def __init__(self, tensor: Tensor) -> None:
-        # Detached: an operation that saves its own result would hold itself for ever.
+        # Detached, because an operation that saves its result would create a reference cycle.
         self.tensor = tensor.detach()
 
 
 class _Ledger:
-    """Bytes of the distinct storages that the graph holds, and the most there were at one time."""
+    """Bytes of the distinct storages that the graph keeps, now and at most."""
 
     def __init__(self) -> None:
         self.now = self.peak = 0
@@ -130,10 +130,10 @@ class _Ledger:
 
 
 def peak_saved_bytes(call: Callable[[], object]) -> int:
-    """The most bytes of distinct storages that autograd keeps at one time for backward passes while ``call`` runs.
+    """Peak size of the distinct storages that autograd keeps for backward passes during ``call`` [bytes].
 
-    Counts what the graph holds, whatever the allocator does, so the figure is the same in every run. Parameters and
-    inputs that the graph keeps are counted too: they stand on both sides of a ratio.
+    It counts the graph's tensors, independent of the allocator, so the figure is the same in every run. It includes
+    parameters and inputs that the graph keeps, on both sides of a ratio.
     """
     ledger = _Ledger()
     with torch.autograd.graph.saved_tensors_hooks(ledger.keep, lambda kept: kept.tensor):
@@ -143,24 +143,24 @@ def peak_saved_bytes(call: Callable[[], object]) -> int:
 
 def peak_resident() -> int:
     """Largest resident memory of this process so far [bytes]."""
-    known = process_memory("VmHWM")  # getrusage counts what the parent held when it started this process
+    known = process_memory("VmHWM")  # getrusage includes the parent's memory at the start of this process
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return known or (peak if sys.platform == "darwin" else 1024 * peak)
 
 
 def process_memory(field: str, file: str = "/proc/self/status") -> int:
-    """A field of a file of Linux' /proc [bytes]; 0 where the system has none."""
+    """A field of a file in Linux' /proc [bytes]; 0 on other systems."""
     lines = Path(file).read_text().splitlines() if Path(file).is_file() else []
     return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{field}:")), 0)
 
 
 @contextmanager
 def spent_in(parts: Mapping[str, Sequence[tuple[Any, str]]], device: torch.device) -> Iterator[dict[str, float]]:
-    """Seconds that pass within functions while the block runs, by the name of their part.
+    """Context that measures the time spent in functions, by the name of their part [s].
 
     Args:
-        parts: for every name the places of its functions: module or class, and attribute.
-        device: is waited for before a clock is read.
+        parts: functions of each part, as module or class and attribute.
+        device: device to synchronise with before each reading of the clock.
     """
     seconds = dict.fromkeys(parts, 0.0)
 
@@ -182,7 +182,7 @@ def spent_in(parts: Mapping[str, Sequence[tuple[Any, str]]], device: torch.devic
 
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
-    """Runs a block with this many threads inside torch's operations."""
+    """Context with ``count`` threads in torch's operations."""
     before = torch.get_num_threads()
     torch.set_num_threads(count)
     try:

@@ -1,4 +1,4 @@
-"""Benchmark: what a frame of an object that is pushed about costs, from the force to the bytes for the browser."""
+"""Benchmark of interaction: cost of a frame from the force to the bytes for the browser."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gausim.viewer.coloring import VIEW, Painter
 from gausim.viewer.splats import Placing, pack
 
 SIZES = {False: (2_000, 20_000), True: (300,)}
-# Parts of a step by what they serve.
+# Parts of a step by purpose.
 GROUPS = {
     "graph": ("aggregation", "edges", "features", "normalisers"),
     "network": ("network",),
@@ -25,7 +25,7 @@ GROUPS = {
 
 
 def run(options: Options, build: Build) -> list[Row]:
-    """Simulated frames per second, and the time of a frame divided into parts; weights are those of no training."""
+    """Simulated frames per second, and the parts of a frame's time, with untrained weights."""
     with torch_threads(options.threads):
         return [row for count in SIZES[options.quick] for row in _frame(count, options, build)]
 

@@ -1,4 +1,4 @@
-"""The textbook MeshGraphNet layer: what the network's tests and its benchmark compare with."""
+"""The textbook MeshGraphNet layer, reference of the network's tests and benchmark."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def naive_network(
 ) -> Float[Tensor, "N Co"]:
     """The function of ``network``, with its weights, in plain differentiable torch.
 
-    The edge update sees the concatenation [edge, source, destination] (Pfaff et al. 2021, equation 1) in one linear
-    layer, whose matrix is put together from the three of the split form. No option of ``network`` matters here.
+    The edge update has one linear layer on the concatenation [edge, source, destination] (Pfaff et al. 2021, equation
+    1), whose matrix is composed of the three of the split form. Options of ``network`` have no effect.
     """
     nodes, edges = _mlp(network.node_encoder, node_features), _mlp(network.edge_encoder, edge_features)
     source, destination = edge_index

@@ -1,4 +1,4 @@
-"""The graph network against the textbook form: time, fraction of the matrix product's peak, memory of training."""
+"""Benchmark of the graph network: time against the textbook form, fraction of the peak, memory of training."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NAIVE = "the textbook form in fp32"
 
 
 class Size(NamedTuple):
-    """Of the graph and the network; by default the fine level of the paper's scene with up to 16 + 16 neighbours."""
+    """Size of graph and network; by default the fine level of the paper's scene with up to 16 + 16 neighbours."""
 
     nodes: int = 1203
     edges: int = 30_000
@@ -31,7 +31,7 @@ class Size(NamedTuple):
 
 
 def run(options: Options) -> list[Row]:
-    """Forward and forward + backward of every variant, their ratios to the textbook form, and what training keeps.
+    """Forward and forward + backward of every variant, ratios to the textbook form, and memory of the graph.
 
     Fraction of the peak: useful operations (:func:`useful_flops`) per second over the rate of torch's float32 matrix
     product (:func:`gausim.benchmark.peaks.peaks`). It may exceed 1, as bfloat16 is faster than float32.
@@ -73,8 +73,8 @@ def useful_flops(network: MeshGraphNet, nodes: int, edges: int) -> tuple[float, 
     """Floating-point operations of the linear layers in one forward pass, and in one backward pass.
 
     A layer of ``rows`` rows takes ``2 rows inputs outputs`` forward and twice that backward (gradients of its inputs
-    and of its matrix), except that the encoders' inputs need no gradient. Counted in the split form, so that the
-    products the textbook form repeats per edge are not useful; norms, activations, gathers and recomputation neither.
+    and of its matrix), except that the encoders' inputs need no gradient. The split form is counted, without the
+    products that the textbook form repeats per edge, norms, activations, gathers and recomputation.
     """
     forward = backward = 0.0
     for name, layer in network.named_modules():

@@ -1,6 +1,6 @@
-"""The machine, and what it can do at best, measured in the same run: what every fraction of a peak is of."""
+"""Peak rates of the machine, measured in the same run as the fractions of them."""
 
-# Annotations would be checked by beartype in the tests, around a function that numba has to compile.
+# Annotations would make beartype, in tests, wrap a function that numba compiles.
 # mypy: allow-untyped-defs, allow-untyped-calls, disable-error-code="misc"
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ TRIES = 7
 
 @dataclass(frozen=True)
 class Peaks:
-    """Best rates of one thread count on one device."""
+    """Peak rates for one number of threads on one device."""
 
-    fma: float  # float32 fused multiply-adds in registers [FLOP/s], one CPU thread; 0 on a GPU, where nothing compares
+    fma: float  # float32 fused multiply-adds in registers [FLOP/s], one CPU thread; 0 on a GPU
     gemm: float  # float32 matrix product [FLOP/s]
     copy: float  # bytes read plus bytes written by a copy much larger than the caches [B/s]
 
@@ -54,7 +54,7 @@ _fma_loop = _make_fma_loop()
 
 
 def fma_peak(threads: int = 1) -> float:
-    """Fused multiply-adds per second of that many threads together, times two [FLOP/s]."""
+    """Twice the fused multiply-adds per second of ``threads`` threads together [FLOP/s]."""
     scale, shift = np.float32(0.9999), np.float32(1e-4)
 
     def loop(rounds: int) -> None:
@@ -80,7 +80,7 @@ def peaks(options: Options) -> Peaks:
 
 
 def processor() -> str:
-    """The processor's name, as the system gives it."""
+    """The processor's name according to the system."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
@@ -88,7 +88,7 @@ def processor() -> str:
 
 
 def machine(options: Options) -> dict[str, str]:
-    """What figures were measured on: processor, device, software and the peaks measured now."""
+    """Processor, device and software of the benchmark, with the peaks measured now."""
     best = peaks(options)
     rates = [f"fused multiply-add {best.fma / 1e9:.0f} GFLOP/s"] if best.fma else []
     rates += [f"matrix product {best.gemm / 1e9:.0f} GFLOP/s", f"copy {best.copy / 1e9:.1f} GB/s"]

@@ -1,4 +1,4 @@
-"""Rendering: the CPU renderer against plain torch in tiles and the processor's peak; threads, compilation, memory."""
+"""Benchmark of rendering: CPU renderer against plain torch and the processor's peak; threads, compilation, memory."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ VIEWS = 4
 UNITS, SH_DEGREE = 1_203, 3
 TORCH = "render=reference: plain torch in tiles, float32, one thread, same run"
 FMA = "the processor's fused multiply-add peak, same run; operations of raster.py x pixels evaluated"
-# Short calls are timed several in a row: in training, too, a call of the renderer follows others.
+# Calls shorter than this are timed several in a row, as in training, where a call of the renderer follows others.
 SHORT_CALLS = 0.02  # [s]
 PARTS = {
     "projection": "project",
@@ -45,7 +45,7 @@ PARTS = {
 
 
 def run(options: Options) -> list[Row]:
-    """Figures of the CPU renderer or, where the device is a GPU, of gsplat's."""
+    """Figures of the CPU renderer or, on a GPU, of gsplat."""
     if options.device.type == "cuda":
         return _gsplat(options)
     cases = QUICK_CASES if options.quick else CASES
@@ -63,7 +63,7 @@ def _name(count: int, size: int) -> str:
 
 
 def _against_torch(name: str, scene: Splats, options: Options) -> list[Row]:
-    """Forward alone and forward with all gradients, one thread, against plain torch."""
+    """Forward pass, and forward and backward pass, with one thread, against plain torch."""
     rows, weights = [], scene.weights()
     renderers: dict[str, Renderer] = {"own": CpuRenderer(threads=1), "torch": ReferenceRenderer()}
     for metric, call in (("forward", Splats.forward), ("forward + backward", partial(Splats.both, weights=weights))):
@@ -78,7 +78,7 @@ def _against_torch(name: str, scene: Splats, options: Options) -> list[Row]:
 
 
 def _parts(name: str, scene: Splats, options: Options) -> list[Row]:
-    """The parts of an image within the renderer, and what the hot loops reach of the peak."""
+    """Times of the renderer's parts, and the fraction of the peak that the hot loops reach."""
     renderer, weights = CpuRenderer(threads=1), scene.weights()
     with spent_in({part: [(Batch, method)] for part, method in PARTS.items()}, options.device) as seconds:
         for _ in range(options.rounds):
@@ -94,7 +94,7 @@ def _parts(name: str, scene: Splats, options: Options) -> list[Row]:
 
 
 def bands_of(scene: Splats) -> list[Band]:
-    """The bands of an image as drawing leaves them."""
+    """The bands of an image after rendering."""
     bands, own = [], Batch.composite
 
     def composite(batch: Batch, band: Band, images: Any) -> None:
@@ -107,12 +107,12 @@ def bands_of(scene: Splats) -> list[Band]:
 
 
 def evaluated(bands: list[Band]) -> int:
-    """Pixels for which the two loops evaluate a kernel: sixteen for each that a block of pixels looks at."""
+    """Number of kernel evaluations in the two loops: sixteen pixels for each kernel of a block."""
     return LANES * sum(int(band.used[:, :BLOCKS].sum()) for band in bands)
 
 
 def _threads(cases: tuple[tuple[int, int], ...], options: Options) -> list[Row]:
-    """Two threads against one, for one view and for several views in one call."""
+    """Two threads against one, for one view and for several in one call."""
     if len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)) < 2:
         print("render: this process has one core; two threads are not measured.", file=sys.stderr)
         return []
@@ -132,7 +132,7 @@ def _threads(cases: tuple[tuple[int, int], ...], options: Options) -> list[Row]:
 
 
 def _appearance(count: int, options: Options) -> list[Row]:
-    """Colours and covariances of deformed kernels, which every image starts from."""
+    """Colours and covariances of deformed kernels, the inputs of rendering."""
     state = deformed(count, UNITS, VIEWS, SH_DEGREE)
     name = f"colours and covariances, {count} kernels, {VIEWS} views, degree {SH_DEGREE}"
     rows = []
@@ -147,7 +147,7 @@ def _appearance(count: int, options: Options) -> list[Row]:
 
 
 def _first_call(count: int, size: int) -> list[Row]:
-    """First calls in new processes: with an empty cache of compiled code, then with a filled one."""
+    """First calls in new processes, with an empty and with a filled cache of compiled code."""
     rows, name = [], f"first call, {count} kernels, {size} x {size}"
     with tempfile.TemporaryDirectory() as cache:
         for state in ("compiles", "cached"):

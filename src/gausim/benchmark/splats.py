@@ -1,4 +1,4 @@
-"""Random Gaussians and cameras that the cases of the renderer draw."""
+"""Random Gaussians and cameras for benchmarks of the renderer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gausim.ops.deformation import polar_rotation
 from gausim.render.draw import SceneAppearance
 
 SPREAD = 0.4  # standard deviation of the means [scene units]
-DISTANCE = 2.5  # of the cameras from the middle [scene units]
+DISTANCE = 2.5  # of the cameras from the centre [scene units]
 FOCAL = 1.2  # [image widths]
 TURN = 0.7  # angle between two cameras [rad]
 
@@ -34,17 +34,17 @@ class Splats(NamedTuple):
     size: tuple[int, int]
 
     def to(self, device: torch.device) -> Splats:
-        """The same on a device."""
+        """Moves all fields to a device."""
         moved = {name: value.to(device) for name, value in self._asdict().items() if name != "size"}
         return self._replace(**moved)
 
     @torch.no_grad()
     def forward(self, renderer: Renderer) -> Rendered:
-        """Images without a graph."""
+        """Renders without a graph."""
         return self._draw(renderer)
 
     def both(self, renderer: Renderer, weights: Float[Tensor, "1 V H W 3"]) -> tuple[Tensor, ...]:
-        """Gradients of the images, summed under ``weights``, with respect to the first five fields."""
+        """Gradients of the weighted sum of the images with respect to the first five fields."""
         names = self._fields[:5]
         leaves = {name: getattr(self, name).detach().requires_grad_() for name in names}
         images = self._replace(**leaves)._draw(renderer)
@@ -55,7 +55,7 @@ class Splats(NamedTuple):
         return renderer(*kernels, self.viewmats, self.Ks, self.size, background=self.background)
 
     def weights(self) -> Float[Tensor, "1 V H W 3"]:
-        """Gradients of the images, as random as the scene."""
+        """Random loss gradients with respect to the images."""
         width, height = self.size
         generator = torch.Generator().manual_seed(1)
         shape = (*self.viewmats.shape[:2], height, width, 3)
@@ -63,10 +63,10 @@ class Splats(NamedTuple):
 
 
 def splats(count: int, width: int, height: int, views: int = 1) -> Splats:
-    """A cloud of ``count`` kernels before cameras that turn around it.
+    """A cloud of ``count`` kernels with cameras around it.
 
     Means are normal, scales log-normal about 0.5 / sqrt(count), so that clouds of any count cover about the same
-    share of an image; orientations and colours are random, opacities uniform.
+    fraction of an image; orientations and colours are random, opacities uniform.
     """
     g = torch.Generator().manual_seed(0)
     log_scales = 0.5 * torch.randn(1, count, 3, generator=g) + math.log(0.5 / count**0.5)
@@ -90,9 +90,9 @@ def splats(count: int, width: int, height: int, views: int = 1) -> Splats:
 
 
 def deformed(count: int, units: int, views: int, degree: int) -> tuple[Tensor, ...]:
-    """What the appearance of random kernels with deformation gradients near one is computed from.
+    """Arguments of :func:`gausim.render.draw.deformed_appearance` for random kernels.
 
-    The arguments of :func:`gausim.render.draw.deformed_appearance`; colours are spherical harmonics of that degree.
+    Deformation gradients are near the identity; colours are spherical harmonics of degree ``degree``.
     """
     g = torch.Generator().manual_seed(0)
     deformation_gradients = torch.eye(3) + 0.1 * torch.randn(1, units, 3, 3, generator=g)
@@ -114,12 +114,12 @@ Form = Callable[..., tuple[Tensor, ...]]
 
 @torch.no_grad()
 def without_graph(form: Form, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """What a form computes of a deformed state."""
+    """Result of a form for a deformed state, without a graph."""
     return form(*state)
 
 
 def gradients(form: Form, state: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """Gradients of all that a form computes with respect to positions, deformation gradients and rotations."""
+    """Gradients of a form's results with respect to positions, deformation gradients and rotations."""
     leaves = [value.detach().requires_grad_() for value in state[:3]]
     outputs = form(*leaves, *state[3:])
     return torch.autograd.grad(outputs, leaves, [torch.ones_like(output) for output in outputs])

@@ -1,4 +1,4 @@
-"""One predicted frame without rendering, with and without hierarchy and part by part; the steps of a training batch."""
+"""Benchmark of one predicted frame without rendering, with and without hierarchy, and of a training batch's steps."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ from gausim.nn.normaliser import RunningNormaliser
 CLUSTERING = "agglomerative"
 # Edge lengths of the two levels, coarse to fine, and of the kernels without hierarchy [fractions of the diagonal].
 EDGE_LENGTHS, KERNEL_LEVEL = (2.0, 0.4), "hierarchy.levels=[{diameter:0.0,edge_length:0.1}]"
-# Calls of what takes long; its first call is not timed either.
+# Timed calls of slow candidates; here, too, the first call is not timed.
 LONG_ROUNDS = 2
 PAPER_RATIO = "with hierarchy, same run (the paper: 2.8 in time, 1.7 in memory, rendering included)"
-# What the neural simulator's speed is compared with.
+# References of the neural simulator's speed.
 ELASTIC, PLAIN = "model=gausim_elastic, same run", "the same steps by the plain forms of all operations"
 
 # Makes the untrained simulator of ``conf/model/PRESET.yaml`` for a scene: build(preset, scene, *settings), settings
-# KEY=VALUE of it. Given by the command, which knows the configurations.
+# KEY=VALUE of it. The command passes it in, because it composes the configurations.
 Build = Callable[..., GausSim]
 
 
 @dataclass(frozen=True)
 class Size:
-    """How large the cases are; the defaults are the paper's scene and a training batch of the bunny."""
+    """Sizes of the cases; the defaults are the paper's scene and a training batch of the bunny."""
 
     kernels: int = 23_422
     units: tuple[int, int] = (1_203, 11)  # of levels 1 and 2
@@ -62,16 +62,16 @@ QUICK = Size(400, (40, 6), 2, 300, (30, 5), 2, ("network.hidden=16", "network.la
 
 
 def run(options: Options, build: Build) -> list[Row]:
-    """Times, fractions outside the network, parts and memory; sizes are those of :class:`Size`."""
+    """Times, fractions outside the network, parts and memory, for the sizes of :class:`Size`."""
     size = QUICK if options.quick else Size()
     with torch_threads(options.threads):
         return [*_paper(size, options, build), *_training(size, options, build)]
 
 
 def cloud(count: int, name: str, *, degree: int = 1) -> GaussianScene:
-    """Kernels spread evenly through an ellipsoid with axes 0.8, 0.6 and 1, the lowest twentieth pinned.
+    """Kernels uniform in an ellipsoid with axes 0.8, 0.6 and 1, the lowest twentieth pinned.
 
-    Their colours are spherical harmonics of this degree.
+    Their colours are spherical harmonics of degree ``degree``.
     """
     generator = torch.Generator().manual_seed(0)
     x = torch.randn(count, 3, generator=generator)
@@ -89,7 +89,7 @@ def cloud(count: int, name: str, *, degree: int = 1) -> GaussianScene:
 
 
 def levels_of(scene: GaussianScene, units: Sequence[int]) -> str:
-    """The setting of the levels that have about so many units, fine to coarse; diameters are found by bisection."""
+    """Setting of levels with about ``units`` units, fine to coarse; diameters are found by bisection."""
     found: tuple[float, ...] = ()
     for wanted in units:
         low, high = 0.0, 1.0
@@ -105,7 +105,7 @@ def levels_of(scene: GaussianScene, units: Sequence[int]) -> str:
 
 
 def parts(template: PreparedTemplate) -> Mapping[str, Sequence[tuple[Any, str]]]:
-    """Where the parts of a step are computed, for :func:`gausim.benchmark.harness.spent_in`."""
+    """Functions of the parts of a step, for :func:`gausim.benchmark.harness.spent_in`."""
     kind = type(template)
     return {
         "aggregation": [(Prepared, "aggregate"), (Prepared, "per_level")],
@@ -150,7 +150,7 @@ def _paper(size: Size, options: Options, build: Build) -> list[Row]:
 
 
 def _training(size: Size, options: Options, build: Build) -> list[Row]:
-    """All steps of a training batch of the neural simulator, beside the elastic one and its own plain forms."""
+    """All steps of a training batch of the neural simulator, against the elastic one and the plain forms."""
     scene = cloud(size.bunny, "bunny")
     levels = levels_of(scene, size.bunny_units)
     bound, elastic = (
@@ -182,21 +182,21 @@ def _outside(case: str, metric: str, times: dict[str, float]) -> list[Row]:
 
 
 def _available_memory(device: torch.device) -> int:
-    """Bytes that can still be had without swapping."""
+    """Memory available without swapping [bytes]."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
     return process_memory("MemAvailable", "/proc/meminfo") or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def _bent(batch: SceneBatch, amount: float) -> Tensor:
-    """Positions (K, 3) of the batch's scenes bent sideways, so that some neighbours are others than at rest."""
+    """Positions (K, 3) of the batch's scenes bent sideways, so that some neighbours differ from those at rest."""
     height = batch.rest[:, 2] - batch.rest[:, 2].min()
     bent = batch.rest + torch.stack((amount * height**2, torch.zeros_like(height), torch.zeros_like(height)), 1)
     return torch.where((batch.kernels.unit < 0)[:, None], batch.rest, bent)
 
 
 class Bound:
-    """A simulator with random weights, a batch of its scene in motion, and what is timed of it."""
+    """A simulator with random weights and a batch of its scene in motion; the methods are timed."""
 
     def __init__(self, model: GausSim, members: int, options: Options, *, steps: int = 1) -> None:
         self.model, self.steps = model.to(options.device), steps
@@ -212,10 +212,10 @@ class Bound:
         with torch.no_grad():
             self.model.eval().step(self.batch, self.state)
         handle.remove()
-        return seen[-len(self.batch.levels) :]  # behind those of the anchor, where there is one
+        return seen[-len(self.batch.levels) :]  # after those of the anchor, if there is one
 
     def differentiable(self) -> Tensor:
-        """All steps with a graph from the initial state and the parameters; one number to differentiate."""
+        """All steps with a graph from the initial state and the parameters; returns a scalar to differentiate."""
         state = SimState(self.state.positions, self.state.previous.clone().requires_grad_())
         prepared, total = self.model.prepare(self.batch), self.batch.rest.new_zeros(())
         for _ in range(self.steps):
@@ -226,13 +226,13 @@ class Bound:
         return total
 
     def both(self) -> None:
-        """Forward and backward, statistics of the inputs included."""
+        """Forward and backward pass, with the input statistics."""
         self.model.train().zero_grad()
         self.differentiable().backward()
 
     @torch.no_grad()
     def forward(self) -> None:
-        """Forward without a graph."""
+        """Forward pass without a graph."""
         self.model.eval()
         prepared, state = self.model.prepare(self.batch), self.state
         for _ in range(self.steps):
@@ -240,12 +240,12 @@ class Bound:
 
     @torch.no_grad()
     def network_forward(self) -> None:
-        """The network of one step alone."""
+        """Forward pass of one step's network alone."""
         for inputs in self._inputs:
             self.model.predictor.network(*inputs)
 
     def network_both(self) -> None:
-        """The network of one step alone, with gradients of its inputs and weights."""
+        """Forward and backward pass of one step's network alone, to its inputs and weights."""
         self.model.zero_grad()
         network = self.model.predictor.network
         differentiable = [(n.clone().requires_grad_(), e.clone().requires_grad_(), i) for n, e, i in self._inputs]
@@ -253,7 +253,7 @@ class Bound:
 
     @torch.no_grad()
     def parts(self, options: Options) -> dict[str, float]:
-        """Seconds of the parts of a forward step, and of what its stretch prepares once."""
+        """Times of the parts of a forward step and of the stretch's preparation [s]."""
         self.model.eval()
         constants = medians({"constants": lambda: self.model.prepare(self.batch)}, options)
         prepared = self.model.prepare(self.batch)

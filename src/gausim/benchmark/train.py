@@ -1,4 +1,4 @@
-"""Training: sequence-steps per second of whole optimiser steps, what takes the time and what the graph holds."""
+"""Benchmark of training: sequence-steps per second of optimiser steps, times of their parts, memory of the graph."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from gausim.kernels.operations import OPERATIONS
 from gausim.training.module import GausSimModule
 from gausim.training.supervision.comparison import Comparison
 
-# Sequences of an optimiser step, at most as many as there are; timed steps of plain torch, which takes long.
+# Largest number of sequences of an optimiser step; timed steps of plain torch, which is slow.
 SEQUENCES, REFERENCE_ROUNDS = 4, 2
 
 
 @dataclass
 class _Case:
-    """A module with a batch and an optimiser that learns nothing, so that every step is the same work."""
+    """A module with a batch and an optimiser of rate zero, so that all steps are equal."""
 
     module: GausSimModule
     samples: list[SequenceSample]
@@ -45,7 +45,7 @@ class _Case:
         samples = [index.sample(i, range(steps + 1), v).to(options.device) for i, v in zip(chosen, views, strict=True)]
         module.to(options.device)
         module.train()
-        module.measuring = False  # the gradients' fractions are measured in every fiftieth step
+        module.measuring = False  # gradient fractions are measured in every fiftieth step only
         optimizer = module.configure_optimizers()
         for group in optimizer.param_groups:
             group["lr"] = 0.0
@@ -60,7 +60,7 @@ class _Case:
         return _Case(self.module, samples, self.optimizer)
 
     def step(self, *, static: bool = False) -> None:
-        """One optimiser step with or without the static loss, which only some batches carry."""
+        """One optimiser step with or without the static loss, which only some batches have."""
         own = self.module.objective
         self.module.objective = replace(own, static_probability=1.0 if static and own.static_weight else 0.0)
         try:
@@ -72,13 +72,13 @@ class _Case:
 def run(
     options: Options, module: GausSimModule, datamodule: ReadyDataModule, others: Mapping[str, GausSimModule]
 ) -> list[Row]:
-    """Times optimiser steps and their parts, and counts what the graph holds.
+    """Times of optimiser steps and their parts, and memory of the graph.
 
     Args:
-        options: how; a quick run predicts three frames, another one as many as the curriculum's last.
-        module: what is trained; its weights do not change, its running statistics do.
-        datamodule: where sequences come from.
-        others: modules of the same data whose speed is compared, by the setting that chooses them.
+        options: options; a quick run predicts three frames, another one the curriculum's largest T.
+        module: trained module; its weights stay constant, its running statistics change.
+        datamodule: source of the sequences.
+        others: modules of the same data for comparison, by the setting that selects them.
     """
     datamodule.setup("fit")
     t_max = datamodule.curriculum.t_max
@@ -120,7 +120,7 @@ def _speed(name: str, case: _Case, rivals: Mapping[str, _Case], options: Options
 
 
 def _parts(case: _Case, options: Options) -> dict[str, float]:
-    """Seconds of the parts of a step without the static loss, means over the rounds."""
+    """Times of the parts of a step without the static loss, means over the rounds [s]."""
     module, optimizer = case.module, type(case.optimizer)
     places: dict[str, list[tuple[Any, str]]] = {
         "rollout": [(type(module.simulator), "prepare"), (type(module.simulator), "step")],

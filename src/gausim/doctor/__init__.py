@@ -1,1 +1,1 @@
-"""Looks at a data set before hours of training are spent on it, and says what is wrong and how to mend it."""
+"""Checks of a data set before training, with findings and remedies."""

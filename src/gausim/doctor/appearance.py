@@ -1,4 +1,4 @@
-"""Appearance: texture for the loss gradient to hold on to, and steady exposure."""
+"""Checks of appearance: texture, which loss gradients need, and constant exposure."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from scipy.ndimage import median_filter
 from gausim.doctor.evidence import Evidence, Watched
 from gausim.doctor.finding import Finding, listed
 
-# Mean slope of the colours within the object [1/255 per reduced pixel] below which it counts as plain.
+# Mean slope of the colours within the object below which it counts as plain [1/255 per reduced pixel].
 _PLAIN = 2.5
-# Relative jumps of the brightness: over time in more than a fraction of the frames, and of a camera against the others.
+# Relative jumps of brightness over time, the fraction of frames with them, and difference between cameras.
 _FLICKER, _OFTEN, _BETWEEN = 0.03, 0.1, 0.15
-# What is opaque, and how far from the edge the inside begins [reduced pixels].
+# Smallest alpha of opaque pixels, and distance of the interior from the edge [reduced pixels].
 _OPAQUE, _INSIDE = 230, 3
 
 
@@ -25,7 +25,7 @@ def _inside(alpha: np.ndarray) -> np.ndarray:
 
 
 def find_plain(evidence: Evidence) -> Iterator[Finding]:
-    """Colours that hardly change within the object."""
+    """Finds objects of nearly constant colour."""
     item, slopes = evidence.first[0], []
     for v in range(len(evidence.views)):
         inside, gray = _inside(item.alpha[0, v]), item.gray[0, v] * 255
@@ -42,7 +42,7 @@ def find_plain(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _brightness(item: Watched, view: int) -> np.ndarray:
-    """Mean over the opaque foreground per frame, (F,); NaN where there is none."""
+    """Mean brightness of the opaque foreground per frame, (F,); NaN without any."""
     opaque = item.alpha[:, view] > _OPAQUE
     count = opaque.sum((-1, -2))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -50,7 +50,7 @@ def _brightness(item: Watched, view: int) -> np.ndarray:
 
 
 def find_flicker(evidence: Evidence) -> Iterator[Finding]:
-    """Brightness that jumps from frame to frame."""
+    """Finds brightness that jumps from frame to frame."""
     fractions: dict[str, float] = {}
     for v, view in enumerate(evidence.views):
         jumps = []
@@ -66,12 +66,12 @@ def find_flicker(evidence: Evidence) -> Iterator[Finding]:
             f"The brightness of {listed(flickers)} jumps from frame to frame (by more than {_FLICKER:.0%} in "
             f"{max(fractions.values()):.0%} of the frames): automatic exposure, or lamps on mains.",
             "Film with fixed exposure, at a shutter time that suits the mains (1/50 or 1/100 s at 50 Hz).",
-            {"share": fractions},
+            {"fraction": fractions},
         )  # fmt: skip
 
 
 def find_uneven_cameras(evidence: Evidence) -> Iterator[Finding]:
-    """Brightness that differs from camera to camera."""
+    """Finds brightness that differs from camera to camera."""
     if evidence.rest is None or evidence.fits is None:
         return
     item, drawn, gains = evidence.first[0], evidence.rest[0], {}

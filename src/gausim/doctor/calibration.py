@@ -1,4 +1,4 @@
-"""Calibration: whether every camera sees the rest scene where frame 0 shows the object."""
+"""Check of calibration: agreement of the rest scene with frame 0 in every camera."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from gausim.doctor.evidence import Evidence
 from gausim.doctor.finding import Finding, listed
 from gausim.doctor.silhouettes import Fit
 
-# Below this overlap a silhouette does not lie on the object at all; above the other a reading fits.
+# Overlap below which a silhouette misses the object, and above which a reading of the calibration fits.
 _MISSED, _FITS = 0.5, 0.8
-# Displacements of silhouettes, as fractions of the picture's longer side: worth a word, and spoiling a training.
+# Displacements of silhouettes that are a warning and a fault [fractions of the image's longer side].
 _WORTH, _SPOILS = 0.006, 0.012
-# Overlap after the best shift and turn, below which the scene has another shape than the object.
+# Overlap after the best shift and rotation, below which scene and object differ in shape.
 _SHAPE = 0.85
 
 
 def find_calibration_faults(evidence: Evidence) -> Iterator[Finding]:
-    """Compares the silhouettes of the rest scene with frame 0, camera by camera, and tries other conventions."""
+    """Compares the rest scene's silhouettes with frame 0 in every camera, and tests other conventions."""
     if evidence.fits is None:
         yield Finding(
             "note", "certain", "There is no rest scene yet, so poses and lenses were not compared with it.",
@@ -38,10 +38,9 @@ def find_calibration_faults(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _consistent_shift(fits: Sequence[Fit]) -> float:
-    """Median displacement over sequences [reduced pixels]; 0 where it differs from sequence to sequence.
+    """Median displacement over sequences [reduced pixels]; 0 if it differs from sequence to sequence.
 
-    A camera that is not where its file says is off by the same in every sequence; an object that is not at rest in
-    frame 0 is not.
+    A wrong camera pose gives the same displacement in every sequence; an object that moves in frame 0 does not.
     """
     pixels = np.array([fit.pixels for fit in fits])
     if not np.isfinite(pixels).all():
@@ -57,7 +56,7 @@ def _moved(evidence: Evidence, fits: dict[str, tuple[Fit, ...]]) -> Iterator[Fin
     worth = [view for view, pixels in off.items() if pixels > _WORTH * longer]
     if not worth:
         return
-    told = "; ".join(_told(view, fits[view], scale) for view in worth)
+    told = "; ".join(_sentence(view, fits[view], scale) for view in worth)
     if 2 * len(worth) < len(off):
         rest = max(pixels for view, pixels in off.items() if view not in worth) / scale
         are, them = ("is", "it") if len(worth) == 1 else ("are", "them")
@@ -81,7 +80,7 @@ def _moved(evidence: Evidence, fits: dict[str, tuple[Fit, ...]]) -> Iterator[Fin
     yield Finding("fault" if spoils else "warning", "certain" if sure else "likely", what, remedy, measured)
 
 
-def _told(view: str, fits: Sequence[Fit], scale: float) -> str:
+def _sentence(view: str, fits: Sequence[Fit], scale: float) -> str:
     if not math.isfinite(np.median([fit.pixels for fit in fits])):
         return f"the rest scene is outside the picture of {view}"
     pixels, degrees = (float(np.median([getattr(fit, key) for fit in fits])) for key in ("pixels", "degrees"))

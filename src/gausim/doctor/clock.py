@@ -1,4 +1,4 @@
-"""Synchronisation: whether the cameras show the same motion in the same frame."""
+"""Check of synchronisation: whether the cameras show the same motion in the same frame."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from gausim.doctor.coverage import view_directions
 from gausim.doctor.evidence import Evidence, Watched
 from gausim.doctor.finding import Finding
 
-# Frames by which a camera may be early or late.
+# Largest tested shift of a camera [frames].
 FURTHEST = 8
-# Correlation that a shift must reach, and gain over no shift, of several sequences together and of one alone.
+# Correlation that a shift must reach, and its gain over no shift, of several sequences together and of one alone.
 _REACHED, _GAIN = 0.5, 0.25
 _REACHED_ALONE, _GAIN_ALONE = 0.65, 0.5
-# Energy is seen at another phase from another side where the object runs round, so the middles of the masks count as
-# much, where their correlation tells anything. Where it does not, energy must reach so much, and gain so much.
+# The energy's phase depends on the view where the object moves in a circle, so the centres of the masks have equal
+# weight if their correlation reaches this. Otherwise the energy alone must reach, and gain, the values after it.
 _TELLING = 0.5
 _REACHED_BY_ITSELF, _GAIN_BY_ITSELF = 0.8, 0.6
-# Overlap with the rest scene below which a camera's pose is no help.
+# Overlap with the rest scene below which a camera's pose is not used.
 _SOMEWHERE = 0.5
-# A camera whose motion correlates less than this with the others' cannot be placed.
+# Correlation with the other cameras' motion below which a camera's shift is undetermined.
 _UNLIKE = 0.3
-# Frames below which nothing can be correlated.
+# Smallest number of frames for a correlation.
 _FEW = 2 * FURTHEST
 
 
 @dataclass(frozen=True, eq=False)
 class _Series:
-    """How one sequence moves over time in each view."""
+    """Motion of one sequence over time in each view."""
 
     name: str
     energy: np.ndarray  # (F - 1, V), see motion_energy
     middles: np.ndarray  # (F, V, 2) of the masks [reduced pixels]
-    seen: np.ndarray  # (V, 2, 3) change of each picture by a change in space at the object [reduced pixels per unit]
+    seen: np.ndarray  # (V, 2, 3) derivative of image by space coordinates at the object [reduced pixels per unit]
 
 
 def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
-    """Correlates every camera's motion energy over time with that of the others, and the middles of the masks."""
+    """Finds shifted cameras by the correlation of motion energy and of mask centres with the other cameras."""
     items = [item for item in evidence.watched if len(item.alpha) >= _FEW]
     series = [_Series(i.name, motion_energy(i), _middles(i), _jacobians(evidence, i.cameras)) for i in items]
     if not series or len(evidence.views) < 2 or max(float(s.energy.max()) for s in series) == 0:
@@ -59,11 +59,11 @@ def find_clock_faults(evidence: Evidence) -> Iterator[Finding]:
             "Compare it by eye in motion.png (--out DIR).", {"view": view},
         )  # fmt: skip
     if any(lags.values()):
-        yield from _told(evidence, lags, guessed, [s.name for s in series])
+        yield from _findings(evidence, lags, guessed, [s.name for s in series])
         return
     for one in series:
         lags, _, guessed = _lags([one], _REACHED_ALONE, _GAIN_ALONE)
-        yield from _told(evidence, lags, guessed, [one.name])
+        yield from _findings(evidence, lags, guessed, [one.name])
 
 
 def motion_energy(item: Watched) -> np.ndarray:
@@ -80,7 +80,7 @@ def motion_energy(item: Watched) -> np.ndarray:
 def _energy_correlation(series: Sequence[_Series], view: int, lags: dict[int, int]) -> np.ndarray:
     """Correlation of a view's energy with the mean of the others', by lag from -FURTHEST to FURTHEST (late: positive).
 
-    ``lags`` is by how much views are late, as far as known.
+    ``lags`` are the known delays of views [frames].
     """
     found = np.zeros(2 * FURTHEST + 1)
     for energy in (s.energy for s in series):
@@ -91,10 +91,10 @@ def _energy_correlation(series: Sequence[_Series], view: int, lags: dict[int, in
 
 
 def _path_correlation(series: Sequence[_Series], view: int, lags: dict[int, int]) -> np.ndarray:
-    """Correlation of the path of a mask's middle with the one that follows from the other views, by lag.
+    """Correlation of a mask centre's path with its prediction from the other views, by lag.
 
-    The path in each picture is a linear picture of one path in space, whose three coordinates the other views give
-    (least squares).
+    The path in each view is a linear image of one path in space, which is estimated from the other views by least
+    squares.
     """
     found = np.zeros(2 * FURTHEST + 1)
     for s in series:
@@ -106,7 +106,7 @@ def _path_correlation(series: Sequence[_Series], view: int, lags: dict[int, int]
 
 
 def _by_lag(own: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """Correlation of two series (F, n), the first one late by -FURTHEST to FURTHEST frames."""
+    """Correlation of two series (F, n), with the first one late by -FURTHEST to FURTHEST frames."""
     found, count = np.zeros(2 * FURTHEST + 1), len(own)
     for i, lag in enumerate(range(-FURTHEST, FURTHEST + 1)):
         a = own[max(0, lag) : count + min(0, lag)]
@@ -117,7 +117,7 @@ def _by_lag(own: np.ndarray, theirs: np.ndarray) -> np.ndarray:
 
 
 def _middles(item: Watched) -> np.ndarray:
-    """Middles of the masks, (F, V, 2) [reduced pixels]; the one before where a mask is empty."""
+    """Centres of the masks, (F, V, 2) [reduced pixels]; that of the frame before for an empty mask."""
     weights = item.alpha.astype(np.float64)
     total = weights.sum((-1, -2))
     rows, columns = np.indices(item.alpha.shape[-2:])
@@ -139,9 +139,9 @@ def _jacobians(evidence: Evidence, cameras: Cameras) -> np.ndarray:
 
 
 def _lags(series: Sequence[_Series], reached: float, gain: float) -> tuple[dict[int, int], set[int], set[int]]:
-    """By how many frames each view is late, which cannot be told, and which rest on energy alone.
+    """Delay of each view [frames], the undetermined views, and the views determined by energy alone.
 
-    The view that gains most by a shift is shifted first, then the next.
+    Views are shifted in the order of their gain, the largest first.
     """
     views = series[0].energy.shape[1]
     lags: dict[int, int] = dict.fromkeys(range(views), 0)
@@ -166,12 +166,12 @@ def _lags(series: Sequence[_Series], reached: float, gain: float) -> tuple[dict[
 
 
 def _score(series: Sequence[_Series], view: int, lags: dict[int, int]) -> tuple[np.ndarray, bool]:
-    """Correlation of a view with the others by lag, and whether the middles of the masks are in it."""
+    """Correlation of a view with the others by lag, and whether it includes the centres of the masks."""
     energy, path = _energy_correlation(series, view, lags), _path_correlation(series, view, lags)
     return ((energy + path) / 2, True) if path.max() >= _TELLING else (energy, False)
 
 
-def _told(evidence: Evidence, lags: dict[int, int], guessed: set[int], sequences: list[str]) -> Iterator[Finding]:
+def _findings(evidence: Evidence, lags: dict[int, int], guessed: set[int], sequences: list[str]) -> Iterator[Finding]:
     place = f"in {sequences[0]}" if len(sequences) == 1 else f"in all {len(sequences)} sequences that were looked at"
     for v, lag in lags.items():
         if lag == 0:

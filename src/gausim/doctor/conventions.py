@@ -1,4 +1,4 @@
-"""Ways to misread calibration files: which of them would put the rest scene where the pictures show it."""
+"""Common misreadings of calibration files, tested by the agreement of the rest scene with the images."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from gausim.core import Cameras, GaussianScene
 from gausim.doctor.silhouettes import draw_silhouettes, overlap
 from gausim.io.transforms import OPENGL_TO_OPENCV
 
-# Lengths that people write beside each other: millimetres, centimetres and metres.
+# Ratios of common units of length: millimetres, centimetres and metres.
 _UNITS = (0.001, 0.01, 0.1, 10.0, 100.0, 1000.0)
-# The focal length is estimated from areas, each time from a better picture.
+# Iterations of the estimate of the focal length from areas.
 _ROUNDS = 4
 _AXES = torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
 class Reading:
-    """The calibration as another convention reads it."""
+    """The calibration under another convention."""
 
-    name: str  # what the file would hold then
+    name: str  # description of the convention
     remedy: str  # what to change
     overlap: float  # mean intersection over union of the silhouettes over the views
 
 
 def try_readings(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], cameras: Cameras) -> list[Reading]:
-    """Reads the cameras of a file in every way that is known to happen; the best fit to the masks of frame 0 first."""
-    # The matrices as the file has them: camera to world, OpenGL axes, as it was read.
+    """Readings of the cameras under common conventions, sorted by their fit to the masks of frame 0, the best first."""
+    # The matrices of the file: camera to world, OpenGL axes.
     stored = torch.linalg.inv(cameras.viewmats.double()) * _AXES
     readings = []
     for name, remedy, change in _POSES:
@@ -59,7 +59,7 @@ def _transposed(pose: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
 
 
 def _world(quarter: int) -> Callable[[Tensor], Tensor]:
-    """The world turned about x by a quarter, forwards or backwards."""
+    """Rotation of the world by ±90 degrees about x."""
     turn = torch.tensor([[1, 0, 0, 0], [0, 0, -quarter, 0], [0, quarter, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
     return lambda pose: _read(turn @ pose)
 
@@ -91,7 +91,7 @@ _POSES: list[tuple[str, str, Callable[[Tensor], Tensor]]] = [
 
 
 def _another_lens(scene: GaussianScene, masks: Float[np.ndarray, "V h w"], cameras: Cameras) -> Reading:
-    """The same poses with the focal length that gives silhouettes of the right size."""
+    """The same poses with the focal length at which silhouettes have the right size."""
     lenses = cameras.Ks.clone()
     for _ in range(_ROUNDS):
         drawn = draw_silhouettes(scene, replace(cameras, Ks=lenses)).alpha

@@ -1,4 +1,4 @@
-"""What there is to train on: pins, frames, sequences, and what the cameras see together."""
+"""Checks of coverage: pins, number of frames and sequences, framing and directions of the cameras."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from gausim.doctor.finding import Finding, listed
 from gausim.ops.selection import require_pinned
 from gausim.ops.visual_hull import search_cube
 
-# Angle between views below which depth is a guess, and below which it is hardly seen at all [degrees].
+# Angle between views below which depth is uncertain, and below which it is almost unobserved [degrees].
 _NARROW, _SAME = 25.0, 10.0
 # Fraction of the frames in which an object may touch the border.
 _OFTEN = 0.2
 # An object is tiny below this fraction of the picture's longer side, or this many of its pixels.
 _TINY_FRACTION, _TINY_PIXELS = 0.12, 24
 
-# The paper's number of seen frames, and what is short of learning anything.
+# The paper's number of seen frames, and the smallest number from which motion can be learned.
 _SEEN, _FEWEST_SEEN = 16, 6
-# Fewer sequences than this hold too few directions of motion.
+# Smallest number of sequences with enough directions of motion.
 _SEQUENCES = 4
-# A scene of which so large a fraction is held has little left to move.
+# Fraction of pinned kernels above which little of a scene can move.
 _MOSTLY_PINNED = 0.9
 
 
 def view_directions(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors from the cameras to what they look at, (V, 3), and that point (3,) [scene units]."""
+    """Unit vectors from the cameras to the object, (V, 3), and its position (3,) [scene units]."""
     cameras = evidence.first[0].cameras
     if evidence.scene is not None:
         middle = evidence.scene.means[evidence.scene.foreground].mean(0)
@@ -40,10 +40,10 @@ def view_directions(evidence: Evidence) -> tuple[np.ndarray, np.ndarray]:
 
 
 def seen_angle(directions: np.ndarray) -> float:
-    """Angle between two views [degrees] that would see depth as well as these; opposite ones see it no better.
+    """Angle between two views [degrees] that observe depth as well as these; opposite views count as equal.
 
-    The sum of I - d d^T over unit directions d says how well motion along each axis is seen; its smallest eigenvalue
-    for two views at angle a is 1 - |cos a|.
+    The sum of I - d d^T over unit directions d measures how well motion along each axis is observed; its smallest
+    eigenvalue for two views at angle a is 1 - |cos a|.
     """
     across = np.mean(np.eye(3) - directions[:, :, None] * directions[:, None, :], axis=0)
     least = float(np.linalg.eigvalsh(across)[0])
@@ -51,7 +51,7 @@ def seen_angle(directions: np.ndarray) -> float:
 
 
 def find_like_directions(evidence: Evidence) -> Iterator[Finding]:
-    """Training views along nearly one line."""
+    """Finds training views along nearly one line."""
     names = list(evidence.data.train_views)
     directions = view_directions(evidence)[0][[evidence.views.index(name) for name in names]]
     angle = seen_angle(directions)
@@ -74,7 +74,7 @@ def find_like_directions(evidence: Evidence) -> Iterator[Finding]:
 
 
 def find_cut_off(evidence: Evidence) -> Iterator[Finding]:
-    """Objects cut off at the border of a picture."""
+    """Finds objects cut off at the border of an image."""
     for v, view in enumerate(evidence.views):
         masks = np.concatenate([item.alpha[:, v] > 127 for item in evidence.watched])
         sides = {"top": masks[:, 0], "bottom": masks[:, -1], "left": masks[:, :, 0], "right": masks[:, :, -1]}
@@ -88,12 +88,12 @@ def find_cut_off(evidence: Evidence) -> Iterator[Finding]:
             f"The object is cut off at the {listed(cut)} of {view} in {max(often.values()):.0%} of the frames"
             f"{'' if moves else ', where nothing moves'}.",
             "Move the camera back or turn it. Where only a part that is held leaves the picture, this does no harm.",
-            {"view": view, "share": often},
+            {"view": view, "fraction": often},
         )  # fmt: skip
 
 
 def find_tiny(evidence: Evidence) -> Iterator[Finding]:
-    """Objects that fill too little of a picture."""
+    """Finds objects that fill too little of an image."""
     for v, view in enumerate(evidence.views):
         lengths = []
         for alpha in (item.alpha[0, v] > 127 for item in evidence.first):
@@ -114,7 +114,7 @@ def find_tiny(evidence: Evidence) -> Iterator[Finding]:
 
 
 def find_pins(evidence: Evidence) -> Iterator[Finding]:
-    """Scenes of which nothing or nearly everything is pinned."""
+    """Finds scenes without pinned kernels, or with nearly all pinned."""
     scene = evidence.scene
     if scene is None:
         return
@@ -133,12 +133,13 @@ def find_pins(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             "warning", "possible",
             f"{fraction:.0%} of the simulated kernels are pinned: hardly anything is left to move.",
-            "Pin only what is held in the videos (`gausim inspect SCENE.ply` draws it in grey).", {"share": fraction},
+            "Pin only what is held in the videos (`gausim inspect SCENE.ply` draws it in grey).",
+            {"fraction": fraction},
         )  # fmt: skip
 
 
 def find_few_frames(evidence: Evidence) -> Iterator[Finding]:
-    """Training frames too few to hold a swing."""
+    """Finds objects with too few training frames for an oscillation."""
     seen = len(evidence.data.train_frames)
     if seen < _SEEN:
         yield Finding(
@@ -151,7 +152,7 @@ def find_few_frames(evidence: Evidence) -> Iterator[Finding]:
 
 
 def find_few_sequences(evidence: Evidence) -> Iterator[Finding]:
-    """Sequences too few to hold many directions of motion."""
+    """Finds objects with too few sequences for several directions of motion."""
     sequences = evidence.sequences
     if sequences < _SEQUENCES:
         yield Finding(

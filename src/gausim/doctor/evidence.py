@@ -1,4 +1,4 @@
-"""What the checks look at: some frames of some sequences, reduced, and the rest scene drawn by every camera."""
+"""Input of the checks: some frames of some sequences, reduced, and the rest scene rendered in every camera."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from gausim.data.objects import ObjectData
 from gausim.data.records import SequenceRecord
 from gausim.doctor.silhouettes import Fit, Silhouettes, draw_silhouettes, fit_silhouette
 
-# Sequences whose motion is watched, and whose first frames are compared with the rest scene.
+# Sequences whose motion is examined, and whose first frames are compared with the rest scene.
 WATCHED_SEQUENCES, FIRST_FRAMES = 4, 12
-# Frames of each that are watched, from frame 0 on, and how many are decoded at a time.
+# Examined frames of each, from frame 0 on, and the number decoded at a time.
 WATCHED_FRAMES, FRAMES_AT_A_TIME = 64, 8
-# Pictures are reduced to this length of their longer side [pixels].
+# Length of the longer side of reduced images [pixels].
 LONGEST = 192
 
 T = TypeVar("T")
@@ -34,7 +34,7 @@ class Watched:
     """Consecutive frames of one sequence from frame 0 on, reduced."""
 
     name: str  # of the sequence
-    cameras: Cameras  # of the reduced pictures
+    cameras: Cameras  # of the reduced images
     rgb: UInt8[np.ndarray, "F V h w 3"]  # over black
     alpha: UInt8[np.ndarray, "F V h w"]  # foreground
 
@@ -46,13 +46,13 @@ class Watched:
 
 @dataclass(eq=False)
 class Evidence:
-    """What is known of one object; :func:`gather` reads it."""
+    """Reduced data of one object, read by :func:`gather`."""
 
     data: ObjectData  # its facts
-    sequences: int  # how many there are
-    scene: GaussianScene | None  # the rest scene, pinned or not; None where there is none yet
-    scale: float  # length of a pixel of the pictures over one of the reduced pictures, at most 1
-    watched: tuple[Watched, ...]  # sequences whose motion is watched
+    sequences: int  # number of all sequences
+    scene: GaussianScene | None  # the rest scene, pinned or not; None if it does not exist
+    scale: float  # size of a pixel over that of a reduced pixel, at most 1
+    watched: tuple[Watched, ...]  # sequences whose motion is examined
     first: tuple[Watched, ...]  # frame 0 of sequences, these and more
 
     @property
@@ -62,7 +62,7 @@ class Evidence:
 
     @cached_property
     def rest(self) -> tuple[Silhouettes, ...] | None:
-        """The rest scene as the cameras of each of :attr:`first` draw it; None without a scene."""
+        """The rest scene rendered in the cameras of each of :attr:`first`; None without a scene."""
         if self.scene is None:
             return None
         drawn: list[Silhouettes] = []
@@ -73,7 +73,7 @@ class Evidence:
 
     @cached_property
     def fits(self) -> tuple[tuple[Fit, ...], ...] | None:
-        """How the rest scene must be moved in each view to lie on frame 0, [sequence][view]; None without a scene."""
+        """Alignment of the rest scene with frame 0 in each view, [sequence][view]; None without a scene."""
         if self.rest is None:
             return None
         return tuple(
@@ -86,18 +86,18 @@ class Evidence:
 
 
 def same_cameras(a: Cameras, b: Cameras) -> bool:
-    """True where two sets of cameras have the same poses and lenses."""
+    """Whether two sets of cameras have the same poses and intrinsics."""
     return bool(torch.equal(a.viewmats, b.viewmats) and torch.equal(a.Ks, b.Ks))
 
 
 def with_bar(items: Sequence[T], step: str) -> Iterable[T]:
-    """The items; a bar shows how many were taken, where standard error is a terminal."""
+    """The items, with a progress bar if standard error is a terminal."""
     console = Console(stderr=True)
     return track(items, step, console=console, transient=True, disable=not console.is_terminal)
 
 
 def gather(data: ObjectData, scene: GaussianScene | None) -> Evidence:
-    """Reads and reduces what the checks need.
+    """Reads and reduces the input of the checks.
 
     Raises:
         DataError: an image is missing or malformed.
@@ -107,7 +107,7 @@ def gather(data: ObjectData, scene: GaussianScene | None) -> Evidence:
     watched, first, scale = [], [], 1.0
     chosen = [name for name in names if name in watched_names or name in first_names]
     for name in with_bar(chosen, "frames"):
-        # Not one of data.sequences: these keep all pictures that were ever decoded.
+        # A new record, because those of data.sequences keep all decoded images.
         record = SequenceRecord(data.root / "sequences" / name, views=data.views, fps=data.fps)
         frames = min(record.count, WATCHED_FRAMES) if name in watched_names else 1
         item, scale = _reduced(record, frames), _factor(record.cameras)
@@ -117,7 +117,7 @@ def gather(data: ObjectData, scene: GaussianScene | None) -> Evidence:
 
 
 def _spread(names: list[str], count: int) -> list[str]:
-    """At most so many of the names, evenly, the first one among them."""
+    """At most ``count`` evenly spaced names, the first included."""
     chosen = np.linspace(0, len(names) - 1, min(count, len(names))).round().astype(int)
     return [names[i] for i in chosen]
 

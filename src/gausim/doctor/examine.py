@@ -1,4 +1,4 @@
-"""Runs all checks on one object, in an order in which none is led astray by the fault of another."""
+"""Examination of one object: runs all checks, and omits those that another check's fault invalidates."""
 
 from __future__ import annotations
 
@@ -36,25 +36,25 @@ CHECKS = (
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """What was found in one object."""
+    """Result of the examination of one object."""
 
     findings: tuple[Finding, ...]  # faults first
-    left_out: dict[str, str]  # checks that another check's fault made useless, with that check
-    evidence: Evidence | None  # what was looked at; None where it could not be read
+    left_out: dict[str, str]  # omitted checks, each with the check whose fault invalidates it
+    evidence: Evidence | None  # examined data; None if it could not be read
 
     @property
     def ruinous(self) -> bool:
-        """True where a training would be ruined."""
+        """Whether there is a fault."""
         return any(finding.severity == "fault" for finding in self.findings)
 
     @property
     def graver(self) -> Examination:
-        """The same without the notes."""
+        """The examination without notes."""
         return replace(self, findings=tuple(f for f in self.findings if f.severity != "note"))
 
 
 def examine(data: ObjectData, scene: GaussianScene | None) -> Examination:
-    """Looks at some frames of an object, whose files are in order, and at its rest scene, pinned or not."""
+    """Examines some frames of an object with valid files, and its rest scene, pinned or not."""
     try:
         evidence = gather(data, scene)
     except DataError as error:
@@ -78,6 +78,6 @@ def examine(data: ObjectData, scene: GaussianScene | None) -> Examination:
 
 
 def _without_consequences(findings: list[Finding]) -> list[Finding]:
-    """Leaves out that a camera is off the rest scene where its frame 0 is a later one, which says all."""
+    """Removes findings that a camera disagrees with the rest scene if its clock is early, which explains them."""
     early = {f.measured["view"] for f in findings if f.check == "clock" and f.severity != "note"}
     return [f for f in findings if f.check != "calibration" or not {*f.measured.get("views", "-")} <= early]

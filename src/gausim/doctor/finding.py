@@ -1,4 +1,4 @@
-"""What an examination finds, and how checks are listed."""
+"""Findings and checks of an examination."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ SEVERITIES: tuple[Severity, ...] = ("fault", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was found."""
+    """One finding."""
 
-    severity: Severity  # "fault" where it would ruin a training, "warning" where it costs quality, "note" otherwise
-    sureness: Sureness  # how sure it is
-    what: str  # what is wrong, in a sentence that names cameras, sequences and files
+    severity: Severity  # "fault" if it makes training useless, "warning" if it lowers the quality, else "note"
+    sureness: Sureness  # certainty of the finding
+    what: str  # the problem, in a sentence that names cameras, sequences and files
     remedy: str  # what to do
-    measured: Mapping[str, Any] = field(default_factory=dict)  # the numbers behind it, for programs
+    measured: Mapping[str, Any] = field(default_factory=dict)  # measured values, for programs
     check: str = ""  # the check that found it, which :func:`gausim.doctor.examine.examine` fills in
 
 
 @dataclass(frozen=True)
 class Check:
-    """One examination."""
+    """One check, made of finders."""
 
-    name: str  # what it examines
-    # look for one kind of fault each; all have this signature
+    name: str  # subject of the check
+    # one per kind of fault
     finders: tuple[Callable[[Evidence], Iterator[Finding]], ...]
-    needs: tuple[str, ...] = ()  # checks whose faults would make this one see ghosts; it is left out after such a fault
+    needs: tuple[str, ...] = ()  # checks whose faults invalidate this one, which is then omitted
 
 
 def listed(names: list[str]) -> str:

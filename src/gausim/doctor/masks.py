@@ -1,4 +1,4 @@
-"""Masks: inverted, missing, empty, blinking, or with a haze around the object."""
+"""Checks of masks: inverted, missing, empty, flickering, or with haze around the object."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from gausim.doctor.evidence import Evidence
 from gausim.doctor.finding import Finding, listed
 from gausim.doctor.silhouettes import overlap
 
-# Foreground along the picture's border: an object may touch it, but does not run all around.
+# Fractions of foreground along the image border above which masks are inverted, and missing.
 _AROUND, _EVERYWHERE = 0.8, 0.999
 # Standard deviation of the colours along the border of a uniform background, and how far red, green and blue lie apart
 # in a coloured one [of 255].
 _UNIFORM, _COLOURED = 8.0, 40.0
-# Alpha that nobody sees (of 255), and how far from the object it counts as haze [reduced pixels].
+# Haze: largest invisible alpha (of 255), distance from the object [reduced pixels], and fraction of the pixels.
 _FAINT, _AWAY, _HAZE = 26, 6, 0.02
-# Relative jump of a mask's area against the frames around it, and the radius of these.
+# Relative jump of a mask's area against the neighbouring frames, and the radius of these.
 _JUMP, _RADIUS = 0.15, 2
-# Fraction of empty frames from which on a training is spoilt.
+# Fraction of empty frames that makes a fault.
 _MANY = 0.1
 
 
 def find_mask_faults(evidence: Evidence) -> Iterator[Finding]:
-    """Compares alpha with what a mask of one object looks like."""
+    """Finds masks that cannot be those of one object."""
     rims = {view: [_rim(item.alpha[0, v]) > 127 for item in evidence.first] for v, view in enumerate(evidence.views)}
     full = [view for view, found in rims.items() if np.median([rim.mean() for rim in found]) > _AROUND]
     if full:
@@ -37,7 +37,7 @@ def find_mask_faults(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _rim(picture: np.ndarray) -> np.ndarray:
-    """The pixels along the picture's border."""
+    """The pixels along the image border."""
     return np.concatenate((picture[0], picture[-1], picture[:, 0], picture[:, -1]))
 
 

@@ -1,4 +1,4 @@
-"""Motion: how much there is, how fast it swings against the frame rate, and whether it begins at rest."""
+"""Checks of motion: its size, its frequency relative to the frame rate, and its start at rest."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from gausim.doctor.finding import Finding, listed
 from gausim.doctor.silhouettes import overlap
 from gausim.metrics.oscillation import coordinates, principal_motions, spectrum
 
-# Frames whose optical flow against frame 0 is looked at, per view, and the part of the foreground that counts.
+# Frames per view whose optical flow against frame 0 is computed, and the percentile over the foreground.
 _FLOW_FRAMES, _QUANTILE = 6, 95
-# Pixels of the pictures below which nothing moves, and below which motion is hidden by noise and mask edges.
+# Displacement below which an object counts as static, and below which noise and mask edges hide motion [pixels].
 _STILL, _SMALL = 0.2, 1.0
-# Overlap of frame 0 with that of the other sequences or the rest scene: below these it is not at rest.
+# Overlap of frame 0 with that of the other sequences or the rest scene, below which it is not at rest.
 _AT_REST, _FAR_FROM_REST = 0.95, 0.85
-# Pictures are reduced to this length for the spectrum, of so many principal motions [pixels].
+# Length of the longer side of images for the spectrum [pixels], and number of principal motions.
 _SPECTRUM_LONGEST, _MOTIONS = 48, 3
-# Fractions of the frame rate: faster motion is not resolved well, or not at all (0.5 is Nyquist's).
+# Frequencies above which motion is resolved badly, or not at all [of the frame rate; 0.5 is Nyquist's limit].
 _FAST, _TOO_FAST = 0.2, 0.34
-# Swings within the frames that were watched, below which there is no telling how fast they are.
+# Number of cycles within the examined frames below which their frequency is undetermined.
 _CYCLES = 2.0
-# Frequencies at which elastic objects on a table swing [Hz].
+# Range of frequencies of elastic objects on a table [Hz].
 _SLOWEST, _FASTEST = 0.3, 15.0
-# Rates of cameras and of what is usually made from their films [frames per second].
+# Rates of cameras and common fractions of them [frames per second].
 _USUAL_RATES = (
     10, 12, 12.5, 15, 20, 24, 25, 30, 48, 50, 60, 75, 90, 100, 120, 144, 150, 180, 200, 240, 300, 400, 480, 500, 600,
     960, 1000,
 )  # fmt: skip
-# NTSC's rates are these times a thousandth less.
+# Relative tolerance, which includes NTSC's rates (a thousandth lower).
 _RATE_TOLERANCE = 2e-3
 
 
 def find_odd_motion(evidence: Evidence) -> Iterator[Finding]:
-    """Too little motion to be seen, or too fast or slow for the frame rate."""
+    """Finds motion that is too small to be seen, or too fast or slow for the frame rate."""
     moving = {item.name: _displacements(item, evidence.scale) for item in evidence.watched}
     largest = {name: float(d.max()) for name, d in moving.items()}
     if max(largest.values()) < _STILL:
@@ -76,7 +76,7 @@ def find_odd_motion(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _displacements(item: Watched, scale: float) -> np.ndarray:
-    """Optical flow of some frames against frame 0, the upper twentieth of the foreground, (f, V) [pixels]."""
+    """95th percentile over the foreground of the optical flow of some frames against frame 0, (f, V) [pixels]."""
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     flow.setFinestScale(0)
     gray = (item.gray * 255 + 0.5).astype(np.uint8)
@@ -91,7 +91,7 @@ def _displacements(item: Watched, scale: float) -> np.ndarray:
 
 
 def find_unrest(evidence: Evidence) -> Iterator[Finding]:
-    """Sequences whose frame 0 is not the rest state."""
+    """Finds sequences whose frame 0 is not the rest state."""
     overlaps = _first_overlaps(evidence)
     off = {name: value for name, value in overlaps.items() if value < _AT_REST}
     if not off:
@@ -108,10 +108,10 @@ def find_unrest(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _first_overlaps(evidence: Evidence) -> dict[str, float]:
-    """How well frame 0 of each sequence agrees with the median over sequences of the same cameras, and the scene.
+    """Overlap of frame 0 of each sequence with the median over sequences of the same cameras and with the scene.
 
-    The worse of the two, each as a median over the cameras. The scene counts relative to the sequence that fits it
-    best, so that a coarse scene or a camera that was moved is no fault of a sequence.
+    It is the smaller of the two medians over cameras. The overlap with the scene is relative to the best sequence, so
+    that a coarse scene or a displaced camera is no fault of a sequence.
     """
     cameras = evidence.first[0].cameras
     alike = [item for item in evidence.first if same_cameras(item.cameras, cameras)]
@@ -123,7 +123,7 @@ def _first_overlaps(evidence: Evidence) -> dict[str, float]:
         if item in alike:
             masks = item.alpha[0] / np.float32(255)
             values.append(float(np.median([overlap(a, b) for a, b in zip(masks, usual, strict=True)])))
-        if best > _AT_REST / 2:  # less is a matter of the calibration
+        if best > _AT_REST / 2:  # a smaller one is due to the calibration
             values.append(aligned[s] / best)
         found[item.name] = min(values)
     return found
@@ -131,19 +131,19 @@ def _first_overlaps(evidence: Evidence) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class Swing:
-    """How the object swings, as far as pictures tell."""
+    """Oscillation of the object, estimated from the images."""
 
     frequency: np.ndarray  # of the spectrum [Hz]
-    power: np.ndarray  # of it, 1 at its peak
-    dominant: float  # where the power peaks [Hz]
-    cycles: float  # of it within the frames that were watched; of a single one nothing can be told
+    power: np.ndarray  # of the spectrum, 1 at its peak
+    dominant: float  # frequency of the peak [Hz]
+    cycles: float  # of the dominant frequency within the examined frames; more than one is needed
 
 
 def swing(evidence: Evidence) -> Swing:
-    """Frequency of the largest change of the pictures, all views together.
+    """Frequency of the largest change of the images, over all views.
 
-    Pictures are taken for displacements: what changes most is a fixed pattern times a coordinate that swings as the
-    object does, as long as it moves by less than its own width.
+    Images stand for displacements: their largest change is a fixed pattern times a coordinate that oscillates with the
+    object, while the displacement is smaller than the object's width.
     """
     motions = [_pattern(item) for item in evidence.watched if len(item.gray) > 3]
     if not motions:
@@ -151,13 +151,13 @@ def swing(evidence: Evidence) -> Swing:
     shapes, _ = principal_motions(motions, _MOTIONS)
     series = [coordinates(motion, shapes) for motion in motions]
     frequency, power = spectrum(series, evidence.data.fps)
-    dominant = float(frequency[1:][power[1:].argmax()])  # without what does not swing
+    dominant = float(frequency[1:][power[1:].argmax()])  # without the constant part
     seconds = min(len(s) for s in series) / evidence.data.fps
     return Swing(frequency, power / max(float(power.max()), 1e-30), dominant, dominant * seconds)
 
 
 def _pattern(item: Watched) -> np.ndarray:
-    """Blurred pictures of all views less frame 0, (F, P, 3)."""
+    """Difference of blurred images of all views from frame 0, (F, P, 3)."""
     frames, views, height, width = item.alpha.shape
     factor = min(1.0, _SPECTRUM_LONGEST / max(height, width))
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
@@ -171,7 +171,7 @@ def _rates(evidence: Evidence) -> Iterator[Finding]:
     fps, found = evidence.data.fps, swing(evidence)
     measured = {"frequency": found.dominant, "cycles": found.cycles, "fps": fps}
     swings = found.cycles >= _CYCLES
-    pace = found.dominant / fps  # swings per frame
+    pace = found.dominant / fps  # cycles per frame
     if swings and pace > _FAST:
         yield Finding(
             "fault" if pace > _TOO_FAST else "warning", "likely",

@@ -1,4 +1,4 @@
-"""Findings as text, as plain data, and as a page with the pictures."""
+"""Output of findings: text, plain data, and an HTML page with pictures."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def findings_text(root: str, found: Examination) -> str:
 
 
 def summary_line(found: Examination) -> str:
-    """How many findings of each severity there are, and what was looked at."""
+    """Number of findings of each severity, and of the frames and views that were examined."""
     counts = [(severity, sum(f.severity == severity for f in found.findings)) for severity in SEVERITIES]
     told = ", ".join(f"{n} {severity}{'s' if n > 1 else ''}" for severity, n in counts if n)
     if not counts[0][1] and not counts[1][1]:
@@ -48,15 +48,15 @@ def summary_line(found: Examination) -> str:
 
 
 def plain_findings(found: Examination) -> dict[str, Any]:
-    """Findings and what was left out as plain data, for JSON, which has null for what is not finite."""
+    """Findings and omitted checks as plain data for JSON, with null for values that are not finite."""
     findings = msgspec.json.encode([vars(finding) for finding in found.findings], enc_hook=float)
     return {"findings": msgspec.json.decode(findings), "left_out": found.left_out}
 
 
 def write_page(path: Path, found: Examination, pictures: Sequence[tuple[str, str]]) -> None:
-    """Writes the HTML page beside the pictures, of which it is given file names and captions.
+    """Writes the HTML page beside the ``pictures``, pairs of file name and caption.
 
-    Names are escaped, and its policy forbids the browser to load anything from elsewhere.
+    Names are escaped, and the page's security policy forbids the browser to load anything from elsewhere.
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     template = environment.from_string(files("gausim.doctor").joinpath("page.html").read_text(encoding="utf-8"))

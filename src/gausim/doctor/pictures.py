@@ -1,4 +1,4 @@
-"""Pictures of what was looked at: views with the scene's outline, motion over time, spectrum, cameras from above."""
+"""Pictures of the examined data: views with the scene's outline, motion over time, spectrum, cameras from above."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from gausim.report.pictures.figures import METHOD_COLORS, save_figure
 
 _DPI = 110
 _COLUMNS = 3
-# Behind the cut-out object, so that dark ones show.
+# Background behind the cut-out object, on which dark objects are visible.
 _BEHIND = 90
 _OUTLINE = "#f0962a"
 
 
 def draw_pictures(evidence: Evidence, out: Path) -> list[tuple[str, str]]:
-    """Writes all pictures into a folder; returns name and caption of each."""
+    """Writes all pictures to a folder; returns name and caption of each."""
     drawn: list[tuple[str, str, Callable[[Evidence], Figure]]] = [
         ("views.png", "Frame 0 of the first sequence in every view; orange: outline of the rest scene, drawn by the "
          "camera that the file states. Both must lie on each other.", _views),

@@ -1,4 +1,4 @@
-"""Silhouettes of the rest scene, and how far they lie from those of the pictures."""
+"""Silhouettes of the rest scene, and their alignment with the masks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gausim.core import Cameras, GaussianScene
 from gausim.render.cpu import CpuRenderer
 from gausim.render.draw import draw
 
-# The alignment's own smoothing [pixels], steps and precision (cv2.findTransformECC).
+# Smoothing [pixels], steps and precision of the alignment (cv2.findTransformECC).
 _SMOOTHING, _STEPS, _PRECISION = 5, 100, 1e-5
 
 
@@ -28,19 +28,19 @@ class Silhouettes:
 
 @dataclass(frozen=True)
 class Fit:
-    """How a drawn silhouette lies on that of a picture."""
+    """Alignment of a rendered silhouette with a mask."""
 
-    overlap: float  # intersection over union as it is
-    aligned: float  # the same after the best shift and turn in the picture
-    shift: tuple[float, float]  # at the middle of the mask, right and down [reduced pixels]; NaN where nothing is drawn
-    turn: float  # in the picture [degrees]
-    # root mean square of the displacement over the mask [reduced pixels]; infinite where nothing is drawn
+    overlap: float  # intersection over union
+    aligned: float  # the same after the best shift and rotation in the image
+    shift: tuple[float, float]  # at the mask's centre, right and down [reduced pixels]; NaN if nothing is rendered
+    turn: float  # rotation in the image [degrees]
+    # root mean square of the displacement over the mask [reduced pixels]; infinite if nothing is rendered
     pixels: float
-    degrees: float  # turn of the camera that would explain it
+    degrees: float  # rotation of the camera that would explain it
 
 
 def draw_silhouettes(scene: GaussianScene, cameras: Cameras) -> Silhouettes:
-    """Draws the rest scene's foreground."""
+    """Renders the rest scene's foreground."""
     shown = scene.select(scene.foreground)
     identity, unit = torch.eye(3)[None, None], torch.zeros(shown.count, dtype=torch.int64)
     with torch.no_grad():
@@ -49,15 +49,15 @@ def draw_silhouettes(scene: GaussianScene, cameras: Cameras) -> Silhouettes:
 
 
 def overlap(a: Float[np.ndarray, "*shape"], b: Float[np.ndarray, "*shape"]) -> float:
-    """Intersection over union of two soft masks; 0 where both are empty."""
+    """Intersection over union of two soft masks; 0 if both are empty."""
     union = float(np.maximum(a, b).sum())
     return float(np.minimum(a, b).sum()) / union if union > 0 else 0.0
 
 
 def fit_silhouette(mask: Float[np.ndarray, "h w"], drawn: Float[np.ndarray, "h w"], focal: float) -> Fit:
-    """Finds the shift and turn in the picture that lay a drawn silhouette on a mask (enhanced correlation).
+    """Shift and rotation in the image that align a rendered silhouette with a mask (enhanced correlation).
 
-    Both are 0 to 1; ``focal`` is the focal length [pixels of both].
+    Both images are in [0, 1]; ``focal`` is the focal length [pixels].
     """
     raw = overlap(mask, drawn)
     if mask.sum() < 1 or drawn.sum() < 1:
@@ -68,14 +68,14 @@ def fit_silhouette(mask: Float[np.ndarray, "h w"], drawn: Float[np.ndarray, "h w
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, _STEPS, _PRECISION)
     try:
         _, found = cv2.findTransformECC(mask, drawn, warp.copy(), cv2.MOTION_EUCLIDEAN, stop, None, _SMOOTHING)  # type: ignore[call-overload]
-    except cv2.error:  # no overlap to begin with: the shift of the middles is all that can be said
+    except cv2.error:  # without overlap, only the shift of the centres is known
         found = warp
     size = (mask.shape[1], mask.shape[0])
     moved = cv2.warpAffine(drawn, found, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     rows, columns = np.nonzero(mask > 0.5) if (mask > 0.5).any() else np.nonzero(mask > 0)
     places = np.stack((columns, rows)).astype(np.float64)
     away = found[:, :2] @ places + found[:, 2:] - places
-    # Positive where the drawn silhouette lies right of and below that of the picture.
+    # Positive if the rendered silhouette is right of and below the mask.
     shift = found[:, :2].astype(np.float64) @ middle + found[:, 2] - middle
     turn = math.degrees(math.atan2(found[1, 0], found[0, 0]))
     tilt = math.degrees(math.atan(float(np.hypot(*shift)) / focal))

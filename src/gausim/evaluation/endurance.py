@@ -1,4 +1,4 @@
-"""Does a simulator stay sane far beyond what it learned: long free motion, and motion under random pushes."""
+"""Long rollouts of a simulator far beyond its training frames: free motion, and motion under random pushes."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from torch import Tensor
 from gausim.core import Dynamics, SimState
 from gausim.metrics.motion import motion_energy
 
-# Frames that one figure is the mean of.
+# Frames over which a figure is averaged.
 WINDOW = 20
-# A push: frames between beginnings, its length in frames, its reach and the shift that it adds per frame [diagonals].
+# A push: frames from start to start, its length in frames, its radius and its shift per frame [diagonals].
 PUSH_EVERY, PUSH_FRAMES, PUSH_REACH, PUSH_SHIFT = 24, 3, 0.15, 0.002
 
 
 @dataclass(frozen=True, eq=False)
 class RandomPushes:
-    """Pushes at random places in random directions, the same for the same seed."""
+    """Pushes at random places in random directions, reproducible by the seed."""
 
     rest: Float[Tensor, "K 3"]  # rest positions [scene units]
     mass: Float[Tensor, " K"]
@@ -32,7 +32,7 @@ class RandomPushes:
     seed: int = 0
 
     def __call__(self, step: int) -> Float[Tensor, "K 3"] | None:
-        """Force on every kernel [mass scene units / s^2]: one that shifts it by f dt^2 / (2 m) (METHOD section 6)."""
+        """Force on every kernel [mass scene units / s^2], which shifts it by f dt^2 / (2 m) (METHOD section 6)."""
         number, age = divmod(step, PUSH_EVERY)
         if step >= self.frames or age >= PUSH_FRAMES:
             return None
@@ -54,21 +54,21 @@ def endure(
     *,
     pushes: RandomPushes | None = None,
 ) -> dict[str, Any]:
-    """Rolls out far and tells how the motion goes on.
+    """Figures of a long rollout: energy, distance from rest and growth.
 
     Args:
-        dynamics: of the scene.
-        initial: where it starts.
+        dynamics: dynamics of the scene.
+        initial: initial state.
         rest: rest positions [scene units].
-        diagonal: of the scene [scene units].
-        frames: to predict.
-        pushes: forces on the way; none when None.
+        diagonal: diagonal of the scene [scene units].
+        frames: number of predicted frames.
+        pushes: forces during the rollout; none when None.
 
     Returns:
-        ``energy``: mean motion energy of every 20 frames [diagonals^2, summed over kernels]; ``away``: mean distance of
-        kernels from rest in them [diagonals]; ``peak``: where its highest energy lies [frames]; ``growth``: the highest
-        energy after the pushes have ended (after the first quarter without pushes) over the highest before; ``late``:
-        energy of the last tenth over the highest of all.
+        ``energy``: mean motion energy of every 20 frames [diagonals^2, summed over kernels]; ``away``: their mean
+        distance of kernels from rest [diagonals]; ``peak``: time of the highest energy [frames]; ``growth``: highest
+        energy after the pushes (after the first quarter without pushes) over the highest before; ``late``: energy of
+        the last tenth over the highest of all.
 
     Raises:
         DivergenceError: a position is not finite; the message names the frame.

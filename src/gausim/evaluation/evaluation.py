@@ -1,7 +1,7 @@
-"""Measures predictions of a whole object against its videos and, where known, its true 3D motion.
+"""Evaluation of predictions of an object against its videos and, where known, its true 3D motion.
 
-Needs no run: any callable that gives a :class:`Trajectory` for a sequence can be measured beside the references
-(the static prediction, linear AR(2) on the true states). Frames stream through in chunks; per-frame figures remain.
+It needs no run: any callable that returns a :class:`Trajectory` of a sequence can be evaluated beside the references
+(the static prediction, linear AR(2) on the true states). Frames are processed in chunks; per-frame figures are kept.
 """
 
 from __future__ import annotations
@@ -57,28 +57,27 @@ from gausim.runs.cost import CostMeter
 from gausim.runs.provenance import code_provenance, data_provenance
 from gausim.training.supervision.points import attach_points
 
-# Predicts every frame of a sequence (count frames, frame 0 first) for all kernels of the scene. One that carries an
-# attribute ``levels`` (plain data: counts, predicted, predictions, kernels) or ``footnotes`` (extrapolates, notes) has
-# it stored in the summary; one that carries ``units`` (the unit of every kernel, level by level) has its error told by
-# level.
+# Predicts every frame of a sequence (count frames, frame 0 first) for all kernels of the scene. Its optional attributes
+# ``levels`` (plain data: counts, predicted, predictions, kernels) and ``footnotes`` (extrapolates, notes) are stored in
+# the summary; with ``units`` (the unit of every kernel, level by level) its error is also computed by level.
 Predict = Callable[[SequenceRecord], Trajectory]
 Rows = dict[str, dict[str, np.ndarray]]
 
-# Modes of the linear references: few, which are robust, and more, which follow finer motion.
+# Modes of the linear references: few for robustness, more for finer motion.
 AR_MODES = (8, 24)
 # Pixels that are rendered and compared at once: about 100 MB of float images and their filters.
 PIXELS_AT_ONCE = 1 << 20
 
 
 def default_metrics(side: int = SMALLEST) -> list[ImageMetric]:
-    """The image metrics of every table, of images of ``side`` pixels: FLIP and LPIPS where they can be measured."""
+    """The image metrics of tables for images of ``side`` pixels, with FLIP and LPIPS where they are available."""
     absent = absent_metrics(side)
     optional = [metric() for metric in (FLIP, LPIPS) if metric.key not in absent]
     return [L2(), ForegroundL2(), PSNR(), ForegroundPSNR(), SSIM(), *optional]
 
 
 def absent_metrics(side: int) -> dict[str, str]:
-    """Why FLIP and LPIPS cannot be measured on images of ``side`` pixels, by their keys."""
+    """Reasons by key why FLIP or LPIPS cannot be computed on images of ``side`` pixels."""
     absent = {} if flip_is_installed() else {FLIP.key: NO_PACKAGE}
     if side < SMALLEST:
         return absent | {LPIPS.key: TOO_SMALL}
@@ -99,16 +98,16 @@ def evaluate_object(
 
     Args:
         data: the object.
-        scene: its rest scene, with all kernels that the trajectories move.
+        scene: its rest scene, with all kernels of the trajectories.
         methods: row name -> prediction.
-        renderer: draws both predictions and the static reference.
+        renderer: renderer of predictions and of the static reference.
         sequences: names of the sequences to measure; all when None.
         views: names of the cameras to measure in; all when None.
         advance: called with a sequence's name when it is done.
 
     Raises:
         DataError: an unknown sequence, or broken data.
-        RunError: a prediction has another number of frames or kernels than asked for, or is not finite.
+        RunError: a prediction has a wrong number of frames or kernels, or is not finite.
     """
     measure = _ObjectMeasure(data, scene, renderer, views)
     records = _chosen(data, sequences)
@@ -116,7 +115,7 @@ def evaluate_object(
     results: list[Rows] = []
     pictures = PictureRecorder(data, records[0].name, measure.views)
     for record in records:
-        # A record of our own: its decoded frames are let go with it instead of filling the memory.
+        # A separate record, so that its decoded frames are freed with it.
         fresh = SequenceRecord(record.root, views=record.views, fps=record.fps)
         results.append(measure.sequence(fresh, methods, references, pictures if record is records[0] else None))
         if advance is not None:
@@ -140,7 +139,7 @@ def evaluate_object(
 
 
 def write_evaluation(folder: Path, objects: list[ObjectCurves], run: dict[str, Any]) -> dict[str, Any]:
-    """Writes metrics.json, metrics.npz, pictures.npz and table.md into ``folder``; returns what metrics.json holds."""
+    """Writes metrics.json, metrics.npz, pictures.npz and table.md to ``folder``; returns the data of metrics.json."""
     folder.mkdir(parents=True, exist_ok=True)
     save_curves(folder / "metrics.npz", objects)
     save_pictures(folder / "pictures.npz", [c.pictures for c in objects if c.pictures is not None])
@@ -167,7 +166,7 @@ def _linear_references(data: ObjectData) -> dict[str, LinearAR2]:
 
 
 class _ObjectMeasure:
-    """Measures one object's sequences; keeps what is summed over all of them (mean colour, largest l2, costs)."""
+    """Figures of one object's sequences, with the quantities over all of them (mean colour, largest l2, costs)."""
 
     def __init__(self, data: ObjectData, scene: GaussianScene, renderer: Renderer, views: Sequence[str] | None) -> None:
         self.data, self.scene, self.renderer = data, scene, renderer
@@ -184,7 +183,7 @@ class _ObjectMeasure:
         self._diagnosis = Diagnosis(data.fps)
 
     def record(self, methods: Mapping[str, Predict]) -> dict[str, Any]:
-        """What is known beside the figures: costs of every method, hashes of the data, what is absent, diagnosis."""
+        """Summary entries besides the figures: costs of every method, hashes of the data, absent metrics, diagnosis."""
         costs = {
             name: {**meter.summary(), "levels": getattr(methods[name], "levels", None)}
             for name, meter in self._costs.items()
@@ -197,7 +196,7 @@ class _ObjectMeasure:
 
     @property
     def mean_color(self) -> tuple[float, float, float]:
-        """Mean colour of the true foreground pixels so far; black where there was none."""
+        """Mean colour of the true foreground pixels so far; black without any."""
         r, g, b = (self._color[:3] / self._color[3].clamp_min(1)).tolist()
         return r, g, b
 
@@ -209,7 +208,7 @@ class _ObjectMeasure:
         references: Mapping[str, LinearAR2],
         pictures: PictureRecorder | None = None,
     ) -> Rows:
-        """Figures of one sequence, (F, V) and (F,) per row and metric; frames go to ``pictures``, too."""
+        """Figures of one sequence, (F, V) and (F,) per row and metric; adds the frames to ``pictures``."""
         trajectories = {}
         for name, predict in methods.items():
             meter = self._costs.setdefault(name, CostMeter())
@@ -267,7 +266,7 @@ class _ObjectMeasure:
         return {row: {m: torch.cat(v).cpu().numpy() for m, v in ms.items()} for row, ms in parts.items()}
 
     def _draw(self, trajectory: Trajectory, frames: range, cameras: Cameras) -> Rendered:
-        """Foreground on black; colours beyond [0, 1] are cut, as in every image file."""
+        """Images of the foreground on black, with colours clamped to [0, 1] as in image files."""
         part = slice(frames.start, frames.stop)
         state = trajectory.positions[part], trajectory.deformation_gradients[part], trajectory.rotations[part]
         images = draw(self.renderer, self.look, *state, trajectory.unit_of_kernel, cameras)
@@ -321,7 +320,7 @@ def _energy(images: Float[Tensor, "F V H W 3"], before: Tensor | None) -> Float[
 
 
 def _stack(results: list[Rows]) -> Rows:
-    """Joins sequences along a new first axis; NaN fills shorter sequences and those whose truth is unknown."""
+    """Stacks sequences along a new first axis, with NaN for missing frames and unknown truth."""
     stacked: Rows = {}
     for row, metric in dict.fromkeys((row, m) for r in results for row, ms in r.items() for m in ms):
         arrays = [r.get(row, {}).get(metric) for r in results]

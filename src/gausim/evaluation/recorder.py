@@ -1,4 +1,4 @@
-"""Collects the small pictures of an evaluation (see :mod:`gausim.results.pictures`) while frames stream through."""
+"""Recorder of an evaluation's small pictures (see :mod:`gausim.results.pictures`)."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from gausim.core import Rendered
 from gausim.data.objects import ObjectData
 from gausim.results.pictures import Pictures
 
-# Longest side [pixels] and number of cameras: pictures go into web pages, whole recordings would not fit.
+# Longest side [pixels] and number of cameras, limited because pictures go into web pages.
 LONGEST, CAMERAS = 192, 4
 
 
 class PictureRecorder:
-    """Keeps one sequence of an object in a few cameras, made smaller.
+    """Small pictures of one sequence of an object in a few cameras.
 
     Args:
         data: the object.
         sequence: name of the sequence.
-        views: cameras that are evaluated; up to four are kept, half of them held-out ones where there are any.
+        views: evaluated cameras; up to four are recorded, half of them held-out ones if there are any.
     """
 
     def __init__(self, data: ObjectData, sequence: str, views: Sequence[str]) -> None:
@@ -38,7 +38,7 @@ class PictureRecorder:
         self._behind: tuple[Tensor, Tensor] | None = None
 
     def add(self, recorded: UInt8[Tensor, "F V H W 4"], drawn: Mapping[str, Rendered]) -> None:
-        """Adds the next frames: as recorded (straight alpha), and as drawn by every method."""
+        """Adds the next frames: recorded ones (straight alpha), and the rendered ones of every method."""
         straight = recorded[:, self._columns].float() / 255
         self._truth.append(_small(straight[..., :3] * straight[..., 3:], straight[..., 3]))
         for name, images in drawn.items():
@@ -63,9 +63,9 @@ class PictureRecorder:
         )
 
     def _background(self) -> np.ndarray | None:
-        """Mean colour of every pixel while the object was not before it; None where the files keep none (all black).
+        """Mean colour of every pixel over frames in which it is background; None if the files have only black there.
 
-        Where the object always was, the mean of the rest of the picture stands in.
+        Pixels that are never background get the mean of the others.
         """
         assert self._behind is not None
         total, count = self._behind

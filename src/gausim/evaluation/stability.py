@@ -1,4 +1,4 @@
-"""Whether small motions grow: eigenvalues of a simulator's step, linearised at rest."""
+"""Linear stability: eigenvalues of a simulator's step at rest."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from gausim.nn.mode import evaluating
 if TYPE_CHECKING:
     from gausim.models.step.simulator import GausSim
 
-# Rows of the Jacobian that one backward pass gives, each in a copy of the scene.
+# Rows of the Jacobian per backward pass, each in a copy of the scene.
 COPIES = 24
-# Up to so many unknowns per state the Jacobian is written out; beyond, ARPACK asks for its products.
+# Largest number of unknowns per state for a dense Jacobian; ARPACK needs only products beyond it.
 DENSE = 1500
 
 
 def largest_eigenvalue(model: GausSim, scene_id: int) -> float:
-    """The largest absolute eigenvalue of the step at rest: small motions grow where it is above 1.
+    """Largest absolute eigenvalue of the step at rest; above 1, small motions grow.
 
-    The step takes displacements (u_t, u_{t-1}) of the finest predicted units, their kernels with them, to
-    (u_{t+1}, u_t); its Jacobian [[A, B], [I, 0]] is taken by automatic differentiation, units that are pinned left out.
-    The energy guard of rollouts takes no part.
+    The step maps displacements (u_t, u_{t-1}) of the finest predicted units and their kernels to (u_{t+1}, u_t). Its
+    Jacobian [[A, B], [I, 0]] over the units that are not pinned comes from automatic differentiation. The energy guard
+    of rollouts is off.
 
     Args:
         model: the simulator.
-        scene_id: of the scene.
+        scene_id: number of the scene.
     """
     step = _LinearStep(model, scene_id)
     count = step.count

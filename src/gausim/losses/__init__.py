@@ -1,4 +1,4 @@
-"""What training minimises: images, the rest state and the momentum between levels."""
+"""Losses of training: images, rest state, and momentum between levels."""
 
 from gausim.losses.image import ImageLoss, structural_similarity
 from gausim.losses.objective import Objective

@@ -15,20 +15,20 @@ from gausim.core import ConfigError
 from gausim.kernels.constants import SSIM_C1, SSIM_C2
 from gausim.kernels.operations import operation
 
-# Pixels of the authors' 960 x 540 frames: sums over their pixels, restated for any image size as mean times this.
+# Pixels of the authors' 960 x 540 frames; their sums over pixels are the mean times this number at any image size.
 REFERENCE_PIXELS = 518_400
 # Width of the Gaussian window of Wang et al. 2004 [pixels].
 SSIM_SIGMA = 1.5
 
-# Pixels whose maps are formed together by the torch path: on a CPU they stay in its cache, on a GPU they fill it.
+# Pixels per block of the torch path: they fit a CPU's cache, or keep a GPU busy.
 CPU_PIXELS, GPU_PIXELS = 200_000, 4_000_000
 
 
 class ImageLoss(nn.Module):
     """lambda times the squared error plus (1 - lambda) times (1 - SSIM) / 2.
 
-    Both are summed over channels, averaged over pixels and views and multiplied by ``pixels``, so that weights of
-    other terms mean the same at every image size.
+    Both are summed over channels, averaged over pixels and views and multiplied by ``pixels``, so that the weights of
+    other terms are independent of the image size.
 
     Attributes:
         compares_alpha: whether images have the opacity as their fourth channel.
@@ -37,12 +37,12 @@ class ImageLoss(nn.Module):
     compares_alpha: bool = False
 
     def __init__(self, *, balance: float = 0.9, window: int = 5, pixels: float = REFERENCE_PIXELS) -> None:
-        """Keeps the settings.
+        """Stores the settings.
 
         Args:
-            balance: lambda, the share of the squared error in [0, 1].
+            balance: lambda, the weight of the squared error in [0, 1].
             window: odd size of the SSIM window [pixels].
-            pixels: the mean over pixels is multiplied by this.
+            pixels: factor on the mean over pixels.
 
         Raises:
             ConfigError: a setting out of range.
@@ -75,11 +75,7 @@ class ImageLoss(nn.Module):
         return image_loss(prediction, target, gaussian_taps(self.window), balance=self.balance, scale=scale)
 
     def check_size(self, images: Float[Tensor, "B V H W C"]) -> None:
-        """Refuses images that are smaller than the SSIM window.
-
-        Raises:
-            ConfigError: they are.
-        """
+        """Raises ConfigError for images that are smaller than the SSIM window."""
         height, width = images.shape[2:4]
         if min(height, width) < self.window:
             raise ConfigError(
@@ -89,7 +85,7 @@ class ImageLoss(nn.Module):
 
 
 class _WithGradient(torch.autograd.Function):
-    """The losses as one node: their gradient is formed with them and scaled in the backward pass."""
+    """The losses as one graph node: their gradient is computed with them and scaled in the backward pass."""
 
     @staticmethod
     def forward(ctx: Any, prediction: Tensor, target: Tensor, loss: ImageLoss) -> Tensor:
@@ -114,14 +110,14 @@ def image_loss(
     balance: float,
     scale: float,
 ) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V H W 3"]]:
-    """What :meth:`ImageLoss.value_and_gradient` gives; never waits for a device.
+    """Implementation of :meth:`ImageLoss.value_and_gradient`, without reads that block the host.
 
     Args:
-        prediction: the images.
-        target: the true ones.
-        taps: of the SSIM window along one axis.
-        balance: share of the squared error; the rest is (1 - SSIM) / 2.
-        scale: what the sums over views, pixels and channels are multiplied by.
+        prediction: predicted images.
+        target: true images.
+        taps: coefficients of the SSIM window along one axis.
+        balance: weight of the squared error; the other part is (1 - SSIM) / 2.
+        scale: factor on the sums over views, pixels and channels.
     """
     pixels = prediction[0, ..., 0].numel()
     states = max(1, (CPU_PIXELS if prediction.device.type == "cpu" else GPU_PIXELS) // pixels)
@@ -153,9 +149,9 @@ def gaussian_taps(window: int) -> tuple[float, ...]:
 def structural_similarity(
     first: Float[Tensor, "N H W"], second: Float[Tensor, "N H W"], taps: Sequence[float]
 ) -> Float[Tensor, "N H W"]:
-    """SSIM map with a Gaussian window and reflected borders, as kornia computes it, at half of its cost on a CPU.
+    """SSIM map with a Gaussian window and reflected borders, as in kornia, at half its cost on a CPU.
 
-    Differentiable in ``first`` only: ``second`` is the ground truth. ``taps`` are those of the window along one axis.
+    Differentiable in ``first`` only; ``second`` is the ground truth. ``taps`` are the window along one axis.
     """
     with torch.no_grad():
         mean_second = _blur(second, taps)
@@ -174,7 +170,7 @@ def _blur(image: Tensor, taps: Sequence[float]) -> Tensor:
     half = len(taps) // 2
     height, width = image.shape[-2:]
     padded = F.pad(image[:, None], (half, half, half, half), mode="reflect")[:, 0]
-    # Shifted sums beat a depth-wise convolution on the CPU; symmetric taps need one product per pair.
+    # Shifted sums are faster than a depth-wise convolution on the CPU; symmetric taps need one product per pair.
     rows = taps[half] * padded[:, half : half + height]
     for i in range(half):
         rows = rows + taps[i] * (padded[:, i : i + height] + padded[:, 2 * half - i : 2 * half - i + height])

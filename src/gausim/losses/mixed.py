@@ -1,4 +1,4 @@
-"""Mixtures of L1, squared error and SSIM, as other methods weigh them: what their stages minimise."""
+"""Mixtures of L1, squared error and SSIM, the image losses of other methods."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SSIM_WINDOW = 11
 
 
 class MixedLoss(ImageLoss):
-    """``l1`` |x - y| + ``mse`` (x - y)^2 + ``dssim`` (1 - SSIM) + ``alpha`` (a - b)^2, each a mean over its numbers.
+    """``l1`` |x - y| + ``mse`` (x - y)^2 + ``dssim`` (1 - SSIM) + ``alpha`` (a - b)^2, each a mean over its values.
 
     Colours x, y are over black; a and b are the opacities. With ``alpha`` > 0 images have a fourth channel.
     """
@@ -22,17 +22,17 @@ class MixedLoss(ImageLoss):
     def __init__(
         self, *, l1: float = 0.0, mse: float = 0.0, dssim: float = 0.0, alpha: float = 0.0, window: int = SSIM_WINDOW
     ) -> None:
-        """Keeps the weights.
+        """Stores the weights.
 
         Args:
-            l1: of the absolute error.
-            mse: of the squared error.
-            dssim: of 1 - SSIM.
-            alpha: of the squared error of the opacity.
+            l1: weight of the absolute error.
+            mse: weight of the squared error.
+            dssim: weight of 1 - SSIM.
+            alpha: weight of the squared error of the opacity.
             window: odd size of the SSIM window [pixels].
 
         Raises:
-            ConfigError: a weight below zero, or none above it.
+            ConfigError: a weight is negative, or all are zero.
         """
         super().__init__(window=window)
         if min(l1, mse, dssim, alpha) < 0 or max(l1, mse, dssim, alpha) == 0:

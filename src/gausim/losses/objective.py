@@ -1,4 +1,4 @@
-"""The weights of the terms and how far gradients reach: everything that defines what is minimised."""
+"""Objective of training: weights of the loss terms and lengths of backpropagation."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from gausim.losses.image import ImageLoss
 
 @dataclass(frozen=True)
 class Objective:
-    """What one optimiser step minimises (METHOD section 4).
+    """Objective of an optimiser step (METHOD section 4).
 
     Attributes:
         image: loss between a predicted and a true image.
-        image_weight: of the image loss (mean over views).
-        static_weight: of the static loss [diagonals^2].
-        rest_image_weight: of the image loss of one step from the rest state against frame 0, in batches that carry the
+        image_weight: weight of the image loss (mean over views).
+        static_weight: weight of the static loss [diagonals^2].
+        rest_image_weight: weight of the image loss of one step from the rest state against frame 0, in batches with the
             static loss.
-        static_probability: how often a batch carries it; None is 1 / T.
-        momentum_weight: of the momentum loss [(total mass x diagonals)^2], times what the rest state scores.
+        static_probability: probability of the static loss in a batch; None is 1 / T.
+        momentum_weight: weight of the momentum loss [(total mass x diagonals)^2], times the rest state's loss.
         over_steps: ``mean`` or ``sum`` of image and momentum losses over the steps of a rollout.
-        backprop_steps: gradients stop every so many steps; 0 lets them through the whole rollout.
-        checkpoint_steps: keep of each step of a rollout its input only and compute it once more in the backward pass;
-            same gradients in less memory, for about a third more time of the dynamics.
-        energy_weight: of the energy that free motion beyond the frames seen gains, as a share of what it has, times the
-            batch's image loss; 0 is off. The model's template must know an energy; None is 1 where it does, else 0.
-        energy_frames: how far that motion goes.
-        energy_stretch: frames over which its energy is averaged, about a period; gradients stop at its ends.
-        energy_probability: how often a batch carries it.
-        mixing_weight: of the squares by which the template's matrices mix the modes of the body it began with, times
-            what the rest state scores: what the frames do not tell stays as it was.
-        explosion: a rollout that moves a kernel further than this from its rest position ends there and the rest of
-            it is not learned from [diagonals of the scene's bounding box]; each such end is counted in the log.
+        backprop_steps: loss gradients stop after this number of steps; 0 lets them through the whole rollout.
+        checkpoint_steps: recompute each step in the backward pass from its input; same loss gradients in less memory,
+            for about a third more time of the dynamics.
+        energy_weight: weight of the relative energy growth of free motion beyond the training frames, times the batch's
+            image loss; 0 is off. It needs a template with an energy; None is 1 with one, else 0.
+        energy_frames: number of frames of that motion.
+        energy_stretch: frames over which its energy is averaged, about a period; loss gradients stop at its ends.
+        energy_probability: probability of this term in a batch.
+        mixing_weight: weight of the penalty on mode mixing (squares of the template's mixing matrices), times the rest
+            state's loss; it keeps the initial modes where the frames do not determine them.
+        explosion: distance from rest of a kernel [diagonals of the scene's bounding box] at which a rollout ends, with
+            no loss beyond it; the log counts these rollouts.
     """
 
     image: ImageLoss = field(default_factory=ImageLoss)
@@ -68,15 +68,15 @@ class Objective:
             raise ConfigError(f"loss.static_probability: expected null or 0..1, got {self.static_probability}.")
 
     def step_weight(self, steps: int) -> float:
-        """What the losses of one of ``steps`` predicted steps count."""
+        """Weight of the losses of one of ``steps`` predicted steps."""
         return 1.0 / steps if self.over_steps == "mean" else 1.0
 
     def static_chance(self, steps: int) -> float:
-        """Probability that a batch of ``steps`` predicted steps also carries the static loss."""
+        """Probability of the static loss in a batch of ``steps`` predicted steps."""
         if self.static_weight == 0 and self.rest_image_weight == 0:
             return 0.0
         return 1 / steps if self.static_probability is None else self.static_probability
 
     def window(self, steps: int) -> int:
-        """Length of the stretches through which gradients flow, within a rollout of ``steps``."""
+        """Length of the stretches through which loss gradients flow, in a rollout of ``steps``."""
         return min(steps, self.backprop_steps) if self.backprop_steps else steps

@@ -1,4 +1,4 @@
-"""The static loss: what rests must stay at rest (METHOD section 4)."""
+"""Static loss: a body at rest stays at rest (METHOD section 4)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from torch import Tensor
 def static_loss(
     positions: Float[Tensor, "K 3"], rest: Float[Tensor, "K 3"], diagonal: Float[Tensor, "K 1"]
 ) -> Float[Tensor, ""]:
-    """Sum over kernels of the squared distance between one step from the rest state and the rest state itself.
+    """Sum over kernels of the squared distance between one step from the rest state and the rest state.
 
-    Lengths are divided by the diagonal of each kernel's scene, so that the unit of the scene does not matter.
+    Lengths are divided by the diagonal of each kernel's scene, so the loss is independent of the scene's unit.
     """
     return ((positions - rest) / diagonal).square().sum()

@@ -1,4 +1,4 @@
-"""FLIP: how different two images look when one flips between them (Andersson et al. 2020), by its authors' package.
+"""FLIP: perceived difference of two images shown alternately (Andersson et al. 2020), by its authors' package.
 
 The package `flip-evaluator` (extra ``flip``) computes on the CPU; images of a GPU are copied there.
 """
@@ -13,17 +13,17 @@ from gausim.core import ConfigError
 from gausim.metrics.image import ImageMetric, Images, Mask, PerImage
 
 NO_PACKAGE = "no package"
-# Under tables that lack it.
+# Note under tables without FLIP.
 NO_FLIP = "FLIP was not measured: `pip install flip-evaluator`; then evaluate again."
 
 
 def flip_is_installed() -> bool:
-    """Whether the package that computes FLIP is there."""
+    """Whether the package that computes FLIP is installed."""
     return find_spec("flip_evaluator") is not None
 
 
 class FLIP(ImageMetric):
-    """Mean FLIP error over pixels, 0 (alike) to 1, in the paper's viewing condition (67 pixels per degree).
+    """Mean FLIP error over pixels, from 0 (equal) to 1, in the paper's viewing condition (67 pixels per degree).
 
     Raises:
         ConfigError: the package is not installed.

@@ -1,4 +1,4 @@
-"""Base of the image metrics: one number per image, averaged over images and ranks."""
+"""Base class of image metrics: one value per image, averaged over images and ranks."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ PerImage = Float[Tensor, " B"]
 
 
 class ImageMetric(Metric, ABC):
-    """Mean over images of :meth:`per_image`; sums are reduced over ranks, so every rank computes the same mean.
+    """Mean of :meth:`per_image` over images; sums are reduced over ranks, so every rank computes the same mean.
 
     Attributes:
         key: name in result files.
         label: name in tables and figures.
-        scale: tables print the value times this.
-        unit: what the printed number is in.
-        higher_is_better: which way is good.
+        scale: factor on the value in tables.
+        unit: unit of the scaled value.
+        higher_is_better: whether larger values are better.
     """
 
     key: ClassVar[str]
@@ -49,21 +49,21 @@ class ImageMetric(Metric, ABC):
         Args:
             prediction: predicted images in [0, 1].
             target: true images in [0, 1].
-            mask: foreground pixels of the true images (whole-image metrics do not look at it).
+            mask: foreground pixels of the true images (unused by whole-image metrics).
 
         Returns:
-            One value per image; NaN where a foreground metric finds no foreground.
+            One value per image; NaN for a foreground metric of an image without foreground.
         """
 
     def update(self, prediction: Images, target: Images, mask: Mask) -> None:
-        """Adds a batch of images; images without a value (no foreground) do not count."""
+        """Adds a batch of images, leaving out those without a value (no foreground)."""
         values = self.per_image(prediction, target, mask)
         known = values[~values.isnan()]
         self.total += known.detach().double().sum()
         self.count += known.shape[0]
 
     def compute(self) -> Float[Tensor, ""]:
-        """Mean over all images seen so far."""
+        """Mean over all images so far."""
         return self.total / self.count
 
 

@@ -19,7 +19,7 @@ class L2(ImageMetric):
 
 
 class ForegroundL2(L2):
-    """The same over the foreground pixels of the true image only, which the black background cannot dilute."""
+    """The same over the foreground pixels of the true image only, without the black background."""
 
     key = "l2_foreground"
     label = "l2 foreground"

@@ -1,4 +1,4 @@
-"""Error of a prediction by level of a hierarchy: how well the big parts move, and how well the small ones."""
+"""Error of a prediction by level of a hierarchy, for coarse and fine motion."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ def level_error(
     rest: Float[Tensor, "P 3"],
     unit: Int[Tensor, " P"],
 ) -> tuple[Float[Tensor, " F"], Float[Tensor, " F"]]:
-    """Mean over units of the distance between the mean of their points and of where these truly are.
+    """Mean over units of the distance between the predicted and the true mean of their points.
 
     Args:
         prediction: predicted positions [scene units].
         target: true positions.
-        rest: positions at rest.
-        unit: the unit of each point at the level; points with -1 count for none.
+        rest: rest positions.
+        unit: the unit of each point at the level; -1 for points without a unit.
 
     Returns:
-        The error of every frame, and that of the rest state.
+        The error of every frame, and the error of the rest state.
     """
     known = unit >= 0
     _, index = unit[known].unique(return_inverse=True)

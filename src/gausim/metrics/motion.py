@@ -1,4 +1,4 @@
-"""Figures of the motion itself: distance of points to the truth, and motion energy."""
+"""Metrics of 3D motion: distance of points to the truth, and motion energy."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ def point_error(
 
 
 def motion_energy(frames: Float[Tensor, "F *N D"]) -> Float[Tensor, " F-1"]:
-    """Sum of ||x_{t+1} - x_t||^2 over all places, for every step.
+    """Sum of ||x_{t+1} - x_t||^2 over points or pixels, for every step.
 
-    It tells a prediction that moves rightly from one that dissipates or explodes: a static or fast-dissipating one gets
-    a deceptively low error on late frames, but the ratio of its energy to the true one is near 0.
+    It detects predictions that dissipate or explode: a static or fast-dissipating one has a misleadingly low error on
+    late frames, but the ratio of its energy to the true one is near 0.
 
     Args:
-        frames: positions of points (D = 3, scene units), or colours of pixels (D = 3, RGB on black: what stays
-            background in both frames adds nothing, so that the sum runs over the foreground by itself).
+        frames: positions of points (D = 3, scene units), or colours of pixels (D = 3, RGB on black, so that pixels that
+            remain background contribute zero).
     """
     return frames.diff(dim=0).square().sum(-1).flatten(1).sum(1)

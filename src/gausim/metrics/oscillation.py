@@ -1,7 +1,7 @@
-"""How a prediction oscillates beside the truth: frequencies, damping, spectrum and phase in the truth's own modes.
+"""Oscillation of predictions and truth: frequencies, damping, spectrum and phase in the truth's principal motions.
 
-Motions are looked at in the principal motions of the true displacements: the few orthogonal shapes that hold most of
-their squared size. A shape seldom is one vibration mode, but it is the same measure for all predictions.
+Principal motions of the true displacements are the few orthogonal shapes with the largest squared displacement. A shape
+is rarely one vibration mode, but the basis is the same for all predictions.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ Array = NDArray[np.float64]
 
 
 def principal_motions(displacements: Sequence[NDArray], count: int) -> tuple[Array, Array]:
-    """Shapes that displacements of all sequences are made of.
+    """Principal components of the displacements of all sequences.
 
     Args:
         displacements: (F, P, 3) from the rest state, per sequence.
-        count: at most so many shapes.
+        count: largest number of shapes.
 
     Returns:
         (M, 3 P) orthonormal shapes, and the fraction (M,) of the squared displacement in each, the largest first.
@@ -44,8 +44,8 @@ class Oscillation:
     """One damped oscillation.
 
     Attributes:
-        frequency: [Hz]; 0 where the motion only decays.
-        damping: fraction of critical damping; negative where it grows, NaN where the motion does not oscillate.
+        frequency: [Hz]; 0 for a motion that only decays.
+        damping: fraction of critical damping; negative if the motion grows, NaN if it does not oscillate.
     """
 
     frequency: float
@@ -53,7 +53,7 @@ class Oscillation:
 
 
 def oscillation(series: Sequence[Array], fps: float) -> Oscillation:
-    """The oscillation z_{t+1} = a z_t + b z_{t-1} that fits a coordinate of all sequences best (least squares).
+    """Least-squares fit of an oscillation z_{t+1} = a z_t + b z_{t-1} to a coordinate of all sequences.
 
     Args:
         series: (F,) values of the coordinate, per sequence.
@@ -74,7 +74,7 @@ def oscillation(series: Sequence[Array], fps: float) -> Oscillation:
 def spectrum(series: Sequence[Array], fps: float) -> tuple[Array, Array]:
     """Frequencies (B,) [Hz] and the power (B,) of coordinates (F, M), summed over them, mean over sequences.
 
-    Sequences are cut to the shortest, their means taken off and a Hann window laid over them.
+    Sequences are cut to the shortest, centred and multiplied by a Hann window.
     """
     length = min(len(s) for s in series)
     found = [periodogram(s[:length], fs=fps, window="hann", detrend="constant", axis=0) for s in series]
@@ -84,7 +84,7 @@ def spectrum(series: Sequence[Array], fps: float) -> tuple[Array, Array]:
 def phase_error(prediction: Sequence[Array], truth: Sequence[Array]) -> Array:
     """Root-mean-square difference of phase (F,) [degrees] between coordinates (F, M), 104 where they are unrelated.
 
-    The phase is that of the analytic signal; a coordinate counts in a frame as much as both of its amplitudes.
+    The phase is that of the analytic signal; the weight of a coordinate in a frame is the product of both amplitudes.
     """
     length = min(len(t) for t in truth)
     squared, weights = np.zeros(length), np.zeros(length)

@@ -6,7 +6,7 @@ from torch import log10
 
 from gausim.metrics.image import ImageMetric, Images, Mask, PerImage, masked_mean
 
-# Identical images would be infinitely good and spoil every mean; 1e-10 caps them at 100 dB.
+# Limits the PSNR of identical images to 100 dB, which otherwise would be infinite.
 SMALLEST_MSE = 1e-10
 
 

@@ -6,8 +6,8 @@ import kornia.metrics
 
 from gausim.metrics.image import ImageMetric, Images, Mask, PerImage
 
-# Window 11 with a Gaussian of sigma 1.5, as in the original definition and in what 3DGS work reports. The training loss
-# uses window 5: a figure that is compared between methods must not be the one that one of them optimises.
+# Window 11 with a Gaussian of sigma 1.5, as in the original definition and in papers on 3DGS. The training loss uses
+# window 5: a metric for the comparison of methods should not be the loss of one of them.
 WINDOW = 11
 
 

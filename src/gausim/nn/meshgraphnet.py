@@ -18,7 +18,7 @@ NORMS = ("pre", "post", "joint")
 
 
 class _SplitLayer(nn.Module):
-    """Pre-norm and SiLU: what each update reads is normalised, then added to the stream.
+    """Layer with pre-norm and SiLU: the inputs of each update are normalised, and the update is added to the stream.
 
     The edge MLP's first layer acts on [edge, source, destination]; it is split into three matrices so that the two
     node products are computed once per node instead of once per edge.
@@ -43,9 +43,9 @@ class _SplitLayer(nn.Module):
 
 
 class _Layer(nn.Module):
-    """The same for other choices than pre-norm and SiLU.
+    """Layer with any norm and activation.
 
-    With norm "post" the updates are normalised instead of what they are computed from (Pfaff et al. 2021).
+    With norm "post" the updates are normalised instead of their inputs (Pfaff et al. 2021).
     """
 
     def __init__(self, hidden: int, *, norm: str, activation: str) -> None:
@@ -67,7 +67,7 @@ class _Layer(nn.Module):
 
 
 class _JointLayer(nn.Module):
-    """The layer of the authors' code: MLPs of three linear layers, one LayerNorm over all that each of them reads.
+    """The layer of the authors' code: MLPs of three linear layers, with one LayerNorm over all inputs of each.
 
     The summed messages are normalised with the node, so that the node stream does not grow from layer to layer.
     """
@@ -89,7 +89,7 @@ class _JointLayer(nn.Module):
 class MeshGraphNet(nn.Module):
     """Encoder, ``layers`` message-passing layers, decoder hidden -> hidden/2 -> hidden/4 -> outputs.
 
-    How it computes (``precision``, ``checkpoint``, ``compile``) changes no parameter: checkpoints fit every choice.
+    ``precision``, ``checkpoint`` and ``compile`` do not change the parameters: checkpoints fit all their values.
     """
 
     def __init__(
@@ -114,14 +114,14 @@ class MeshGraphNet(nn.Module):
             outputs: number of outputs per node.
             hidden: width of all hidden layers.
             layers: message-passing layers.
-            norm: LayerNorm ``pre`` (of what a residual update reads), ``post`` (of the update), or ``joint``: the
-                authors' layers, with three linear layers per MLP, one LayerNorm over all that each reads, none before
+            norm: LayerNorm ``pre`` (of the inputs of a residual update), ``post`` (of the update), or ``joint``: the
+                authors' layers, with three linear layers per MLP, one LayerNorm over all inputs of each, none before
                 the decoder, and ReLU in encoders and decoder.
             activation: ``silu`` or ``relu``.
             precision: ``fp32``, or ``bf16``: the products of the message-passing layers in bfloat16, all streams, sums,
                 encoders and the decoder in float32. An autocast around the network means ``bf16`` too.
-            checkpoint: keep only the streams before every few layers (2 of 16) and recompute the rest in the backward
-                pass, with the same gradients bit by bit.
+            checkpoint: keep only the streams before every few layers (2 of 16) and recompute the others in the backward
+                pass, with the same loss gradients bit by bit.
             compile: compile the layers at the first call, for any number of nodes and edges; needs a C++ compiler on
                 the CPU and triton on a GPU. It pays on a GPU.
 
@@ -147,7 +147,7 @@ class MeshGraphNet(nn.Module):
     def forward(
         self, node_features: Float[Tensor, "N Cn"], edge_features: Float[Tensor, "E Ce"], edge_index: Int[Tensor, "2 E"]
     ) -> Float[Tensor, "N Co"]:
-        """Outputs per node; ``edge_index`` holds (source, destination), best sorted by destination."""
+        """Outputs per node; ``edge_index`` is (source, destination), preferably sorted by destination."""
         device = node_features.device.type
         bf16 = self.precision == "bf16" or torch.is_autocast_enabled(device)
         with torch.autocast(device, enabled=False):
@@ -160,16 +160,16 @@ class MeshGraphNet(nn.Module):
 
     def _process(self, nodes: Tensor, edges: Tensor, edge_index: Tensor) -> Tensor:
         modules = list(self.processor)
-        # For none and for one the compiler would build a variant each: such graphs run as they are.
+        # The compiler would build special variants for zero and one node or edge, so these graphs run uncompiled.
         compiled = self.compiled and min(len(nodes), len(edges)) > 1
         if compiled:
             for layer in modules:
-                if layer._compiled_call_impl is None:  # all share their code, so the compiler works once
+                if layer._compiled_call_impl is None:  # all have the same code, which is compiled once
                     layer.compile(dynamic=True)
         layers: list[Callable] = [layer if compiled else layer.forward for layer in modules]
         if not (self.checkpointed and torch.is_grad_enabled()):
             return _run(layers, nodes, edges, edge_index)[0]
-        # 16 layers keep 16 / 2 streams, plus 2 x 2 arrays while a segment is recomputed: near the least sum.
+        # 16 layers keep 16 / 2 streams, plus 2 x 2 arrays while a segment is recomputed: near the minimum.
         size = max(1, math.isqrt(len(layers) // 2))
         for first in range(0, len(layers), size):
             segment = layers[first : first + size]

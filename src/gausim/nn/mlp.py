@@ -1,4 +1,4 @@
-"""Small building blocks of networks."""
+"""Multilayer perceptrons."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from torch import nn
 
 @contextmanager
 def evaluating(model: nn.Module) -> Iterator[None]:
-    """Evaluation mode, and afterwards the mode that was."""
+    """Context of evaluation mode, which restores the previous mode."""
     was_training = model.training
     if was_training:
         model.eval()

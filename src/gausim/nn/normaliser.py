@@ -13,17 +13,17 @@ from torch import Tensor, nn
 class RunningNormaliser(nn.Module):
     """Normalises the first ``size`` features by statistics gathered in training; the others pass unchanged.
 
-    In training mode a call adds what it sees to ``gathered``; :meth:`absorb` makes that part of the statistics. Between
-    two calls of :meth:`absorb` the layer is one fixed function, so that a step of the optimiser is the gradient of one
-    function and can be divided over ranks, whose ``gathered`` are added before. Features pass unchanged as long as
-    there are no statistics.
+    In training mode a call adds its features to ``gathered``; :meth:`absorb` adds these sums to the statistics. Between
+    two calls of :meth:`absorb` the layer is a fixed function, so that an optimiser step has the loss gradient of one
+    function and can be divided over ranks, whose ``gathered`` are added first. Without statistics, features pass
+    unchanged.
 
     Statistics are buffers (part of the checkpoint) in float64. The standard deviation is floored because x_{-1} = X
     makes every velocity zero at the start.
 
     Attributes:
-        gathered: number, sum and sum of squares of what was seen since :meth:`absorb`; not part of the checkpoint.
-        frozen: calls in training mode add nothing to it.
+        gathered: number, sum and sum of squares of the features since :meth:`absorb`; not part of the checkpoint.
+        frozen: whether calls in training mode leave ``gathered`` unchanged.
     """
 
     count: Tensor
@@ -33,12 +33,12 @@ class RunningNormaliser(nn.Module):
     gathered: Float[Tensor, " G"]
 
     def __init__(self, size: int, *, floor: float = 1e-2, max_updates: int = 100_000) -> None:
-        """Makes an empty one.
+        """Starts without statistics.
 
         Args:
-            size: features that are normalised.
-            floor: the smallest standard deviation, in the features' own units.
-            max_updates: calls of :meth:`absorb` after which the statistics stay as they are.
+            size: number of normalised features.
+            floor: smallest standard deviation, in the unit of each feature.
+            max_updates: calls of :meth:`absorb` after which the statistics are constant.
         """
         super().__init__()
         self.size, self.floor, self.max_updates, self.frozen = size, floor, max_updates, False
@@ -66,7 +66,7 @@ class RunningNormaliser(nn.Module):
 
     @torch.no_grad()
     def absorb(self) -> None:
-        """Takes what was gathered into the statistics; nothing is read on the host."""
+        """Adds the gathered sums to the statistics, without a read on the host."""
         counts = (self.gathered[0] > 0) & (self.updates < self.max_updates)
         number, total, squares = self.gathered.split((1, self.size, self.size))
         for statistic, seen in ((self.count, number[0]), (self.total, total), (self.squares, squares)):
@@ -76,13 +76,13 @@ class RunningNormaliser(nn.Module):
 
 
 def normalisers_of(module: nn.Module) -> list[RunningNormaliser]:
-    """All of them in a module, in its order."""
+    """All normalisers of a module, in its order."""
     return [m for m in module.modules() if isinstance(m, RunningNormaliser)]
 
 
 @contextmanager
 def gathering_nothing(normalisers: Iterable[RunningNormaliser]) -> Iterator[None]:
-    """The block in which calls leave no trace: what was counted already is computed once more."""
+    """Context in which calls gather no statistics, for the recomputation of a step."""
     held = [(n, n.frozen) for n in normalisers]
     for normaliser, _ in held:
         normaliser.frozen = True

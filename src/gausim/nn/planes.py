@@ -10,15 +10,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 SUM, PRODUCT = "sum", "product"
-# Range that features of planes of space are drawn from (K-Planes, 4DGS).
+# Range of initial features of spatial planes (K-Planes, 4DGS).
 LOW, HIGH = 0.1, 0.5
 
 
 class Planes(nn.Module):
-    """One plane of features for each pair of D axes, looked up bilinearly; D = 3 is a tri-plane, D = 4 a HexPlane.
+    """One plane of features for each pair of D axes, interpolated bilinearly; D = 3 is a tri-plane, D = 4 a HexPlane.
 
-    Planes of two of the first three axes begin at random; those with the fourth (time) begin at 1, so that a product
-    does not depend on time at first. Coordinates beyond [-1, 1] see the border.
+    Planes of two of the first three axes are initialised at random, those with the fourth (time) with 1, so that a
+    product is constant in time at first. Coordinates beyond [-1, 1] are clamped.
 
     Attributes:
         pairs: the axes of every plane.
@@ -29,12 +29,12 @@ class Planes(nn.Module):
         """Draws the planes from the global generator.
 
         Args:
-            resolution: numbers along each of the D axes.
+            resolution: number of grid points along each of the D axes.
             features: channels of every plane.
             combine: ``product`` or ``sum`` of the planes' features.
 
         Raises:
-            ValueError: an unknown way to combine, or fewer than two numbers along an axis.
+            ValueError: ``combine`` is unknown, or an axis has fewer than two grid points.
         """
         super().__init__()
         if combine not in (SUM, PRODUCT) or len(resolution) not in (3, 4) or min(resolution) < 2:
@@ -64,7 +64,7 @@ class Planes(nn.Module):
         return result
 
     def variation(self) -> Float[Tensor, ""]:
-        """Mean squared difference of neighbouring features along the axes of space, summed over planes."""
+        """Mean squared difference of neighbouring features along the spatial axes, summed over planes."""
         total = torch.zeros((), device=self.planes[0].device)
         for (_, j), plane in zip(self.pairs, self.planes, strict=True):
             total = total + plane.diff(dim=3).square().mean()  # axis i < 3 is always one of space
@@ -73,7 +73,7 @@ class Planes(nn.Module):
         return total
 
     def unsteadiness(self) -> Float[Tensor, ""]:
-        """Mean squared second difference of features along time, summed over planes with time; 0 without."""
+        """Mean squared second difference of features in time, summed over planes with time; 0 without time."""
         total = torch.zeros((), device=self.planes[0].device)
         for (_, j), plane in zip(self.pairs, self.planes, strict=True):
             if j == 3 and plane.shape[2] > 2:

@@ -1,1 +1,1 @@
-"""Tables and figures from result files and arrays; never from a model."""
+"""Reports: tables and figures from result files and arrays, never from a model."""

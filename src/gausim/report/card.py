@@ -1,4 +1,4 @@
-"""The card of a run: Markdown with front matter, from what its directory records; nothing is measured or guessed."""
+"""Card of a run: Markdown with front matter, from the records in its directory."""
 
 from __future__ import annotations
 
@@ -11,33 +11,33 @@ from jinja2 import Environment, PackageLoader
 
 from gausim.report.gather.runs import RunRecord, dig
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import GROUP_TITLES, LEGEND, NO_FORESIGHT, markdown_table, object_tables, said
+from gausim.results.table import GROUP_TITLES, LEGEND, NO_FORESIGHT, footnotes_of, markdown_table, object_tables
 
-# Hugging Face and code hosts show a file of this name.
+# Hugging Face and code hosts display a file of this name.
 CARD = "README.md"
 TAGS = ("gaussian-splatting", "neural-simulation", "elastic-dynamics", "3d")
 _LICENCES = ("licence", "license")
-# The figure of a group that stands in the front matter and that the limitations speak of.
+# Figure of each group in the front matter and in the limitations.
 _HEADLINES = {"points": "error_3d", "heldout": "l2", "train": "l2"}
 
 
 @dataclass(frozen=True)
 class CardFacts:
-    """What a card says beyond the run's own records."""
+    """Contents of a card beyond the run's records."""
 
-    command: str  # how the run's directory is written in commands
-    about: str = ""  # what its model's preset says of itself
-    data: Mapping[str, Mapping[str, Any]] | None = None  # dataset.json by object, where the data set is here
-    base: str = ""  # what its configuration is compared with, in words
+    command: str  # the run's directory as written in commands
+    about: str = ""  # description of the model's preset
+    data: Mapping[str, Mapping[str, Any]] | None = None  # dataset.json by object, if the data set is available
+    base: str = ""  # reference of the comparison of configurations, in words
     differences: Sequence[tuple[str, str, str]] = ()  # key, value of the run and value of that base
-    overrides: Sequence[str] = ()  # what it was started with, paths of that machine left out
+    overrides: Sequence[str] = ()  # overrides of its command, without paths
     finished: Mapping[str, Any] = field(default_factory=dict)  # content of FINISHED
     endurance: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # content of endurance.json
     licence: str | None = None  # of the weights
 
 
 def card(run: RunRecord, facts: CardFacts) -> str:
-    """The card of a run; parts that are missing are named, with the command that makes them."""
+    """The card of a run, with the commands that make missing parts."""
     environment = Environment(
         loader=PackageLoader("gausim.report"), trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
     )
@@ -46,7 +46,7 @@ def card(run: RunRecord, facts: CardFacts) -> str:
     data, trainer = run.config.get("data", {}), run.config.get("trainer", {})
     costs = {name: dig(entry, "efficiency", _method(entry)) for name, entry in objects.items()}
     first = next(iter(objects.values()), None)
-    fit = None if first is None else said(first, _method(first)).get("fit")
+    fit = None if first is None else footnotes_of(first, _method(first)).get("fit")
     return environment.get_template("card.md").render(
         run=run,
         facts=facts,
@@ -62,7 +62,7 @@ def card(run: RunRecord, facts: CardFacts) -> str:
         asked=[f"{key} {trainer[key]}" for key in ("accelerator", "devices", "threads", "precision") if key in trainer],
         fit=fit if isinstance(fit, Mapping) else None,
         headline=_headline,
-        said=lambda entry: said(entry, _method(entry)),
+        footnotes_of=lambda entry: footnotes_of(entry, _method(entry)),
         no_foresight=NO_FORESIGHT,
     )
 
@@ -112,7 +112,7 @@ def _headline_metrics(entry: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _headline(entry: dict[str, Any]) -> dict[str, Any] | None:
-    """What the limitations say of the unseen frames: ratios to standing still, and energy."""
+    """Figures of the unseen frames for the limitations: ratios to the static prediction, and energy."""
     row = entry["rows"].get(_method(entry), {})
     for group, metric in _HEADLINES.items():
         if dig(row, "unseen", group, metric, "mean") is not None:

@@ -1,4 +1,4 @@
-"""Every figure of a report as CSV, at full precision and not scaled."""
+"""All figures of a report as CSV, at full precision and unscaled."""
 
 from __future__ import annotations
 

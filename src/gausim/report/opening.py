@@ -1,4 +1,4 @@
-"""What a report begins with: per run a video, three sentences, and one table."""
+"""First screens of a report: per run a video, three sentences, and one table."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from gausim.results.curves import ERROR_3D, STATIC
 from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import Table, plus_minus
 
-# Videos are most of a page's size; the page of a run alone has its video.
+# Largest number of first screens, because videos make up most of a page's size.
 MOST_OPENINGS = 6
-# Of the one table; the last is the prediction of no motion.
+# Largest number of rows of its table; the last is the static prediction.
 MOST_ROWS = 6
 _STILL = "no motion"
-# Metric, views (None: those of the row), heading, digits.
+# Columns: metric, views (None: those of the row), heading, digits.
 _COLUMNS = (
     ("psnr", None, "PSNR [dB] ↑", 1),
     ("ssim", None, "SSIM ↑", 3),
@@ -39,28 +39,28 @@ _COLUMNS = (
 class Opening:
     """The first screen of one run and object."""
 
-    label: str  # what it is chosen by
+    label: str  # its label in the list of first screens
     name: str  # of the object
     title: str  # heading: the object and the row
     row: str  # label of its row
-    seed: str  # which of several seeds; empty for one
+    seed: str  # its seed, empty if there is one only
     run: RunRecord  # of the video
     sentences: tuple[str, str, str]  # over all seeds of the row
     table: Table
     film: Film | None
-    problem: str  # why there is no video, and what to do
-    unfinished: bool  # whether the figures are of a checkpoint in the middle of training
+    problem: str  # reason for a missing video, and the remedy
+    unfinished: bool  # whether the figures are of an unfinished training
 
 
 def make_openings(study: Study, *, pictures: bool = True) -> tuple[list[Opening], int]:
-    """The openings of the best runs: the best of every object, then the next; one per row before further seeds.
+    """The first screens of the best runs: the best of every object, then the next; one per row before further seeds.
 
     Args:
-        study: what the report is about.
+        study: data of the report.
         pictures: whether they have videos.
 
     Returns:
-        At most ``MOST_OPENINGS``, and the number of those left out.
+        At most ``MOST_OPENINGS`` first screens, and the number of omitted ones.
     """
     ranked = [_ranked(study, name) for name in study.objects]
     turns = [run for turn in zip_longest(*ranked) for run in turn if run is not None]
@@ -69,7 +69,7 @@ def make_openings(study: Study, *, pictures: bool = True) -> tuple[list[Opening]
 
 
 def _ranked(study: Study, name: str) -> list[tuple[str, Group, RunRecord]]:
-    """The evaluated runs about an object, the best seed of every row first, by their errors."""
+    """The evaluated runs of an object, sorted by error, with the best seed of every row first."""
     found: list[tuple[int, float, Group, RunRecord]] = []
     for group in study.groups:
         seeds = [(outcome([entry], group.method).merit, run) for run, entry in group.entries(name)]
@@ -79,7 +79,7 @@ def _ranked(study: Study, name: str) -> list[tuple[str, Group, RunRecord]]:
 
 
 def unanswered(study: Study) -> list[str]:
-    """For every run without figures, the command that leads to them; in words, backquotes about the command."""
+    """For every run without figures a sentence with the command, in backquotes, that computes them."""
     remedies = {
         NOT_EVALUATED: "{name} is trained and not evaluated: `gausim evaluate {path}` measures it.",
         UNFINISHED: "{name} is not finished ({detail}): give its `gausim train` command again, or measure what there "
@@ -121,7 +121,7 @@ def _opening(study: Study, name: str, group: Group, run: RunRecord, *, pictures:
 
 
 def first_table(study: Study, group: Group, name: str) -> Table:
-    """The one table: of a row alone its frames and views, else all rows in the frames never seen."""
+    """The table of a first screen: frames and views of a single row, else all rows on unseen frames."""
     rivals = [g for g in study.groups if name in g.objects]
     return _own_table(study, group, name) if len(rivals) == 1 else _comparison(study, rivals, name)
 
@@ -162,7 +162,7 @@ def _span(split: Sequence[int]) -> str:
 
 
 def _rows(group: Group, name: str, split: str, label: str, *, row: str | None = None) -> list[list[str]]:
-    """The line of the training views, and that of the views never trained on where they were measured."""
+    """The lines of the training views and, if measured, of the held-out views."""
     lines: list[list[str]] = []
     for views, title in (("train", "training"), ("heldout", "new")):
         line = _row(group, name, split, views, label, row=row)
@@ -198,7 +198,7 @@ def _legend(rows: list[list[str]]) -> str:
 
 
 def _tidy(stubs: list[str], rows: list[list[str]], caption: str) -> Table:
-    """The table without columns that no row has anything for."""
+    """The table without empty columns."""
     head = [*stubs, *(heading for _, _, heading, _ in _COLUMNS)]
     kept = [i for i in range(len(head)) if i < len(stubs) or any(_is_figure(row[i]) for row in rows)]
     breaks = [i for i, row in enumerate(rows) if i and (row[0] == _STILL or (len(stubs) > 1 and row[0]))]

@@ -1,4 +1,4 @@
-"""A report as HTML (one file, no script, nothing from anywhere else), Markdown and LaTeX, from the templates here."""
+"""Reports as HTML (one file without scripts or external resources), Markdown and LaTeX, from templates."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ _ANGLES = {
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """What a report says."""
+    """Contents of a report."""
 
     title: str
     study: Study
     sheets: Sequence[Sheet]
-    sources: Sources  # where their numbers link to
-    openings: Sequence[Opening]  # first screens, of which one is shown at a time
-    left: int = 0  # number of first screens that were left out
+    sources: Sources  # link targets of their numbers
+    openings: Sequence[Opening]  # first screens, shown one at a time
+    left: int = 0  # number of omitted first screens
     exhibits: Sequence[tuple[str, list[Exhibit]]] = ()  # pictures and videos by object
-    notes: Sequence[str] = ()  # what a reader must know
+    notes: Sequence[str] = ()  # notes for the reader
 
 
 def html_page(content: Content) -> str:
-    """The page; every text is escaped, and its policy forbids the browser to load anything."""
+    """The page, with all texts escaped and a security policy that forbids the browser to load anything."""
     sections = [(name, [sheet for sheet in content.sheets if sheet.section == name]) for name in SECTIONS]
     return _rendered(
         "page.html",
@@ -61,8 +61,8 @@ def html_page(content: Content) -> str:
 
 
 def markdown_report(content: Content) -> str:
-    """The whole report without its pictures."""
-    # Further seeds of a row have its sentences.
+    """The whole report without pictures."""
+    # All seeds of a row have the same sentences.
     told = {opening.title: opening for opening in reversed(content.openings)}
     options = {"finalize": _escaping(markdown_escape), "lstrip_blocks": True}
     return _rendered("report.md", content, options, openings=list(reversed(told.values())), notes=content.study.notes)
@@ -82,24 +82,24 @@ def _rendered(template: str, content: Content, options: Mapping[str, Any], **mor
 
 
 def _escaping(escape: Callable[[str], str]) -> Callable[[Any], Any]:
-    """What escapes every expression of a template but those that it calls safe, which know their own markup."""
+    """Finalizer of a template that escapes every expression not marked as safe."""
     return lambda value: value if hasattr(value, "__html__") else escape(str(value))
 
 
 def latex_escape(text: str) -> str:
-    """Text that LaTeX prints as it is, on one line; control characters are dropped."""
+    """Text escaped for LaTeX, on one line; control characters are removed."""
     flat = re.sub(r"\s+", " ", text)
     return "".join(_LATEX.get(c, c) for c in flat if c.isprintable())
 
 
 def markdown_escape(text: str) -> str:
-    """Text that Markdown prints as it is, also inside a table; backquotes stay, for commands."""
+    """Text escaped for Markdown, also in tables; backquotes stay, for commands."""
     flat = re.sub(r"\s+", " ", text)
     return re.sub(r"([\\*_\[\]|<>#~&])", r"\\\1", flat)
 
 
 def summary_line(study: Study) -> str:
-    """How many runs there are, and in what state."""
+    """Number of runs, by state."""
     states = Counter(run.status for run in study.runs)
     shown = ", ".join(f"{count} {state}" for state, count in states.items())
     objects = ", ".join(study.objects) or "none"

@@ -1,4 +1,4 @@
-"""Where every number of a report comes from: its run, or its set of runs."""
+"""Sources of a report's numbers: runs and sets of runs."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from gausim.report.tables.sheets import Sheet
 
 
 class Sources:
-    """Gives every set of runs that a number comes from a place in the report to link to.
+    """Link targets in the report for the sources of numbers.
 
     Attributes:
         runs: all runs.
-        sets: the sets of several runs that some number was computed from.
+        sets: sets of several runs from which a number was computed.
     """
 
     def __init__(self, runs: Sequence[RunRecord], sheets: Sequence[Sheet], out: Path) -> None:
-        """Collects them; ``out`` is the report's folder, which links are relative to."""
+        """Collects the sources; links are relative to the report's folder ``out``."""
         self._out, self.runs = out.resolve(), tuple(runs)
         every = [tuple(dict.fromkeys(e.runs)) for sheet in sheets for line in sheet.lines for e in line.entries]
         self.sets = [same for same in dict.fromkeys(every) if len(same) > 1]
@@ -28,9 +28,9 @@ class Sources:
         self._anchors |= {same: f"runs-{i}" for i, same in enumerate(self.sets, 1)}
 
     def anchor(self, runs: Sequence[RunRecord]) -> str:
-        """Where a number computed from these runs links to; empty where it comes from none."""
+        """Link target of a number computed from ``runs``; empty without runs."""
         return self._anchors.get(tuple(dict.fromkeys(runs)), "")
 
     def link(self, run: RunRecord) -> str:
-        """The relative address of a run's directory."""
+        """Relative path of a run's directory."""
         return quote(Path(os.path.relpath(run.path.resolve(), self._out)).as_posix())

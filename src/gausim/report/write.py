@@ -1,4 +1,4 @@
-"""Makes a report: from directories of runs to HTML, Markdown, LaTeX and CSV files."""
+"""Writer of reports: from directories of runs to HTML, Markdown, LaTeX and CSV files."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ PAGE, MARKDOWN, LATEX, NUMBERS = "report.html", "report.md", "tables.tex", "numb
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """A report that was written."""
+    """A written report."""
 
     study: Study
-    openings: list[Opening]  # the best run's first; none where nothing was evaluated
+    openings: list[Opening]  # the best run's first; empty without evaluations
     files: list[Path]  # the page first
 
 
@@ -36,14 +36,14 @@ def write_report(
     pictures: bool = True,
     say: Callable[[str], None] = lambda text: None,
 ) -> Report:
-    """Writes the report of all runs at or below ``roots`` into ``out``.
+    """Writes the report of all runs at or below ``roots`` to ``out``.
 
     Args:
         roots: run directories, sweeps, or folders of them.
         out: folder of the report; not searched for runs.
         title: heading.
         pictures: whether the page has figures and videos.
-        say: told what is being drawn.
+        say: called with messages on the progress.
 
     Raises:
         RunError: a root is no directory, or there is no run.

@@ -1,8 +1,8 @@
-"""Per-frame figures of an evaluated object: what the tables and plots are computed from.
+"""Per-frame figures of an evaluated object, from which tables and plots are computed.
 
-``metrics.npz`` holds them as ``OBJECT/ROW/METRIC``: image metrics and ``image_energy`` as (S, F, V) over sequences,
-frames and views, ``error_3d`` and ``point_energy`` as (S, F). NaN pads sequences that are shorter than the longest.
-Energies of frame t belong to the step from t-1 to t and exist for the row ``truth`` too.
+Arrays of ``metrics.npz`` are named ``OBJECT/ROW/METRIC``: image metrics and ``image_energy`` are (S, F, V) over
+sequences, frames and views, ``error_3d`` and ``point_energy`` (S, F). NaN pads shorter sequences. Energies of frame t
+are those of the step from t-1 to t, and exist for the row ``truth``, too.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _FACTS = "facts"
 
 @dataclass(frozen=True)
 class ImageMetricInfo:
-    """How an image metric is named and printed (value times scale, in unit)."""
+    """Name and display of an image metric (value times ``scale``, in ``unit``)."""
 
     key: str
     label: str
@@ -41,16 +41,16 @@ class ImageMetricInfo:
 
 @dataclass(frozen=True)
 class ObjectFacts:
-    """What was evaluated."""
+    """Facts of an evaluated object."""
 
     name: str  # of the object
     fps: float
     sequences: tuple[str, ...]
     frames: tuple[int, ...]  # number of frames of each sequence
     views: tuple[str, ...]
-    train_views: tuple[str, ...]  # those of the views that training saw
-    first_unseen: int  # first frame that training did not see
-    methods: tuple[str, ...]  # rows that are predictions of a method (the others are references)
+    train_views: tuple[str, ...]  # views used in training
+    first_unseen: int  # first frame not used in training
+    methods: tuple[str, ...]  # rows of methods (the others are references)
     metrics: tuple[ImageMetricInfo, ...]
     mean_color: tuple[float, float, float]  # of the true foreground, in [0, 1]
     max_l2: float  # largest per-pixel colour distance of any prediction of the first method
@@ -58,16 +58,16 @@ class ObjectFacts:
 
 @dataclass(frozen=True, eq=False)
 class ObjectCurves:
-    """Facts and arrays of one object: ``values[row][metric]``, see the module's text for shapes."""
+    """Facts and arrays of one object: ``values[row][metric]``, of the shapes given above."""
 
     facts: ObjectFacts
     values: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
-    record: dict[str, Any] = field(default_factory=dict)  # goes into the summary as it is (efficiency, sources, ...)
-    pictures: Pictures | None = None  # of one sequence; they have a file of their own
+    record: dict[str, Any] = field(default_factory=dict)  # copied to the summary (efficiency, sources, ...)
+    pictures: Pictures | None = None  # of one sequence; stored in another file
 
     @property
     def rows(self) -> list[str]:
-        """Rows of the tables: all but the truth."""
+        """Rows of tables, all but the truth."""
         return [row for row in self.values if row != TRUTH]
 
     def view_indices(self, group: str) -> list[int]:
@@ -77,7 +77,7 @@ class ObjectCurves:
 
 
 def save_curves(path: Path, objects: list[ObjectCurves]) -> None:
-    """Writes all objects' arrays and facts into one npz (the facts as JSON text; nothing is pickled)."""
+    """Writes all objects' arrays and facts to one npz (the facts as JSON text, without pickles)."""
     arrays: dict[str, Any] = {}
     for curves in objects:
         arrays[f"{curves.facts.name}/{_FACTS}"] = np.array(msgspec.json.encode(curves.facts).decode())
@@ -88,10 +88,10 @@ def save_curves(path: Path, objects: list[ObjectCurves]) -> None:
 
 
 def load_curves(path: Path) -> list[ObjectCurves]:
-    """Reads what :func:`save_curves` wrote.
+    """Reads a file of :func:`save_curves`.
 
     Raises:
-        RunError: the file is missing or not such a file.
+        RunError: the file is missing or malformed.
     """
     try:
         arrays = read_npz(path)

@@ -1,4 +1,4 @@
-"""What kind of error a prediction makes where the true motion is known: frequency, damping, phase, first velocity."""
+"""Diagnosis of predictions whose true motion is known: frequency, damping, phase and first velocity."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from gausim.metrics.oscillation import (
 )
 from gausim.results.curves import TRUTH
 
-# Principal motions that are looked at; more hold too little to have a frequency that can be told.
+# Number of principal motions; further ones are too small for an estimate of their frequency.
 MOTIONS = 8
-# Points of each sequence that are kept: enough for smooth motion, few enough to keep all sequences.
+# Points used per sequence: enough for smooth motion, few enough for the memory of all sequences.
 POINTS = 2048
 
 
 class Diagnosis:
-    """Collects true and predicted displacements of all sequences of an object and compares them at the end."""
+    """Comparison of true and predicted displacements over all sequences of an object."""
 
     def __init__(self, fps: float) -> None:
-        """Begins with no sequence; ``fps`` frames per second."""
+        """Starts without sequences; ``fps`` in frames per second."""
         self._fps = fps
         self._truth: list[NDArray] = []
         self._predicted: dict[str, list[NDArray]] = {}
@@ -44,13 +44,13 @@ class Diagnosis:
         predictions: Mapping[str, Tensor],
         units: Mapping[str, Sequence[Tensor]] | None = None,
     ) -> None:
-        """Takes one sequence.
+        """Adds one sequence.
 
         Args:
             truth: true positions (F, P, 3).
-            rest: at rest (P, 3).
-            predictions: positions as every row predicts them.
-            units: of the rows with a hierarchy: the unit of each point, level by level, the small ones first.
+            rest: rest positions (P, 3).
+            predictions: predicted positions by row.
+            units: for rows with a hierarchy, the unit of each point, level by level, the finest first.
         """
         for name, levels in (units or {}).items():
             pairs = [level_error(predictions[name].to(truth), truth, rest, unit) for unit in levels]
@@ -62,7 +62,7 @@ class Diagnosis:
             self._predicted.setdefault(name, []).append(_thin(points - rest.to(points), every))
 
     def summary(self) -> dict[str, Any] | None:
-        """Plain data of what was found (see report.summary), or None without a sequence that moves."""
+        """The diagnosis as plain data (see :mod:`gausim.results.summary`), or None if no sequence moves."""
         if not self._truth or not any(np.abs(d).max() > 0 for d in self._truth):
             return None
         shapes, fraction = principal_motions(self._truth, MOTIONS)

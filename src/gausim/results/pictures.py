@@ -1,8 +1,8 @@
-"""Small pictures of one evaluated sequence, for people: truth and predictions in several cameras, with their alpha.
+"""Small pictures of one evaluated sequence for display: truth and predictions in several cameras, with alpha.
 
-``pictures.npz`` holds them per object: ``OBJECT/facts`` (JSON text), ``OBJECT/truth`` and ``OBJECT/prediction/METHOD``
-as (F, V, h, w, 4) uint8, colours premultiplied with alpha, and ``OBJECT/background`` (V, h, w, 3) where the recording
-shows one. Numbers are never computed from them.
+Arrays of ``pictures.npz`` per object: ``OBJECT/facts`` (JSON text), ``OBJECT/truth`` and ``OBJECT/prediction/METHOD``
+as (F, V, h, w, 4) uint8, colours premultiplied with alpha, and ``OBJECT/background`` (V, h, w, 3) if the recording
+has one. No figures are computed from them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jaxtyping import UInt8
 from gausim.core import RunError
 from gausim.io.npz import read_npz
 
-# What stands behind an object whose recording has no background of its own.
+# Background colour of an object whose recording has no background.
 PLAIN = (46, 48, 52)
 
 
@@ -28,9 +28,9 @@ class _Facts:
     object: str
     sequence: str
     fps: float
-    first_unseen: int  # first frame that training did not see
+    first_unseen: int  # first frame not used in training
     views: tuple[str, ...]  # names of the V cameras
-    heldout_views: tuple[str, ...]  # those of them that training never saw
+    heldout_views: tuple[str, ...]  # those not used in training
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +38,8 @@ class Pictures(_Facts):
     """Pictures of one sequence of one object."""
 
     truth: UInt8[np.ndarray, "F V h w 4"]  # recorded frames, RGB premultiplied with alpha
-    predictions: dict[str, np.ndarray] = field(default_factory=dict)  # the same of every method
-    background: UInt8[np.ndarray, "V h w 3"] | None = None  # what the cameras saw behind the object, where known
+    predictions: dict[str, np.ndarray] = field(default_factory=dict)  # likewise, by method
+    background: UInt8[np.ndarray, "V h w 3"] | None = None  # recorded background, if known
 
     def over_background(self, frames: UInt8[np.ndarray, "F V h w 4"]) -> UInt8[np.ndarray, "F V h w 3"]:
         """Frames over the recorded background, or over plain grey."""
@@ -61,10 +61,10 @@ def save_pictures(path: Path, pictures: list[Pictures]) -> None:
 
 
 def load_pictures(path: Path) -> list[Pictures]:
-    """Reads what :func:`save_pictures` wrote.
+    """Reads a file of :func:`save_pictures`.
 
     Raises:
-        RunError: the file is missing or not such a file.
+        RunError: the file is missing or malformed.
     """
     try:
         arrays = read_npz(path)
@@ -75,10 +75,10 @@ def load_pictures(path: Path) -> list[Pictures]:
 
 
 def kept_pictures(run: Path, name: str) -> list[Pictures]:
-    """The pictures of an object that the evaluation of a run directory keeps.
+    """The pictures of an object in the evaluation of a run directory.
 
     Raises:
-        RunError: it keeps none, or they cannot be read.
+        RunError: there are none, or they cannot be read.
     """
     path = run / "evaluation" / "pictures.npz"
     if not path.is_file():

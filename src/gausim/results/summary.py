@@ -1,4 +1,4 @@
-"""From per-frame figures to the numbers of a table, and the file that holds them.
+"""Summary of per-frame figures for tables, and its file.
 
 ``metrics.json`` (schema ``gausim.evaluation/1``)::
 
@@ -29,11 +29,11 @@ A CELL is ``{"mean", "std", "ratio"}``: mean and standard deviation over sequenc
 of a sequence) and the mean divided by the static row's (null for the floor and for what is better when higher). Ends
 of splits are exclusive. The cell of ``motion_energy`` has besides ``"pooled"``: predicted over true energy summed over
 all sequences, which no single sequence at rest can spoil; its mean and std are over the sequences' own ratios and its
-ratio is null. Undefined numbers are null. ``footnotes`` are what a method says of itself, and what its training cost;
-one that does not extrapolate repeats beyond the trained frames what it was fitted to. ``diagnosis`` looks at the motion
-in the principal motions of the truth: ``share`` of the squared displacement, ``frequencies`` and ``dampings`` (of
-critical) of each; power per ``frequency`` over all of them; ``phase_error`` per frame; ``level_errors`` over static's,
-of the units' centres at each level of a hierarchy, the small ones first; the truth is a row. ``provenance``,
+ratio is null. Undefined numbers are null. ``footnotes`` are notes on a method and the cost of its training; a method
+that does not extrapolate repeats its fitted motion beyond the training frames. ``diagnosis`` describes motion in the
+principal motions of the truth: the fraction (``share``) of the squared displacement, ``frequencies`` and ``dampings``
+(of critical) of each; power per ``frequency`` over all of them; ``phase_error`` per frame; ``level_errors`` of the
+units' centres over static's, at each level of a hierarchy, the finest first; the truth is a row. ``provenance``,
 ``efficiency``, ``sources``, ``absent``, ``footnotes`` and ``diagnosis`` are not in files of earlier versions.
 """
 
@@ -54,9 +54,9 @@ from gausim.results.curves import ERROR_3D, IMAGE_ENERGY, POINT_ARRAYS, POINT_EN
 
 SCHEMA = "gausim.evaluation/1"
 MOTION_ENERGY = "motion_energy"
-# The shorter of the paper's two test ranges ends here; every READY sequence reaches it.
+# End of the shorter of the paper's two test ranges, which every READY sequence has.
 HEADLINE_STOP = 50
-# The first frames after training, where errors have not yet grown to the motion's own size.
+# First unseen frames, where errors are still smaller than the motion.
 NEAR_FRAMES = 10
 
 _POINT_METRICS = {
@@ -79,7 +79,7 @@ class _Contrast(msgspec.Struct):
 
 
 class _Object(msgspec.Struct):
-    """What tables are made from; files of earlier versions have no more."""
+    """The fields that tables need; files of earlier versions have no others."""
 
     sequences: list[str]
     splits: dict[str, tuple[int, int]]
@@ -96,7 +96,7 @@ class _Summary(msgspec.Struct):
 
 
 def frame_splits(frames: int, first_unseen: int) -> dict[str, tuple[int, int]]:
-    """Named ranges [first, end) of frames; ``unseen_all`` only where it goes beyond ``unseen``."""
+    """Named ranges [first, end) of frames; ``unseen_all`` only if it is longer than ``unseen``."""
     splits = {"seen": (0, min(first_unseen, frames))}
     if frames > first_unseen:
         stop = min(frames, max(HEADLINE_STOP, first_unseen + 1))
@@ -164,13 +164,13 @@ def _row(
 
 
 def _window(values: np.ndarray, start: int, stop: int, views: list[int] | None) -> np.ndarray:
-    """(S, everything else) of the frames and views asked for."""
+    """(S, all other axes) of the chosen frames and views."""
     window = values[:, start:stop] if views is None else values[:, start:stop][:, :, views]
     return window.reshape(len(values), -1)
 
 
 def _ratio_base(curves: ObjectCurves, metric: str, reference: np.ndarray | None) -> np.ndarray | None:
-    """What to divide by; nothing for metrics of which more is better (a ratio of decibels says nothing)."""
+    """Denominator of ratios; None for metrics that are better when higher (a ratio of decibels has no meaning)."""
     better = {m.key: m.higher_is_better for m in curves.facts.metrics}
     return None if better.get(metric, False) else reference
 
@@ -206,7 +206,7 @@ def _finite(value: float) -> float | None:
 def write_summary(
     path: Path, objects: list[ObjectCurves], run: dict[str, Any], *, provenance: dict[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Writes ``metrics.json`` and returns what it holds."""
+    """Writes ``metrics.json`` and returns its data."""
     entries = {c.facts.name: summarise(c) for c in objects}
     summary = {"schema": SCHEMA, "run": run, "provenance": provenance or {}, "objects": entries}
     path.write_text(json.dumps(summary, indent=1, allow_nan=False) + "\n")
@@ -217,7 +217,7 @@ def load_summary(path: Path) -> dict[str, Any]:
     """Reads a ``metrics.json``.
 
     Raises:
-        RunError: it is missing, no JSON, of another schema, or a field that tables need is missing or of another type.
+        RunError: the file is missing, not JSON or of another schema, or a field of tables is missing or malformed.
     """
     try:
         summary = parse_json(path.read_bytes())

@@ -1,4 +1,4 @@
-"""Tables from ``metrics.json``: Markdown text, and headers and rows for any other printer."""
+"""Tables from ``metrics.json``: Markdown text, or headers and rows for other formats."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NO_FORESIGHT = "Does not foresee: its frames after the trained ones repeat what 
 
 @dataclass(frozen=True)
 class Table:
-    """A title, column heads and rows of text; ``breaks`` are rows that begin a new block of frames."""
+    """A table of text; ``breaks`` are the rows at which a new range of frames begins."""
 
     title: str
     head: list[str]
@@ -31,7 +31,7 @@ class Table:
 
 
 def object_tables(name: str, entry: dict[str, Any]) -> list[Table]:
-    """The tables of one object: 3D first where truth exists, then training views, then held-out views."""
+    """The tables of one object: 3D if the truth is known, training views, held-out views."""
     present = {g for row in entry["rows"].values() for split in row.values() for g in split}
     return [_group_table(name, entry, group) for group in GROUP_TITLES if group in present]
 
@@ -57,7 +57,7 @@ def _group_table(name: str, entry: dict[str, Any], group: str) -> Table:
 
 
 def _metrics_of(entry: dict[str, Any], group: str) -> list[str]:
-    """Metrics that any row has in this group, in their first order, the energy last."""
+    """Metrics of any row in this group, in their first order, the energy last."""
     found: dict[str, None] = {}
     for row in entry["rows"].values():
         for split in row.values():
@@ -84,13 +84,13 @@ def _line(frames: str, row: str, cells: dict[str, Any], infos: dict[str, Any]) -
 
 
 def plus_minus(mean: float, deviation: float | None = None, *, scale: float = 1.0, digits: int = 2) -> str:
-    """A figure times ``scale``, and behind it the deviation where there is one."""
+    """A figure times ``scale``, followed by its deviation if given."""
     shown = f"{mean * scale:.{digits}f}"
     return shown if deviation is None else f"{shown} {spread(deviation * scale, digits)}"
 
 
 def spread(deviation: float, digits: int = 2) -> str:
-    """A deviation as it is printed."""
+    """A deviation as text."""
     return f"± {deviation:.{digits}f}"
 
 
@@ -98,23 +98,23 @@ def _number(value: float | None, digits: int) -> str:
     return "" if value is None else f"{value:.{digits}f}"
 
 
-def said(entry: dict[str, Any], method: str) -> dict[str, Any]:
-    """The ``footnotes`` of a method in an object's entry; empty where there are none."""
+def footnotes_of(entry: dict[str, Any], method: str) -> dict[str, Any]:
+    """The ``footnotes`` of a method in an object's entry; empty if there are none."""
     every = entry.get("footnotes")
     own = every.get(method) if isinstance(every, dict) else None
     return own if isinstance(own, dict) else {}
 
 
 def footnotes(entry: dict[str, Any], method: str) -> list[str]:
-    """What a method says of itself in an object's entry: sentences, the first that it does not foresee."""
-    own = said(entry, method)
+    """Notes on a method in an object's entry, in sentences; the first states that it does not extrapolate."""
+    own = footnotes_of(entry, method)
     notes = own.get("notes")
     sentences = [str(note) for note in notes] if isinstance(notes, list) else []
     return [NO_FORESIGHT, *sentences] if own.get("extrapolates") is False else sentences
 
 
 def gaps(summary: dict[str, Any]) -> list[str]:
-    """What no table of an evaluation has, and how to get it: sentences."""
+    """Metrics that no table of an evaluation has, and how to get them, in sentences."""
     absent = [found for entry in summary["objects"].values() if isinstance(found := entry.get("absent"), dict)]
     remedies = {("flip", NO_PACKAGE): NO_FLIP, ("lpips", NO_WEIGHTS): NO_LPIPS}
     return [remedy for (key, why), remedy in remedies.items() if any(found.get(key) == why for found in absent)]
@@ -144,7 +144,7 @@ def markdown(summary: dict[str, Any]) -> str:
 
 
 def _contrast(summary: dict[str, Any]) -> str:
-    """The paper's table of colour contrast, which explains differences of absolute errors between objects."""
+    """The paper's table of colour contrast, on which absolute errors of objects depend."""
     head = ["object", "mean foreground colour", "its norm", "largest l2 of a pixel"]
     rows = []
     for name, entry in summary["objects"].items():

@@ -1,4 +1,4 @@
-"""What the static prediction scores on each training sequence and how much the truth moves."""
+"""Losses of the static prediction on each training sequence, and the squared change of the truth."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from gausim.training.supervision.images import Supervision
 
 @dataclass
 class SequenceBaseline:
-    """Constants of one sequence, as far as its frames have been seen.
+    """Baseline metrics of one sequence, for the frames measured so far.
 
     Attributes:
-        floor: loss of the rest state on frame 0, what the reconstruction itself leaves.
+        floor: loss of the rest state on frame 0, due to the reconstruction.
         static: loss of the rest state on frames 1, 2, ...
         motion: squared change of the truth from frame t to t + 1 (images: summed over pixels).
     """
@@ -28,19 +28,19 @@ class SequenceBaseline:
 
 
 def excess(loss: float, static: float, floor: float) -> float:
-    """A loss over that of the rest state, both above what the reconstruction leaves; finite where nothing moves yet."""
+    """A loss over that of the rest state, both less the floor; finite also before any motion."""
     return (loss - floor) / max(static - floor, 1e-3 * static, 1e-12)
 
 
 class Baselines:
-    """Measures each sequence once; later batches look the numbers up."""
+    """Cache of the baseline metrics of sequences, each measured once."""
 
     def __init__(self, supervision: Supervision) -> None:
         self._supervision = supervision
         self._known: dict[int, SequenceBaseline] = {}
 
     def of(self, sample: SequenceSample, rest: Tensor) -> SequenceBaseline:
-        """The baseline of a sample's sequence, for at least the sample's frames; ``rest`` is its scene's."""
+        """The baseline of a sample's sequence, for at least the sample's frames; ``rest`` are its rest positions."""
         known = self._known.setdefault(sample.sequence_id, SequenceBaseline())
         seen = len(known.static)
         if seen < sample.steps:
@@ -52,13 +52,13 @@ class Baselines:
         return known
 
     def learn(self, sequences: Sequence[int], baselines: Sequence[SequenceBaseline]) -> None:
-        """Takes what the ranks found, so that each knows what one rank alone would."""
+        """Stores the ranks' baselines, so that all ranks have the same."""
         self._known.update(zip(sequences, baselines, strict=True))
 
     def state_dict(self) -> dict[int, dict[str, Any]]:
-        """What is known of each sequence: measured with other frames at once, the last bits would differ."""
+        """The baseline of each sequence; measuring again in other groups of frames would change the last bits."""
         return {sequence: asdict(known) for sequence, known in self._known.items()}
 
     def load_state_dict(self, state: dict[int, dict[str, Any]]) -> None:
-        """Continues with what ``state`` knew."""
+        """Restores the baselines."""
         self._known = {sequence: SequenceBaseline(**known) for sequence, known in state.items()}

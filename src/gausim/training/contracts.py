@@ -1,4 +1,4 @@
-"""What training asks of a simulator that learns: steps over a disjoint graph of several sequences."""
+"""Interface of a trainable simulator: steps over a disjoint graph of several sequences."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class SceneBatch(Protocol):
 
     Attributes:
         rest: (K over all members, 3) rest positions [scene units].
-        members: the sequences, in the order that was asked for. Each has a ``scene_id``, its rows of positions
-            ``kernels`` and of gradients and rotations ``units`` (slices), and the unit of each of its kernels, counted
-            within ``units`` (``unit_of_kernel``).
+        members: the sequences, in the requested order. Each has a ``scene_id``, slices ``kernels`` of the positions and
+            ``units`` of the deformation gradients and rotations, and the unit of each of its kernels, counted within
+            ``units`` (``unit_of_kernel``).
     """
 
     rest: Tensor
@@ -33,7 +33,7 @@ class Step(Protocol):
     Attributes:
         positions: (K over all members, 3) kernel means [scene units].
         deformation_gradients: (N over all members, 3, 3) accumulated deformation gradients of the units.
-        rotations: (N over all members, 3, 3) their accumulated rotations.
+        rotations: (N over all members, 3, 3) accumulated rotations of the units.
         momentum: the momentum loss, summed over members; zero where it is switched off.
     """
 
@@ -45,10 +45,10 @@ class Step(Protocol):
 
 @runtime_checkable
 class Simulator(Protocol):
-    """The dynamics as training sees it; a torch module besides.
+    """Dynamics of a batch of sequences, as a torch module.
 
-    What else :class:`gausim.models.step.scene_model.SceneModel` offers is used where a model has it: the units of its
-    kernels (``units_of_kernels``), an energy (``knows_energy``, ``energy``) and its template's ``mixing``.
+    Training uses these members of :class:`gausim.models.step.scene_model.SceneModel` where a model has them: the units
+    of its kernels (``units_of_kernels``), an energy (``knows_energy``, ``energy``) and its template's ``mixing``.
 
     Attributes:
         scenes: the rest scenes; their index is the ``scene_id`` of samples.
@@ -60,10 +60,10 @@ class Simulator(Protocol):
         """The disjoint graph of one sequence per entry."""
 
     def prepare(self, batch: Any) -> Any:
-        """What the steps of one stretch share; gradients flow through it, so the next stretch needs another."""
+        """Quantities common to the steps of one stretch; part of its graph, so each stretch computes its own."""
 
     def step(self, batch: Any, state: SimState, force: Tensor | None = None, prepared: Any = None) -> Any:
-        """Predicts the next frame of all members; ``prepared`` is made for this step alone when None."""
+        """Predicts the next frame of all members; without ``prepared`` it is computed for this step alone."""
 
     def parameter_groups(self) -> dict[str, list[Parameter]]:
         """Trainable parameters: ``network`` (shared by all scenes), ``scene`` (densities, attributes), ``template``."""

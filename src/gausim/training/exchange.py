@@ -1,4 +1,4 @@
-"""What the ranks add up at the end of an optimiser step: gradients and statistics of inputs."""
+"""Sums over ranks at the end of an optimiser step: loss gradients and input statistics."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from gausim.training.statistics import Statistics
 
 
 class Exchange:
-    """Makes the parts of the ranks the step of one rank; for a rank that is alone, it only keeps the statistics."""
+    """Sums of loss gradients and input statistics over ranks; with one rank, it updates the statistics only."""
 
     def __init__(self, ranks: Ranks, model: nn.Module) -> None:
         self._ranks, self._normalisers = ranks, normalisers_of(model)
         self._begun = False
 
     def begin(self, see_first_frame: Callable[[], None]) -> None:
-        """Before the first step: normalisers without statistics see the first frame of the ranks' first batches."""
+        """Initialises normalisers without statistics from the first frame of the ranks' first batches."""
         if not self._begun and not all(float(normaliser.count) for normaliser in self._normalisers):
             see_first_frame()
             self.statistics()
@@ -29,10 +29,9 @@ class Exchange:
 
     @torch.no_grad()
     def step(self, weights: Sequence[Parameter], network: Sequence[Parameter], statistics: Statistics) -> None:
-        """Adds gradients and what normalisers gathered; a weight that is in no rank's sequences keeps no gradient.
+        """Adds the ranks' loss gradients and normaliser sums; a weight that no rank's sequences use keeps no gradient.
 
-        The pulls in ``statistics``, of the weights of the ``network``, become those of all sequences, and their ratio
-        is formed.
+        The ``pulls`` in ``statistics``, gradients of the ``network``, are added as well, and their ratio is computed.
         """
         if self._ranks.size > 1:
             gathered = self._gathered()
@@ -50,13 +49,13 @@ class Exchange:
 
     @torch.no_grad()
     def statistics(self) -> None:
-        """Adds what normalisers gathered, and takes it into their statistics."""
+        """Adds the ranks' normaliser sums and updates the statistics."""
         gathered = self._gathered()
         _assign(gathered, self._ranks.add(gathered, gathered))
         self.absorb()
 
     def absorb(self) -> None:
-        """Takes what normalisers gathered, added already, into their statistics."""
+        """Updates the statistics with normaliser sums that are added already."""
         for normaliser in self._normalisers:
             normaliser.absorb()
 

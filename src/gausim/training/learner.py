@@ -1,4 +1,4 @@
-"""What a step of the optimiser works on: all parts of a training, without Lightning."""
+"""Parts of training that an optimiser step needs, without Lightning."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from gausim.training.terms.free_motion import FreeMotion
 
 
 class Learner(nn.Module):
-    """A method, what is minimised, what predictions are compared with, and what the steps so far have found.
+    """A method with its objective, supervision, optimiser settings and baseline metrics.
 
     Attributes:
-        images: draws predictions, whatever they are compared with.
-        diagonals: of the scenes [scene units].
-        barren: steps in a row from which nothing was learned.
-        measuring: whether this step measures how much of the network's gradient is of the momentum loss.
+        images: supervision by images, also used to render predictions.
+        diagonals: diagonals of the scenes [scene units].
+        barren: number of successive steps without a usable stretch.
+        measuring: whether this step measures the momentum loss's gradient fraction.
         shown: sequences of the last step.
     """
 
@@ -61,20 +61,20 @@ class Learner(nn.Module):
 
     @property
     def simulator(self) -> Simulator:
-        """The model, as what it can do."""
+        """The model, typed as a simulator."""
         return cast(Simulator, self.model)
 
     @property
     def renderer(self) -> Renderer:
-        """What draws the predictions."""
+        """The renderer of predictions."""
         return self.images.renderer
 
     def groups(self) -> dict[str, list[nn.Parameter]]:
-        """All parameters by the name that tells how fast they learn."""
+        """Parameters by group; each group has a learning rate."""
         return self.method.groups()
 
     def configure_optimizers(self) -> Any:
-        """One optimiser over all groups; None where nothing learns.
+        """One optimiser over all groups; None without trainable parameters.
 
         Raises:
             ConfigError: a parameter is in no group.
@@ -86,7 +86,7 @@ class Learner(nn.Module):
         return self.method.build(self.settings)
 
     def take_up(self, task: Task) -> None:
-        """Minimises what a task says from here on."""
+        """Adopts the objective and settings of a task."""
         if task.is_new:
             self.baselines = Baselines(self.supervision)
         if task.objective is not None:
@@ -94,29 +94,29 @@ class Learner(nn.Module):
         self.settings = task.settings or self.settings
 
     def accumulate(self, loss: Tensor) -> None:
-        """Adds the gradients of a loss; there are none where nothing learns."""
+        """Adds the gradients of a loss, if there are trainable parameters."""
         if loss.requires_grad:
             loss.backward()
 
     def defers(self, device: torch.device) -> bool:
-        """Whether reading a number would make the host wait; such reads are put off to the step's end."""
+        """Whether reading a value would block the host; such reads are deferred to the end of the step."""
         return self.method.defers and device.type != "cpu"
 
     def network(self) -> list[nn.Parameter]:
-        """Weights of the network that learn."""
+        """Trainable weights of the network."""
         return [p for p in self.groups().get("network", []) if p.requires_grad]
 
     def baseline(self, sample: SequenceSample) -> SequenceBaseline:
-        """What the rest state scores on a sample's sequence, for at least the sample's frames."""
+        """Baseline metrics of a sample's sequence, for at least the sample's frames."""
         return self.baselines.of(sample, self.simulator.batch([sample.scene_id]).rest)
 
     def rest_loss(self, sample: SequenceSample) -> float:
-        """What the rest state scores on the frames of a sample, their mean: the unit of penalties."""
+        """Mean loss of the rest state on the frames of a sample: the unit of penalties."""
         losses = self.baseline(sample).static[: sample.steps]
         return sum(losses) / len(losses)
 
     def initial(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> SimState:
-        """Where the rollouts of a batch begin."""
+        """Initial state of the rollouts of a batch."""
         return self.method.initial(samples, batch)
 
     @torch.no_grad()
@@ -132,10 +132,10 @@ class Learner(nn.Module):
     def predict_images(self, sample: SequenceSample) -> Float[Tensor, "F V H W 3"]:
         """Images of frames 0..T of one training sequence, in evaluation mode."""
         batch = self.simulator.batch([sample.scene_id])
-        look, units = self.images.looks.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
+        appearance, units = self.images.appearances.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
         frames = [self.images.rest_image(sample, batch.rest).rgb]
         with evaluating(self):
             for _, made in windows(self.simulator, batch, self.initial([sample], batch), sample.steps, 1):
                 states = States.of(made).tensors()
-                frames.append(draw(self.images.renderer, look, *states, units, sample.cameras).rgb)
+                frames.append(draw(self.images.renderer, appearance, *states, units, sample.cameras).rgb)
         return torch.cat(frames)

@@ -1,4 +1,4 @@
-"""What is trained: one simulator that all sequences share, or a method that is fitted to every sequence by itself."""
+"""Trainable methods: one simulator of all sequences, or a method that is fitted to every sequence separately."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from gausim.training.terms.term import Term
 
 @dataclass(frozen=True)
 class Moment:
-    """Where in a run a step of the optimiser stands.
+    """Position of an optimiser step in a run: after ``epoch`` of ``epochs`` and ``batch`` of ``batches`` in the epoch.
 
-    After ``epoch`` epochs of ``epochs`` and ``batch`` batches of ``batches``; a fraction ``least`` of the run counts as
-    done at least, because its time is spent, and ``most`` at most, because the end of the run has not begun.
+    The fraction done is at least ``least``, the part of the time budget that is used, and at most ``most``, while the
+    final part of the run has not begun.
     """
 
     epoch: int
@@ -46,9 +46,9 @@ class Moment:
 
 @dataclass(frozen=True)
 class Task:
-    """What the next step of the optimiser is about: the rate that is logged, and the objective and settings if new.
+    """Settings of the next optimiser step: the logged learning rate, and a new objective and settings, if any.
 
-    ``is_new`` tells that the rest state has to be scored anew.
+    ``is_new`` requires the losses of the rest state to be computed again.
     """
 
     rate: float
@@ -58,17 +58,17 @@ class Task:
 
 
 class Method(ABC):
-    """A method as training sees it: its parameters, where its rollouts begin, and how fast it learns.
+    """Interface of a trainable method: its parameters, initial states and learning rates.
 
     Attributes:
         name: its row in tables.
-        extrapolates: whether frames beyond the trained ones are foreseen.
+        extrapolates: whether it predicts frames beyond the training frames.
         model: the simulator of a batch (:class:`gausim.training.contracts.Simulator`).
-        initial_states: parameters of the sequences; None where the model has its own.
+        initial_states: initial-state parameters of the sequences; None where they belong to the model.
         scene_of_sequence: the scene of each training sequence.
-        learns: whether it has anything to learn.
-        defers: whether numbers may be read at a step's end only, where a device would be waited for.
-        warns: whether a prediction that stands still is worth a warning.
+        learns: whether it has trainable parameters.
+        defers: whether reads that block the host may be deferred to the end of a step.
+        warns: whether a static prediction is reported as a collapse.
     """
 
     name: str
@@ -80,23 +80,23 @@ class Method(ABC):
 
     @abstractmethod
     def groups(self) -> dict[str, list[nn.Parameter]]:
-        """All parameters by the name that tells how fast they learn."""
+        """Parameters by group; each group has a learning rate."""
 
     @abstractmethod
     def build(self, settings: OptimizerSettings) -> Optimizer | None:
-        """The optimiser over all groups; None where nothing learns."""
+        """The optimiser over all groups; None without trainable parameters."""
 
     @abstractmethod
     def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, now: Moment) -> Task:
-        """Sets the learning rates, and says what is minimised."""
+        """Sets the learning rates, and returns the settings of the step."""
 
     @abstractmethod
     def terms(self) -> Sequence[Term]:
-        """Terms of the loss beside the rollout's, in the order of their backward passes."""
+        """Loss terms in addition to the rollout's, in the order of their backward passes."""
 
     @abstractmethod
     def initial(self, samples: Sequence[SequenceSample], batch: Any) -> SimState:
-        """Where the rollouts of a batch begin; gradients flow into it."""
+        """Initial state of the rollouts of a batch; loss gradients flow into it."""
 
     @abstractmethod
     def predict(self, sequence_id: int, steps: int) -> Trajectory:
@@ -107,23 +107,23 @@ class Method(ABC):
         """
 
     def end_epoch(self, least: float) -> bool:
-        """Prepares the next epoch; returns whether there is none. ``least`` is as in :class:`Moment`."""
+        """Prepares the next epoch; returns whether training is over. ``least`` is that of :class:`Moment`."""
         return False
 
     def notes(self) -> list[str]:
-        """What a reader of its figures must know, in sentences."""
+        """Notes on its figures, in sentences."""
         return []
 
     def state_dict(self) -> dict[str, Any]:
-        """What a resumed run needs beside parameters; plain containers."""
+        """State of a resumed run in addition to the parameters, as plain containers."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on with it."""
+        """Restores the state."""
         self.take_notes(state)
 
     def take_notes(self, state: Mapping[str, Any]) -> None:  # noqa: B027
-        """As much of it as :meth:`notes` needs."""
+        """Restores the part of the state that :meth:`notes` needs."""
 
 
 class SharedSimulator(Method):
@@ -144,7 +144,7 @@ class SharedSimulator(Method):
         self._simulator, self._states = cast(Simulator, model), cast(Any, initial_states)
 
     def groups(self) -> dict[str, list[nn.Parameter]]:
-        """Those of the model, and the initial states."""
+        """The model's parameter groups, and the initial states."""
         return {**self._simulator.parameter_groups(), "initial": list(self.initial_states.parameters())}
 
     def build(self, settings: OptimizerSettings) -> Optimizer:
@@ -152,7 +152,7 @@ class SharedSimulator(Method):
         return settings.build({name: [p for p in own if p.requires_grad] for name, own in self.groups().items()})
 
     def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, now: Moment) -> Task:
-        """Sets the rates by the schedule."""
+        """Sets the learning rates by the schedule."""
         return Task(settings.network_lr * settings.set_rates(optimizer, now.done, now.epochs))
 
     def terms(self) -> Sequence[Term]:
@@ -165,7 +165,7 @@ class SharedSimulator(Method):
         return SimState(batch.rest, previous.to(batch.rest))
 
     def predict(self, sequence_id: int, steps: int) -> Trajectory:
-        """Frames 0..``steps`` of a training sequence, from its own initial state, for all kernels of its scene."""
+        """Frames 0..``steps`` of a training sequence from its initial state, for all kernels of its scene."""
         scene_id = self.scene_of_sequence[sequence_id]
         previous = self._states.previous(sequence_id)
         initial = SimState(self._simulator.scenes[scene_id].means.to(previous), previous)

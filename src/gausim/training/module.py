@@ -1,4 +1,4 @@
-"""The LightningModule: hooks around the optimiser's step (:mod:`gausim.training.step`), numbers and checkpoints."""
+"""LightningModule of training: hooks around the optimiser step (:mod:`gausim.training.step`), metrics, checkpoints."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from gausim.training.supervision.motion_tracks import TrackSupervision
 
 # Below this fraction of the true motion energy a prediction counts as collapsed to the rest state.
 COLLAPSED = 0.05
-# Optimiser steps before a collapse is worth a warning: initial states begin at rest, so every run begins static.
+# Optimiser steps before a collapse is reported: initial states begin at rest, so every run begins static.
 COLLAPSE_AFTER = 100
 
 
 class GausSimModule(Learner, LightningModule):
-    """Trains a method: rollout as one graph, drawing, losses, one optimiser step per batch.
+    """Trains a method: rollout, rendering, losses and one optimiser step per batch.
 
-    Backward runs after every stretch through which gradients flow, so that memory does not grow with T. Under several
-    ranks each computes its part of the sequences; the sums of gradients, statistics and numbers over the ranks are
-    those of one rank that computes them all.
+    The backward pass runs after every stretch of the rollout, so that memory does not grow with T. Each of several
+    ranks computes a part of the sequences; sums of loss gradients, statistics and metrics over the ranks equal those of
+    a single rank.
     """
 
     def __init__(self, *, seed: int = 0, fraction_every: int = 50, **parts: Any) -> None:
-        """Takes the ``parts`` of a :class:`~gausim.training.learner.Learner`; it builds nothing.
+        """Stores the ``parts`` of a :class:`~gausim.training.learner.Learner`.
 
         Args:
-            seed: of each step's draws (static loss, free motion), together with its number.
-            fraction_every: optimiser steps between measurements of how much of the gradient is of momentum; 0 is never.
-            parts: of the learner.
+            seed: seed of each step's random numbers (static loss, free motion), together with the step's number.
+            fraction_every: optimiser steps between measurements of the momentum loss's gradient fraction; 0 is never.
+            parts: arguments of the learner.
         """
         super().__init__(**parts)
         self.automatic_optimization = False
@@ -54,23 +54,23 @@ class GausSimModule(Learner, LightningModule):
 
     @property
     def method_name(self) -> str:
-        """What the predictions are called in tables."""
+        """Name of the predictions in tables."""
         return self.method.name
 
     @property
     def footnotes(self) -> dict[str, Any]:
-        """Whether the method extrapolates, what readers of its figures must know, and what training cost."""
+        """Whether the method extrapolates, notes on its figures, and the cost of training."""
         fit = self.cost.summary() if self.cost.seconds else None
         return {"extrapolates": self.method.extrapolates, "notes": self.notes(), "fit": fit}
 
     def notes(self) -> list[str]:
-        """What a reader of the figures must know, in sentences; nothing was spent where nothing learns."""
+        """Notes on the figures, in sentences; without training costs where the method is not trained."""
         return self.method.notes() + (self.cost.notes() if self.method.learns else [])
 
     # ------------------------------------------------------------------------------------------------ one step
 
     def training_step(self, samples: list[SequenceSample], batch_idx: int) -> None:
-        """Rolls the batch forward, draws it, and makes one step of the optimiser."""
+        """Predicts and renders the batch, and makes one optimiser step."""
         optimizer, trainer = cast(Any, self.optimizers()), self.trainer
         batches, epochs = float(trainer.num_training_batches), trainer.max_epochs or 1
         now = Moment(self.current_epoch, batch_idx, batches, epochs, self.time_fraction, self.progress_limit)
@@ -88,11 +88,11 @@ class GausSimModule(Learner, LightningModule):
         draws: torch.Generator,
         advance: Callable[[], object] | None = None,
     ) -> dict[str, float]:
-        """One step with all losses (:func:`gausim.training.step.optimise`); works without a trainer, too."""
+        """One optimiser step with all losses (:func:`gausim.training.step.optimise`), with or without a trainer."""
         return step.optimise(self, samples, optimizer, draws, advance or optimizer.step)
 
     def accumulate(self, loss: Tensor) -> None:
-        """Adds the gradients of a loss, by the trainer where there is one."""
+        """Adds the gradients of a loss, through the trainer if there is one."""
         if self._trainer is None:
             super().accumulate(loss)
         elif loss.requires_grad:
@@ -112,7 +112,7 @@ class GausSimModule(Learner, LightningModule):
                 logger.log_metrics({f"train/{k}": v for k, v in stats.items()}, step=self.global_step)
 
     def note(self, name: str, value: float) -> None:
-        """Adds a number of the epoch under way to its means."""
+        """Adds a value to a mean of the current epoch."""
         self._sums[name] = [value, 1.0]
 
     def epoch_means(self) -> dict[str, float]:
@@ -120,15 +120,15 @@ class GausSimModule(Learner, LightningModule):
         return {name: total / weight for name, (total, weight) in self._sums.items() if weight}
 
     def on_train_start(self) -> None:
-        """Counts the cost from here."""
+        """Starts to measure the cost of training."""
         self.cost.begin()
 
     def on_train_epoch_start(self) -> None:
-        """Starts the epoch's sums anew."""
+        """Resets the epoch's sums."""
         self._sums.clear()
 
     def on_train_epoch_end(self) -> None:
-        """Forms the epoch's means, warns of a collapse, and lets the method prepare the next epoch."""
+        """Computes the epoch's means, warns of a collapse, and lets the method prepare the next epoch."""
         self.summary = self.epoch_means()
         row = {f"epoch/{name}": value for name, value in self.summary.items()}
         for logger in self.trainer.loggers:  # not log_dict: Lightning would write it after the epoch's checkpoint
@@ -148,7 +148,7 @@ class GausSimModule(Learner, LightningModule):
     # ------------------------------------------------------------------------------------------------ checkpoints
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Adds the scenes' fingerprints, the averaged weights and the epoch's numbers."""
+        """Adds the scenes' fingerprints, the averaged weights and the epoch's sums."""
         own: dict[str, Any] = {"format": RESUME_FORMAT, "scenes": fingerprints(self.simulator.scenes)}
         own["average"] = self.average.state_dict()
         own["epoch"] = {"sums": self._sums, "summary": self.summary, "warned": self._warned, "barren": self.barren}
@@ -161,7 +161,7 @@ class GausSimModule(Learner, LightningModule):
         """Refuses a checkpoint of other scenes; restores what :meth:`on_save_checkpoint` added.
 
         Raises:
-            RunError: naming both scenes.
+            RunError: the checkpoint is of other scenes.
         """
         check_scenes(checkpoint, self.simulator.scenes, "the checkpoint")
         checkpoint["state_dict"] = with_present_weights(checkpoint["state_dict"])
@@ -177,7 +177,7 @@ class GausSimModule(Learner, LightningModule):
         self.method.load_state_dict(own)
 
     def take_notes(self, checkpoint: Mapping[str, Any]) -> None:
-        """What a checkpoint says of its training, for :attr:`footnotes`."""
+        """Restores from a checkpoint what :attr:`footnotes` needs."""
         self.method.take_notes(checkpoint["gausim"])
         if "cost" in checkpoint:  # not in those of earlier versions
             self.cost.load_state_dict(checkpoint["cost"])

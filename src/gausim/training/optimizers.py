@@ -1,4 +1,4 @@
-"""The optimiser's settings: groups with learning rates of their own, schedules, clipping."""
+"""Settings of the optimiser: learning rates by parameter group, schedules, clipping."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ GROUPS = ("network", "scene", "template", "initial")
 
 @runtime_checkable
 class Schedule(Protocol):
-    """How the learning rates change over a run."""
+    """Learning-rate schedule of a run."""
 
     def factor(self, epoch: float, epochs: int) -> float:
-        """What the learning rates are multiplied by at ``epoch`` (with its fraction) of ``epochs``."""
+        """Factor on the learning rates at ``epoch`` (with its fraction) of ``epochs``."""
 
 
 @dataclass(frozen=True)
 class HalvingSchedule:
-    """Halved after ``first`` epochs and then every ``every`` epochs (METHOD section 4)."""
+    """Schedule that halves the rates after ``first`` epochs and then every ``every`` epochs (METHOD section 4)."""
 
     first: int = 16
     every: int = 2
@@ -40,11 +40,11 @@ class HalvingSchedule:
 
 @dataclass(frozen=True)
 class StableDecaySchedule:
-    """A linear start, constant rates, and a fall along half a cosine over the last part of the run.
+    """Schedule of a linear warm-up, constant rates, and a half-cosine decay over the final part of the run.
 
-    What ends a run early moves its last part forward: nothing that was learned before has to be learned again. With
-    ``decay`` 1 there is no such part: the rates fall all along, and the run has the length that it was given. The start
-    takes ``warmup`` epochs, the fall a fraction ``decay`` of the run, down to the factor ``final``.
+    An early end moves the final part forward, so no training is repeated. With ``decay`` 1 the rates decay over the
+    whole run, whose length is then fixed. The warm-up takes ``warmup`` epochs, the decay a fraction ``decay`` of the
+    run, down to the factor ``final``.
     """
 
     warmup: float = 1.0
@@ -58,7 +58,7 @@ class StableDecaySchedule:
             )
 
     def factor(self, epoch: float, epochs: int) -> float:
-        """Between ``final`` and 1 (below that during the start)."""
+        """A factor between ``final`` and 1 (less during the warm-up)."""
         if epoch < self.warmup:
             return max(0.05, epoch / self.warmup)
         fraction = (min(1.0, epoch / max(1, epochs)) - 1 + self.decay) / self.decay
@@ -67,7 +67,7 @@ class StableDecaySchedule:
 
 @dataclass(frozen=True)
 class ExponentialSchedule:
-    """Falls by the same factor in equal times, down to ``final`` at the end."""
+    """Schedule of exponential decay down to the factor ``final`` at the end."""
 
     final: float = 0.1
 
@@ -78,7 +78,7 @@ class ExponentialSchedule:
 
 @dataclass(frozen=True)
 class LinearSchedule:
-    """Falls evenly, down to ``final`` at the end."""
+    """Schedule of linear decay down to the factor ``final`` at the end."""
 
     final: float = 0.0
 
@@ -89,11 +89,11 @@ class LinearSchedule:
 
 @dataclass(frozen=True)
 class OptimizerSettings:
-    """Who learns how fast; ``conf/optimizer/default.yaml`` and ``conf/base/more.yaml`` say what the settings are.
+    """Optimiser and learning rates; ``conf/optimizer/default.yaml`` and ``conf/base/more.yaml`` explain the settings.
 
-    ``decay`` is the weight decay by group, of matrices and of all initial states: what the data say little about
-    returns to zero, where Adam alone would let it wander. Without an ``optimizer`` it is Adam, without a ``schedule``
-    the rates are constant.
+    ``decay`` is the weight decay by group, of matrices and of all initial states: parameters that the data hardly
+    determine return to zero, where Adam alone would let them drift. The default ``optimizer`` is Adam; without a
+    ``schedule`` the rates are constant.
     """
 
     optimizer: Callable[..., Optimizer] | None = None
@@ -120,13 +120,13 @@ class OptimizerSettings:
     def build(self, groups: Mapping[str, Sequence[Parameter]]) -> Optimizer:
         """The optimiser over the named groups ``network``, ``scene``, ``template`` and ``initial``.
 
-        A parameter that is not in a batch has no gradient there, and the optimiser leaves it and its momentum alone.
+        A parameter that a batch does not use has no loss gradient, and the optimiser skips it and its momentum.
         """
         template = self.scene_lr if self.template_lr is None else self.template_lr
         rates = dict(zip(GROUPS, (self.network_lr, self.scene_lr, template, self.initial_lr), strict=True))
         made: list[dict[str, Any]] = []
         for name, members in groups.items():
-            parts: dict[float, list[Parameter]] = {0.0: []}  # what does not decay comes first
+            parts: dict[float, list[Parameter]] = {0.0: []}  # parameters without decay come first
             for p in members:
                 decay = self.decay.get(name, 0.0) if p.ndim >= 2 or name == "initial" else 0.0
                 parts.setdefault(decay, []).append(p)
@@ -144,11 +144,11 @@ class OptimizerSettings:
         return factor
 
     def clip(self, optimizer: Optimizer) -> dict[str, Tensor]:
-        """Clips the gradients; returns the norm of each named group before clipping."""
+        """Clips the loss gradients; returns the norm of each named group before clipping."""
         grads: dict[str, list[Tensor]] = {}
         for group in optimizer.param_groups:
             grads.setdefault(group["name"], []).extend(p.grad for p in group["params"] if p.grad is not None)
-        device = optimizer.param_groups[0]["params"][0].device  # a zero elsewhere would be waited for
+        device = optimizer.param_groups[0]["params"][0].device  # a zero on the host would block
         zero = torch.zeros((), device=device)
         norms = {name: torch.nn.utils.get_total_norm(g) if g else zero for name, g in grads.items()}
         if self.clip_norm > 0:

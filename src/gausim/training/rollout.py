@@ -1,4 +1,4 @@
-"""Rolling a batch forward in stretches that gradients do not leave."""
+"""Rollout of a batch in stretches; loss gradients flow within a stretch only."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gausim.training.ranks.ranks import Ranks, interleave
 
 @dataclass(eq=False)
 class Frame:
-    """One predicted frame (see :class:`gausim.training.contracts.Step`), and the state to go on from if it is more."""
+    """One predicted frame (see :class:`gausim.training.contracts.Step`), and a state that is more than positions."""
 
     positions: Tensor
     deformation_gradients: Tensor
@@ -33,10 +33,10 @@ class Frame:
 
 
 def checkpointed_step(model: Simulator, batch: SceneBatch, state: SimState) -> Frame:
-    """A step of which the graph keeps the input only: it is computed once more in the backward pass.
+    """A step whose graph keeps the input only (gradient checkpointing): it is recomputed in the backward pass.
 
-    It shares nothing with other steps, so that computing it again takes the same way; the running statistics of the
-    inputs do not count it twice.
+    It uses nothing prepared for other steps, so that the second computation equals the first; the running statistics
+    of the inputs do not count it twice.
     """
     normalisers, calls = normalisers_of(cast(nn.Module, model)), itertools.count()
 
@@ -45,13 +45,13 @@ def checkpointed_step(model: Simulator, batch: SceneBatch, state: SimState) -> F
             step = model.step(batch, SimState(positions, previous))
         return step.positions, step.deformation_gradients, step.rotations, step.momentum
 
-    # No random numbers in a step, so no generator is to be put back.
+    # A step draws no random numbers, so no generator needs to be restored.
     return Frame(*torch_checkpoint(run, state.positions, state.previous, use_reentrant=False, preserve_rng_state=False))
 
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """What is drawn: T predicted frames of all members of a batch (see :class:`gausim.training.contracts.Step`)."""
+    """T predicted frames of all members of a batch (see :class:`gausim.training.contracts.Step`)."""
 
     positions: Float[Tensor, "T K 3"]
     deformation_gradients: Float[Tensor, "T N 3 3"]
@@ -63,7 +63,7 @@ class States:
         return States(*(torch.stack([getattr(step, f.name) for step in steps]) for f in fields(States)))
 
     def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The three of them."""
+        """Positions, deformation gradients and rotations."""
         return self.positions, self.deformation_gradients, self.rotations
 
 
@@ -77,12 +77,11 @@ def windows(
     *,
     checkpoint: bool = False,
 ) -> Iterator[tuple[int, list[PredictedStep]]]:
-    """Rolls a batch ``steps`` frames forward, ``length`` at a time.
+    """Predicts ``steps`` frames of a batch in stretches of ``length`` frames.
 
-    Gradients flow within a stretch and, from the first one, into the initial state; each stretch starts from detached
-    numbers, so a caller that calls backward after every stretch needs memory for one only. ``restart`` is applied to
-    the state that each stretch starts from; ``checkpoint`` keeps of each step its input only and computes it once more
-    in the backward pass.
+    Loss gradients flow within a stretch and, from the first one, into the initial state; each stretch starts from
+    detached values, so a backward pass after every stretch needs memory for one stretch only. ``restart`` is applied to
+    the first state of each stretch; ``checkpoint`` recomputes each step in the backward pass.
 
     Yields:
         The number of frames predicted before the stretch, and its steps.
@@ -102,13 +101,13 @@ def windows(
 
 
 def _following(step: PredictedStep, state: SimState) -> SimState:
-    """The state after a step: the step's own where a model carries more than positions (``step.state``)."""
+    """The state after a step: ``step.state`` where a model's state is more than positions."""
     own: SimState | None = getattr(step, "state", None)
     return SimState(step.positions, state.positions) if own is None else own
 
 
 def after(steps: Sequence[PredictedStep], state: SimState) -> SimState:
-    """The state behind a stretch that began at ``state``, without history."""
+    """The state after a stretch that began at ``state``, detached."""
     for step in steps:
         state = _following(step, state)
     return state.detach()
@@ -123,7 +122,7 @@ def reach(batch: SceneBatch, diagonals: Sequence[float], positions: Float[Tensor
 
 
 def check_reach(table: Sequence[Sequence[float]], start: int, samples: Sequence[SampleFacts]) -> float:
-    """The largest entry of what :func:`reach` found in a stretch.
+    """The largest value that :func:`reach` returned for a stretch.
 
     Raises:
         DivergenceError: a position is not finite; names the step and the sequence.
@@ -136,11 +135,11 @@ def check_reach(table: Sequence[Sequence[float]], start: int, samples: Sequence[
 
 
 class Explosions:
-    """Ends a rollout at the stretch in which a kernel moves too far from rest; that stretch is not learned from.
+    """Ends a rollout before the stretch in which a kernel moves too far from rest; that stretch has no loss.
 
-    It ends on all ranks at once, as it would for one rank with all sequences. Where reading a number does not make the
-    host wait, the loop simply stops. Else (``deferred``) it goes on from the rest state, without an influence on
-    anything, and how long the rollout lasted is read at the end of the step.
+    It ends on all ranks at once, as it would on one rank with all sequences. Where reading a value does not block the
+    host, the loop stops. Otherwise (``deferred``) it continues from the rest state with zero loss, and the length of
+    the rollout is read at the end of the step.
     """
 
     def __init__(
@@ -155,8 +154,8 @@ class Explosions:
     ) -> None:
         """Begins a rollout of the samples of all ranks.
 
-        ``batch`` is what this rank computes, None without sequences; ``limit`` is what is too far [diagonals of the
-        member's scene]; ``deferred`` is the device where reads are put off, else None.
+        ``batch`` is this rank's part, None without sequences; ``limit`` is the largest distance from rest [diagonals
+        of the member's scene]; ``deferred`` is the device where reads are deferred, else None.
         """
         self._batch, self._diagonals, self._samples = batch, diagonals, samples
         self._limit, self._ranks = limit, ranks
@@ -164,9 +163,9 @@ class Explosions:
         self._lasts = None if deferred is None else torch.ones((), dtype=torch.bool, device=deferred)
 
     def end(self, positions: Float[Tensor, "T K 3"] | None, start: int, found: list[Tensor]) -> bool:
-        """Looks at a stretch; returns whether to stop, else adds its reach to ``found``.
+        """Checks a stretch; returns whether to stop, else appends its reach to ``found``.
 
-        A rank without sequences has no positions and learns what the others found.
+        A rank without sequences has no positions and receives the result of the others.
 
         Raises:
             DivergenceError: a position is not finite (not when deferred).
@@ -187,7 +186,7 @@ class Explosions:
         return False
 
     def spared(self, states: States) -> States:
-        """The states, or those of rest once the rollout has ended: they can be drawn whatever happened."""
+        """The states, or the rest state once the rollout has ended, which can always be rendered."""
         if self._lasts is None or self._rest is None:
             return states
         identity = torch.eye(3, dtype=states.deformation_gradients.dtype, device=states.deformation_gradients.device)
@@ -199,14 +198,14 @@ class Explosions:
         return values if self._lasts is None else torch.where(self._lasts, values, torch.zeros_like(values))
 
     def restart(self, state: SimState) -> SimState:
-        """The state, or that of rest once the rollout has ended."""
+        """The state, or the rest state once the rollout has ended."""
         if self._lasts is None or self._rest is None:
             return state
         return SimState(*(torch.where(self._lasts, x, self._rest) for x in (state.positions, state.previous)))
 
 
 def describe(step: int | None, samples: Sequence[SampleFacts], sample: SampleFacts | None, what: str) -> str:
-    """The message of a divergence: where, in which sequence and what broke."""
+    """The message of a divergence: the step, the sequence and the value that is not finite."""
     name = f"{sample.object_name}/{sample.sequence_name}" if sample is not None else ", ".join(
         f"{s.object_name}/{s.sequence_name}" for s in samples
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What one optimiser step found: kept on the device, read in one go, joined over ranks, checked."""
+"""Statistics of an optimiser step: stored on the device, read at once, joined over ranks and checked."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from gausim.training.ranks.ranks import interleave
 from gausim.training.rollout import check_reach, describe
 
 Table = list[list[float]]
-# Found stretch by stretch, and once per step where it is looked at.
+# Measured in every stretch, and at most once per step.
 SERIES, SINGLE = ("reach", "images", "momentum", "motion"), ("static", "growth", "gradient_fraction")
 
 
 @dataclass(frozen=True)
 class Found:
-    """The numbers of a step on the host.
+    """Statistics of a step on the host.
 
     Attributes:
-        reach: how far kernels moved, per stretch, step and sequence.
+        reach: largest distance of a kernel from rest, per stretch, step and sequence [diagonals].
         images: image loss per stretch, step and sequence.
         momentum: momentum loss per stretch and step, summed over sequences.
         motion: squared change of the predicted images per stretch, summed over sequences.
-        static: the static loss of the scenes that are this rank's, if this batch carried it.
-        growth: of the energy of free motion, this rank's sequences' part of the mean, if looked at.
-        gradient_fraction: the momentum loss's fraction of the network's gradient, if measured; the same on all ranks.
-        gradients: norm of each parameter group's gradient; likewise.
+        static: the static loss of this rank's scenes, if the batch had this term.
+        growth: energy growth of free motion, this rank's part of the mean, if measured.
+        gradient_fraction: the momentum loss's fraction of the network's loss gradient, if measured; equal on all ranks.
+        gradients: norm of each parameter group's loss gradient; equal on all ranks.
     """
 
     reach: list[Table]
@@ -47,7 +47,7 @@ class Found:
 
     @staticmethod
     def join(parts: Sequence[Found]) -> Found:
-        """What one rank with all sequences would have found."""
+        """The statistics that one rank with all sequences would have."""
         if len(parts) == 1:
             return parts[0]
         held = [part for part in parts if part.reach]  # the others had no sequence
@@ -69,12 +69,12 @@ class Found:
         return [row for table in self.images for row in table]
 
     def lasting(self, samples: Sequence[SampleFacts], explosion: float) -> Found:
-        """Ends the rollout of the samples at its first explosion and checks that all is finite.
+        """Ends the rollout of the samples at its first explosion and checks that all values are finite.
 
-        A stretch in which a kernel moves further than ``explosion`` does not count [diagonals].
+        A stretch in which a kernel moves further than ``explosion`` [diagonals] is left out.
 
         Raises:
-            DivergenceError: a number is not finite; names the step and the sequence where there is one.
+            DivergenceError: a value is not finite; names the step and the sequence, if it has one.
         """
         start = lasted = 0
         for table in self.reach:
@@ -99,7 +99,7 @@ class Found:
                 raise DivergenceError(describe(step, samples, sample, f"{what} is {value}"))
 
     def stats(self, steps: int, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:
-        """What is logged of a step of T = ``steps`` predicted frames; the baselines are of its sequences."""
+        """Logged metrics of a step of T = ``steps`` predicted frames, from the baselines of its sequences."""
         frames, count = self.frames, len(baselines)
         single = {
             "momentum_share": self.gradient_fraction, "loss_static": self.static, "energy_growth": self.growth,
@@ -116,10 +116,10 @@ class Found:
 
 @dataclass
 class Statistics:
-    """What one optimiser step found, stretch by stretch, on the device; :class:`Found` says what is what.
+    """Statistics of an optimiser step on the device, by stretch; :class:`Found` explains the attributes.
 
     Attributes:
-        pulls: gradients of the network by the image losses and by the momentum loss, where their ratio is measured.
+        pulls: the network's gradients of the image losses and of the momentum loss, where their ratio is measured.
     """
 
     reach: list[Float[Tensor, "T S"]] = field(default_factory=list)
@@ -132,7 +132,7 @@ class Statistics:
     gradient_fraction: Float[Tensor, ""] | None = None
 
     def fetch(self, norms: Mapping[str, Tensor]) -> Found:
-        """Fetches everything at once, the norm of each parameter group's gradient too."""
+        """Copies all statistics and the norms of the parameter groups' loss gradients to the host at once."""
         parts = [x for name in SERIES for x in getattr(self, name)]
         parts += [x for x in (*(getattr(self, name) for name in SINGLE), *norms.values()) if x is not None]
         device = parts[0].device
@@ -143,12 +143,12 @@ class Statistics:
 
 
 def _take(shape: Sequence[int], numbers: Iterator[float]) -> Any:
-    """Numbers in nested lists of a shape."""
+    """Nested lists of a shape, filled from ``numbers``."""
     return [_take(shape[1:], numbers) for _ in range(shape[0])] if shape else next(numbers)
 
 
 def _compare(frames: Table, motion: float, baselines: Sequence[SequenceBaseline]) -> dict[str, float]:
-    """The prediction's losses and motion against the static prediction's and the truth's."""
+    """Losses relative to those of the static prediction, and motion energy relative to the truth."""
     floor = static = first = moved = 0.0
     for baseline in baselines:
         floor += baseline.floor * len(frames)

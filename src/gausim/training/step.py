@@ -1,4 +1,4 @@
-"""One step of the optimiser: inputs, rollout, terms, backward, step."""
+"""One optimiser step: inputs, rollout, loss terms, backward passes, update."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from gausim.training.rollout import Explosions, States, after, describe, windows
 from gausim.training.statistics import Found, Statistics
 from gausim.training.terms.term import StepInputs
 
-# Batches in a row whose rollout explodes before anything can be learned from it; then training has diverged.
+# Successive batches whose rollouts explode in the first stretch, after which training counts as diverged.
 BARREN_BATCHES = 20
 
 
@@ -27,13 +27,13 @@ def optimise(
     draws: torch.Generator,
     advance: Callable[[], object],
 ) -> dict[str, float]:
-    """One step with all losses; returns what is logged of it.
+    """One optimiser step with all losses; returns its logged metrics.
 
-    ``samples`` are this rank's part of the batch, which may be empty where there are several; ``draws`` are the random
-    numbers of the step, and ``advance`` makes the optimiser's step.
+    ``samples`` are this rank's part of the batch, which may be empty with several ranks; ``draws`` generates the random
+    numbers of the step, and ``advance`` calls the optimiser.
 
     Raises:
-        DivergenceError: a number is not finite; no parameter has moved.
+        DivergenceError: a value is not finite; the parameters are unchanged.
     """
     optimizer.zero_grad(set_to_none=True)
     whole = interleave(learner.ranks.gather([sample.facts for sample in samples]))
@@ -57,7 +57,7 @@ def optimise(
 
 @torch.no_grad()
 def _see_first_frame(learner: Learner, samples: list[SequenceSample]) -> None:
-    """Lets the statistics of a new model's inputs begin with the first frame of its first batch."""
+    """Initialises the input statistics of a new model with the first frame of its first batch."""
     if samples:
         batch = learner.simulator.batch([s.scene_id for s in samples])
         learner.simulator.step(batch, learner.initial(samples, batch))
@@ -66,7 +66,7 @@ def _see_first_frame(learner: Learner, samples: list[SequenceSample]) -> None:
 def roll_out(
     learner: Learner, samples: list[SequenceSample], whole: list[SampleFacts], draws: torch.Generator
 ) -> Statistics:
-    """Predicts the batch stretch by stretch, with a backward pass after each: memory does not grow with T."""
+    """Predicts the batch with a backward pass after each stretch, so that memory does not grow with T."""
     steps, objective, ranks = whole[0].steps, learner.objective, learner.ranks
     if any(s.steps != steps for s in whole):
         raise ConfigError(f"a batch needs sequences of equal length, got {[s.steps for s in whole]} steps.")
@@ -76,7 +76,7 @@ def roll_out(
     deferred = device if learner.defers(device) else None
     explosions = Explosions(batch, learner.diagonals, whole, objective.explosion, ranks=ranks, deferred=deferred)
     free, unit = learner.free_motion.chosen(draws), _momentum_unit(learner, samples)
-    if batch is None:  # hears where the others' rollout ends
+    if batch is None:  # takes part in the ranks' decision on where rollouts end
         any(explosions.end(None, start, statistics.reach) for start in range(0, steps, length))
         return statistics
     comparison = learner.supervision.comparison(samples, batch)
@@ -103,7 +103,7 @@ def roll_out(
 def descend(
     learner: Learner, losses: Tensor, momentum: Tensor, per: float, statistics: Statistics, *, measure: bool
 ) -> None:
-    """Backward of one stretch; the mean over sequences, whatever the stretch's length."""
+    """Backward pass of one stretch, for the mean over sequences, independent of the stretch's length."""
     objective, network = learner.objective, learner.network()
     images_term = objective.image_weight * per * losses.sum()
     momentum_term = objective.momentum_weight * per * momentum.sum()
@@ -116,13 +116,13 @@ def descend(
 
 
 def _pull(loss: Tensor, network: list[nn.Parameter]) -> Tensor:
-    """Gradient of the network by one term."""
+    """Gradient of one loss term with respect to the network."""
     grads = torch.autograd.grad(loss, network, retain_graph=True, allow_unused=True, materialize_grads=True)
     return torch.cat([grad.flatten() for grad in grads])
 
 
 def _momentum_unit(learner: Learner, samples: list[SequenceSample]) -> float:
-    """What the rest state scores on the frames of the batch, over all ranks: the unit of the momentum loss."""
+    """Loss of the rest state on the frames of the batch, over all ranks: the unit of the momentum loss."""
     if learner.objective.momentum_weight == 0:
         return 0.0
     scores = interleave(learner.ranks.gather([learner.rest_loss(sample) for sample in samples]))
@@ -130,7 +130,7 @@ def _momentum_unit(learner: Learner, samples: list[SequenceSample]) -> float:
 
 
 def _read(learner: Learner, samples: list[SequenceSample], whole: list[SampleFacts], found: Found) -> dict[str, float]:
-    """Joins the numbers of all ranks, checks them and forms what is logged."""
+    """Joins and checks the values of all ranks, and computes the logged metrics."""
     parts = learner.ranks.gather((found, [learner.baseline(sample) for sample in samples]))
     lasting = Found.join([part[0] for part in parts]).lasting(whole, learner.objective.explosion)
     baselines = interleave([part[1] for part in parts])

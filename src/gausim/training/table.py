@@ -1,4 +1,4 @@
-"""A CSV file that a resumed run goes on with: no row twice, none lost."""
+"""CSV tables of resumable runs: no duplicate rows, none lost."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from gausim.io.files import write_durably
 
 
 class Table:
-    """Rows that are on the disk as soon as they are appended; :meth:`resume_at` drops those that come again.
+    """CSV table that writes each row at once; :meth:`resume_at` removes the rows that will be repeated.
 
-    ``key`` is the column that counts. Values outside ``columns`` are left out; where none are given, the table grows.
+    ``key`` is the counting column. Values outside ``columns`` are left out; without ``columns``, new ones are added.
     """
 
     def __init__(self, path: Path, key: str, columns: Sequence[str] = ()) -> None:
@@ -22,7 +22,7 @@ class Table:
         self._columns = list(columns)
 
     def append(self, row: Mapping[str, Any]) -> None:
-        """Adds a row; columns that it does not know stay empty."""
+        """Adds a row; missing columns stay empty."""
         if self._fixed:
             row = {name: row.get(name, "") for name in self._fixed}
         if self.path.is_file() and set(row) <= set(self._columns):
@@ -32,7 +32,7 @@ class Table:
             self._write([*self.rows(), row])
 
     def resume_at(self, last: int) -> None:
-        """Keeps the rows whose key is at most ``last``; a row that was torn while it was written is not of these."""
+        """Keeps the rows whose key is at most ``last``, without incomplete ones."""
         if self.path.is_file():
             whole = [row for row in self.rows() if None not in row and None not in row.values()]
             self._write([row for row in whole if float(row[self._key] or 0) <= last])

@@ -23,7 +23,7 @@ from gausim.training.ranks.layout import Layout, RanksStrategy
 
 @dataclass(frozen=True)
 class TrainerSettings(Layout):
-    """How long, how precisely and where a run trains: the keys of ``conf/trainer`` say what the settings are."""
+    """Length, precision and devices of a training: the keys of ``conf/trainer`` explain the settings."""
 
     max_epochs: int = 120
     threads: int | None = None
@@ -45,7 +45,7 @@ def make_trainer(
 ) -> Trainer:
     """The Lightning trainer of a run.
 
-    Its files go to ``run_dir``; the ``crew`` are its ranks, where there are several.
+    Files go to ``run_dir``; the ``crew`` has the ranks, if there are several.
 
     Raises:
         ConfigError: more than one rank without a crew.
@@ -59,7 +59,7 @@ def make_trainer(
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     keep_freed_memory()
-    # Convergence stands before what tells of its judgement.
+    # Convergence precedes callbacks that report its result.
     own: list[Callback] = [] if settings.convergence is None else [settings.convergence]
     own += [c for c in callbacks if settings.progress or not isinstance(c, ProgressBar)]
     if settings.max_minutes is not None:
@@ -78,7 +78,7 @@ def make_trainer(
         enable_model_summary=False,
         num_sanity_val_steps=0,
         limit_val_batches=0,
-        use_distributed_sampler=False,  # the sampler deals out shares itself
+        use_distributed_sampler=False,  # our sampler divides the batches
         default_root_dir=None if run_dir is None else str(run_dir),
         plugins=[AtomicCheckpointIO(), *([] if environment is None else [environment])],
     )

@@ -1,4 +1,4 @@
-"""What a run may take over from another: the network that scenes share with its statistics, or all of the simulator."""
+"""Weights from another run: the network with its input statistics, or the whole simulator."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _SHOWN = 3
 
 
 def load_shared(simulator: GausSim, run_dir: Path | str, model: Mapping[str, Any]) -> None:
-    """Loads what a trained run's scenes shared into a simulator of any scenes; everything else of it stays as it is.
+    """Loads the weights common to a trained run's scenes into a simulator of any scenes; the others stay unchanged.
 
-    ``model`` is the configuration of the simulator, to tell what differs.
+    ``model`` is the configuration of the simulator, for the message of an error.
 
     Raises:
         RunError: there is no run or no readable checkpoint.
-        ConfigError: its network is of another shape; nothing was loaded.
+        ConfigError: the networks' shapes differ; nothing was loaded.
     """
     there, _ = _read(run_dir)
     shared = tuple(f"{name}." for name in simulator.shared())
@@ -38,13 +38,13 @@ def load_shared(simulator: GausSim, run_dir: Path | str, model: Mapping[str, Any
 
 
 def load_simulator(simulator: GausSim, run_dir: Path | str, model: Mapping[str, Any]) -> None:
-    """Loads all of a trained simulator into one of some of its scenes, which are told by name, size and positions.
+    """Loads all weights of a trained simulator into one of some of its scenes, identified by name, size and positions.
 
-    ``model`` is the configuration of the simulator, to tell what differs.
+    ``model`` is the configuration of the simulator, for the message of an error.
 
     Raises:
         RunError: there is no run or no readable checkpoint, or it was not trained on a scene.
-        ConfigError: its weights are of another shape; nothing was loaded.
+        ConfigError: the weights' shapes differ; nothing was loaded.
     """
     there, trained = _read(run_dir)
     shared = tuple(f"{name}." for name in simulator.shared())
@@ -62,7 +62,7 @@ def load_simulator(simulator: GausSim, run_dir: Path | str, model: Mapping[str, 
 
 
 def _read(run_dir: Path | str) -> tuple[dict[str, Tensor], list[dict[str, Any]]]:
-    """A trained simulator's weights by name, averaged where the run averaged, and the scenes that it knows."""
+    """A trained simulator's weights by name (moving averages where the run has them), and its scenes."""
     checkpoint = read_checkpoint(RunDirectory(run_dir).checkpoint)
     weights = averaged_weights(checkpoint).items()
     own = {name.removeprefix(_PREFIX): value for name, value in weights if name.startswith(_PREFIX)}
@@ -70,14 +70,14 @@ def _read(run_dir: Path | str) -> tuple[dict[str, Tensor], list[dict[str, Any]]]
 
 
 def _is_below(name: str, prefix: str) -> bool:
-    """Whether a name is the prefix or lies below it; ``attributes.10`` does not lie below ``attributes.1``."""
+    """Whether a name equals the prefix or is below it; ``attributes.10`` is not below ``attributes.1``."""
     return name == prefix or (prefix.endswith(".") and name.startswith(prefix))
 
 
 def _check(
     found: Mapping[str, Tensor], own: Mapping[str, Tensor], what: str, run_dir: Path | str, model: Mapping[str, Any]
 ) -> None:
-    """Raises ConfigError where weights cannot be loaded, with the settings of ``model`` that differ from the run's."""
+    """Raises ConfigError where weights do not fit, naming the settings of ``model`` that differ from the run's."""
     problems = []
     for name in sorted(set(found) | set(own)):
         shapes = [tuple(side[name].shape) if name in side else None for side in (found, own)]

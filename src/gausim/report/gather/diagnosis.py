@@ -1,4 +1,4 @@
-"""How predictions oscillate beside the truth, as metrics.json tells it (``diagnosis``)."""
+"""Diagnosis of the oscillation of predictions and truth, read from metrics.json (``diagnosis``)."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ Number = float | None
 
 
 class Motion(msgspec.Struct):
-    """How one row moves; None where a figure is not defined, and no phase, cosine or levels where there are none.
+    """Motion of one row, with None for undefined figures.
 
     Attributes:
         spectrum: power per frequency.
-        frequencies: of each principal motion [Hz].
-        dampings: fraction of critical.
-        phase_error: per frame [degrees].
-        velocity_cosine: of the first velocity to the true one.
-        level_errors: over the static prediction's, of the units of each level of a hierarchy, the small ones first.
+        frequencies: frequency of each principal motion [Hz].
+        dampings: damping of each principal motion, as a fraction of critical damping.
+        phase_error: phase error per frame [degrees].
+        velocity_cosine: cosine between the first velocity and the true one.
+        level_errors: errors over the static prediction's of the units of each level, the finest first.
     """
 
     spectrum: list[float]
@@ -35,22 +35,22 @@ class Motion(msgspec.Struct):
 
 
 class Diagnosis(msgspec.Struct):
-    """What is known of the motions of one object.
+    """Diagnosis of one object.
 
     Attributes:
-        share: of the squared displacement in each principal motion.
-        frequency: of the spectra [Hz].
+        fraction: fraction of the squared displacement in each principal motion (key ``share`` of the file).
+        frequency: frequencies of the spectra [Hz].
         rows: the truth and the predictions.
-        first_unseen: first frame that training did not see.
+        first_unseen: first unseen frame.
     """
 
-    share: list[float]
+    fraction: list[float] = msgspec.field(name="share")
     frequency: list[float]
     rows: dict[str, Motion]
     first_unseen: int = 0
 
     def frequency_error(self, row: str) -> float:
-        """Mean over principal motions, weighted by :attr:`share`, of the relative error of the frequency."""
+        """Mean over principal motions, weighted by :attr:`fraction`, of the relative error of the frequency."""
         found, true = (numbers(self.rows[r].frequencies) for r in (row, TRUTH))
         with np.errstate(divide="ignore", invalid="ignore"):
             return self._mean(np.where(true > 0, np.abs(found / true - 1), np.nan))
@@ -68,22 +68,22 @@ class Diagnosis(msgspec.Struct):
         return float(part[np.isfinite(part)].mean()) if np.isfinite(part).any() else float("nan")
 
     def _mean(self, values: np.ndarray) -> float:
-        known, share = np.isfinite(values), numbers(self.share)
-        return float(np.average(values[known], weights=share[known])) if share[known].any() else float("nan")
+        known, weights = np.isfinite(values), numbers(self.fraction)
+        return float(np.average(values[known], weights=weights[known])) if weights[known].any() else float("nan")
 
 
 def read_diagnosis(entry: Mapping[str, Any]) -> Diagnosis | None:
-    """The diagnosis of an object's entry in metrics.json; None where there is none that makes sense."""
+    """The diagnosis of an object's entry in metrics.json; None if it is missing or malformed."""
     try:
         found = msgspec.convert(entry.get("diagnosis"), Diagnosis)
         found.first_unseen = msgspec.convert(dig(entry, "splits", "seen"), tuple[int, int])[1]
     except msgspec.ValidationError:
         return None
-    size = len(found.frequency), len(found.share), len(found.share)
+    size = len(found.frequency), len(found.fraction), len(found.fraction)
     sizes = {(len(m.spectrum), len(m.frequencies), len(m.dampings)) for m in found.rows.values()}
     return found if TRUTH in found.rows and sizes == {size} and all(size) else None
 
 
 def numbers(values: Sequence[Number]) -> np.ndarray:
-    """The figures as an array, NaN where one is not defined."""
+    """The figures as an array, with NaN for undefined ones."""
     return np.array(values, float)

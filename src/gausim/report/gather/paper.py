@@ -1,4 +1,4 @@
-"""The figures that the GausSim paper printed, as reference rows (its own recordings and cameras; not ours)."""
+"""Figures of the GausSim paper as reference rows, measured on its recordings and cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Finds run directories and reads what they say: configuration, state, summary. Nothing in them is trusted or run."""
+"""Search for run directories, and their configuration, state and summary, which are read as untrusted data."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from gausim.results.summary import load_summary
 from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT
 from gausim.runs.renamed import with_present_names
 
-# What makes a directory with an unreadable configuration a run nevertheless.
+# Files that identify a run whose configuration is unreadable.
 _TRACES = (FINISHED, FAILED, EPOCHS, LAST_CHECKPOINT)
 _KEYS_OF_A_RUN = {"model", "data", "seed"}
-# Keys that do not change what is computed, or that only tell seeds apart.
+# Keys without an effect on the result, and those of seeds.
 _FREE = ("paths", "logger", "callbacks", "sweep", "task_name", "evaluate", "seed", "data.seed", "trainer")
 _DIGITS = 12  # of hashes and commits
-_HYDRA = ".hydra"  # Hydra's own folder, also of a job that never came to a run of its own
+_HYDRA = ".hydra"  # Hydra's folder, also of a job that did not start a run
 
 EVALUATED, NOT_EVALUATED, UNFINISHED = "evaluated", "not evaluated", "unfinished"
 FAILURE, BROKEN = "failed", "broken files"
@@ -38,8 +38,8 @@ class RunRecord:
     path: Path
     name: str  # its path below the searched directory
     status: str  # one of the constants above
-    detail: str  # what more is known of the status, for people
-    config: dict[str, Any] = field(default_factory=dict, repr=False)  # empty where it is unreadable
+    detail: str  # explanation of the status, for display
+    config: dict[str, Any] = field(default_factory=dict, repr=False)  # empty if unreadable
     choices: dict[str, str] = field(default_factory=dict, repr=False)  # Hydra's, of every config group
     summary: dict[str, Any] | None = field(default=None, repr=False)  # content of evaluation/metrics.json
 
@@ -50,22 +50,22 @@ class RunRecord:
 
     @property
     def objects(self) -> dict[str, dict[str, Any]]:
-        """What its evaluation has of every object."""
+        """Its evaluation's entries by object."""
         return (self.summary or {}).get("objects", {})
 
     @cached_property
     def settings(self) -> dict[str, str]:
-        """Dotted keys and values of what is computed, seeds aside."""
+        """Dotted keys and values of the settings that affect the result, without seeds."""
         return self.settings_besides(())
 
     def settings_besides(self, keys: tuple[str, ...]) -> dict[str, str]:
-        """The settings but those of the groups ``keys``."""
+        """The settings without those of the groups ``keys``."""
         flat = flatten(self.config)
         return {k: v for k, v in flat if not any(k == f or k.startswith(f"{f}.") for f in (*_FREE, *keys))}
 
     @property
     def config_hash(self) -> str:
-        """First twelve digits of the SHA-256 of the whole configuration, or ``?`` where there is none."""
+        """First twelve digits of the SHA-256 of the whole configuration, or ``?`` without one."""
         if not self.config:
             return "?"
         return hashlib.sha256(json.dumps(dict(flatten(self.config)), sort_keys=True).encode()).hexdigest()[:_DIGITS]
@@ -77,13 +77,13 @@ class RunRecord:
 
     @property
     def checkpoint(self) -> str:
-        """Epoch and updates of the checkpoint that was evaluated, or ``?``."""
+        """Epoch and updates of the evaluated checkpoint, or ``?``."""
         state = (self.summary or {}).get("run", {})
         return "?" if state.get("epoch") is None else f"epoch {state['epoch']}, {state.get('updates')} updates"
 
     @property
     def commit(self) -> str:
-        """Commit of the program that evaluated it, ``+`` where it was modified; else its version; else ``?``."""
+        """Commit of the program that evaluated it, with ``+`` if modified; else its version; else ``?``."""
         commit, version = (dig(self.summary, "provenance", key) for key in ("commit", "gausim"))
         if isinstance(commit, str):
             return commit[:_DIGITS] + ("+" if dig(self.summary, "provenance", "modified") else "")
@@ -91,7 +91,7 @@ class RunRecord:
 
     @property
     def data_hashes(self) -> dict[str, tuple[str, str]]:
-        """First digits of the hashes of every object's scene and manifest; ``?`` where they were not recorded."""
+        """First digits of the hashes of every object's scene and manifest, or ``?`` if not recorded."""
 
         def digits(entry: dict[str, Any], key: str) -> str:
             return (dig(entry, "sources", key, "sha256") or "?")[:_DIGITS]
@@ -100,12 +100,12 @@ class RunRecord:
 
     @property
     def is_from_unfinished(self) -> bool:
-        """Whether its numbers are those of a checkpoint in the middle of training."""
+        """Whether its figures are of an unfinished training."""
         return self.summary is not None and self.summary["run"].get("finished") is False
 
 
 def dig(node: Any, *keys: str) -> Any:
-    """What nested dictionaries hold under these keys; None where they do not."""
+    """The value in nested dictionaries under these keys; None if there is none."""
     for key in keys:
         node = node.get(key) if isinstance(node, dict) else None
     return node
@@ -125,7 +125,7 @@ def find_runs(roots: Sequence[Path], *, skip: Path | None = None) -> list[RunRec
 
     Args:
         roots: directories.
-        skip: a directory that is not searched (where the report goes).
+        skip: a directory that is not searched (that of the report).
 
     Raises:
         RunError: a root is no directory, or there is no run at all.
@@ -146,7 +146,7 @@ def find_runs(roots: Sequence[Path], *, skip: Path | None = None) -> list[RunRec
 
 
 def _run_folders(root: Path, skip: Path | None) -> Iterator[Path]:
-    """Run directories, and the directories of jobs that Hydra began and that never came to a run of their own."""
+    """Run directories, and directories of Hydra jobs that did not start a run."""
     dead: list[Path] = []
     alive: list[Path] = []
     for name, folders, files in os.walk(root):
@@ -172,7 +172,7 @@ def _yaml(path: Path) -> dict[str, Any]:
     """A mapping from a YAML file, with the safe loader: no tag builds an object.
 
     Raises:
-        RunError: the file is missing, no YAML or no mapping.
+        RunError: the file is missing, not YAML or not a mapping.
     """
     try:
         loaded = yaml.safe_load(path.read_text())
@@ -217,7 +217,7 @@ def _state(folder: Path, is_run: bool) -> tuple[str, str]:
 
 
 def _progress(folder: Path) -> str:
-    """How far a run's own table of epochs goes."""
+    """Progress of a run according to its table of epochs."""
     try:
         with (folder / EPOCHS).open(newline="", errors="replace") as file:
             rows = list(csv.DictReader(file))

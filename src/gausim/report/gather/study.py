@@ -1,4 +1,4 @@
-"""Sorts runs into rows: runs that differ by their seed are one row, named after what their configuration chose."""
+"""Groups runs into rows: runs that differ by their seed are one row, named after their configuration."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from gausim.results.table import footnotes
 
 FULL = "full"
 NOT_MEASURED = "not measured"
-# Settings that say which object a run is about.
+# Settings that select the object of a run.
 _WHICH_OBJECT = ("data.root", "data.names", "data.scene", "data.masks", "data.selections")
-# The order of rows and columns: the paper's, then what it does not have.
+# The paper's order of rows and columns; others follow.
 _ORDER = ("jointly", "w/o mass", "w/o momentum", "w/o hierarchy")
-# At most so many differing settings are put into a row's name.
+# Largest number of differing settings in a row's name.
 _KEYS_IN_NAMES = 3
-# Of runs that all lack a number, the state that is shown first.
+# States of runs without a number, in the order of precedence.
 _WORST = (FAILURE, BROKEN, UNFINISHED, NOT_EVALUATED)
 
 
-# The runs of a row, by the objects that they are about.
+# The runs of a row, by their objects.
 About = dict[tuple[str, ...], tuple[RunRecord, ...]]
 
 
 @dataclass(frozen=True)
 class Value:
-    """A figure of a row: over sequences, and over seeds where there are several."""
+    """A figure of a row, over sequences and, if there are several, seeds."""
 
     mean: float  # of all seeds' means over sequences
     std: float | None  # standard deviation over sequences (over seeds: root of the mean square)
@@ -42,7 +42,7 @@ class Value:
 
 @dataclass(frozen=True)
 class Cell:
-    """A value, or why there is none, and the runs it comes from."""
+    """A value, or the reason why it is missing, and its source runs."""
 
     value: Value | None
     status: str = ""
@@ -51,16 +51,16 @@ class Cell:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Runs of one configuration and one method of their summaries; they differ by their seeds.
+    """Runs of one configuration and one method of their summaries, which differ by their seeds.
 
-    A network per object, each of the same configuration, is one group; so is one network of several objects.
+    Networks of single objects with the same configuration are one group, as is one network of several objects.
     """
 
     label: str  # name of the row
-    family: str  # the model's name, without what was varied
-    variation: str  # what was varied
+    family: str  # the model's name, without the variation
+    variation: str  # the varied settings
     method: str  # row of the summaries
-    about: About  # the runs, evaluated ones or not
+    about: About  # the runs, evaluated or not
 
     @property
     def runs(self) -> tuple[RunRecord, ...]:
@@ -73,16 +73,16 @@ class Group:
         return tuple(name for names in self.about for name in names)
 
     def of(self, name: str) -> tuple[RunRecord, ...]:
-        """The runs that are about an object; they differ by their seeds."""
+        """The runs of an object, which differ by their seeds."""
         return next((same for names, same in self.about.items() if name in names), ())
 
     @property
     def evaluated(self) -> list[RunRecord]:
-        """Runs that have numbers."""
+        """The evaluated runs."""
         return [r for r in self.runs if r.summary is not None]
 
     def singles(self) -> list[Group]:
-        """Each evaluated run as a group of its own."""
+        """Each evaluated run as a separate group."""
         return [
             replace(self, about={names: (run,)})
             for names, same in self.about.items()
@@ -97,20 +97,20 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """Everything that a report is about."""
+    """Data of a report."""
 
     runs: tuple[RunRecord, ...]
     groups: tuple[Group, ...]  # rows of the tables
     objects: tuple[str, ...]  # columns, those with numbers first
-    notes: tuple[str, ...]  # what a reader must know to trust the tables
+    notes: tuple[str, ...]  # notes on the reliability of the tables
 
     def splits(self, name: str) -> dict[str, Sequence[int]]:
-        """Ranges of frames of an object, as its first evaluated run has them."""
+        """Splits of an object's frames, from its first evaluated run."""
         entries = (entry for group in self.groups for _, entry in group.entries(name))
         return dict(next(entries, {"splits": {}})["splits"])
 
     def info(self, metric: str) -> dict[str, Any] | None:
-        """How a metric is printed; None where no run has it."""
+        """Display of a metric; None if no run has it."""
         entries = (entry for group in self.groups for run in group.evaluated for entry in run.objects.values())
         return next((entry["metrics"][metric] for entry in entries if metric in entry["metrics"]), None)
 
@@ -119,7 +119,7 @@ def make_study(runs: Sequence[RunRecord]) -> Study:
     """Groups runs and names the rows."""
     by_config: dict[str, list[RunRecord]] = {}
     for run in runs:
-        # A run without a configuration is a row of its own.
+        # A run without a configuration is a separate row.
         key = json.dumps(run.settings, sort_keys=True) if run.config else str(run.path)
         by_config.setdefault(key, []).append(run)
     members = _rows([tuple(same) for same in by_config.values()], runs)
@@ -132,14 +132,14 @@ def make_study(runs: Sequence[RunRecord]) -> Study:
     ]
     families = list(dict.fromkeys(g.family for g in groups))
     groups.sort(key=lambda g: (families.index(g.family), _place(g.variation)))
-    # Dictionaries keep the order and drop what comes twice.
+    # A dictionary keeps the order and removes duplicates.
     known = dict.fromkeys(o for g in groups for run in g.evaluated for o in run.objects)
     every = known | dict.fromkeys(o for g in groups for o in g.objects)
     return Study(tuple(runs), tuple(groups), tuple(every), tuple(_notes(groups)))
 
 
 def _rows(members: Sequence[tuple[RunRecord, ...]], runs: Sequence[RunRecord]) -> list[About]:
-    """Puts runs that differ by the one object that they are about into one row; joint runs are rows of their own."""
+    """Joins runs that differ by their single object into one row; joint runs are separate rows."""
     rows: list[About] = []
     for same in members:
         names = _objects(same, runs)
@@ -153,26 +153,26 @@ def _rows(members: Sequence[tuple[RunRecord, ...]], runs: Sequence[RunRecord]) -
 
 
 def _continues(row: About, names: tuple[str, ...], run: RunRecord) -> bool:
-    """Whether a run on one object belongs to a row of single objects: another object, the same settings besides."""
+    """Whether a run on one object belongs to a row of single objects: another object, other settings equal."""
     first = next(iter(row.values()))[0]
     settings, own = (r.settings_besides(_WHICH_OBJECT) for r in (first, run))
     return names not in row and all(len(other) == 1 for other in row) and bool(run.config) and settings == own
 
 
 def _place(variation: str) -> list[int]:
-    """What a variation is sorted by: nothing varied first, then the paper's order, then the order of the runs."""
+    """Sort key of a variation: none first, then the paper's order, then the order of the runs."""
     parts = variation.split(" (")[0].split(", ") if variation != FULL else []
     return [_ORDER.index(part) if part in _ORDER else len(_ORDER) for part in parts]
 
 
 def _methods(same: Sequence[RunRecord]) -> list[tuple[str | None, str]]:
-    """Methods of the summaries: (what is added to the label, row); usually one and nothing."""
+    """Methods of the summaries as (suffix of the label, row); usually one method without suffix."""
     rows = dict.fromkeys(m for r in same for entry in r.objects.values() for m in entry["methods"])
     return [(None, next(iter(rows), ""))] if len(rows) < 2 else [(m, m) for m in rows]
 
 
 def _objects(same: Sequence[RunRecord], runs: Sequence[RunRecord]) -> tuple[str, ...]:
-    """What the runs are about: from their summaries, else from a run on the same data, else the data's directory."""
+    """Objects of the runs: from their summaries, else from a run on the same data, else the data's directory."""
     for pool in (same, [r for r in runs if _data(r) == _data(same[0])]):
         for run in pool:
             if run.objects:
@@ -189,11 +189,11 @@ def _data(run: RunRecord) -> tuple[Any, Any]:
     return (data.get("names"), data.get("root", "?")) if isinstance(data, dict) else (None, "?")
 
 
-_SWITCHES = ("no_mass", "no_momentum", "no_hierarchy")  # ablations that are told from the settings themselves
+_SWITCHES = ("no_mass", "no_momentum", "no_hierarchy")  # ablations that are identified by the settings
 
 
 def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
-    """(label, family, variation) from what the configuration computes, not from what it is called."""
+    """(label, family, variation) from the settings of the configuration, not from its name."""
     simulator = dig(run.config, "model", "simulator")
     family = run.choices.get("model") or str(run.config.get("name") or run.name)
     levels = dig(simulator, "hierarchy", "levels")
@@ -205,7 +205,7 @@ def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
     ) if is_off]  # fmt: skip
     name = str(dig(run.config, "ablation", "name") or "none")
     parts = [part for part in name.split("+") if part not in ("none", "full", "joint")]
-    if off:  # what is switched off has been named; of a list, the others have not
+    if off:  # ablations by settings are named already, others of a list are not
         parts = [part for part in parts if part not in _SWITCHES] if "+" in name else []
     varied = [*(["jointly"] if objects > 1 else []), *off, *parts]
     variation = ", ".join(varied) or FULL
@@ -213,9 +213,9 @@ def _names(run: RunRecord, objects: int) -> tuple[str, str, str]:
 
 
 def _distinct(labels: list[tuple[str, str, str]], members: Sequence[About]) -> list[tuple[str, str, str]]:
-    """Adds to labels that two configurations on one object share what tells them apart: the run's name, or settings.
+    """Distinguishes equal labels of two configurations on one object by the run's name or by settings.
 
-    Of several full configurations the one that the ablations are variations of keeps the plain label.
+    Of several full configurations, the reference of the ablations keeps the plain label.
     """
     objects = [[name for names in about for name in names] for about in members]
     firsts = [next(iter(about.values()))[0] for about in members]
@@ -233,7 +233,7 @@ def _distinct(labels: list[tuple[str, str, str]], members: Sequence[About]) -> l
 
 
 def _reference(family: str, labels: Sequence[tuple[str, str, str]], firsts: Sequence[RunRecord]) -> int | None:
-    """The full configuration that differs least from the family's ablations; None without any, or in a tie."""
+    """The full configuration that differs least from the family's ablations; None without one, or in a tie."""
     full = [i for i, label in enumerate(labels) if label[1:] == (family, FULL)]
     ablated = [firsts[i].settings for i, label in enumerate(labels) if label[1] == family and i not in full]
     if not ablated:
@@ -260,12 +260,12 @@ def _difference(run: RunRecord, rivals: Sequence[RunRecord]) -> str:
 
 
 def says(group: Group) -> list[str]:
-    """What the group's method says of itself, each sentence once."""
+    """Notes on the group's method, each sentence once."""
     entries = (entry for name in group.objects for _, entry in group.entries(name))
     return list(dict.fromkeys(note for entry in entries for note in footnotes(entry, group.method)))
 
 
-# What the seeds of a row must have in common to be compared, and where a summary says it.
+# Facts that the seeds of a row must have in common, by their place in a summary.
 _COMPARED = {
     "sequences": ("sequences",),
     "ranges of frames": ("splits",),
@@ -294,12 +294,12 @@ def _notes(groups: Sequence[Group]) -> list[str]:
 
 
 def cell(group: Group, name: str, split: str, views: str, metric: str, *, row: str | None = None) -> Cell:
-    """A figure of a group on an object, pooled over its seeds: of its method, or of a reference ``row``."""
+    """A figure of a group on an object, pooled over its seeds, for its method or a reference ``row``."""
     return pooled(group, name, lambda entry: dig(entry["rows"], row or group.method, split, views, metric), metric)
 
 
 def pooled(group: Group, name: str, find: Callable[[dict[str, Any]], Any], metric: str) -> Cell:
-    """Pools what ``find`` picks out of every seed's entry of an object."""
+    """Pools the figure that ``find`` returns for every seed's entry of an object."""
     if name not in group.objects:
         return Cell(None)
     entries = group.entries(name)
@@ -308,7 +308,7 @@ def pooled(group: Group, name: str, find: Callable[[dict[str, Any]], Any], metri
         worst = next((s for s in _WORST if s in states), NOT_MEASURED)
         return Cell(None, worst, group.of(name))
     found = [(run, find(entry)) for run, entry in entries]
-    # Sequences at rest spoil a mean of ratios; the pooled ratio is what tables show of the energy.
+    # Tables show the pooled ratio of the energy, because sequences at rest distort a mean of ratios.
     key = "pooled" if metric == MOTION_ENERGY else "mean"
     numbers = [(run, dig(c, key), dig(c, "std")) for run, c in found]
     valid = [(run, mean, std) for run, mean, std in numbers if mean is not None]

@@ -1,4 +1,4 @@
-"""Picture of a hierarchy: every level's units in their own colours, seen from two sides."""
+"""Picture of a hierarchy: the units of every level in different colours, seen from two sides."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 
 from gausim.io.files import replacing
 
-# Neighbouring units get hues this far apart on the colour circle: the golden ratio never repeats.
+# Distance of successive units' hues on the colour circle: multiples of the golden ratio never repeat.
 GOLDEN = 0.6180339887498949
-# Point area [points^2] for a thousand kernels; more kernels get smaller points.
+# Area of a point for a thousand kernels, smaller for more [points^2].
 POINT_AREA = 30.0
 PINNED_COLOR = (0.25, 0.25, 0.25)
 
@@ -35,8 +35,8 @@ def draw_clusters(
         path: PNG to write.
         means: rest positions of the kernels [scene units].
         labels: for each level the unit of every kernel.
-        pinned: kernels that are drawn dark grey.
-        title: what stands above.
+        pinned: pinned kernels, drawn dark grey.
+        title: title of the picture.
         names: heading of each level.
         sides: for each row the horizontal and the vertical axis (0, 1, 2 for x, y, z).
         flip: draw the vertical axis downwards (scenes whose up is negative).
@@ -50,7 +50,7 @@ def draw_clusters(
         colors[pinned] = PINNED_COLOR
         for row, (across, up) in enumerate(sides):
             panel = panels[row, column]
-            # Nearest to the eye last: the third axis is depth.
+            # In the order of depth (the third axis), the nearest last.
             order = np.argsort(means[:, 3 - across - up] * (1 if row else -1), kind="stable")
             panel.scatter(means[order, across], means[order, up], s=area, c=colors[order], linewidths=0)
             panel.set_aspect("equal")

@@ -1,4 +1,4 @@
-"""Figures from result arrays: errors over time, space-time slices, contact sheets. Never touches a model."""
+"""Figures from result arrays: errors over time, space-time slices, contact sheets."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def error_figure(curves: ObjectCurves, path: Path, *, sequence: str | None = Non
 def error_plot(
     rows: Sequence[tuple[str, Sequence[tuple[ObjectCurves, str]]]], *, title: str = "", sequence: str | None = None
 ) -> Figure:
-    """Errors over time of every row: 3D where truth exists, then l2 in the training and held-out views.
+    """Errors over time of every row: 3D if the truth is known, then l2 in the training and held-out views.
 
     Args:
         rows: label, and the evaluations (seeds) with the name of their row; the mean and, for methods, a band of one
@@ -73,7 +73,7 @@ def _error_panel(
         padded = [np.pad(n, ((0, 0), (0, length - n.shape[1])), constant_values=np.nan) for n in lines]
         stacked = np.concatenate(padded) * (1.0 if metric == ERROR_3D else 1e3)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # frames that no sequence has
+            warnings.simplefilter("ignore", RuntimeWarning)  # frames beyond all sequences
             mean, std = np.nanmean(stacked, 0), np.nanstd(stacked, 0)
         style = "-" if is_method else "--" if label == STATIC else ":"
         axes.plot(mean, style, color=color, label=label, linewidth=1.8 if is_method else 1.2)
@@ -97,11 +97,11 @@ def _lines(curves: ObjectCurves, row: str, panel: tuple[str, str], sequence: str
 def slices_plot(
     columns: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], first_unseen: int
 ) -> tuple[Figure, list[tuple[str, int]]]:
-    """Space-time slices under one another, through the line that moves most in the first film of a column.
+    """Space-time slices below each other, through the line with the most motion in a column's first film.
 
     Args:
         columns: heading of each, and its films: label and (F, H, W, 3) uint8, of any length.
-        first_unseen: first frame that training did not see; a line marks it.
+        first_unseen: first unseen frame, marked by a line.
 
     Returns:
         The figure, and the line of each column: ("column" | "row", index).
@@ -128,9 +128,9 @@ def slices_plot(
 def slice_figure(
     truth: np.ndarray | None, prediction: np.ndarray, path: Path, *, title: str, first_unseen: int
 ) -> tuple[str, int]:
-    """Writes space-time slices of truth (without it, of the prediction alone) above prediction; returns their line.
+    """Writes space-time slices of truth (if given) above prediction; returns their line.
 
-    Films are (F, H, W, 3) uint8, of any length; a mark stands before ``first_unseen``.
+    Films are (F, H, W, 3) uint8, of any length; a line marks ``first_unseen``.
     """
     films = [] if truth is None else [("ground truth", truth)]
     figure, lines = slices_plot([(title, [*films, ("prediction", prediction)])], first_unseen)
@@ -139,7 +139,7 @@ def slice_figure(
 
 
 def contact_frames(frames: int, first_unseen: int, count: int = 8) -> list[int]:
-    """Frames worth a place on a contact sheet: first, last seen, first unseen, last, and evenly between."""
+    """Frames of a contact sheet: first, last seen, first unseen, last, and evenly spaced ones between."""
     edges = {0, min(first_unseen - 1, frames - 1), min(first_unseen, frames - 1), frames - 1}
     even = np.linspace(0, frames - 1, count).round().astype(int).tolist()
     return sorted(edges | {f for f in even if min(abs(f - e) for e in edges) > 2})
@@ -148,7 +148,7 @@ def contact_frames(frames: int, first_unseen: int, count: int = 8) -> list[int]:
 def panels_plot(
     rows: Sequence[tuple[str, Sequence[np.ndarray | None]]], heads: Sequence[tuple[str, bool]], *, title: str = ""
 ) -> Figure:
-    """Labelled rows of (H, W, 3) uint8 pictures (None: an empty place); heads of foreseen columns are orange."""
+    """Labelled rows of (H, W, 3) uint8 pictures (None: empty); headings of unseen columns are orange."""
     height, width = next(image.shape[:2] for _, images in rows for image in images if image is not None)
     size = (1.25 * len(heads), 1.25 * height / width * len(rows) + (0.6 if title else 0.3))
     figure, places = made_figure(len(rows), len(heads), size, title)
@@ -167,9 +167,9 @@ def panels_plot(
 def contact_sheet(
     truth: np.ndarray | None, prediction: np.ndarray, path: Path, *, title: str, first_unseen: int
 ) -> None:
-    """Chosen frames of truth, prediction and error under one another; foreseen frames carry an orange number.
+    """Chosen frames of truth, prediction and error below each other; unseen frames have orange numbers.
 
-    Films are (F, H, W, 3) uint8; frames beyond the end of the truth stay empty.
+    Films are (F, H, W, 3) uint8; frames beyond the truth are empty.
     """
     chosen = contact_frames(len(prediction), first_unseen)
     rows: list[tuple[str, list[np.ndarray | None]]] = [("prediction", [prediction[f] for f in chosen])]
@@ -187,14 +187,14 @@ def picture_grid(images: Sequence[np.ndarray], labels: Sequence[str], path: Path
     figure, places = made_figure(rows, columns, (3.2 * columns, (3.2 * ratio + 0.3) * rows + 0.3), title)
     for axes in places:
         axes.set_axis_off()
-    for axes, image, label in zip(places, images, labels, strict=False):  # the last row may have places left
+    for axes, image, label in zip(places, images, labels, strict=False):  # the last row may be incomplete
         axes.imshow(image)
         axes.set_title(label, fontsize=8)
     save_figure(figure, path)
 
 
 def made_figure(rows: int, columns: int, size: tuple[float, float], title: str = "") -> tuple[Figure, np.ndarray]:
-    """A figure of this size [inches] with its axes, row by row."""
+    """A figure of ``size`` [inches] with its axes, row by row."""
     figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
     if title:
         figure.suptitle(title, fontsize=10)
@@ -202,6 +202,6 @@ def made_figure(rows: int, columns: int, size: tuple[float, float], title: str =
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Writes a figure and the folder it lies in."""
+    """Writes a figure, and creates its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)

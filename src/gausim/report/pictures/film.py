@@ -1,4 +1,4 @@
-"""The video that a report begins with: truth, prediction and error in a view that training never saw."""
+"""Video on the first screen of a report: truth, prediction and error in a held-out view."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from gausim.report.pictures.frames import ERROR_RANGE, Timeline, brighten, error
 from gausim.report.pictures.media import video_uri
 from gausim.results.pictures import Pictures, kept_pictures
 
-# A panel fits into this box [pixels]; a video that is over sooner is shown at half speed [seconds].
+# Largest width and height of a panel [pixels]; length below which a video is shown at half speed [s].
 _WIDEST, _HIGHEST, _SHORT = 352, 400, 4.0
 
 
 @dataclass(frozen=True)
 class Film:
-    """A video of truth, prediction and error side by side: data URIs of the MP4 and of its picture before it plays."""
+    """A video of truth, prediction and error side by side: data URIs of the MP4 and of its poster image."""
 
     uri: str
     poster: str
@@ -31,10 +31,10 @@ class Film:
 
 
 def make_film(run: RunRecord, name: str, method: str) -> Film:
-    """The video of an evaluated run and object, in the first view never trained on, else in the first view.
+    """The video of an evaluated run and object, in the first held-out view, else in the first view.
 
     Raises:
-        RunError: the evaluation kept no pictures of this object and method, or they cannot be read.
+        RunError: the evaluation has no pictures of this object and method, or they cannot be read.
     """
     found = next((item for item in kept_pictures(run.path, name) if method in item.predictions), None)
     if found is None:
@@ -53,7 +53,7 @@ def make_film(run: RunRecord, name: str, method: str) -> Film:
 def _frames(pictures: Pictures, method: str, view: int, gain: float) -> Iterator[np.ndarray]:
     height, width = pictures.truth.shape[2:4]
     zoom = min(_WIDEST / width, _HIGHEST / height)
-    # The encoder takes even sizes.
+    # The encoder requires even sizes.
     size = 2 * max(1, round(width * zoom / 2)), 2 * max(1, round(height * zoom / 2))
     both = pictures.truth, pictures.predictions[method]
     truth, predicted = (pictures.over_background(frames)[:, view] for frames in both)

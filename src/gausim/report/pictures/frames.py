@@ -1,4 +1,4 @@
-"""Pictures for people from images of truth and prediction: side-by-side frames, error colours, space-time lines."""
+"""Comparison of images of truth and prediction: side-by-side frames, error colours, space-time slices."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-# Colour distance that the error panel shows as white-hot; the largest possible one is sqrt(3).
+# Colour distance at the bright end of the error colours; the largest possible one is sqrt(3).
 ERROR_RANGE = 0.5
 PANEL_HEIGHT = 320
 _BAR, _LINE = 24, 8
 SEEN, FORESEEN = (120, 160, 200), (240, 150, 40)
 _INK, _PAPER = (235, 235, 235), (24, 24, 24)
-# The brightest percentile of the true foreground becomes this light; never more than so much gain.
+# Brightness to which the brightest percentile of the true foreground is raised, and the largest gain.
 _LIGHT, _MOST_GAIN = 230.0, 2.5
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Where a video stands: how many frames there are, and the first that training did not see."""
+    """Number of a video's frames, and the first unseen one."""
 
     frames: int
     first_unseen: int
 
 
 def error_colors(truth: np.ndarray, prediction: np.ndarray) -> np.ndarray:
-    """Per-pixel colour distance of (H, W, 3) uint8 images as a heat map, black = 0, brightest = ERROR_RANGE."""
+    """Heat map of the colour distance per pixel of (H, W, 3) uint8 images, black = 0, brightest = ERROR_RANGE."""
     distance = np.linalg.norm(truth.astype(np.float32) - prediction.astype(np.float32), axis=-1) / 255
     level = np.clip(distance / ERROR_RANGE * 255 + 0.5, 0, 255).astype(np.uint8)
     return cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
@@ -44,12 +44,12 @@ def video_frame(
     """One frame of a comparison: ground truth | prediction | error, labels above, the time line below.
 
     Args:
-        truth: (H, W, 3) uint8; None beyond the recorded frames, where its panels stay empty.
+        truth: (H, W, 3) uint8; None beyond the recorded frames, whose panels are empty.
         prediction: (H, W, 3) uint8.
         frame: its number.
         timeline: of the whole video.
-        title: what is shown (sequence and view).
-        height: smaller images are enlarged to so many rows.
+        title: sequence and view.
+        height: number of rows to which smaller images are enlarged.
     """
     missing = np.full_like(prediction, _PAPER[0])
     error = missing if truth is None else error_colors(truth, prediction)
@@ -64,13 +64,13 @@ def video_frame(
 
 
 def label_bar(text: str, width: int) -> np.ndarray:
-    """A dark bar of this width with a line of text."""
+    """A dark bar with a line of text."""
     bar = np.full((_BAR, width, 3), _PAPER, np.uint8)
     return cv2.putText(bar, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.48, _INK, 1, cv2.LINE_AA)
 
 
 def timeline_bar(frame: int, timeline: Timeline, title: str, width: int) -> np.ndarray:
-    """Title, number of the frame and a line of time; orange from the first frame that training did not see."""
+    """Title, number of the frame and time line, which is orange from the first unseen frame on."""
     foreseen = frame >= timeline.first_unseen
     state = "FORESEEN" if foreseen else "seen in training"
     bar = label_bar(f"{title}   frame {frame}/{timeline.frames - 1}   {state}", width)
@@ -80,7 +80,7 @@ def timeline_bar(frame: int, timeline: Timeline, title: str, width: int) -> np.n
 
 
 def time_line(frame: int, timeline: Timeline, width: int) -> np.ndarray:
-    """The line of time alone, up to a frame; a mark stands where the foreseen frames begin."""
+    """The time line up to a frame, with a mark at the first unseen frame."""
     line = np.full((_LINE, width, 3), _PAPER, np.uint8)
     begin, now = (round(width * f / timeline.frames) for f in (timeline.first_unseen, frame + 1))
     line[:, : min(begin, now)] = SEEN
@@ -101,14 +101,14 @@ def moving_line(frames: np.ndarray) -> tuple[str, int]:
 
 
 def space_time_slice(frames: np.ndarray, line: tuple[str, int]) -> np.ndarray:
-    """That line of every (F, H, W, 3) frame side by side: (pixels of the line, F, 3), time to the right."""
+    """One image line of all (F, H, W, 3) frames side by side: (pixels of the line, F, 3), time to the right."""
     kind, index = line
     picked = frames[:, :, index] if kind == "column" else frames[:, index]
     return picked.swapaxes(0, 1)
 
 
 def brighten(frames: np.ndarray, gain: float) -> np.ndarray:
-    """uint8 frames times a gain, cut at white; for the eye only."""
+    """uint8 frames times a gain, clipped at white; for display only."""
     if gain == 1:
         return frames
     table = np.clip(np.arange(256) * gain + 0.5, 0, 255).astype(np.uint8)
@@ -116,7 +116,7 @@ def brighten(frames: np.ndarray, gain: float) -> np.ndarray:
 
 
 def light_gain(truth: np.ndarray) -> float:
-    """The gain that makes the foreground of (..., 4) uint8 frames, RGB premultiplied with alpha, bright enough."""
+    """Gain for display of the foreground of (..., 4) uint8 frames, RGB premultiplied with alpha."""
     opaque = truth[truth[..., 3] > 128][:, :3]
     bright = float(np.percentile(opaque.max(-1), 95)) if len(opaque) else _LIGHT
     return round(min(_MOST_GAIN, max(1.0, _LIGHT / max(bright, 1.0))), 2)

@@ -25,7 +25,7 @@ from gausim.results.curves import STATIC, ObjectCurves, load_curves
 from gausim.results.pictures import Pictures, kept_pictures
 
 TRUTH = "ground truth"
-# More predictions than these side by side are too small to see; the tables have them all.
+# Largest number of predictions and of views side by side; the tables have all.
 MOST_METHODS, MOST_VIEWS = 5, 3
 # Height of a panel of a video [pixels].
 _PANEL = 168
@@ -33,7 +33,7 @@ _PANEL = 168
 
 @dataclass(frozen=True)
 class Exhibit:
-    """One picture or video: heading, how to read it, ``image`` or ``video``, and its data URI."""
+    """One picture or video: heading, caption, ``image`` or ``video``, and its data URI."""
 
     title: str
     caption: str
@@ -45,13 +45,13 @@ class Exhibit:
 class Shown:
     """Pictures of one sequence, the truth first."""
 
-    pictures: Pictures  # what they were made from (cameras, border of the seen frames)
+    pictures: Pictures  # the source (cameras, first unseen frame)
     columns: list[tuple[str, np.ndarray]]  # names and (F, V, h, w, 3) frames over the background, brightened
-    note: str  # what was done to them, for captions
+    note: str  # note on their processing, for captions
 
 
 def object_figures(study: Study, name: str) -> tuple[list[Exhibit], list[str]]:
-    """All pictures of one object, and what could not be shown and why."""
+    """All pictures of one object, and the reasons for missing ones."""
     figures: list[Exhibit] = []
     problems: list[str] = []
     curves = _curves(study, name, problems)
@@ -60,13 +60,13 @@ def object_figures(study: Study, name: str) -> tuple[list[Exhibit], list[str]]:
     figures += _motions(study, name)
     for shown in _shown(study, name, problems):
         figures += [_slices(shown), _grid(shown), _cameras(shown)]
-        # The page opens with a video of each; this one is for comparing them.
+        # The first screens have a video of each method; this one compares them.
         figures += [_video(shown)] if len(shown.columns) > 2 else []
     return figures, problems
 
 
 def _motions(study: Study, name: str) -> list[Exhibit]:
-    """Spectra and phase errors, of the first seed of every row, where the true motion is known."""
+    """Spectra and phase errors of the first seed of every row, if the true motion is known."""
     named = []
     for group in study.groups:
         found = [d for _, entry in group.entries(name) if (d := read_diagnosis(entry)) and group.method in d.rows]
@@ -95,7 +95,7 @@ def _curves(study: Study, name: str, problems: list[str]) -> list[tuple[Group, l
 
 
 def _error_curves(name: str, curves: Sequence[tuple[Group, list[ObjectCurves]]]) -> Exhibit:
-    """Errors over time of all rows, mean over sequences and seeds; the seen frames are shaded."""
+    """Errors over time of all rows, averaged over sequences and seeds; the seen frames are shaded."""
     rows = [(group.label, [(c, group.method) for c in seeds]) for group, seeds in curves]
     figure = error_plot([*rows, (STATIC, [(curves[0][1][0], STATIC)])])
     caption = (
@@ -105,7 +105,7 @@ def _error_curves(name: str, curves: Sequence[tuple[Group, list[ObjectCurves]]])
 
 
 def _shown(study: Study, name: str, problems: list[str]) -> Iterator[Shown]:
-    """One set of pictures per sequence and cameras; runs that kept the same ones stand side by side."""
+    """One set of pictures per sequence and cameras, with all runs that have them side by side."""
     sets: dict[tuple[object, ...], list[tuple[str, Pictures, np.ndarray]]] = {}
     for group in study.groups:
         for run, _ in group.entries(name)[:1]:
@@ -139,7 +139,7 @@ def _lit(members: Sequence[tuple[str, Pictures, np.ndarray]]) -> Shown:
 
 
 def _slices(shown: Shown) -> Exhibit:
-    """Space-time slices through the line that moves most, one row per method and column per camera."""
+    """Space-time slices through the line with the most motion, one row per method and column per camera."""
     pictures = shown.pictures
     columns = [
         (_view_name(pictures, view), [(_short(label), frames[:, view]) for label, frames in shown.columns])
@@ -158,7 +158,7 @@ def _grid(shown: Shown) -> Exhibit:
 
 
 def _cameras(shown: Shown) -> Exhibit:
-    """The last seen, a foreseen and the last frame in several cameras."""
+    """The last seen, an unseen and the last frame in several cameras."""
     pictures = shown.pictures
     last, border = len(pictures.truth) - 1, pictures.first_unseen
     chosen = sorted({min(border - 1, last), min((border + last) // 2, last), last})
@@ -168,7 +168,7 @@ def _cameras(shown: Shown) -> Exhibit:
 
 
 def _panels(shown: Shown, places: Sequence[tuple[int, int, str]]) -> str:
-    """One row per method; a column's frame, view and heading are given."""
+    """One row per method; ``places`` are frame, view and heading of the columns."""
     rows = [(_short(label), [images[f, v] for f, v, _ in places]) for label, images in shown.columns]
     return _drawn(panels_plot(rows, [(head, f >= shown.pictures.first_unseen) for f, _, head in places]))
 
@@ -204,7 +204,7 @@ def _video_frames(shown: Shown, views: Sequence[int]) -> Iterator[np.ndarray]:
 
 
 def _some_views(pictures: Pictures) -> list[int]:
-    """A few cameras: trained ones, and one that training never saw where there is one."""
+    """A few training cameras, and a held-out one if there is any."""
     trained = [i for i, v in enumerate(pictures.views) if v not in pictures.heldout_views]
     heldout = [i for i, v in enumerate(pictures.views) if v in pictures.heldout_views]
     return [*trained[: MOST_VIEWS - bool(heldout)], *heldout[:1]]

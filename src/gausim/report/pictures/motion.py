@@ -1,4 +1,4 @@
-"""Figures of how predictions oscillate beside the truth, and of long rollouts."""
+"""Figures of the oscillation of predictions and truth, and of long rollouts."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _GREYS = ("#777777", "#aaaaaa")
 
 
 def diagnosis_plot(named: Sequence[tuple[str, Diagnosis, str]], *, title: str) -> Figure:
-    """Spectra and phase errors of several predictions beside the truth.
+    """Spectra and phase errors of several predictions, with the truth.
 
     Args:
         named: label, diagnosis and row in it of each prediction.
@@ -39,7 +39,7 @@ def diagnosis_plot(named: Sequence[tuple[str, Diagnosis, str]], *, title: str) -
         if row != TRUTH:
             phase.plot(numbers(motion.phase_error), style, color=color, linewidth=width)
     phase.axvspan(-0.5, first.first_unseen - 0.5, color=SEEN_SHADE, linewidth=0, zorder=0)
-    # The page turns formulas off, and so would print those of the default labels.
+    # The page disables formulas, which the default labels contain.
     power.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0e}"))
     power.set(title="power of the motion", xlabel="frequency [Hz]", ylabel="squared displacement per Hz")
     phase.set(title="phase error [degrees]", xlabel="frame (shaded: seen)", ylim=(0, 130))
@@ -51,7 +51,7 @@ def diagnosis_plot(named: Sequence[tuple[str, Diagnosis, str]], *, title: str) -
 
 
 def diagnosis_figure(name: str, entry: Mapping[str, Any], path: Path) -> bool:
-    """Writes the figure of one evaluation; returns whether there was something to show."""
+    """Writes the figure of one evaluation; returns False if it has no diagnosis."""
     found = read_diagnosis(entry)
     methods = [m for m in entry.get("methods", []) if found is not None and m in found.rows]
     if found is None or not methods:
@@ -64,7 +64,7 @@ def endurance_figure(name: str, rollouts: Mapping[str, Mapping[str, Any]], path:
     """Motion energy and distance from rest over the frames of every rollout of ``endurance.json``.
 
     Args:
-        name: of the object.
+        name: name of the object.
         rollouts: by kind: ``window`` [frames], ``energy`` and ``away`` per window.
         path: PNG to write.
     """

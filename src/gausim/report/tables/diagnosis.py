@@ -1,4 +1,4 @@
-"""Tables of how predictions oscillate beside the truth."""
+"""Tables of the oscillation of predictions and truth."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gausim.results.curves import TRUTH
 
 
 def diagnosis_sheets(study: Study) -> list[Sheet]:
-    """One table per object whose true motion is known."""
+    """One table for each object whose true motion is known."""
     sheets = []
     for name in study.objects:
         lines, reference = [], None

@@ -1,4 +1,4 @@
-"""All tables of a report, and those of a shape of their own: ablations, efficiency, colour contrast."""
+"""All tables of a report, and the special ones: ablations, efficiency, colour contrast."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from gausim.report.tables.sheets import (
 )
 from gausim.results.curves import ERROR_3D
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import plus_minus, said
+from gausim.results.table import footnotes_of, plus_minus
 
-# What ablations are compared by: (metric, views).
+# (metric, views) in which ablations are compared.
 _ABLATED = (
     ("l2", "train"), ("ssim", "train"), ("lpips", "train"), ("flip", "train"),
     (ERROR_3D, "points"), (MOTION_ENERGY, "points"), (MOTION_ENERGY, "train"),
@@ -42,7 +42,7 @@ _MEGA, _GIGA = 1e6, 1e9
 
 
 def make_sheets(study: Study) -> list[Sheet]:
-    """Every table that there is something for: the paper's first, then what tells more."""
+    """All tables with figures: the paper's first, then further ones."""
     found = {pair: metric_sheet(study, *pair) for pair in TABLES}
     first = [found.pop((metric, "train")) for metric in paper.TABLES]
     sheets = [*first, *ablation_sheets(study), efficiency_sheet(study), *found.values()]
@@ -51,7 +51,7 @@ def make_sheets(study: Study) -> list[Sheet]:
 
 
 def ablation_sheets(study: Study) -> list[Sheet]:
-    """One table per object and model that was run in several variations; columns are variations, as in the paper."""
+    """One table per object and model with several variations; columns are variations, as in the paper."""
     sheets = []
     for name in study.objects:
         about = [group for group in study.groups if name in group.objects]
@@ -129,7 +129,7 @@ _COSTS_CAPTION = (
 
 
 def efficiency_sheet(study: Study) -> Sheet:
-    """Units per level, fraction that is predicted, seconds and memory per predicted frame and of training."""
+    """Units per level, their predicted fraction, time and memory per predicted frame and of training."""
     lines = []
     for group in study.groups:
         for name in group.objects:
@@ -145,7 +145,7 @@ def efficiency_sheet(study: Study) -> Sheet:
 
 
 def _costs(group: Group, name: str) -> tuple[Entry, ...]:
-    """What a group's predictions and trainings cost on an object, in the columns of ``_COSTS``."""
+    """Costs of a group's predictions and trainings on an object, in the columns of ``_COSTS``."""
     entries = group.entries(name)
     found = [(r, cost) for r, e in entries if (cost := dig(e, "efficiency", group.method))]
     if not found:
@@ -153,7 +153,7 @@ def _costs(group: Group, name: str) -> tuple[Entry, ...]:
         missing = Entry(states[0] if states else NOT_MEASURED, missing=True, runs=group.of(name))
         return (missing, *map(plain, [""] * (len(_COSTS) - 1)))
     runs, costs = tuple(r for r, _ in found), [cost for _, cost in found]
-    fits = [fit for _, e in entries if number(dig(fit := said(e, group.method).get("fit"), "cpu_seconds"))]
+    fits = [fit for _, e in entries if number(dig(fit := footnotes_of(e, group.method).get("fit"), "cpu_seconds"))]
     levels = dig(costs[0], "levels", "counts")
     predictions, kernels = (number(dig(costs[0], "levels", key)) for key in ("predictions", "kernels"))
     wall, processor = _known(fits, "seconds"), _known(fits, "cpu_seconds")
@@ -177,12 +177,12 @@ def _arrows(counts: Sequence[Any]) -> str:
 
 
 def _known(nodes: Sequence[Any], *keys: str) -> list[float]:
-    """The numbers that nodes have under these keys."""
+    """The nodes' numbers under these keys."""
     return [value for node in nodes if (value := number(dig(node, *keys))) is not None]
 
 
 def _memory(costs: Sequence[dict[str, Any]]) -> tuple[str, str]:
-    """What is printed large and small of the memory: of a GPU the peak, of a process what a prediction adds to it."""
+    """Main and small text of the memory: of a GPU the peak, of a process the increase by a prediction."""
     peak, added, first = (
         max(_known(costs, "memory", f"{key}bytes"), default=None) for key in ("peak_", "added_", "first_added_")
     )
@@ -190,7 +190,7 @@ def _memory(costs: Sequence[dict[str, Any]]) -> tuple[str, str]:
         return "", ""
     if str(dig(costs[0], "memory", "kind")).startswith("CUDA"):
         return f"{peak / _GIGA:.2f} GB", f"+ {added / _MEGA:.0f} MB"
-    if first is None:  # earlier versions: freed memory hid what was added
+    if first is None:  # earlier versions: freed memory hid the increase
         return f"{peak / _GIGA:.2f} GB", "whole process"
     return f"+ {added / _MEGA:.1f} MB", f"first + {first / _MEGA:.0f} MB; process {peak / _GIGA:.2f} GB"
 
@@ -199,7 +199,7 @@ _CONTRAST = ("mean foreground colour", "its norm", "largest l2 of a pixel")
 
 
 def contrast_sheet(study: Study) -> Sheet:
-    """The paper's table of colour contrast, which explains absolute differences between objects."""
+    """The paper's table of colour contrast, on which absolute errors of objects depend."""
     own = [_contrast(study, name) for name in study.objects]
     theirs = [_printed(paper.CONTRAST.get(paper.paper_object(name) or "")) for name in study.objects]
     lines = [Line(_CONTRAST[i], METHOD, tuple(column[i] for column in own)) for i in range(3)]
@@ -213,7 +213,7 @@ def contrast_sheet(study: Study) -> Sheet:
 
 
 def _contrast(study: Study, name: str) -> tuple[Entry, ...]:
-    """The contrast of an object, as the first run has it that recorded one."""
+    """The contrast of an object, from the first run that recorded one."""
     for run, found in (item for group in study.groups for item in group.entries(name)):
         if contrast := found.get("contrast"):
             return _printed((contrast["mean_color"], contrast["norm"], contrast["max_l2"]), run)

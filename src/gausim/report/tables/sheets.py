@@ -1,4 +1,4 @@
-"""The tables of a report, before anybody has written them as HTML, Markdown or LaTeX."""
+"""Tables of a report, independent of HTML, Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import NO_FORESIGHT, plus_minus, spread
 
 METHOD, REFERENCE, PAPER = "method", "reference", "paper"
-# The splits of the paper; `unseen_all` exists where recordings go on beyond frame 49.
+# The paper's splits; `unseen_all` exists for recordings beyond frame 49.
 SPLITS = ("seen", "unseen", "unseen_all")
 VIEWS = {"train": "training cameras", "heldout": "cameras never trained on", "points": "3D, true points"}
 _IMAGES = ("l2", "ssim", "lpips", "psnr", "flip")
-# (metric, views) of the tables, the paper's three first. A table that no run has anything for is left out.
+# (metric, views) of the tables, the paper's three first. Tables without figures of any run are left out.
 TABLES = (
     *((metric, "train") for metric in _IMAGES),
     (ERROR_3D, "points"), (MOTION_ENERGY, "points"), (MOTION_ENERGY, "train"),
     *((metric, "heldout") for metric in _IMAGES),
 )  # fmt: skip
-# What tables belong to, in the order of a page.
+# Sections of tables, in the order of a page.
 ABLATIONS, MOTION = "Ablations", "3D error and motion"
 TRAINING_VIEWS, NEW_VIEWS = "Images in the training views", "Images in views never trained on"
 COST, CONTRAST = "Time and memory", "Colour contrast"
 SECTIONS = (ABLATIONS, MOTION, TRAINING_VIEWS, NEW_VIEWS, COST, CONTRAST)
-# LPIPS has a table of the paper's figures even where nobody measured it.
+# LPIPS, for the table of the paper's figures when no run measured it.
 _LPIPS = {"label": "LPIPS", "scale": 100.0, "unit": "1e-2", "higher_is_better": False}
 NOTHING = "–"
 FLOOR = "reconstruction (floor)"
@@ -43,18 +43,18 @@ OLD_EVALUATION = "Not measured: by an evaluation of an earlier version; call `ga
 
 @dataclass(frozen=True)
 class Entry:
-    """One place of a table."""
+    """One entry of a table."""
 
-    text: str  # the number, or why there is none
-    extra: str = ""  # what stands small behind it (spread over seeds)
-    best: bool = False  # to be printed bold
-    missing: bool = False  # the text is no number
-    runs: tuple[RunRecord, ...] = ()  # what it was computed from
+    text: str  # the number, or the reason why it is missing
+    extra: str = ""  # small text after it (spread over seeds)
+    best: bool = False  # whether it is printed bold
+    missing: bool = False  # whether the text is a reason instead of a number
+    runs: tuple[RunRecord, ...] = ()  # source of the number
 
 
 @dataclass(frozen=True)
 class Line:
-    """One row: its label, whose figures these are (method, reference or paper), and its entries."""
+    """One row: its label, its kind (method, reference or paper), and its entries."""
 
     label: str
     kind: str
@@ -62,7 +62,7 @@ class Line:
 
     @property
     def runs(self) -> list[RunRecord]:
-        """All runs that its entries were computed from."""
+        """All source runs of its entries."""
         return list(dict.fromkeys(run for entry in self.entries for run in entry.runs))
 
 
@@ -71,31 +71,31 @@ class Sheet:
     """One table."""
 
     key: str  # short name for files and anchors
-    section: str  # what it belongs to, of SECTIONS
+    section: str  # one of SECTIONS
     title: str
-    caption: str  # how to read it
+    caption: str  # explanation
     columns: tuple[tuple[str, tuple[str, ...]], ...]  # groups of columns: heading, headings of its columns
     lines: tuple[Line, ...]
     stub: str = ""  # heading of the labels
 
     @property
     def label(self) -> str:
-        """The key in letters and digits."""
+        """The key, in letters and digits only."""
         return re.sub(r"[^A-Za-z0-9]+", "-", self.key)
 
     @property
     def has_groups(self) -> bool:
-        """Whether its columns stand under headings."""
+        """Whether its columns have group headings."""
         return any(group for group, _ in self.columns)
 
     @property
     def heads(self) -> list[str]:
-        """Headings of all columns, those of their groups before them."""
+        """Headings of all columns, each after that of its group."""
         return [f"{group} {sub}".strip() for group, subs in self.columns for sub in subs]
 
 
 def split_title(study: Study, name: str, split: str) -> str:
-    """Seen, or Unseen and the number of frames, as the paper says it."""
+    """Title of a split as in the paper: Seen, or Unseen with the number of frames."""
     if split == "seen":
         return "Seen"
     start, stop = study.splits(name)[split]
@@ -103,7 +103,7 @@ def split_title(study: Study, name: str, split: str) -> str:
 
 
 def metric_sheet(study: Study, metric: str, views: str) -> Sheet | None:
-    """Rows methods, columns objects and ranges of frames, as the paper has it; None where nobody has the metric."""
+    """The paper's table of a metric: rows of methods, columns of objects and splits; None if no run has the metric."""
     info = study.info(metric) or (_LPIPS if metric == "lpips" else None)
     if info is None:
         return None
@@ -153,7 +153,7 @@ def _caption(metric: str, views: str, info: dict[str, Any], lines: Sequence[Line
 
 
 def entry(c: Cell, info: dict[str, Any], *, best: bool = False) -> Entry:
-    """A cell as it is printed."""
+    """A cell as a printed entry."""
     if c.value is None:
         return Entry(c.status or NOTHING, missing=True, runs=c.runs)
     value, scale = c.value, info["scale"]
@@ -166,7 +166,7 @@ def seeds_entry(
     values: Sequence[float | None], form: str, *, stds: Sequence[float] = (), note: str = "",
     runs: tuple[RunRecord, ...] = (),
 ) -> Entry:  # fmt: skip
-    """The mean of one figure per seed (and of ``stds``), and small behind it how far the seeds differ and ``note``."""
+    """The mean of one figure per seed (and of ``stds``), followed in small by the spread of the seeds and ``note``."""
     known = [value for value in values if value is not None and math.isfinite(value)]
     if not known:
         return Entry(NOTHING, missing=True, runs=runs)
@@ -177,12 +177,12 @@ def seeds_entry(
 
 
 def plain(text: str, extra: str = "", *, runs: tuple[RunRecord, ...] = ()) -> Entry:
-    """An entry of a text, or of nothing where it is empty."""
+    """An entry with a text; a missing entry if the text is empty."""
     return Entry(text or NOTHING, extra, missing=not text, runs=runs)
 
 
 def best_of(cells: Sequence[Cell], metric: str, info: dict[str, Any]) -> set[int]:
-    """Rows with the best mean as printed; nobody is best alone or where no direction is good."""
+    """Rows with the best mean as printed; none for a single row or for a metric without a better direction."""
     better = info["higher_is_better"]
     if better is None and metric != MOTION_ENERGY:
         return set()
@@ -196,9 +196,9 @@ def best_of(cells: Sequence[Cell], metric: str, info: dict[str, Any]) -> set[int
 def _references(
     study: Study, columns: Sequence[tuple[str, list[str]]], metric: str, views: str, info: dict[str, Any]
 ) -> list[Line]:
-    """Rows of the summaries that are no method, and in the training views the reconstruction against frame 0.
+    """Rows of references in the summaries, and in the training views the reconstruction against frame 0.
 
-    What the reconstruction has under the seen frames is what no motion can beat by much.
+    The reconstruction's figure, in the column of seen frames, is the floor of any prediction.
     """
     rows = dict.fromkeys(
         row for g in study.groups for name in study.objects for _, e in g.entries(name)
@@ -224,9 +224,9 @@ def _references(
 
 
 def _versions(study: Study, finds: Sequence[Callable[[Group], Cell]]) -> list[list[Cell]]:
-    """The cells of a reference on one object: several where runs were evaluated on other sequences or scenes.
+    """The cells of a reference on one object: several if runs were evaluated on different sequences or scenes.
 
-    References do not depend on seeds: each run speaks for itself, and runs that say the same are named together.
+    References do not depend on seeds, so runs are not averaged; runs with equal figures have one cell.
     """
     found: dict[tuple[Any, ...], list[Cell]] = {}
     for single in (one for group in study.groups for one in group.singles()):

@@ -1,4 +1,4 @@
-"""How well a method foresees an object, as figures that readers ask for first and as three sentences."""
+"""Verdict on a method's predictions of an object: key figures and three sentences."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Any
 from gausim.report.gather.runs import dig
 from gausim.results.curves import ERROR_3D, STATIC
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import said
+from gausim.results.table import footnotes_of
 
-# A prediction whose error is at least so much of the static one's is no prediction.
+# Error relative to the static prediction's from which a prediction counts as useless.
 NO_BETTER = 0.9
-# Upper ends and words: error over that of no motion, and predicted over true energy.
+# Upper limits and words, for the error over the static prediction's and for predicted over true energy.
 _FORESIGHT = (
     (0.2, "it foresees the motion closely"),
     (0.5, "it foresees most of the motion"),
@@ -31,29 +31,29 @@ _LIVELINESS = (
     (2.0, "it is livelier than the object"),
     (math.inf, "it gains energy that the object does not have"),
 )
-# Images of a view count as equally good within so many decibels.
+# Difference within which images of two views count as equally good [dB].
 _SAME_DB = 1.0
 _EVALUATE = "`gausim evaluate RUN` measures it."
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the sentences are made of; means over seeds, None where a figure is not known."""
+    """Figures of the sentences: means over seeds, None where unknown."""
 
-    frames: tuple[int, int] | None  # first and last that training did not see; None where the recordings end before
-    measured: str  # what the errors are of: points (3D), or train (l2 of the images in the training views)
-    error: float | None  # on unseen frames, over that of a prediction of no motion
-    seen_error: float | None  # the same on the frames that training saw
+    frames: tuple[int, int] | None  # first and last unseen frame; None if the recordings end before
+    measured: str  # kind of the errors: points (3D), or train (l2 of the images in the training views)
+    error: float | None  # on unseen frames, over the static prediction's
+    seen_error: float | None  # the same on seen frames
     energy: float | None  # predicted over true motion energy on unseen frames
     psnr: dict[str, float | None]  # by train and heldout views, of unseen frames [dB]
-    still_psnr: dict[str, float | None]  # the same of a prediction of no motion
+    still_psnr: dict[str, float | None]  # the same of the static prediction
     heldout_views: tuple[str, ...]
     seeds: int  # number of evaluations
-    repeats: bool  # whether the method repeats what it was fitted to instead of foreseeing
+    repeats: bool  # whether the method repeats its fitted motion instead of extrapolating
 
     @property
     def merit(self) -> float:
-        """What runs are sorted by: the error on unseen frames (on seen ones where there are none), unknown last."""
+        """Sort key of runs: the error on unseen frames, or on seen ones without these; unknown errors come last."""
         known = self.error if self.frames is not None else self.seen_error
         return math.inf if known is None else known
 
@@ -80,12 +80,12 @@ def outcome(entries: Sequence[dict[str, Any]], method: str) -> Outcome:
         still_psnr={views: mean(STATIC, split, views, "psnr", "mean") for views in ("train", "heldout")},
         heldout_views=tuple(entries[0].get("heldout_views", ())),
         seeds=len(entries),
-        repeats=said(entries[0], method).get("extrapolates") is False,
+        repeats=footnotes_of(entries[0], method).get("extrapolates") is False,
     )
 
 
 def sentences(found: Outcome) -> tuple[str, str, str]:
-    """Three sentences: how far off it is where it foresees, how lively it is, and how it looks from elsewhere."""
+    """Three sentences on the prediction: its error, its motion energy, and its images in held-out views."""
     return _error(found), _energy(found), _views(found)
 
 
@@ -152,7 +152,7 @@ def _names(views: Sequence[str]) -> str:
 
 
 def _gain(found: Outcome, views: str) -> str:
-    """How much better than a prediction of no motion, as the end of a sentence."""
+    """Gain over the static prediction, as the end of a sentence."""
     own, still = found.psnr[views], found.still_psnr[views]
     if own is None or still is None:
         return ""
@@ -161,5 +161,5 @@ def _gain(found: Outcome, views: str) -> str:
 
 
 def _words(scale: Sequence[tuple[float, str]], value: float) -> str:
-    """The words of a figure as it is printed."""
+    """The words for a figure, rounded as printed."""
     return next(words for end, words in scale if round(value, 2) < end)

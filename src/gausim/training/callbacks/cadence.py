@@ -1,4 +1,4 @@
-"""What callbacks share: when they act, and the data that they look at."""
+"""Functions for callbacks: their epochs and the training data."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from gausim.data.datamodule import ReadyDataModule
 
 
 def has_come(trainer: Trainer, every: int) -> bool:
-    """At the end of an epoch: whether it is one of every so many, or the last one; ``every`` 0 is never."""
+    """Whether the epoch that ends is a multiple of ``every`` or the last one; ``every`` 0 is never."""
     epoch = trainer.current_epoch + 1
     return every > 0 and (trainer.should_stop or epoch == trainer.max_epochs or epoch % every == 0)
 
 
 def training_data(trainer: Trainer) -> ReadyDataModule:
-    """What the trainer was given to train on."""
+    """The trainer's data module."""
     data = getattr(trainer, "datamodule", None)
     assert isinstance(data, ReadyDataModule)
     return data

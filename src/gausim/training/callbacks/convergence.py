@@ -1,8 +1,8 @@
-"""Ends training when it has learned: judged by a forecast of frames that it is not trained on until then.
+"""Convergence of training, measured by a forecast of training frames that are held back.
 
-A run learns at constant rates, on rollouts that stop short of the last training frames. After each epoch the frames
-held back are foreseen. Once that forecast no longer gets better, or the run's allowance of epochs or minutes nears its
-end, the run finishes: all training frames are shown, and the rates fall (``training.optimizers.StableDecaySchedule``).
+A run trains at constant learning rates on rollouts that end before the last training frames. After each epoch the
+frames held back are predicted. When that forecast no longer improves, or the limit of epochs or minutes is near, the
+final part begins: all training frames are used, and the rates fall (``training.optimizers.StableDecaySchedule``).
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from gausim.training.module import GausSimModule
 from gausim.training.optimizers import StableDecaySchedule
 from gausim.training.rollout import States, windows
 
-# Shows of a sequence that an improvement is stated for.
+# Shows of a sequence over which an improvement is measured.
 PER_SHOWS = 10
-# A forecast that leaves more than this of what the rest state misses has learned next to nothing.
+# Relative error of the forecast above which almost nothing was learned; 1 is the error of the rest state.
 LITTLE = 0.8
-# Where the rest state misses hardly more in later frames than in frame 0, there is nothing to learn from.
+# Fraction of the rest state's loss due to motion, below which the frames contain almost no motion to learn.
 STILL = 0.05
 
 
 @dataclass(frozen=True)
 class Forecast:
-    """How well frames held back are foreseen.
+    """Errors of the forecast of frames held back.
 
     Attributes:
-        error: loss of the prediction over that of the rest state, both above what the reconstruction leaves on frame 0.
-        moving: fraction of the rest state's loss that is above what the reconstruction leaves.
+        error: loss of the prediction over that of the rest state, both less the floor (the loss on frame 0).
+        moving: fraction of the rest state's loss that is above the floor.
     """
 
     error: float
@@ -48,19 +48,18 @@ class Forecast:
 
 
 class Convergence(Callback):
-    """Judges after each epoch, and begins the end of the run.
+    """Measures the forecast after each epoch, and begins the final part of the run.
 
-    Inactive where the optimiser has another schedule than
-    :class:`~gausim.training.optimizers.StableDecaySchedule` or one that falls all along, or the curriculum's first T
-    leaves nothing to hold back; the run then has the length of its ``max_epochs``.
+    Active only with :class:`~gausim.training.optimizers.StableDecaySchedule` and ``decay`` < 1, and if the curriculum's
+    first T leaves frames to hold back; otherwise the run has ``max_epochs`` epochs.
 
     Attributes:
-        forecasts: one per epoch since T came to its largest without the frames held back.
+        forecasts: one per epoch since T reached its largest value without the frames held back.
         converged: whether the forecast ceased to improve.
     """
 
     def __init__(self, *, held_back: int = 4, window: int = 40, tolerance: float = 0.01, sequences: int = 12) -> None:
-        """The settings stand in ``conf/base/more.yaml``."""
+        """``conf/base/more.yaml`` explains the settings."""
         if min(held_back, window, sequences) < 1 or not 0 <= tolerance < 1:
             raise ConfigError(
                 "trainer.convergence: expected held_back, window, sequences >= 1 and tolerance in [0, 1), got "
@@ -70,24 +69,24 @@ class Convergence(Callback):
         self._sequences, self._shows, self._allowance = sequences, 1, 0
         self.forecasts: list[Forecast] = []
         self.converged, self._judges = False, False
-        self._ending_since: int | None = None  # epochs done then
+        self._ending_since: int | None = None  # epochs done at the beginning of the final part
 
     # ------------------------------------------------------------------------------------------------ training
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Holds frames back, or goes on with the end of a resumed run."""
+        """Holds frames back, or continues the final part of a resumed run."""
         data = training_data(trainer)
         self._shows = data.repeats
         allowance = trainer.max_epochs or 0
         if self._ending_since is not None and allowance > self._allowance and not self.converged:
-            self._ending_since = None  # it was cut short, and has been granted more
+            self._ending_since = None  # it was cut short, and now has more epochs or minutes
         self._allowance = allowance
         self._judges = self._active(pl_module, data)
         if self._judges:
             self._apply(trainer, pl_module)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Judges, and begins the end where it is time; all ranks hear the same."""
+        """Measures the forecast, and begins the final part when it is due, on all ranks alike."""
         data = training_data(trainer)
         if not self.is_learning:
             return
@@ -105,11 +104,11 @@ class Convergence(Callback):
 
     @property
     def is_learning(self) -> bool:
-        """Whether it judges, and the end has not begun."""
+        """Whether it is active and the final part has not begun."""
         return self._judges and self._ending_since is None
 
     def began_to_end(self, trainer: Trainer) -> bool:
-        """Whether the end begins with the epoch that is over, because the allowance nears its own."""
+        """Whether the final part begins after this epoch because the limit of epochs or minutes is near."""
         return self._ending_since == trainer.current_epoch + 1 and not self.converged
 
     def _active(self, module: LightningModule, data: ReadyDataModule) -> bool:
@@ -138,9 +137,9 @@ class Convergence(Callback):
 
     @property
     def improvement(self) -> float | None:
-        """By how much the best forecast's error fell in ten shows of a sequence, lately; None before it can be told.
+        """Recent relative decrease of the best forecast's error in ten shows of a sequence; None while too few epochs.
 
-        The best, because at constant rates the error of one epoch's weights goes up and down by a fifth.
+        The best one is used because at constant rates the error fluctuates by a fifth from epoch to epoch.
         """
         length = max(1, math.ceil(self._window / self._shows))
         if len(self.forecasts) < 2 * length:
@@ -152,7 +151,7 @@ class Convergence(Callback):
         return 1 - (now / before) ** (PER_SHOWS / (length * self._shows))
 
     def summary(self) -> dict[str, Any]:
-        """What is kept of the judgement with a finished run; empty where nothing was judged."""
+        """Summary of the forecasts for a finished run; empty without forecasts."""
         if not self._judges:
             return {}
         lately = self.forecasts[-1] if self.forecasts else None
@@ -162,13 +161,13 @@ class Convergence(Callback):
         return {**found, "verdict": verdict(found)}
 
     def state_dict(self) -> dict[str, Any]:
-        """What was found, and whether the end has begun."""
+        """The forecasts, and whether the final part has begun."""
         pairs = [[f.error, f.moving] for f in self.forecasts]
         return {"forecasts": pairs, "converged": self.converged, "ending_since": self._ending_since,
                 "allowance": self._allowance}  # fmt: skip
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Goes on with it."""
+        """Restores the state."""
         self.forecasts = [Forecast(*pair) for pair in state_dict["forecasts"]]
         self.converged, self._ending_since = bool(state_dict["converged"]), state_dict["ending_since"]
         self._allowance = int(state_dict["allowance"])
@@ -176,7 +175,7 @@ class Convergence(Callback):
 
 @torch.no_grad()
 def forecast(module: GausSimModule, samples: Sequence[SequenceSample], first: int) -> Forecast:
-    """Predicts the frames after ``first`` of all samples, each from its own initial state, and compares them."""
+    """Errors of the predicted frames after ``first`` of all samples, each from its initial state."""
     loss = floor = static = 0.0
     try:
         with evaluating(module):
@@ -197,7 +196,7 @@ def forecast(module: GausSimModule, samples: Sequence[SequenceSample], first: in
 
 
 def verdict(found: dict[str, Any]) -> str:
-    """One sentence or two: how far the run came, and whether more would help."""
+    """The result of a run's convergence in one or two sentences, with advice on further training."""
     error, moving, rate = found.get("held_back_error"), found.get("moving"), found.get("improvement")
     more = "The same command goes on from where the rates began to fall."
     if error is None or moving is None:

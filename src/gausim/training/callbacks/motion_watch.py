@@ -1,4 +1,4 @@
-"""What kind of error the motion has, live in training: beyond the seen frames, per level, in frequency and phase."""
+"""Motion errors during training: on unseen frames, per level, in frequency and phase."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ LEVELS = 3
 
 
 class MotionWatch(Callback):
-    """Foresees the first training sequences of every object whose true motion is known and tells how.
+    """Predicts the first training sequences of every object whose true motion is known, and measures the errors.
 
-    It looks at frames that training does not see, as evaluation does, and nothing of it reaches training: ``gap`` is
-    the generalisation gap, the error of the unseen frames less that of the seen ones, both over the static
-    prediction's. Rows go to ``motion.csv`` of the run, means over objects to every logger.
+    It uses unseen frames, as evaluation does, without an effect on training: ``gap`` is the generalisation gap, the
+    error on unseen frames less that on seen frames, both over the static prediction's. Rows go to ``motion.csv`` of the
+    run, means over objects to every logger.
     """
 
     COLUMNS = (
@@ -43,7 +43,7 @@ class MotionWatch(Callback):
     )  # fmt: skip
 
     def __init__(self, *, every_epochs: int = 10, sequences: int = 4) -> None:
-        """Looks every so many epochs (0 is never) and after the last, at the first ``sequences`` of every object."""
+        """Measures every ``every_epochs`` epochs (0: never) and after the last, on ``sequences`` of each object."""
         if every_epochs < 0 or sequences < 1:
             raise ConfigError(
                 f"callbacks.motion: expected every_epochs >= 0 and sequences >= 1, got {every_epochs} and {sequences}."
@@ -51,17 +51,17 @@ class MotionWatch(Callback):
         self._every, self._sequences = every_epochs, sequences
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Drops rows of epochs that a resumed run does again."""
+        """Drops rows of epochs that a resumed run repeats."""
         if trainer.is_global_zero:
             self._table(trainer).resume_at(trainer.current_epoch)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Looks when the epoch has come."""
+        """Measures if the epoch is due."""
         if not (trainer.is_global_zero and has_come(trainer, self._every)):
             return
         assert isinstance(pl_module, GausSimModule)
         with undisturbed(), torch.no_grad(), evaluating(pl_module):
-            rows = self._look(trainer, pl_module)
+            rows = self._measure(trainer, pl_module)
         for name, row in rows.items():
             place = {"epoch": trainer.current_epoch + 1, "step": trainer.global_step, "object": name}
             self._table(trainer).append({**place, **{key: short(value) for key, value in row.items()}})
@@ -73,7 +73,7 @@ class MotionWatch(Callback):
     def _table(self, trainer: Trainer) -> Table:
         return Table(Path(trainer.default_root_dir) / MOTION, "epoch", self.COLUMNS)
 
-    def _look(self, trainer: Trainer, module: GausSimModule) -> dict[str, dict[str, float]]:
+    def _measure(self, trainer: Trainer, module: GausSimModule) -> dict[str, dict[str, float]]:
         rows, first = {}, 0
         units_of_kernels = getattr(module.model, "units_of_kernels", lambda scene_id: ())
         for scene_id, item in enumerate(training_data(trainer).objects):
@@ -86,7 +86,7 @@ class MotionWatch(Callback):
     def _predicted(
         self, module: GausSimModule, item: ObjectData, scene_id: int, first: int
     ) -> Iterator[tuple[GroundTruth, Tensor, Tensor]]:
-        """True motion of each sequence, the predicted one and the kernels that the points are attached to."""
+        """True and predicted motion of each sequence, and the kernels that the points are attached to."""
         points = item.rest_points
         if points is None:
             return
@@ -107,7 +107,7 @@ class MotionWatch(Callback):
 def figures(
     found: Sequence[tuple[GroundTruth, Tensor, Tensor]], item: ObjectData, units: Sequence[Tensor]
 ) -> dict[str, float]:
-    """The figures of one object; what cannot be told is left out."""
+    """The figures of one object, without those that cannot be computed."""
     unseen, diagnosis = item.train_frames.stop, Diagnosis(item.fps)
     # Prediction and reference by frame, over all sequences: mean distance from the truth, and motion energy.
     errors, energies = [], []

@@ -1,4 +1,4 @@
-"""Pictures of training: what the network predicts of the frames it sees, every few epochs, for every dashboard."""
+"""Media of training for dashboards: predictions of seen frames, every few epochs."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ PREDICTION, STATIC = "prediction", "static"
 
 
 class Panels(Callback):
-    """Predicts the first sequence of every object in its first training camera and shows it.
+    """Renders predictions of the first sequence of every object in its first training camera.
 
-    Frames 0..``t_max`` of the curriculum are predicted, whatever T is at the time; frames that training may not see are
-    not touched. Videos, pictures and tables go to ``panels/`` of the run and to every logger that shows media, errors
-    as numbers to every logger. Training is the same with and without.
+    Frames 0..``t_max`` of the curriculum are predicted, whatever the current T; unseen frames are not read. Videos,
+    pictures and tables go to ``panels/`` of the run and to every logger that shows media, errors as numbers to every
+    logger. There is no effect on training.
     """
 
     def __init__(self, *, every_epochs: int = 5, objects: int = 4) -> None:
-        """Shows the first ``objects`` every so many epochs (0 is never) and after the last."""
+        """Renders the first ``objects`` every ``every_epochs`` epochs (0: never) and after the last."""
         if every_epochs < 0 or objects < 1:
             raise ConfigError(
                 f"callbacks.panels: expected every_epochs >= 0 and objects >= 1, got {every_epochs} and {objects}."
@@ -43,12 +43,12 @@ class Panels(Callback):
         self._every, self._objects = every_epochs, objects
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Drops what is shown of steps that a resumed run does again."""
+        """Removes the media of steps that a resumed run repeats."""
         if trainer.is_global_zero:
             forget_media(Path(trainer.default_root_dir), trainer.global_step)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Shows what is predicted when the epoch has come."""
+        """Renders the predictions if the epoch is due."""
         if trainer.is_global_zero and has_come(trainer, self._every):
             assert isinstance(pl_module, GausSimModule)
             with undisturbed():
@@ -90,7 +90,7 @@ class Panels(Callback):
 
 
 def _clip(module: GausSimModule, sample: SequenceSample) -> tuple[Clip, dict[str, float]]:
-    """What is shown of a sequence, and its figures: l2 and static's [1e-3], their ratio, motion energy."""
+    """The media of a sequence, and its figures: l2 and static's [1e-3], their ratio, motion energy."""
     prediction = module.predict_images(sample)[:, 0].clamp(0, 1)
     if not bool(torch.isfinite(prediction).all()):
         raise DivergenceError("the predicted images are not finite")

@@ -20,7 +20,7 @@ from gausim.training.callbacks.time_budget import TimeBudget
 from gausim.training.module import GausSimModule
 from gausim.training.table import Table, short
 
-# Epochs that the time left is told from.
+# Number of recent epochs from which the remaining time is estimated.
 RECENT = 8
 
 
@@ -44,7 +44,7 @@ class EpochSummary(Callback):
         self._began = time.monotonic()
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Drops rows of epochs that a resumed run does again, and goes on with the clock of a cut epoch."""
+        """Drops rows of epochs that a resumed run repeats, and continues the clock of an interrupted epoch."""
         self._began = time.monotonic() - self._elapsed
         if trainer.is_global_zero:
             self._table(trainer).resume_at(trainer.current_epoch)
@@ -52,7 +52,7 @@ class EpochSummary(Callback):
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Writes the row and prints the line.
 
-        Callbacks come before the module's own end of epoch, so the means are asked for here.
+        Lightning calls callbacks before the module's ``on_train_epoch_end``, so the means are computed here.
         """
         assert isinstance(pl_module, GausSimModule)
         means: dict[str, Any] = pl_module.epoch_means()
@@ -65,11 +65,11 @@ class EpochSummary(Callback):
             sys.stdout.flush()  # where output is piped, the epochs of a long run should show as they end
 
     def state_dict(self) -> dict[str, float]:
-        """Seconds that the epoch under way has taken."""
+        """Time since the beginning of the current epoch [s]."""
         return {"elapsed": time.monotonic() - self._began}
 
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        """Takes them."""
+        """Restores the time."""
         self._elapsed = float(state_dict["elapsed"])
 
     def _line(self, trainer: Trainer, means: dict[str, Any]) -> str:
@@ -85,7 +85,7 @@ class EpochSummary(Callback):
         parts.append(f"{means['seconds']:.1f} s")
         self._paces.append((int(means.get("steps", 0)), means["seconds"]))
         module = cast(GausSimModule, trainer.lightning_module)
-        # The stages of a fit have lengths of their own.
+        # Epochs of a fit's stages differ in length.
         left = None if module.initial_states is None else _minutes_left(trainer, self._paces)
         judged = any(isinstance(c, Convergence) and c.is_learning for c in cast(Any, trainer).callbacks)
         if left is not None:
@@ -97,7 +97,7 @@ class EpochSummary(Callback):
 
 
 def _minutes_left(trainer: Trainer, paces: Sequence[tuple[int, float]]) -> float | None:
-    """What the epochs to come will take, by the time that a predicted frame took lately [minutes]; None for none."""
+    """Time of the remaining epochs, from the recent time per predicted frame [minutes]; None without epochs."""
     done, epochs = trainer.current_epoch + 1, trainer.max_epochs or 0
     shown = sum(steps for steps, _ in paces)
     if done >= epochs or not shown:
@@ -109,7 +109,7 @@ def _minutes_left(trainer: Trainer, paces: Sequence[tuple[int, float]]) -> float
 
 
 class Progress(RichProgressBar):
-    """Lightning's rich progress bar with our numbers."""
+    """Lightning's rich progress bar with the metrics of training."""
 
     def __init__(self, *, refresh_rate: int = 1, leave: bool = False) -> None:
         """``refresh_rate`` in batches; ``leave`` keeps the bar of every epoch."""

@@ -1,4 +1,4 @@
-"""Checkpoints of a run, and what Lightning leaves out of them."""
+"""Checkpoints of a run, with the state that Lightning leaves out."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from gausim.training.ranks.ranks import Ranks
 
 
 class RunCheckpoint(Checkpoint):
-    """Saves ``last.ckpt`` every so often, within epochs too, and numbered snapshots where asked for.
+    """Saves ``last.ckpt`` periodically, also within epochs, and numbered snapshots on request.
 
-    Where its allowance and not convergence begins the end of a run, ``before_the_end.ckpt`` is what more time goes on
-    from.
+    If the final part of a run begins before convergence, ``before_the_end.ckpt`` is saved, from which a run with more
+    time continues.
     """
 
     def __init__(
         self, *, every_epochs: int = 1, every_minutes: float = 1.0, every_steps: int = 0, snapshot_every: int = 0
     ) -> None:
-        """The settings stand in ``conf/base/more.yaml``; none of them changes what is learned."""
+        """``conf/base/more.yaml`` explains the settings; they have no effect on the result of training."""
         if every_epochs < 1 or min(every_minutes, every_steps, snapshot_every) < 0:
             raise ConfigError(
                 "callbacks.checkpoint: expected every_epochs >= 1 and every_minutes, every_steps, snapshot_every >= 0, "
@@ -39,18 +39,18 @@ class RunCheckpoint(Checkpoint):
         self._saved_at, self._saved_step = time.monotonic(), 0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Counts from here."""
+        """Starts the clock."""
         self._saved_at, self._saved_step = time.monotonic(), trainer.global_step
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Saves within an epoch; where the epoch is about to end, its end saves."""
+        """Saves within an epoch, but not after its last batch."""
         if not (trainer.is_last_batch or trainer.should_stop) and self._due(trainer):
             self._save(trainer)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Saves when the epoch has come, the optimiser included (Lightning calls this last)."""
+        """Saves if the epoch is due, with the optimiser's state (Lightning calls this callback last)."""
         if has_come(trainer, self._every) or self._due(trainer):
             self._save(trainer)
         epoch = trainer.current_epoch + 1
@@ -69,13 +69,13 @@ class RunCheckpoint(Checkpoint):
 
     def _save(self, trainer: Trainer) -> None:
         for logger in trainer.loggers:
-            logger.save()  # rows up to this step must not be lost: a resumed run does not log them again
+            logger.save()  # a resumed run does not log rows up to this step again
         trainer.save_checkpoint(Path(trainer.default_root_dir) / LAST_CHECKPOINT, weights_only=False)
         self._saved_at, self._saved_step = time.monotonic(), trainer.global_step
 
 
 class ExactResume(Callback):
-    """Restores what Lightning does not: random generators, loggers' rows, and that a run was already over."""
+    """Restores the state that Lightning does not: random generators, loggers' rows and the end of a finished run."""
 
     def __init__(self) -> None:
         self._random: dict[str, Any] | None = None
@@ -95,15 +95,15 @@ class ExactResume(Callback):
         checkpoint["resume"] = {"random": states, "over": at_epoch_end and trainer.should_stop}
 
     def on_load_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
-        """Takes them; a run that was stopped for good is not trained further."""
+        """Restores them; a run that had ended is not trained further."""
         own = checkpoint["resume"]
-        if self._ranks.rank < len(own["random"]):  # one that was not there draws from its seed
+        if self._ranks.rank < len(own["random"]):  # an additional rank starts from its seed
             self._random = own["random"][self._ranks.rank]
         if own["over"]:
             trainer.should_stop = True
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Restores the generators and drops what the loggers hold of steps that will be done again."""
+        """Restores the generators and removes logged steps that will be repeated."""
         if self._random is not None:
             restore_random_state(self._random)
         for logger in trainer.loggers:

@@ -1,4 +1,4 @@
-"""The time that a run may take."""
+"""The time budget of a run."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from gausim.training.module import GausSimModule
 
 
 class TimeBudget(Callback):
-    """Ends training after so many minutes, resumed runs included; the epoch under way is cut and saved.
+    """Ends training after a number of minutes, resumed runs included; the current epoch is cut short and saved.
 
-    The learning-rate schedule advances with the budget, so that it comes to its end. A clock never runs twice alike,
-    so the learning rates differ between any two runs. A resumed run is exact in everything else.
+    The learning-rate schedule advances with the budget, so that it is completed. As times differ from run to run, so do
+    the learning rates. Everything else is exact in a resumed run.
     """
 
     def __init__(self, *, minutes: float, clock: str = "wall") -> None:
@@ -28,18 +28,18 @@ class TimeBudget(Callback):
 
     @property
     def minutes_left(self) -> float:
-        """What is left of the budget, on its own clock [minutes]."""
+        """Remaining time by the budget's clock [minutes]."""
         return max(0.0, self._budget - self._used) / 60.0
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Starts the clock; a resumed run's first step has the learning rate of the time used so far."""
+        """Starts the clock; a resumed run's first step has the learning rate of the time used before."""
         self._mark = self._clock()
         self._drive(pl_module)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Stops the training once the budget is used up."""
+        """Stops training when the budget is used up."""
         now = self._clock()
         # One clock for all ranks: their learning rates and their last step must agree.
         self._used = float(trainer.strategy.broadcast(self._used + now - self._mark))
@@ -57,5 +57,5 @@ class TimeBudget(Callback):
         return {"used": self._used}
 
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        """Continues to count."""
+        """Restores the time used."""
         self._used = float(state_dict["used"])

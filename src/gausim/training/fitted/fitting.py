@@ -1,7 +1,7 @@
-"""Fits a method to its sequences in stages, by the same steps of the optimiser as a simulator.
+"""Fit of a method to its sequences in stages, with the optimiser step of a simulator.
 
-A fitted method differs in three points, and only these are here: its state is more than two positions, its parameters
-belong to sequences, and what is minimised changes from stage to stage.
+A fitted method differs from a simulator in three points: its state is more than two positions, its parameters belong to
+sequences, and the objective changes from stage to stage.
 """
 
 from __future__ import annotations
@@ -28,31 +28,31 @@ from gausim.training.terms.term import StepInputs, Term
 
 @dataclass(frozen=True, eq=False)
 class Carried(SimState):
-    """Positions of all members of a batch, and the whole states that they are of."""
+    """Positions of all members of a batch, and the members' complete states."""
 
     parts: tuple[FittedState, ...]
 
     @staticmethod
     def of(parts: Sequence[FittedState]) -> Carried:
-        """Joins the members."""
+        """Concatenates the members' states."""
         positions = torch.cat([part.positions for part in parts])
         return Carried(positions, positions, tuple(parts))
 
     def detach(self) -> Carried:
-        """The same numbers without history."""
+        """The same values without a graph."""
         return Carried.of([part.detach() for part in self.parts])
 
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """Several sequences side by side (see :class:`gausim.training.contracts.SceneBatch`)."""
+    """Batch of independent sequences (see :class:`gausim.training.contracts.SceneBatch`)."""
 
     rest: Float[Tensor, "K 3"]
     members: tuple[Member, ...]
 
 
 class Sequences(nn.Module):
-    """A fitted method as the simulator of a batch: sequences side by side, each by itself."""
+    """Simulator interface of a fitted method: a batch of independent sequences."""
 
     def __init__(self, method: FittedMethod) -> None:
         super().__init__()
@@ -60,7 +60,7 @@ class Sequences(nn.Module):
         self.scenes: Sequence[GaussianScene] = method.scenes
 
     def batch(self, scene_ids: Sequence[int]) -> Batch:
-        """Rows of one sequence per entry."""
+        """The batch of one sequence per entry."""
         device = next((p.device for p in self.parameters()), torch.device("cpu"))
         places, kernels, units = [], 0, 0
         for scene_id in scene_ids:
@@ -71,30 +71,31 @@ class Sequences(nn.Module):
         return Batch(torch.cat([self.scenes[i].means for i in scene_ids]).to(device), tuple(places))
 
     def prepare(self, batch: Batch) -> None:
-        """Nothing is shared between steps but what a state carries."""
+        """Does nothing: steps have only the state in common."""
 
     def step(self, batch: Batch, state: Carried, force: None = None, prepared: None = None) -> Frame:
         """The next frame of every sequence."""
         parts = [self.method.advance(part) for part in state.parts]
         following = Carried.of(parts)
-        gradients, rotations = (
+        deformation_gradients, rotations = (
             torch.cat([getattr(p, name) for p in parts]) for name in ("deformation_gradients", "rotations")
         )
-        return Frame(following.positions, gradients, rotations, gradients.new_zeros(()), following)
+        no_momentum = rotations.new_zeros(())
+        return Frame(following.positions, deformation_gradients, rotations, no_momentum, following)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """The method's."""
+        """The method's parameter groups."""
         return {name: list(members) for name, members in self.method.parameter_groups().items()}
 
 
 class Penalties:
-    """What a stage asks of a method beside the rollout's loss."""
+    """Penalties of a stage, added to the rollout's loss."""
 
     def __init__(self, method: FittedMethod, weights: Mapping[str, float]) -> None:
         self._method, self._weights = method, weights
 
     def descend(self, step: StepInputs) -> None:
-        """Backward of the sequences that are this rank's; the mean over all sequences of the step."""
+        """Backward pass over this rank's sequences, for the mean over all sequences of the step."""
         if not self._weights:
             return
         for facts in step.whole[step.ranks.rank :: step.ranks.size]:
@@ -106,14 +107,13 @@ class Penalties:
 class StagedFit(Method):
     """A method with parameters for every sequence, fitted stage by stage.
 
-    With ``data.batch_size`` 1 the fits of the sequences do not see each other (their gradients are clipped one by
-    one), but for what the method shares between the sequences of an object. The ``curriculum`` has T of the epochs,
-    which the stages of the ``plan`` set; a rollout ends where a kernel is further than ``explosion`` from rest
-    [diagonals of the scene].
+    With ``data.batch_size`` 1 the fits of the sequences are independent (loss gradients are clipped per sequence),
+    except for parameters of the whole object. The stages of the ``plan`` set T of the ``curriculum``; a rollout ends
+    where a kernel is further than ``explosion`` from rest [diagonals of the scene].
     """
 
     model: Sequences
-    initial_states, defers, warns = None, False, False  # after an explosion there is no state of rest to go on from
+    initial_states, defers, warns = None, False, False  # no rest state to continue from after an explosion
 
     def __init__(self, fitted: FittedMethod, plan: FitPlan, curriculum: StagedCurriculum, explosion: float) -> None:
         penalties = sorted(fitted.penalties(0)) if any(s.penalties for _, s in plan.order) else []
@@ -126,7 +126,7 @@ class StagedFit(Method):
         self._explosion = explosion
 
     def notes(self) -> list[str]:
-        """The method's own, and which stages were cut short."""
+        """The fitted method's notes, and a note on shortened stages."""
         notes = list(self.fitted.notes())
         for name, stage in self.plan.order:
             if stage.iterations < stage.original:
@@ -141,15 +141,15 @@ class StagedFit(Method):
         return notes
 
     def groups(self) -> dict[str, list[nn.Parameter]]:
-        """The method's parameters."""
+        """The fitted method's parameter groups."""
         return self.model.parameter_groups()
 
     def build(self, settings: OptimizerSettings) -> Optimizer | None:
-        """One optimiser over the groups of the method; stages set their rates."""
+        """One optimiser over the groups of the method; the stages set their learning rates."""
         return self.plan.build(self.groups())
 
     def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, now: Moment) -> Task:
-        """Enters the stage of the epoch and sets its rates; the largest is logged."""
+        """Enters the stage of the epoch and sets its learning rates; the largest is logged."""
         batches = max(1.0, now.batches)
         name, stage, begun = self.plan.place(self.curriculum.position)
         self.made[name] += self.plan.shows / batches
@@ -166,7 +166,7 @@ class StagedFit(Method):
         return Task(rate, objective, OptimizerSettings(clip_norm=stage.clip_norm), is_new=before not in ("", name))
 
     def end_epoch(self, least: float) -> bool:
-        """Fixes what the next epoch learns: the next iterations, or what the clock says."""
+        """Moves to the next epoch's position in the plan: one epoch on, or further if the time budget demands it."""
         self.curriculum.enter(max(self.curriculum.position + 1, least * self.plan.epochs))
         return self.curriculum.position >= self.plan.epochs
 
@@ -175,7 +175,7 @@ class StagedFit(Method):
         return (Penalties(self.fitted, dict(self.plan.order)[self.stage].penalties),)
 
     def initial(self, samples: Sequence[SequenceSample], batch: Any) -> SimState:
-        """Frame 0 of every sequence, as the method has it."""
+        """The method's state at frame 0 of every sequence."""
         return Carried.of([self.fitted.begin(s.sequence_id) for s in samples])
 
     def predict(self, sequence_id: int, steps: int) -> Trajectory:
@@ -184,16 +184,16 @@ class StagedFit(Method):
         return FittedDynamics(self.fitted, sequence_id).rollout(SimState(rest, rest), steps)
 
     def state_dict(self) -> dict[str, Any]:
-        """Where in the plan the fit is."""
+        """The position of the fit in the plan."""
         place = self.curriculum.state_dict() if self.learns else {}
         return {"plan": {"place": place, "stage": self.stage, "made": dict(self.made)}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on there."""
+        """Restores the position in the plan."""
         self.take_notes(state)
         self.curriculum.load_state_dict(state["plan"]["place"])
 
     def take_notes(self, state: Mapping[str, Any]) -> None:
-        """The stages that were made."""
+        """Restores the stage and the iterations done in each stage."""
         self.stage = state["plan"]["stage"]
         self.made.update(state["plan"]["made"])

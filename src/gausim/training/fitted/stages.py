@@ -1,4 +1,4 @@
-"""The stages in which a method is fitted, as data: what learns how fast, on how many frames, by which loss."""
+"""Stages of a fit, as data: learning rates, numbers of frames and losses."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from gausim.training.optimizers import Schedule
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage.
+    """One stage of a fit.
 
     Attributes:
         iterations: optimiser steps for each sequence.
-        rates: learning rate of each parameter group that learns; the others rest.
-        frames: predicted frames T at the beginning and at the end of the stage, growing evenly between; 0 is as many
-            as training may see.
-        schedules: how the rates of a group change, counted in iterations of the stage; ``default`` is for the groups
+        rates: learning rate of each trained parameter group; the others stay constant.
+        frames: predicted frames T at the beginning and at the end of the stage, linear between; 0 is the number of
+            training frames.
+        schedules: learning-rate schedules by group, counted in iterations of the stage; ``default`` is for the groups
             that are not named.
-        penalties: weights of what the method offers to be minimised besides, by name.
-        backprop_steps: gradients stop every so many frames; 0 lets them through the whole rollout.
-        clip_norm: all gradients together are clipped at this norm; 0 does not clip.
-        original: iterations of the published method at least; where there are fewer here, tables say so. 0: not known.
+        penalties: weights of the method's penalties, by name.
+        backprop_steps: loss gradients stop after this number of frames; 0 lets them through the whole rollout.
+        clip_norm: largest norm of all loss gradients together; 0 does not clip.
+        original: iterations of the published method; tables mark a stage that has fewer. 0 is unknown.
     """
 
     iterations: int
@@ -54,12 +54,12 @@ class Stage:
             )
 
     def steps(self, done: float, most: int) -> int:
-        """Predicted frames T after a fraction ``done`` of the stage; ``most`` is what training may see."""
+        """Predicted frames T after a fraction ``done`` of the stage; ``most`` is the number of training frames."""
         first, last = (most if n == 0 else min(n, most) for n in self.frames)
         return first + round((last - first) * min(1.0, max(0.0, done)))
 
     def rate(self, group: str, iteration: float) -> float:
-        """Learning rate of a group (0 where it rests) after so many iterations of the stage."""
+        """Learning rate of a group after ``iteration`` iterations of the stage; 0 where it is not trained."""
         schedule = self.schedules.get(group, self.schedules.get("default"))
         factor = 1.0 if schedule is None else schedule.factor(iteration, self.iterations)
         return self.rates.get(group, 0.0) * factor
@@ -70,10 +70,10 @@ class FitPlan:
     """The stages of a method, one after the other.
 
     Attributes:
-        stages: by name; null leaves one out. None at all: nothing is learned.
-        round: iterations of every sequence between two looks (rows of epochs.csv, checkpoints, a change of stage or
-            of T); fewer where a stage has fewer.
-        optimizer: makes the optimiser from parameter groups; Adam when None.
+        stages: stages by name; null leaves one out. Without stages there is no training.
+        round: iterations of every sequence per epoch (a row of epochs.csv, a checkpoint, a change of stage or of T);
+            fewer where a stage has fewer.
+        optimizer: constructor of the optimiser from parameter groups; Adam when None.
     """
 
     stages: Mapping[str, Stage | None] = field(default_factory=dict)
@@ -86,7 +86,7 @@ class FitPlan:
 
     @property
     def order(self) -> list[tuple[str, Stage]]:
-        """The stages that are made."""
+        """The stages in their order, without those left out."""
         return [(name, stage) for name, stage in self.stages.items() if stage is not None]
 
     @property
@@ -113,12 +113,12 @@ class FitPlan:
                     )
 
     def build(self, groups: Mapping[str, Sequence[Parameter]]) -> Optimizer | None:
-        """One optimiser over all groups; None where nothing learns."""
+        """One optimiser over all groups; None without stages."""
         made = [{"params": list(members), "lr": 0.0, "name": name} for name, members in groups.items() if members]
         return (self.optimizer or Adam)(made) if made and self.order else None
 
     def place(self, epochs: float) -> tuple[str, Stage, float]:
-        """The stage after so many epochs of the plan, and the iterations of it that lie behind."""
+        """The stage after ``epochs`` epochs of the plan, its name, and the iterations of it that are done."""
         rest, order = epochs, self.order
         while len(order) > 1 and rest >= self._epochs(order[0][1]):  # a budget may run a little beyond the last
             rest -= self._epochs(order.pop(0)[1])
@@ -128,7 +128,7 @@ class FitPlan:
 
 @dataclass
 class StagedCurriculum(Curriculum):
-    """T as the stages have it: set by :meth:`enter` before every epoch; ``t_max`` is what training may see.
+    """T of the stages, set by :meth:`enter` before every epoch; ``t_max`` is the number of training frames.
 
     Attributes:
         plan: the stages.
@@ -143,11 +143,11 @@ class StagedCurriculum(Curriculum):
 
     @property
     def position(self) -> float:
-        """Where in the plan the epoch under way began [epochs of the plan]."""
+        """Position in the plan at the beginning of the current epoch [epochs of the plan]."""
         return self._state["position"]
 
     def enter(self, position: float) -> None:
-        """Fixes stage and T of the next epoch."""
+        """Sets stage and T of the next epoch."""
         steps = self.t_max
         if self.plan.order:
             _, stage, done = self.plan.place(position)
@@ -155,13 +155,13 @@ class StagedCurriculum(Curriculum):
         self._state.update(position=position, steps=float(steps))
 
     def steps(self, epoch: int) -> int:
-        """Predicted steps T of the epoch under way; its number does not matter."""
+        """Predicted steps T of the current epoch; its number is not used."""
         return int(self._state["steps"])
 
     def state_dict(self) -> dict[str, float]:
-        """Where in the plan."""
+        """The position in the plan."""
         return dict(self._state)
 
     def load_state_dict(self, state: Mapping[str, float]) -> None:
-        """Continues where ``state`` was taken."""
+        """Restores the position in the plan."""
         self._state.update(state)

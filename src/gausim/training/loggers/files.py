@@ -1,4 +1,4 @@
-"""Loggers that go on where a resumed run goes on: no row twice, none lost up to the checkpoint.
+"""Loggers of resumable runs: no duplicate rows, and none lost up to the checkpoint.
 
 Only the first rank has loggers.
 """
@@ -22,15 +22,15 @@ from gausim.training.table import Table
 
 @runtime_checkable
 class Resumable(Protocol):
-    """A logger that can forget what was logged after a step."""
+    """A logger that can remove later steps."""
 
     def resume_at(self, step: int) -> None:
-        """Drops what was logged for later optimiser steps than ``step``; 0 is a new run."""
+        """Removes entries of optimiser steps after ``step``; 0 is a new run."""
         ...
 
 
 class CsvLog(Logger):
-    """One table ``csv/metrics.csv`` (Lightning's own logger deletes the rows of the process before)."""
+    """One table ``csv/metrics.csv`` (Lightning's logger deletes the rows of an earlier process)."""
 
     version = ""
 
@@ -45,7 +45,7 @@ class CsvLog(Logger):
         return self._name
 
     def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
-        """Nothing: the run directory holds its configuration."""
+        """Does nothing: the run directory contains the configuration."""
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Writes one row; columns not seen before are added to the table."""
@@ -57,7 +57,7 @@ class CsvLog(Logger):
 
 
 class TensorBoardLog(TensorBoardLogger):
-    """TensorBoard's events in one folder; those of steps that a resumed run does again are marked as void.
+    """TensorBoard's events in one folder; events of steps that a resumed run repeats are marked as invalid.
 
     Videos are animated GIFs under IMAGES, tables and the configuration are under TEXT.
     """
@@ -67,19 +67,19 @@ class TensorBoardLog(TensorBoardLogger):
         super().__init__(save_dir, name=name, version="")
 
     def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
-        """Shows the configuration."""
+        """Logs the configuration as text."""
         text = yaml.safe_dump(dict(params), sort_keys=False)
         self.experiment.add_text("config", "    " + text.replace("\n", "\n    "))  # indented text is code in Markdown
 
     def resume_at(self, step: int) -> None:
-        """Tells TensorBoard to forget what earlier files hold of later steps."""
+        """Marks later steps in earlier event files as invalid."""
         from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 
         restart = Event(step=step + 1, session_log=SessionLog(status=SessionLog.START))
         self.experiment.file_writer.add_event(restart)
 
     def log_media(self, media: Media) -> None:
-        """Shows the media of one step."""
+        """Logs the media of one step."""
         for name in media.names:
             self._image(f"{name}/video", _gif(media.video(name)), media.step)
             for kind, path in media.pictures(name).items():
@@ -115,7 +115,7 @@ def error_plot(media: Media, name: str) -> bytes:
 
 
 def _gif(video: Path) -> bytes:
-    """TensorBoard plays no other videos."""
+    """A video as animated GIF, TensorBoard's only video format."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "video.gif"
         write_gif(path, read_video(video), video_rate(video))

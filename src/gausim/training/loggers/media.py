@@ -1,4 +1,4 @@
-"""What dashboards show of training besides numbers: videos, pictures and tables, as files of the run."""
+"""Media of training for dashboards: videos, pictures and tables, as files of the run."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from gausim.io.video import write_video
 from gausim.report.pictures.frames import Timeline, error_colors, label_bar, moving_line, space_time_slice, video_frame
 
 FOLDER = "panels"
-# Shown images are shrunk to at most, and videos enlarged to at least, so many rows [pixels].
+# Largest number of rows of images, which are shrunk to it, and smallest of videos, which are enlarged [pixels].
 MOST_ROWS, LEAST_ROWS = 256, 128
-# Space-time slices are at least so wide: one pixel per frame is too little to see [pixels].
+# Smallest width of space-time slices: one pixel per frame is too narrow [pixels].
 _SLICE_WIDTH = 384
 _STEP = re.compile(r"step_(\d+)")
 
@@ -58,18 +58,18 @@ class Media:
 
 @runtime_checkable
 class MediaLog(Protocol):
-    """A logger that shows media; one without this method (the CSV table) shows none."""
+    """A logger for media; the CSV table is none."""
 
     def log_media(self, media: Media) -> None:
-        """Shows the media of one step."""
+        """Logs the media of one step."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Clip:
-    """One sequence as seen by one camera: truth and prediction over black, and errors by frame, as they are printed.
+    """One sequence in one camera: truth and prediction over black, and errors by frame in the units of tables.
 
-    ``name`` is that of its files, ``title`` is for people.
+    ``name`` is for files, ``title`` for display.
     """
 
     name: str
@@ -81,7 +81,7 @@ class Clip:
 
 
 def write_media(run: Path, step: int, clips: Sequence[Clip], columns: list[str], rows: list[list[str]]) -> Media:
-    """Writes the media of an optimiser step into the run directory, all or nothing; the table is that of objects."""
+    """Writes the media of a step to the run directory, atomically; ``columns`` and ``rows`` are by object."""
     media = Media(run / FOLDER / f"step_{step:06d}", step)
     temporary = media.folder.with_name(f".{media.folder.name}.tmp")
     shutil.rmtree(temporary, ignore_errors=True)
@@ -101,7 +101,7 @@ def media_of(run: Path) -> list[Media]:
 
 
 def forget_media(run: Path, after: int) -> None:
-    """Removes media of later steps than ``after``, and half-written ones."""
+    """Removes media of later steps than ``after``, and incomplete ones."""
     for media in media_of(run):
         if media.step > after:
             shutil.rmtree(media.folder)
@@ -110,7 +110,7 @@ def forget_media(run: Path, after: int) -> None:
 
 
 def safe_name(*parts: str) -> str:
-    """One file name from names that may hold any character."""
+    """A file name from names with arbitrary characters."""
     return re.sub(r"[^\w.-]+", "_", "_".join(parts))
 
 
@@ -138,7 +138,7 @@ def _shrunk(frames: UInt8[np.ndarray, "F H W 3"]) -> UInt8[np.ndarray, "F h w 3"
 def frame_panel(
     truth: UInt8[np.ndarray, "F H W 3"], prediction: UInt8[np.ndarray, "F H W 3"]
 ) -> UInt8[np.ndarray, "R C 3"]:
-    """Three rows (ground truth, prediction, error colours) of six evenly spread frames, the first and the last too."""
+    """Three rows (ground truth, prediction, error colours) of six evenly spaced frames, first and last included."""
     chosen = sorted({round(i * (len(truth) - 1) / 5) for i in range(6)})
     rows = truth[chosen], prediction[chosen], [error_colors(truth[i], prediction[i]) for i in chosen]
     padded = [[np.pad(image, ((0, 2), (0, 2), (0, 0)), constant_values=64) for image in row] for row in rows]
@@ -148,7 +148,7 @@ def frame_panel(
 def slice_panel(
     truth: UInt8[np.ndarray, "F H W 3"], prediction: UInt8[np.ndarray, "F H W 3"]
 ) -> UInt8[np.ndarray, "R C 3"]:
-    """Space-time slices of truth, prediction and error along the line that moves most in the truth, time rightwards."""
+    """Space-time slices of truth, prediction and error along the true motion's strongest line, time to the right."""
     line = moving_line(truth)
     first, second = space_time_slice(truth, line), space_time_slice(prediction, line)
     named = {f"truth, {line[0]} {line[1]}": first, "prediction": second, "error": error_colors(first, second)}

@@ -1,4 +1,4 @@
-"""MLflow: one run there per run directory, whatever happens to the process that trains."""
+"""MLflow logger: one MLflow run per run directory, also after interruptions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gausim.training.loggers.media import Media
 if TYPE_CHECKING:
     from mlflow.tracking import MlflowClient
 
-# What MLflow takes of parameters.
+# MLflow's limits: parameters per call and characters per value.
 _PARAMS_AT_ONCE, _LONGEST_PARAM = 100, 6000
 
 
@@ -33,7 +33,7 @@ class MlflowLog(MLFlowLogger):
     def __init__(
         self, save_dir: str | Path, *, database: str | Path, experiment: str = "gausim", name: str | None = None
     ) -> None:
-        """Begins nothing before the first number.
+        """Starts no MLflow run before the first metric.
 
         ``save_dir`` is the run directory, ``database`` the SQLite file of all runs; media go to a folder
         ``mlflow_artifacts`` beside it.
@@ -50,7 +50,7 @@ class MlflowLog(MLFlowLogger):
 
     @property
     def experiment(self) -> MlflowClient:
-        """The client of MLflow, with this run begun or gone on with."""
+        """MLflow's client, after this run was started or continued."""
         if not self._initialized:
             with undisturbed():
                 self._open()
@@ -59,7 +59,7 @@ class MlflowLog(MLFlowLogger):
 
     @property
     def version(self) -> str:
-        """The run's id, begun if need be."""
+        """The run's id; starts the run if necessary."""
         return str(self.run_id)
 
     def _open(self) -> None:
@@ -79,7 +79,7 @@ class MlflowLog(MLFlowLogger):
                 )
         try:
             _ = super().experiment
-        except MlflowException:  # another job of a sweep made the experiment meanwhile
+        except MlflowException:  # another job of a sweep created the experiment meanwhile
             _ = super().experiment
         run = self._run_id or ""
         write_durably(id_file, run.encode())
@@ -90,16 +90,16 @@ class MlflowLog(MLFlowLogger):
         client.set_tag(run, "run_directory", str(self._folder))
 
     def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
-        """Keeps the configuration for the begin of the run."""
+        """Stores the configuration for the start of the run."""
         self._config = dict(params)
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Logs numbers of a step, those aside that the run has: MLflow forgets nothing, and keeps both."""
+        """Logs metrics of a step that the run does not have yet: MLflow cannot replace values."""
         new = {_key(k): float(v) for k, v in metrics.items() if math.isfinite(v)}
         super().log_metrics({k: v for k, v in new.items() if (step or 0) > self._known.get(k, -1)}, step)
 
     def log_media(self, media: Media) -> None:
-        """Keeps the media of one step as artifacts."""
+        """Stores the media of one step as artifacts."""
         place = f"media/{media.folder.name}"
         self.experiment.log_artifacts(self.version, str(media.folder), place)
         for name in media.names:
@@ -109,19 +109,19 @@ class MlflowLog(MLFlowLogger):
                 self.experiment.log_artifact(self.version, str(path), place)
 
     def resume_at(self, step: int) -> None:
-        """Begins, and looks up what the run has of every number."""
+        """Starts the run, and reads the last step of every metric that it has."""
         client = self.experiment
         for key in client.get_run(self.version).data.metrics:
             self._known[key] = max(metric.step for metric in client.get_metric_history(self.version, key))
 
     def finalize(self, status: str = "success") -> None:
-        """Ends the run, once."""
+        """Ends the run; later calls do nothing."""
         super().finalize(status)
         self._initialized = False
 
 
 def _key(name: str) -> str:
-    """A name that MLflow takes."""
+    """A metric's name in characters that MLflow allows."""
     return "".join(c if c.isalnum() or c in "_-./ " else "_" for c in name)
 
 

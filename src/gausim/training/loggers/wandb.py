@@ -1,4 +1,4 @@
-"""Weights & Biases: one run there per run directory, whatever happens to the process that trains."""
+"""Weights & Biases logger: one wandb run per run directory, also after interruptions."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from gausim.runs.randomness import undisturbed
 from gausim.training.loggers.media import Media, media_of
 from gausim.training.table import Table
 
-# Seconds after which a server that does not answer is given up.
+# Time limit of the server's first answer [s].
 _PATIENCE = 30.0
 
 
 class WandbLog(WandbLogger):
     """Lightning's logger, offline by default; a resumed run continues under the id kept in ``wandb_id``.
 
-    ``wandb sync`` lets one offline part of a run replace another. So a resumed run logs again what the run logged up to
-    its checkpoint (kept in ``wandb/metrics.csv`` and ``panels/``) and removes the earlier part: what lies in the
-    directory is always one part, and whole. All that is logged of one optimiser step makes one row there.
+    ``wandb sync`` replaces one offline part of a run by another. So a resumed run logs all entries up to its checkpoint
+    again (from ``wandb/metrics.csv`` and ``panels/``) and removes the earlier part: the directory always contains one
+    complete part. All entries of one optimiser step are one wandb row.
     """
 
     def __init__(
@@ -39,12 +39,12 @@ class WandbLog(WandbLogger):
         tags: Sequence[str] = (),
         offline: bool = True,
     ) -> None:
-        """Begins nothing before the first number; ``save_dir`` is the run directory, for the rest see wandb's own."""
+        """Starts no wandb run before the first metric; ``save_dir`` is the run directory, the rest as in wandb."""
         self._folder, self._local = Path(save_dir), offline
         super().__init__(
             name=name, save_dir=save_dir, project=project, group=group, tags=list(tags),
             mode="offline" if offline else "online", resume=None if offline else "allow", job_type="train",
-            reinit="create_new",  # a sweep has several runs in one process; none is the process's own
+            reinit="create_new",  # a sweep has several runs in one process
             settings={"console": "off", "silent": True, "init_timeout": _PATIENCE},
         )  # fmt: skip
         self._table = Table(self._folder / "wandb" / "metrics.csv", "step")
@@ -52,7 +52,7 @@ class WandbLog(WandbLogger):
 
     @property
     def version(self) -> str:
-        """The run's id, made at the first use."""
+        """The run's id, created on first use."""
         path = self._folder / WANDB_ID
         if not path.is_file():
             write_durably(path, uuid.uuid4().hex[:12].encode())
@@ -60,7 +60,7 @@ class WandbLog(WandbLogger):
 
     @property
     def experiment(self) -> Any:
-        """The run there, begun at the first use. Lightning's would count log calls as steps.
+        """The wandb run, started on first use; Lightning's property would count log calls as steps.
 
         Raises:
             RunError: the server does not answer, or refuses.
@@ -79,29 +79,29 @@ class WandbLog(WandbLogger):
         return self._experiment
 
     def log_hyperparams(self, params: Any, *args: Any, **kwargs: Any) -> None:
-        """Keeps the configuration for the begin of the run."""
+        """Stores the configuration for the start of the run."""
         self._wandb_init["config"] = dict(params)
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
-        """Logs numbers of a step."""
+        """Logs metrics of a step."""
         self._table.append({"step": step, **{name: float(value) for name, value in metrics.items()}})
         self._log(metrics, step or 0)
 
     def log_media(self, media: Media) -> None:
-        """Shows the media of one step."""
+        """Logs the media of one step."""
         with undisturbed():
             shown = _shown(media)
         self._log(shown, media.step)
 
     def resume_at(self, step: int) -> None:
-        """Begins, and logs again what the run has logged up to ``step``, as far as it is not there."""
+        """Starts the run, and logs again entries up to ``step`` that the server does not have."""
         self._table.resume_at(step)
         own = self.experiment
         entries: list[tuple[int, Any]] = [(m.step, m) for m in media_of(self._folder) if m.step <= step]
         for row in self._table.rows():
             at = int(row.pop("step") or 0)
             entries.append((at, {name: float(value) for name, value in row.items() if value}))
-        # Numbers come before media, and steps in their order.
+        # In the order of steps, metrics before media.
         for at, entry in sorted(entries, key=lambda pair: (pair[0], isinstance(pair[1], Media))):
             self.log_media(entry) if isinstance(entry, Media) else self._log(entry, at)
         self.save()
@@ -112,21 +112,21 @@ class WandbLog(WandbLogger):
                     shutil.rmtree(folder, ignore_errors=True)
 
     def save(self) -> None:
-        """Closes the row of the latest step, so that it is kept whatever happens to this process."""
+        """Writes the row of the latest step, so that it survives an interruption."""
         if self._experiment is not None and self._row_is_open:
             with undisturbed():
                 self._experiment.log({}, commit=True)
             self._row_is_open = False
 
     def finalize(self, status: str) -> None:
-        """Ends the run, once."""
+        """Ends the run; later calls do nothing."""
         run, self._experiment = self._experiment, None
         if run is not None:
             with undisturbed():
                 run.finish(exit_code=int(status == "failed"))
 
     def _log(self, values: Mapping[str, Any], step: int) -> None:
-        # The server has steps that a resumed run does again; it refuses them.
+        # The server refuses steps that it has, which a resumed run repeats.
         if step >= self.experiment.starting_step:
             with undisturbed():
                 self.experiment.log(dict(values), step=step)

@@ -1,8 +1,8 @@
-"""Starts the ranks of a run and brings them together, one run after the other in one process if need be.
+"""Start and end of the ranks of a run; one process may have several runs one after the other.
 
 The first rank builds its run and then starts the others, which receive the resolved configuration from it: no command
-line is parsed twice, so a job of a sweep never starts another sweep. Where a scheduler (SLURM, torchrun) has started
-all ranks, nothing is started here. What is set up for a run is gone after it.
+line is parsed twice, so a job of a sweep never starts another sweep. Ranks that a scheduler (SLURM, torchrun) has
+started are used as they are. After a run its process group and environment variables are removed.
 """
 
 from __future__ import annotations
@@ -30,25 +30,24 @@ from gausim.core import ConfigError, GausSimError, RunError
 from gausim.training.ranks.layout import LOCALHOST, Layout, LocalRanks
 from gausim.training.ranks.ranks import Ranks, is_lost_connection
 
-# Seconds: between looks at the other ranks; for them to end by themselves; for this rank to notice that one is gone
-# before it is ended too (it may be waiting for a device that will never answer).
+# Seconds between checks of the other ranks; until ranks that do not end are killed; and until this process is killed
+# after the loss of another rank (it may be waiting for a device that will never answer).
 LOOK, ENDING, NOTICING = 0.05, 30.0, 60.0
 UNHARMED = "The last checkpoint, if any, is unharmed; the same command continues from it."
 
 
 class Crew:
-    """The ranks of one run, from their start to their end; use it as a context.
+    """The ranks of one run, from their start to their end; a context manager.
 
-    ``environment`` tells Lightning where this rank stands; it is None for a run of one rank.
+    ``environment`` is Lightning's cluster environment of this rank, None for a run of one rank.
     """
 
     def __init__(
         self, layout: Layout, follow: Callable[[Crew], object] | None = None, *, rank: int = 0, port: int | None = None
     ) -> None:
-        """Starts nothing yet.
+        """``follow`` is the function (of a module) that the other ranks on this machine call.
 
-        ``follow`` is what the other ranks on this machine do, a function of a module; a rank that another process has
-        started has the number ``rank`` and finds the first one's store at ``port``.
+        A rank started by another process has the number ``rank`` and finds the first rank's store at ``port``.
         """
         self.layout, self.ranks = layout, Ranks()
         self.environment: ClusterEnvironment | None = None
@@ -62,7 +61,7 @@ class Crew:
     # ------------------------------------------------------------------------------------------------ coming together
 
     def __enter__(self) -> Crew:
-        """Joins ranks that run already; the first rank of a machine without a scheduler is still alone."""
+        """Joins ranks that run already; without a scheduler, the first rank remains alone until :meth:`start`."""
         if self._port is not None:
             self._store = dist.TCPStore(
                 LOCALHOST, self._port, self.layout.size, False, self._timeout, wait_for_workers=False
@@ -118,7 +117,7 @@ class Crew:
         return self.environment is None or self.environment.global_rank() == 0
 
     def start(self, task: object) -> None:
-        """Starts the ranks that nobody has started yet, and tells them the task (plain data)."""
+        """Starts the other ranks, unless a scheduler did, and sends them the task (plain data)."""
         if self.layout.size == 1 or self.environment is not None:
             return
         self._store = dist.TCPStore(LOCALHOST, 0, self.layout.size, True, self._timeout, wait_for_workers=False)
@@ -142,10 +141,10 @@ class Crew:
     # ------------------------------------------------------------------------------------------------ ending
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Ends the ranks together; after an error of this one, the others at once.
+        """Waits for the end of all ranks; after an error of this one, ends the others at once.
 
         Raises:
-            RunError: another rank is gone; says which one and why.
+            RunError: another rank has failed; names the rank and its error.
         """
         try:
             if error is None:
@@ -160,7 +159,7 @@ class Crew:
             self._end()
 
     def _part(self) -> None:
-        """Waits until all have done their work."""
+        """Waits until all ranks have finished."""
         if self.ranks.size > 1:
             dist.barrier()
         deadline = time.monotonic() + ENDING
@@ -170,12 +169,12 @@ class Crew:
                 warnings.warn(f"rank {rank} did not end by itself after the run and was ended.", stacklevel=3)
 
     def _explain(self, error: BaseException) -> None:
-        """Says in place of a broken connection which rank is gone and what it said last."""
+        """Replaces the error of a broken connection by one that names the failed rank and its last output."""
         if not is_lost_connection(error):
             return
         deadline = time.monotonic() + ENDING / 3
         while self._others and time.monotonic() < deadline and all(p.exitcode is None for p in self._others.values()):
-            time.sleep(LOOK)  # its connection breaks a moment before it is gone
+            time.sleep(LOOK)  # a connection breaks shortly before its process ends
         if gone := self._obituary():
             raise RunError(gone) from error
         words = (str(error) or type(error).__name__).splitlines()[0]
@@ -190,7 +189,7 @@ class Crew:
             process.kill()
             process.join()
         if dist.is_initialized():
-            with suppress(RuntimeError):  # of ranks that are gone
+            with suppress(RuntimeError):  # of ranks that have ended
                 dist.destroy_process_group()
         if self._logs is not None:
             self._logs.cleanup()
@@ -201,7 +200,7 @@ class Crew:
                 os.environ[name] = value
 
     def _watch(self) -> None:
-        """Ends this process if it does not notice that another rank is gone: a device may wait for it for ever."""
+        """Kills this process if it does not react to the loss of another rank: it may wait on a device for ever."""
         others, told = self._others, None
         while self._others is others:
             time.sleep(LOOK * 10)
@@ -213,7 +212,7 @@ class Crew:
                     os._exit(2)
 
     def _obituary(self) -> str | None:
-        """How the first rank that failed ended, and what it said last; None where none did."""
+        """Exit status and last output of the first rank that failed; None if none did."""
         for rank, process in self._others.items():
             status = process.exitcode
             if status not in (None, 0):
@@ -230,7 +229,7 @@ class Crew:
 
 
 def _run_rank(follow: Callable[[Crew], object], layout: Layout, rank: int, port: int, log: str) -> None:
-    """One more rank, in a process of its own, until the first one is done or gone; its output goes to ``log``."""
+    """Main function of another rank's process, which ends with the first rank; its output goes to ``log``."""
     os.setsid()  # an interrupt from the keyboard is for the first rank alone
     with open(log, "wb") as file:
         os.dup2(file.fileno(), 1)

@@ -1,4 +1,4 @@
-"""Where a run's ranks stand, and what Lightning is told of it."""
+"""Number and placement of a run's ranks, and their description for Lightning."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOCALHOST = "127.0.0.1"
 
 @dataclass(frozen=True)
 class Layout:
-    """How many processes train together (``devices`` are per machine), and how they talk."""
+    """Number of ranks (``devices`` are per machine), their devices and the time limit of their communication."""
 
     devices: int = 1
     num_nodes: int = 1
@@ -33,7 +33,7 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """All ranks."""
+        """Number of all ranks."""
         return self.devices * self.num_nodes
 
     @property
@@ -43,12 +43,12 @@ class Layout:
 
     @property
     def backend(self) -> str:
-        """Of torch.distributed; what the hosts tell each other goes by gloo in any case."""
+        """Backend of torch.distributed for tensors on the device; the hosts always communicate by gloo."""
         return "cpu:gloo,cuda:nccl" if self.on_gpu else "gloo"
 
 
 class LocalRanks(LightningEnvironment):
-    """Tells Lightning where a rank stands on this machine; no environment variable is read or set."""
+    """Lightning's cluster environment of a rank on this machine; it reads and sets no environment variable."""
 
     creates_processes_externally = True
     main_address = LOCALHOST
@@ -58,31 +58,31 @@ class LocalRanks(LightningEnvironment):
         self._global_rank, self._world_size, self._main_port = rank, size, port
 
     def local_rank(self) -> int:
-        """This rank: all are on one machine."""
+        """Number of this rank, as all are on one machine."""
         return self._global_rank
 
     def node_rank(self) -> int:
-        """The only machine."""
+        """0, the only machine."""
         return 0
 
 
 class RanksStrategy(DDPStrategy):
-    """Replicas whose module adds up the gradients by itself (:meth:`GausSimModule.optimise`).
+    """Replicas whose loss gradients are added by the module (:meth:`GausSimModule.optimise`).
 
-    Torch's wrapper would reduce after every stretch of a rollout, wait for ranks that have no sequence, and give a
-    gradient of zero to parameters of sequences that are in no batch.
+    Torch's wrapper would reduce after every stretch of a rollout, wait for ranks that have no sequence, and give zero
+    loss gradients to parameters of sequences that are in no batch.
     """
 
     def _configure_launcher(self) -> None:
-        """None: the ranks run already."""
+        """Sets no launcher: the ranks run already."""
 
     def setup_distributed(self) -> None:
-        """Takes the process group that :class:`Crew` has set up."""
+        """Uses the process group of :class:`Crew`."""
         reset_seed()
         self.set_world_ranks()
 
     def configure_ddp(self) -> None:
-        """All ranks start from the first one's weights and buffers."""
+        """Copies the first rank's weights and buffers to all ranks."""
         assert self.model is not None
         for tensor in (*self.model.parameters(), *self.model.buffers()):
             dist.broadcast(tensor.detach(), src=0)

@@ -1,7 +1,7 @@
-"""What the processes of one training run do together: gather numbers, add gradients, agree.
+"""Communication between the ranks of a training run: gathering of values, sums of loss gradients, decisions.
 
-Every rank holds the whole model and takes its share of the sequences of a step. Nothing here is averaged: each rank
-weighs its own part by the whole step's number of sequences, so sums over ranks are the step of one rank.
+Every rank has the whole model and computes a part of a step's sequences. Values are added, not averaged: each rank
+divides its losses by the whole step's number of sequences, so the sums over ranks equal the step of a single rank.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ T = TypeVar("T")
 
 
 class Ranks:
-    """The processes that train together, or this one alone where torch's process group is not up.
+    """The ranks of torch's process group, or this process alone where there is none.
 
-    What every rank calls must be called by all in the same order; a process that is alone goes straight through.
+    The methods are collective: all ranks must call them in the same order. In a single process they return at once.
     """
 
     @property
     def size(self) -> int:
-        """How many there are."""
+        """Number of ranks."""
         return dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
 
     @property
     def rank(self) -> int:
-        """The number of this one; 0 is the one that writes."""
+        """Number of this rank; rank 0 writes the files."""
         return dist.get_rank() if self.size > 1 else 0
 
     def gather(self, value: T) -> list[T]:
-        """The values of all ranks, in their order; small plain data."""
+        """The values of all ranks, in rank order; for small plain data."""
         if self.size == 1:
             return [value]
         found: list[Any] = [None] * self.size
@@ -43,7 +43,7 @@ class Ranks:
         return found
 
     def first(self, function: Callable[[], T]) -> T:
-        """What a function returns that only the first rank calls; what it raises, the others raise as a RunError."""
+        """Result of a function that only the first rank calls; an error there is a RunError on the other ranks."""
         if self.size == 1:
             return function()
         answer: list[Any] = [None, None]
@@ -69,9 +69,9 @@ class Ranks:
         return least.bool()
 
     def add(self, tensors: Sequence[Tensor | None], like: Sequence[Tensor]) -> list[Tensor | None]:
-        """Sums of tensors over ranks, all of one type in one message: the same bits on every rank.
+        """Sums of tensors over ranks, one message per data type; the same bits on every rank.
 
-        None counts as zero, and where no rank has a tensor there is none; ``like`` has the shapes, types and device.
+        None counts as zero, and stays None where no rank has a tensor; ``like`` has the shapes, types and device.
         """
         if self.size == 1:
             return list(tensors)
@@ -88,7 +88,7 @@ class Ranks:
         return sums
 
     def check_alike(self, fingerprint: str, what: str) -> None:
-        """Raises RunError where a text is not the same everywhere: drifted ranks no longer train one model."""
+        """Raises RunError where a fingerprint differs between ranks, which then no longer train one model."""
         found = self.gather(fingerprint)
         different = [rank for rank, text in enumerate(found) if text != found[0]]
         if different:
@@ -98,14 +98,14 @@ class Ranks:
             )
 
 
-def interleave(shares: Sequence[Sequence[T]]) -> list[T]:
-    """The order of a step's sequences from the ranks' shares: rank r holds places r, r + ranks, r + 2 ranks, ..."""
-    length = max(map(len, shares))
-    return [share[i] for i in range(length) for share in shares if i < len(share)]
+def interleave(slices: Sequence[Sequence[T]]) -> list[T]:
+    """A step's sequences in order, from the ranks' slices: rank r has items r, r + ranks, r + 2 ranks, ..."""
+    length = max(map(len, slices))
+    return [rank_slice[i] for i in range(length) for rank_slice in slices if i < len(rank_slice)]
 
 
 def is_lost_connection(error: BaseException) -> bool:
-    """Whether an error says that another rank is gone, or did not answer in time."""
+    """Whether an error means that another rank has ended or did not answer in time."""
     if isinstance(error, GausSimError):
         return False
     return isinstance(error, dist.DistError) or (isinstance(error, RuntimeError) and "gloo" in str(error).lower())

@@ -1,4 +1,4 @@
-"""Drawing what was predicted and comparing it with the frames, a few states at a time."""
+"""Rendering of predicted states and their image loss, a few states at a time."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from gausim.render.draw import SceneAppearance, draw
 from gausim.training.contracts import SceneBatch
 from gausim.training.rollout import States
 
-# Pixels that are drawn and compared together: enough for each call to be cut by state and not within an image, and to
-# keep a GPU busy; few enough for the images to be a small part of the memory.
+# Pixels rendered and compared in one call: enough to divide calls between images and to keep a GPU busy; few enough for
+# the images to be a small part of the memory.
 CPU_PIXELS, GPU_PIXELS = 1_000_000, 4_000_000
 
 
 class ViewGroup(NamedTuple):
-    """Sequences of a batch, by their places in it, that one call of the renderer can draw together."""
+    """Sequences of a batch (by index) that one call of the renderer can draw together."""
 
     scene_id: int
     members: tuple[int, ...]
@@ -31,7 +31,7 @@ class ViewGroup(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """States that are drawn and compared together: steps of some members of one view group, counted in the stretch."""
+    """States rendered and compared together: steps, counted in the stretch, of some members of one view group."""
 
     group: int
     members: tuple[int, ...]
@@ -39,13 +39,13 @@ class Chunk(NamedTuple):
 
 
 class Comparison:
-    """Compares the frames that a rollout predicts with the true ones, stretch by stretch.
+    """Image loss of a rollout's predicted frames, stretch by stretch.
 
-    No image outlives its chunk: each chunk is drawn and compared, and the gradients with respect to its states are
-    formed at once. The memory of drawing therefore does not grow with the number of steps.
+    Images are freed after their chunk: each chunk is rendered and compared, and the loss gradients with respect to its
+    states are computed at once. The memory of rendering therefore does not grow with the number of steps.
 
     Attributes:
-        last: the images that the latest stretch ended with, per member; at first those of the rest state.
+        last: last images of the latest stretch, per member; at first those of the rest state.
     """
 
     def __init__(
@@ -54,29 +54,29 @@ class Comparison:
         loss: ImageLoss,
         batch: SceneBatch,
         groups: Sequence[ViewGroup],
-        looks: Sequence[SceneAppearance],
+        appearances: Sequence[SceneAppearance],
         frames: Sequence[UInt8[Tensor, "T _ _ _ 4"]],
         rest: Sequence[Float[Tensor, "_ _ _ C"]],
     ) -> None:
-        """Binds what stays the same over a rollout.
+        """Stores the constants of a rollout.
 
-        ``groups`` are the members by scene and cameras, with the appearance (``looks``) of each group's scene; the true
-        ``frames`` 1..T and images of the ``rest`` state are each member's. Groups may differ in views and image size.
+        ``groups`` are the members by scene and cameras, with one of the ``appearances`` each; ``frames`` are the true
+        frames 1..T and ``rest`` the rest state's images of each member. Groups may differ in views and image size.
         """
         self._renderer, self._loss, self._batch = renderer, loss, batch
-        self._groups, self._looks, self._frames = groups, looks, frames
+        self._groups, self._appearances, self._frames = groups, appearances, frames
         self.last = list(rest)
 
     def __call__(self, states: States, start: int) -> tuple[Float[Tensor, "T S"], Float[Tensor, ""]]:
         """Image loss of each predicted frame and member, and the squared change of the predicted images (summed).
 
-        Differentiable in the states through the losses alone; ``start`` frames were predicted before them.
+        Only the losses are differentiable in the states; ``start`` is the number of frames predicted before.
         """
         losses, motion = _Compare.apply(*states.tensors(), self, start)
         return losses, motion
 
     def chunks(self, steps: int) -> list[Chunk]:
-        """The states in the order in which they are drawn: a few steps of one member, or several members whole."""
+        """Chunks in the order of rendering: a few steps of one member, or all steps of several members."""
         result = []
         budget = CPU_PIXELS if self._batch.rest.device.type == "cpu" else GPU_PIXELS
         for number, group in enumerate(self._groups):
@@ -89,21 +89,21 @@ class Comparison:
         return result
 
     def rows(self, member: int) -> tuple[slice, slice, slice]:
-        """Where the member's positions, gradients and rotations stand in the batch."""
+        """The member's rows of positions, deformation gradients and rotations in the batch."""
         place = self._batch.members[member]
         return place.kernels, place.units, place.units
 
     def draw(self, chunk: Chunk, states: States) -> Float[Tensor, "M T V H W C"]:
-        """Images of the states of a chunk, member by member; gradients flow into the states."""
+        """Images of the states of a chunk, member by member; differentiable in the states."""
         group, units = self._groups[chunk.group], self._batch.members[chunk.members[0]].unit_of_kernel
-        drawn = draw(self._renderer, self._looks[chunk.group], *states.tensors(), units, group.cameras)
+        drawn = draw(self._renderer, self._appearances[chunk.group], *states.tensors(), units, group.cameras)
         images = channels(drawn.rgb, drawn.alpha, self._loss)
         return images.unflatten(0, (len(chunk.members), -1))
 
     def compare(
         self, images: Float[Tensor, "M T V H W C"], chunk: Chunk, start: int
     ) -> tuple[Float[Tensor, "M T"], Float[Tensor, "M T V H W C"], Float[Tensor, ""]]:
-        """Losses of a chunk's images, the gradient of their sum, and the squared change since the frames before."""
+        """Losses of a chunk's images, the gradient of their sum, and the squared change from frame to frame."""
         span = slice(start + chunk.span.start, start + chunk.span.stop)
         frames = torch.stack([self._frames[i][span].to(images.device, non_blocking=True) for i in chunk.members])
         target = channels(*composite(frames), self._loss)
@@ -118,12 +118,12 @@ class Comparison:
 
 
 def channels(rgb: Float[Tensor, "*B 3"], alpha: Float[Tensor, " *B"], loss: ImageLoss) -> Float[Tensor, "*B C"]:
-    """The channels that a loss compares: the colours, and the opacity where it asks for it."""
+    """The channels that a loss compares: the colours, with the opacity if the loss uses it."""
     return torch.cat((rgb, alpha[..., None]), -1) if loss.compares_alpha else rgb
 
 
 class _Compare(torch.autograd.Function):
-    """Drawing and loss of a stretch as one node that keeps only the gradients with respect to the states."""
+    """Rendering and loss of a stretch as one graph node, which stores the loss gradients of the states only."""
 
     @staticmethod
     def forward(
@@ -163,14 +163,14 @@ class _Compare(torch.autograd.Function):
 
 
 def _gather(values: Tensor, kind: int, chunk: Chunk, work: Comparison) -> Tensor:
-    """The rows of a chunk's members in its steps, member by member, as a leaf of its own."""
+    """The rows of a chunk's members in its steps, member by member, as a new leaf tensor."""
     return torch.cat([values.detach()[chunk.span, work.rows(member)[kind]] for member in chunk.members])
 
 
 def _scatter(
     images: Tensor, slope: Tensor, leaves: list[Tensor], kept: list[Tensor | None], chunk: Chunk, work: Comparison
 ) -> None:
-    """Forms the gradients with respect to a chunk's states and writes them to where its members stand."""
+    """Computes the loss gradients with respect to a chunk's states and writes them to its members' rows."""
     wanted = [kind for kind, leaf in enumerate(leaves) if leaf.requires_grad]
     found = torch.autograd.grad(images, [leaves[kind] for kind in wanted], slope, allow_unused=True)
     for kind, gradient in zip(wanted, found, strict=True):

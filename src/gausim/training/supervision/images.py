@@ -1,4 +1,4 @@
-"""What a rollout is compared with: videos, motion tracked in them, or the true motion of points."""
+"""Supervision of rollouts: the interface, and supervision by the images of the training views."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from gausim.training.contracts import SceneBatch
 from gausim.training.rollout import States
 from gausim.training.supervision.comparison import Comparison, ViewGroup, channels
 
-# Losses (T, S) of T predicted frames of S sequences, and the squared change of what is compared, summed. ``start``
-# frames were predicted before them. Differentiable in the states through the losses alone.
+# Losses (T, S) of T predicted frames of S sequences, and the summed squared change of the compared quantity. ``start``
+# is the number of frames predicted before them. Only the losses are differentiable in the states.
 Compare = Callable[[States, int], tuple[Tensor, Tensor]]
 
 
 class StaticFigures(NamedTuple):
-    """What the rest state scores on each frame of a sequence, and the squared change of the truth to the next one."""
+    """Loss of the rest state on each frame of a sequence, and squared change of the truth to the next frame."""
 
     losses: list[float]
     motion: list[float]
@@ -34,12 +34,12 @@ class StaticFigures(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """What a run has at hand for the making of its supervision.
+    """Parts of a run from which supervision is built.
 
     Attributes:
-        truth: true motion of a sequence by its number, None where it is not known.
-        motions: smooth motions that the model can carry, of a scene by its number; None where it has no such basis.
-        loss: compares images.
+        truth: true motion of a sequence by its number, None where it is unknown.
+        motions: smooth motions of the model's template, of a scene by its number; None where it has no such basis.
+        loss: image loss.
     """
 
     scenes: Sequence[GaussianScene]
@@ -51,17 +51,17 @@ class Sources:
 
 @runtime_checkable
 class Supervision(Protocol):
-    """What training compares predictions with."""
+    """Interface of supervision: losses of predictions and of the rest state."""
 
     def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Compare:
-        """What compares the rollout of a batch, stretch by stretch."""
+        """Loss function of a batch's rollout, called for each stretch."""
 
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
-        """Scores the rest state on frames ``first`` .. T of a sample."""
+        """Losses of the rest state on frames ``first`` .. T of a sample."""
 
 
-class Looks:
-    """The appearance of every scene's foreground, made once and moved to the device on first use."""
+class Appearances:
+    """Appearance of every scene's foreground, computed once and moved to the device on first use."""
 
     def __init__(self, scenes: Sequence[GaussianScene]) -> None:
         self._scenes = list(scenes)
@@ -77,20 +77,20 @@ class Looks:
 
 
 class ImageSupervision:
-    """Draws predictions in a sample's cameras and compares them with its frames."""
+    """Supervision by images: renders predictions in a sample's cameras and compares them with its frames."""
 
     def __init__(self, scenes: Sequence[GaussianScene], renderer: Renderer, loss: ImageLoss) -> None:
         self.renderer, self.loss = renderer, loss
-        self.looks = Looks(scenes)
+        self.appearances = Appearances(scenes)
         self._keys: dict[tuple[int, tuple[str, ...]], Hashable] = {}
         self._rest: dict[Hashable, Rendered] = {}
 
     def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Comparison:
-        """What draws and compares the predictions of a batch."""
+        """Rendering and image loss of the predictions of a batch."""
         return self._comparison(samples, batch, slice(1, None))
 
     def at_rest(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Comparison:
-        """What compares one step from the rest state with frame 0 of the samples."""
+        """Rendering and image loss of one step from the rest state, against frame 0 of the samples."""
         return self._comparison(samples, batch, slice(0, 1))
 
     def _comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch, frames: slice) -> Comparison:
@@ -99,15 +99,15 @@ class ImageSupervision:
             places.setdefault(self._key(sample), []).append(i)
         groups = [ViewGroup(samples[p[0]].scene_id, tuple(p), samples[p[0]].cameras) for p in places.values()]
         members = zip(samples, batch.members, strict=True)
-        looks = [self.looks.of(group.scene_id, batch.rest) for group in groups]
+        appearances = [self.appearances.of(group.scene_id, batch.rest) for group in groups]
         rest = [self.rest_image(sample, batch.rest[member.kernels]).rgb[0] for sample, member in members]
         true = [sample.frames[frames] for sample in samples]
-        return Comparison(self.renderer, self.loss, batch, groups, looks, true, rest)
+        return Comparison(self.renderer, self.loss, batch, groups, appearances, true, rest)
 
     def _key(self, sample: SequenceSample) -> Hashable:
-        """What must agree for two sequences to be drawn in one call: scene, cameras and image size.
+        """Key of sequences that one call of the renderer can draw together: scene, cameras and image size.
 
-        A sequence's cameras stand still, so they are fetched from the device once.
+        The cameras of a sequence are constant, so they are fetched from the device once.
         """
         cameras, known = sample.cameras, (sample.sequence_id, sample.cameras.names)
         if known not in self._keys:
@@ -116,19 +116,19 @@ class ImageSupervision:
         return self._keys[known]
 
     def rest_image(self, sample: SequenceSample, rest: Float[Tensor, "K 3"]) -> Rendered:
-        """The rest state (one) in a sample's cameras; drawn once per scene and set of cameras."""
+        """Image of the rest state in a sample's cameras; rendered once per scene and set of cameras."""
         key = self._key(sample)
         if key not in self._rest:
-            look = self.looks.of(sample.scene_id, rest)
+            appearance = self.appearances.of(sample.scene_id, rest)
             identity = torch.eye(3, dtype=rest.dtype, device=rest.device)[None, None]
             units = torch.zeros(rest.shape[0], dtype=torch.long, device=rest.device)
             with torch.no_grad():
-                self._rest[key] = draw(self.renderer, look, rest[None], identity, identity, units, sample.cameras)
+                self._rest[key] = draw(self.renderer, appearance, rest[None], identity, identity, units, sample.cameras)
         return self._rest[key]
 
     @torch.no_grad()
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
-        """Scores the images of the rest state on frames ``first`` .. T of a sample."""
+        """Image losses of the rest state on frames ``first`` .. T of a sample."""
         drawn = self.rest_image(sample, rest)
         frames, alpha = composite(sample.frames[first:].to(drawn.rgb.device))
         image, target = channels(drawn.rgb, drawn.alpha, self.loss), channels(frames, alpha, self.loss)
@@ -137,4 +137,4 @@ class ImageSupervision:
 
 
 def training_views(sources: Sources) -> None:
-    """Stands for the images of the training views, which every module compares with by itself."""
+    """Selects the images of the training views, the learner's default supervision."""

@@ -1,15 +1,14 @@
-"""Training on motion that is found in the videos first: see, then learn.
+"""Supervision by motion tracks: kernel motion fitted to the videos before training on it.
 
-A rollout can only show what its dynamics allow, so the gradient of its images mixes two questions: where is the object
-in this frame, and which forces bring it there. Here the first is answered alone. Each frame's coordinates in the
-model's smooth motions are those whose drawing agrees best with the frame,
+A rollout can only show motion that its dynamics allow, so the loss gradient of its images mixes two questions: where
+the object is in this frame, and which forces bring it there. Tracking answers the first question alone. Each frame's
+coordinates in the model's smooth motions are those whose rendering agrees best with the frame,
 
     q_t = argmin_q L(draw(X + sum_m q_m phi_m), frame_t) + prior |q|^2,    q_0 = 0,
 
-found by Adam from an extrapolation of the two frames before; no dynamics are assumed. The motions phi have sizes at
-which each costs the same elastic energy, so what no camera tells stays as it is at rest. Rollouts are then compared
-with the tracked kernels in 3D: every part of the object counts alike, however little texture it shows, and nothing is
-drawn.
+found by Adam from an extrapolation of the two frames before; no dynamics are assumed. The motions phi are scaled to
+equal elastic energy, so coordinates that no camera determines stay at rest. Rollouts are then compared with the tracked
+kernels in 3D: every part of the object has the same weight, with little texture or much, and nothing is rendered.
 """
 
 from __future__ import annotations
@@ -27,15 +26,15 @@ from gausim.data.records import GroundTruth
 from gausim.ops.deformation import polar_rotation
 from gausim.render.draw import draw
 from gausim.training.supervision.comparison import channels
-from gausim.training.supervision.images import Looks, Sources
+from gausim.training.supervision.images import Appearances, Sources
 from gausim.training.supervision.points import PointSupervision
 
-# Adam's moments: a frame is found in some tens of iterations, so they forget soon.
+# Adam's decay rates of the moments: short memories, because a frame takes some tens of iterations.
 BETAS = (0.8, 0.95)
 
 
 class MotionTracker:
-    """Finds the coordinates of a scene's smooth motions frame by frame."""
+    """Fits the coordinates of a scene's smooth motions frame by frame."""
 
     def __init__(
         self,
@@ -46,7 +45,7 @@ class MotionTracker:
         momentum: float = 0.7,
         prior: float = 1.0,
     ) -> None:
-        """The settings stand in ``conf/supervision/tracks.yaml``; the rate falls linearly to zero."""
+        """``conf/supervision/tracks.yaml`` explains the settings; the rate falls linearly to zero."""
         if iterations < 1 or rate <= 0:
             raise ConfigError(
                 f"supervision: expected iterations >= 1 and rate > 0, got iterations={iterations}, rate={rate}."
@@ -54,7 +53,7 @@ class MotionTracker:
         self._sources, self._iterations, self._rate = sources, iterations, rate
         self._momentum, self._prior = momentum, prior
         self._motions: dict[int, SmoothMotions] = {}
-        self._looks = Looks(sources.scenes)
+        self._appearances = Appearances(sources.scenes)
 
     def motions(self, scene_id: int) -> SmoothMotions:
         """The smooth motions of a scene; raises ConfigError where the model has none."""
@@ -71,8 +70,8 @@ class MotionTracker:
     def extend(self, known: Float[Tensor, "F M"] | None, sample: SequenceSample) -> Float[Tensor, "T M"]:
         """Coordinates of all frames of a sample; those of its first F frames are ``known``.
 
-        A frame's coordinates depend on the frames before it and on nothing else, so in how many calls a sequence is
-        tracked makes no difference.
+        A frame's coordinates depend on the earlier frames only, so the result is independent of the number of calls in
+        which a sequence is tracked.
         """
         motions = self.motions(sample.scene_id)
         if known is None:
@@ -87,7 +86,7 @@ class MotionTracker:
 
     def _find(self, sample: SequenceSample, frame: int, guess: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
         loss, renderer = self._sources.loss, self._sources.renderer
-        motions, look = self.motions(sample.scene_id).to(guess), self._looks.of(sample.scene_id, guess)
+        motions, appearance = self.motions(sample.scene_id).to(guess), self._appearances.of(sample.scene_id, guess)
         rest = self._sources.scenes[sample.scene_id].means.to(guess)
         target = channels(*composite(sample.frames[frame : frame + 1]), loss)
         place = guess.clone().requires_grad_()
@@ -97,7 +96,7 @@ class MotionTracker:
             deformation_gradients = motions.deformations(place[None])
             rotations = polar_rotation(deformation_gradients.detach())
             state = rest + motions.displacements(place[None]), deformation_gradients, rotations
-            drawn = draw(renderer, look, *state, motions.unit_of_kernel, sample.cameras)
+            drawn = draw(renderer, appearance, *state, motions.unit_of_kernel, sample.cameras)
             optimizer.zero_grad()
             error = loss(channels(drawn.rgb, drawn.alpha, loss), target).sum()
             (error + self._prior * place.square().sum()).backward()
@@ -106,13 +105,13 @@ class MotionTracker:
 
 
 class TrackSupervision(PointSupervision):
-    """Compares predicted kernels with where they are tracked in the videos.
+    """Supervision by motion tracks: compares predicted kernels with their tracked positions.
 
-    Frames are tracked when a sample first holds them, so that what the curriculum does not show is not looked at.
+    A frame is tracked when a sample first contains it, so frames that the curriculum does not show are never read.
     """
 
     def __init__(self, sources: Sources, *, energy_weight: float = 0.3, **tracking: Any) -> None:
-        """Prepares the tracker with the settings of :class:`MotionTracker`; the weight is of the loss."""
+        """``energy_weight`` is that of :class:`PointSupervision`, ``tracking`` are arguments of the tracker."""
         super().__init__(sources, energy_weight=energy_weight)
         self.tracker = MotionTracker(sources, **tracking)
         for scene_id in range(len(sources.scenes)):
@@ -121,7 +120,7 @@ class TrackSupervision(PointSupervision):
         self._coordinates: dict[int, Tensor] = {}
 
     def motion(self, sample: SequenceSample) -> GroundTruth:
-        """The kernels that can move, where they are tracked."""
+        """Tracked positions of the simulated kernels."""
         known = self._coordinates.get(sample.sequence_id)
         if known is None or len(known) <= sample.steps:
             with torch.enable_grad():
@@ -136,12 +135,12 @@ class TrackSupervision(PointSupervision):
         return dict(self._coordinates)
 
     def load_state_dict(self, state: dict[int, Tensor]) -> None:
-        """Takes what a run had tracked."""
+        """Restores the coordinates."""
         self._coordinates = dict(state)
 
 
 def tracks_or_images(sources: Sources, **settings: Any) -> TrackSupervision | None:
-    """Tracked motion where the model has smooth motions to track it in; else None, which means the images."""
+    """Supervision by motion tracks where the model has smooth motions; else None, which selects the images."""
     if any(sources.motions(scene_id) is None for scene_id in range(len(sources.scenes))):
         return None
     return TrackSupervision(sources, **settings)

@@ -1,4 +1,4 @@
-"""Training on the true motion of points instead of images: the quick lane for trying out ideas about dynamics."""
+"""Supervision by the true motion of points instead of images: fast experiments on dynamics."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from gausim.training.contracts import SceneBatch
 from gausim.training.rollout import States
 from gausim.training.supervision.images import Sources, StaticFigures
 
-# Motion energy below this share of the true one counts as this share: initial states begin at rest.
-STILL_SHARE = 0.05
+# Lower bound of the ratio of predicted to true motion energy in the loss: initial states begin at rest.
+LEAST_RATIO = 0.05
 
 
 def attach_points(scene: GaussianScene, points: Float[Tensor, "P 3"]) -> Int[Tensor, " P"]:
-    """The nearest simulated kernel of every rest-space point, whose unit it follows."""
+    """Nearest simulated kernel of every rest-space point; the point moves with that kernel's unit."""
     candidates = scene.simulated.nonzero()[:, 0]
     chunks = points.to(scene.means).split(1024)
     return torch.cat([candidates[torch.cdist(p, scene.means[candidates]).argmin(1)] for p in chunks])
 
 
 class PointSupervision:
-    """Compares predicted with true positions of the points whose motion a data set knows.
+    """Supervision by the true positions of points, where a data set has them.
 
     The loss of a frame is the mean over points of the squared distance, in (per cent of the scene's diagonal)^2.
-    Nothing is drawn. Only frames that the sample holds are looked at: those that training on images would see.
+    Nothing is rendered. Only the sample's frames are compared, the same as with supervision by images.
     """
 
     def __init__(self, sources: Sources, *, energy_weight: float = 0.0) -> None:
-        """``energy_weight`` is of the squared logarithm of predicted over true motion energy.
+        """``energy_weight`` weighs the squared logarithm of predicted over true motion energy.
 
-        Its mean over the halves of a stretch counts, times what the rest state scores: a motion that is out of step
-        would else rather stop.
+        The term is its mean over the halves of a stretch, times the rest state's loss. Without it, the least loss of a
+        motion with a wrong phase is no motion.
         """
         self._scenes, self._read = sources.scenes, sources.truth
         self._energy_weight = energy_weight
@@ -46,7 +46,7 @@ class PointSupervision:
         self._attached: dict[int, Int[Tensor, " P"]] = {}
 
     def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> _PointComparison:
-        """What compares the predictions of a batch."""
+        """Loss function of the predictions of a batch."""
         truths = [self.motion(sample) for sample in samples]
         for sample, truth in zip(samples, truths, strict=True):
             if sample.scene_id not in self._attached:
@@ -57,18 +57,18 @@ class PointSupervision:
         return _PointComparison(batch, known, attached, scales, self._energy_weight)
 
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
-        """Scores the rest state on frames ``first`` .. T of a sample."""
+        """Losses of the rest state on frames ``first`` .. T of a sample."""
         truth = self.motion(sample)
         positions = truth.positions[first : sample.steps + 1]
         motion = _squared(positions.diff(dim=0))
-        losses = _squared(positions - truth.rest) * (1 + self._energy_weight * math.log(1 + 1 / STILL_SHARE) ** 2)
+        losses = _squared(positions - truth.rest) * (1 + self._energy_weight * math.log(1 + 1 / LEAST_RATIO) ** 2)
         return StaticFigures((self._scale(sample) * losses).tolist(), (self._scale(sample) * motion).tolist())
 
     def _scale(self, sample: SequenceSample) -> float:
         return (100 / self._scenes[sample.scene_id].diagonal) ** 2
 
     def motion(self, sample: SequenceSample) -> GroundTruth:
-        """The motion that a sample is compared with, in all its frames; raises DataError where it is not known."""
+        """True motion of a sample in all its frames; raises DataError where it is unknown."""
         if sample.sequence_id not in self._known:
             truth = self._read(sample.sequence_id)
             if truth is None:
@@ -81,7 +81,7 @@ class PointSupervision:
 
 
 class _PointComparison:
-    """Compares the frames that a rollout predicts with the true points, stretch by stretch."""
+    """Loss of a rollout's predicted points, stretch by stretch."""
 
     def __init__(
         self,
@@ -121,10 +121,10 @@ class _PointComparison:
 
 
 def _energy_mismatch(made: Float[Tensor, " T"], true: Float[Tensor, " T"]) -> Float[Tensor, ""]:
-    """Squared logarithm of predicted over true motion energy, the mean over the two halves of T frames."""
+    """Squared logarithm of predicted over true motion energy, averaged over the two halves of T frames."""
     halves = [half for half in zip(made.tensor_split(2), true.tensor_split(2), strict=True) if len(half[0])]
     energies = torch.stack([torch.stack((a.mean(), b.mean())) for a, b in halves])
-    least = STILL_SHARE * energies[:, 1].clamp_min(torch.finfo(true.dtype).tiny)
+    least = LEAST_RATIO * energies[:, 1].clamp_min(torch.finfo(true.dtype).tiny)
     return ((energies[:, 0] + least) / (energies[:, 1] + least)).log().square().mean()
 
 

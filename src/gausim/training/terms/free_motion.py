@@ -1,4 +1,4 @@
-"""No energy without a force: a regulariser of free motion beyond the frames that training sees."""
+"""Penalty on the energy growth of free motion beyond the training frames."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from gausim.losses.objective import Objective
 from gausim.training.contracts import SceneBatch, Step
 from gausim.training.rollout import after, windows
 
-# The motion that goes on is made smaller or larger by up to these factors, so that no size of motion is left out.
+# Range of the random factor on the motion that continues freely, so that all amplitudes are trained.
 SMALLEST, LARGEST = 0.2, 1.5
 TINY = 1e-30
-# Tells the random numbers of free motion from the others of a step.
+# Separates the random numbers of free motion from the others of a step.
 FREE_MOTION = 1
 
 
 def energy_growth(
     model: Any, batch: SceneBatch, state: SimState, frames: int, stretch: int, draws: torch.Generator
 ) -> Iterator[Float[Tensor, " S"]]:
-    """Lets the motion of a batch go on freely and says by how much its energy grows.
+    """Continues the motion of a batch without forces and computes the growth of its energy.
 
-    The energy of a vibration in the template's terms is not constant from frame to frame, so the means over stretches
-    of about a period are compared. The motion goes on from ``state`` at a random size, for ``frames`` frames; gradients
-    stop at the beginning of every ``stretch``. One that explodes ends without a word: its gradients are not finite.
+    The energy of a vibration in the template's terms is not constant from frame to frame, so means over stretches of
+    about a period are compared. The motion continues from ``state``, scaled by a random factor, for ``frames`` frames;
+    loss gradients stop at the beginning of every ``stretch``. After an explosion nothing more is yielded: its loss
+    gradients are not finite.
 
     Yields:
         max(0, ln E_k / E_{k-1}) of every member, stretch by stretch from the second on; differentiable.
@@ -47,7 +48,7 @@ def energy_growth(
     for _, made in windows(model, batch, state, frames - stretch, stretch):
         now = _mean_energy(model, batch, state, made)
         if not bool(torch.isfinite(now).all()):
-            return  # exploded; nothing can be learned from it (the one number of a step that a GPU is waited for)
+            return  # exploded; loss gradients are not finite (the step's only read that blocks on a GPU)
         yield (now.clamp_min(TINY) / before.clamp_min(TINY)).log().clamp_min(0)
         before, state = now.detach(), after(made, state)
 
@@ -59,10 +60,10 @@ def _mean_energy(model: Any, batch: SceneBatch, state: SimState, made: list[Step
 
 
 class FreeMotion:
-    """The term of the loss: how often, how far and with what weight motion goes on freely.
+    """Loss term of free motion, with its probability, length and weight.
 
     Attributes:
-        weight: of the growth of energy; 0 where the model knows none.
+        weight: weight of the energy growth; 0 for a model without an energy.
     """
 
     def __init__(self, model: nn.Module, objective: Objective) -> None:
@@ -77,7 +78,7 @@ class FreeMotion:
         self._model, self._objective = model, objective
 
     def chosen(self, draws: torch.Generator) -> torch.Generator | None:
-        """Whether this batch's motion goes on to see if its energy grows: the generator of that, or None."""
+        """Draws whether this batch has the term; returns its random generator, or None."""
         if self.weight == 0 or float(torch.rand((), generator=draws)) >= self._objective.energy_probability:
             return None
         return torch.Generator().manual_seed(hash_seed(draws.initial_seed(), FREE_MOTION))
@@ -91,10 +92,10 @@ class FreeMotion:
         draws: torch.Generator,
         backward: Callable[[Tensor], None],
     ) -> Float[Tensor, ""]:
-        """Backward of the growth, each member's in units of its image loss; returns the mean growth.
+        """Backward pass of the growth, each member's in units of its image loss; returns the mean growth.
 
-        The motion goes on from ``state``; ``count`` are the sequences of the step over all ranks, and ``draws`` come
-        from :meth:`chosen`.
+        The motion continues from ``state``; ``count`` is the number of the step's sequences over all ranks, and
+        ``draws`` is the generator of :meth:`chosen`.
         """
         frames, stretch = self._objective.energy_frames, self._objective.energy_stretch
         total = losses.new_zeros(())

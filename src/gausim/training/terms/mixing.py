@@ -1,4 +1,4 @@
-"""The penalty on mode mixing: what the frames do not tell of a trained template stays as the body was."""
+"""Penalty on mode mixing: keeps a trained template near the body's modes where the frames do not determine it."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from gausim.training.terms.term import StepInputs
 
 
 class MixingTerm:
-    """The template's mixing of modes, for each sequence in units of its rest state's loss."""
+    """Penalty on the template's mixing of modes, in units of the rest state's loss of each sequence."""
 
     def __init__(self, simulator: object) -> None:
         self._simulator = simulator
 
     def descend(self, step: StepInputs) -> None:
-        """Backward of the sequences of this rank; there is none where the simulator mixes nothing."""
+        """Backward pass over this rank's sequences; does nothing for a simulator without mixing."""
         weight, mixing_of = step.objective.mixing_weight, getattr(self._simulator, "mixing", None)
         if not weight or mixing_of is None:
             return

@@ -1,4 +1,4 @@
-"""The static loss: a body at rest stays at rest, and its picture is that of frame 0 (METHOD section 4)."""
+"""Static loss: a body at rest stays at rest, and its image is frame 0 (METHOD section 4)."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from gausim.training.terms.term import StepInputs
 
 
 class RestTerm:
-    """One step from the rest state, in some batches: ||x_1 - X||^2 in diagonals, and the image loss of its picture."""
+    """Loss of one step from the rest state, in some batches: ||x_1 - X||^2 in diagonals, and the image loss."""
 
     def __init__(self, simulator: Simulator) -> None:
         self._simulator = simulator
 
     def descend(self, step: StepInputs) -> None:
-        """Backward of both, where the draw says so; a scene's static loss is one rank's."""
+        """Backward pass of both parts, in randomly drawn steps; one rank computes a scene's static loss."""
         chance = step.objective.static_chance(step.whole[0].steps)
         if float(torch.rand((), generator=step.draws)) >= chance:
             return

@@ -1,4 +1,4 @@
-"""What a term of the loss beside the rollout's own is given, and what it does with it."""
+"""Interface of a loss term that does not need the rollout, and its inputs."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from gausim.training.supervision.images import ImageSupervision
 
 @dataclass(frozen=True, eq=False)
 class StepInputs:
-    """One step of the optimiser, as its terms see it.
+    """Inputs of the loss terms in one optimiser step.
 
-    ``samples`` are this rank's sequences and ``whole`` the facts of all ranks'; ``draws`` are the random numbers of the
-    step. ``rest_loss`` is what the rest state scores on the frames of a sample, their mean: the unit of penalties.
+    ``samples`` are this rank's sequences and ``whole`` describes those of all ranks; ``draws`` generates the step's
+    random numbers. ``rest_loss`` is the mean loss of the rest state on the frames of a sample: the unit of penalties.
     """
 
     samples: Sequence[SequenceSample]
@@ -38,7 +38,7 @@ class StepInputs:
 
 @runtime_checkable
 class Term(Protocol):
-    """A term of the loss that does not need the rollout."""
+    """A loss term that does not need the rollout."""
 
     def descend(self, step: StepInputs) -> None:
-        """Backward of the term, as the mean over all sequences of the step."""
+        """Backward pass of the term, for the mean over all sequences of the step."""
