@@ -1,4 +1,4 @@
-"""The Python interface: a learned object in a few lines.
+"""The Python interface to learned objects.
 
 sim = gausim.load("outputs/demo/seed_0")
 sim.apply_force("tip", direction=(1, 0, 0), weights=3, frames=8)
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 
 class Simulation:
-    """A learned object that can be pushed, watched and drawn; made by :func:`load`.
+    """A learned object that can be pushed, simulated and rendered; made by :func:`load`.
 
     Attributes:
-        interaction: what is behind it: its state, what acts on it, its session.
-        cameras: those of the data set.
-        renderer: what draws it.
+        interaction: state of the object, forces on it, and its session.
+        cameras: cameras of the data set.
+        renderer: renderer of the object.
     """
 
     def __init__(self, interaction: Interaction, cameras: Cameras, renderer: Renderer) -> None:
@@ -45,7 +45,7 @@ class Simulation:
 
     @property
     def frame(self) -> SteppedFrame:
-        """The latest frame: positions, gradients and rotations."""
+        """The latest frame: positions, deformation gradients and rotations."""
         return self.interaction.frame
 
     @property
@@ -54,10 +54,10 @@ class Simulation:
         return self.interaction.trajectory()
 
     def step(self, n: int = 1) -> SteppedFrame:
-        """Makes ``n`` steps and returns the latest frame.
+        """Takes ``n`` steps and returns the latest frame.
 
         Raises:
-            DivergenceError: the simulation went wrong; :meth:`reset` begins again.
+            DivergenceError: a position is not finite; :meth:`reset` restarts the simulation.
         """
         for _ in range(n):
             self.interaction.step()
@@ -72,46 +72,46 @@ class Simulation:
         frames: int | None = None,
         name: str = "force",
     ) -> None:
-        """Pushes from now on.
+        """Applies a force from now on.
 
         Args:
             on: a part in words (``whole``, ``tip``, ``unit:1/7``, ``ball:X,Y,Z,R``, ``kernels:0-9``) or a selection.
             direction: ``x``, ``-z``, ... or a vector of any length.
             weights: size of the force [weights of the part].
-            frames: how long; None: until :meth:`release`.
-            name: a force of the same name takes the place of the last one.
+            frames: duration [frames]; None: until :meth:`release`.
+            name: name of the force; it replaces an earlier force of the same name.
 
         Raises:
-            ConfigError: the part has nothing that can move, or the force is too large.
+            ConfigError: the part has no free kernel, or the force is too large.
         """
         part = parse_part(on, self.interaction.scene) if isinstance(on, str) else on
         x, y, z = parse_direction(direction) if isinstance(direction, str) else direction
         self.act(Force(part, (float(x), float(y), float(z)), float(weights), frames, name))
 
     def release(self, name: str | None = None) -> None:
-        """Ends the force of a name, or all of them."""
+        """Ends the force of this name, or all forces."""
         self.act(Release(name))
 
     def act(self, event: Event) -> None:
-        """Does any event of :mod:`gausim.interaction.session`: an impulse, wind, gravity, a pin.
+        """Applies any event of :mod:`gausim.interaction.session`: an impulse, wind, gravity, a pin.
 
         Raises:
-            ConfigError: it cannot be done.
+            ConfigError: the event is invalid for this object.
         """
         self.interaction.act(event)
 
     def reset(self) -> None:
-        """Back to the initial state with nothing acting; the session goes on."""
+        """Returns to the initial state without forces; the session continues."""
         self.interaction.reset()
 
     def render(
         self, camera: str | float | Cameras | None = None, *, background: tuple[float, float, float] | None = None
     ) -> np.ndarray:
-        """Draws the latest frame, (H, W, 3) uint8.
+        """Renders the latest frame, (H, W, 3) uint8.
 
         Args:
-            camera: name of a view of the data set, the azimuth of an orbit about z [degree], or a camera (the first
-                of them is taken); the data set's first when None.
+            camera: name of a view of the data set, the azimuth of an orbit about z [degree], or cameras, of
+                which the first is used; None: the first camera of the data set.
             background: RGB in 0..1; black when None.
 
         Raises:
@@ -143,14 +143,14 @@ class Simulation:
         return self.cameras.select([0 if camera is None else names.index(camera)])
 
     def save_session(self, path: Path | str) -> None:
-        """Writes what was done so far, to be replayed with :meth:`replay` or `gausim simulate --session`."""
+        """Writes the session so far, for :meth:`replay` or `gausim simulate --session`."""
         save_session(self.interaction.session(), path)
 
     def replay(self, path: Path | str) -> Trajectory:
-        """Begins anew and does what a session says; bit for bit what was recorded.
+        """Restarts and replays a recorded session; the result is equal bit for bit.
 
         Raises:
-            DataError: the session is broken, or was made with something else.
+            DataError: the session is malformed, or was recorded with another run or scene.
         """
         return replay(self.interaction, load_session(path))
 
@@ -158,7 +158,7 @@ class Simulation:
 def load(
     run: Path | str,
     *,
-    object: str | None = None,  # noqa: A002 - what the command line calls it
+    object: str | None = None,  # noqa: A002 - its name on the command line
     sequence: str = REST,
     gravity: float | None = None,
     most_force: float | None = None,
@@ -169,16 +169,16 @@ def load(
 
     Args:
         run: directory of the run.
-        object: its name; the first one when None.
-        sequence: whose beginning is the initial state, or ``rest``.
-        gravity: acceleration that makes a weight of a mass [scene units / s^2]; 9.81 when None.
+        object: name of the object; the first one when None.
+        sequence: sequence that gives the initial state, or ``rest``.
+        gravity: acceleration that defines the unit of weight [scene units / s^2]; 9.81 when None.
         most_force: the largest force [weights]; 10 when None.
-        keep: so many of the latest frames are kept for the trajectory; None keeps all.
+        keep: number of latest frames kept for the trajectory; None keeps all.
         data: keys of the run's data configuration to replace, e.g. ``{"root": "/elsewhere"}``.
 
     Raises:
-        RunError: there is no run, or it holds another scene than it was trained on.
-        DataError: there is no such object or sequence.
+        RunError: there is no run, or its scene differs from the one it was trained on.
+        DataError: the object or sequence does not exist.
     """
     loaded = load_run(run, data=data)
     interaction = open_interaction(

@@ -1,4 +1,4 @@
-"""Types, errors and contracts that every other room builds on."""
+"""Types, errors and interfaces that all other packages of gausim use."""
 
 import importlib
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,7 @@ from gausim.core.errors import (
     SceneError,
 )
 
-# The errors alone load at once: what a command line says before it works must not wait for torch.
+# Only the errors are imported eagerly, so that the command line can report errors without loading torch.
 if TYPE_CHECKING:
     from gausim.core.camera import Cameras
     from gausim.core.fitted import FittedDynamics, FittedMethod, FittedState, TakesOver

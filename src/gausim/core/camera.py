@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gausim.core.errors import DataError
 
-# A rotation read from six-digit text is orthonormal to about 1e-5; 1e-3 still tells it from a scale or a shear.
+# A rotation read from six-digit text is orthonormal to about 1e-5; 1e-3 still distinguishes it from scale or shear.
 ROTATION_TOLERANCE = 1e-3
 
 
@@ -33,7 +33,7 @@ class Cameras:
     names: tuple[str, ...]
 
     def validated(self, source: str) -> Cameras:
-        """Returns itself, or raises :class:`DataError` naming ``source`` and the camera whose pose is none."""
+        """Returns itself, or raises :class:`DataError` naming ``source`` and the camera with an invalid pose."""
         r = self.viewmats[:, :3, :3].double()
         error = (r @ r.mT - torch.eye(3, dtype=r.dtype)).abs().amax((-1, -2))
         for i, name in enumerate(self.names):

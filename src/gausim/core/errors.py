@@ -1,4 +1,4 @@
-"""Errors a user can act on. Every message says what was expected, what was found and what to do about it."""
+"""Errors that a user can act on. Every message states the expectation, the finding and a remedy."""
 
 
 class GausSimError(Exception):
@@ -14,20 +14,20 @@ class DataError(GausSimError):
 
 
 class ConfigError(GausSimError):
-    """A configuration names something unknown or contradicts itself."""
+    """A configuration has an unknown key or value, or contradicts itself."""
 
 
 class RunError(GausSimError):
-    """A run directory or checkpoint cannot be used as asked (finished, of another scene, of another config)."""
+    """A run directory or checkpoint is unsuitable for the request (finished, another scene, another configuration)."""
 
 
 class BusyError(RunError):
-    """Another process works in the run directory, which is left to it."""
+    """Another process is writing to the run directory."""
 
 
 class DivergenceError(GausSimError):
-    """Training or simulation left the finite numbers; the message names the step and the term that broke."""
+    """Training or simulation produced NaN or infinity; the message names the step and the term."""
 
 
 class FetchError(GausSimError):
-    """A published run or data set cannot be had: unknown, out of reach, damaged, unsafe, or no room for it."""
+    """A published run or data set cannot be fetched: unknown, unreachable, damaged, unsafe, or the disk is full."""

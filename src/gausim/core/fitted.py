@@ -1,4 +1,4 @@
-"""Methods that are fitted to recorded sequences: what training, evaluation and rollouts ask of each of them."""
+"""Interface of methods that are fitted to recorded sequences, for training, evaluation and rollouts."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from gausim.core.state import SimState, Trajectory
 
 @dataclass(frozen=True, eq=False)
 class FittedState:
-    """One sequence at one frame.
+    """State of a fitted method in one frame of one sequence.
 
     Attributes:
         sequence_id: the sequence, numbered over all objects.
-        frame: its frame, 0 the first.
+        frame: index of the frame, from 0.
         positions: kernel means [scene units].
         deformation_gradients: deformation gradients of the N units that carry kernels.
-        rotations: their rotations.
-        inner: what the method carries on to the next frame beside these (anchors, particles, fields).
+        rotations: rotations of these units.
+        inner: further variables of the method that the next frame needs (anchors, particles, fields).
     """
 
     sequence_id: int
@@ -38,7 +38,7 @@ class FittedState:
     inner: tuple[Tensor, ...] = ()
 
     def detach(self) -> FittedState:
-        """The same numbers without history (gradients stop here)."""
+        """The same values, detached from the graph of loss gradients."""
         return replace(
             self,
             positions=self.positions.detach(),
@@ -50,17 +50,17 @@ class FittedState:
 
 @runtime_checkable
 class FittedMethod(Protocol):
-    """A method with parameters of its own for each sequence (an initial velocity) or object (a stiffness).
+    """A method with separate parameters for each sequence (an initial velocity) or object (a stiffness).
 
-    It is a torch module besides. It knows neither images nor losses: the engine draws its states with the renderer and
-    compares them with the videos, in the stages that ``conf/model/NAME.yaml`` lists.
+    It is also a torch module. It uses neither images nor losses: the engine renders its states and compares them with
+    the videos, in the stages that ``conf/model/NAME.yaml`` lists.
 
     Attributes:
-        name: its row in tables.
+        name: label of its row in tables.
         scenes: the rest scenes; their index is the ``scene_id`` of samples.
-        fps: frames per second of each.
+        fps: frames per second of each scene.
         scene_of_sequence: the scene of each sequence.
-        extrapolates: whether frames beyond the trained ones are foreseen; else they repeat what was fitted.
+        extrapolates: whether frames beyond the trained ones are predicted; otherwise they repeat the fitted ones.
     """
 
     name: str
@@ -70,33 +70,33 @@ class FittedMethod(Protocol):
     extrapolates: bool
 
     def notes(self) -> tuple[str, ...]:
-        """What a reader of its figures must know: one sentence each, printed under every table."""
+        """Remarks on the method, one sentence each, printed under every table."""
 
     def unit_of_kernel(self, scene_id: int) -> Int[Tensor, " K"]:
-        """The unit of every kernel of a scene, a row of the states' gradients and rotations."""
+        """The unit of every kernel: its row in the states' deformation gradients and rotations."""
 
     def begin(self, sequence_id: int) -> FittedState:
-        """Frame 0 of a sequence; gradients flow into its parameters."""
+        """Frame 0 of a sequence; loss gradients reach its parameters."""
 
     def advance(self, state: FittedState) -> FittedState:
         """The next frame."""
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
-        """All parameters by the name that stages give a learning rate to."""
+        """All parameters, by the group names to which stages assign learning rates."""
 
     def penalties(self, sequence_id: int) -> Mapping[str, Tensor]:
-        """What else a stage may weigh and minimise for a sequence (smoothness of fields), by name."""
+        """Further loss terms of a sequence that a stage may weight (smoothness of fields), by name."""
 
 
 @runtime_checkable
 class TakesOver(Protocol):
-    """A fitted method that begins with what another has found (``init_from=RUN``)."""
+    """A fitted method that can be initialised from another trained method (``init_from=RUN``)."""
 
     def take_over(self, other: object) -> None:
-        """Copies what it needs of a trained method.
+        """Copies the parameters it needs from a trained method.
 
         Raises:
-            ConfigError: ``other`` has nothing for it.
+            ConfigError: ``other`` has none of these parameters.
         """
 
 
@@ -105,32 +105,32 @@ class FittedDynamics:
     """A fitted method on one of its sequences, as :class:`gausim.core.Dynamics`."""
 
     method: FittedMethod
-    sequence_id: int  # it brings its own initial velocity
+    sequence_id: int  # it has a fitted initial velocity
 
     def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
-        """Predicts ``steps`` frames; only the positions of ``initial`` count, as frame 0.
+        """Predicts ``steps`` frames; of ``initial`` only the positions are used, as frame 0.
 
         Raises:
             ConfigError: forces are given.
-            DivergenceError: the prediction left the finite numbers; names the frame.
+            DivergenceError: a predicted position is not finite; names the frame.
         """
         if forces is not None:
             raise ConfigError(no_forces(self.method))
         return roll_out(self.stepper(initial), steps)
 
     def stepper(self, initial: SimState) -> FittedStepper:
-        """Begins at frame 0; only the positions of ``initial`` count."""
+        """Stepper at frame 0; of ``initial`` only the positions are used."""
         return FittedStepper(self.method, self.sequence_id, initial)
 
 
 class FittedStepper:
-    """A fitted method frame by frame: :class:`gausim.core.Stepper` that takes no forces."""
+    """Steps a fitted method frame by frame: a :class:`gausim.core.Stepper` without forces."""
 
     takes_forces: bool = False
     limited: int = 0
 
     def __init__(self, method: FittedMethod, sequence_id: int, initial: SimState) -> None:
-        """Begins ``method``'s sequence ``sequence_id`` at the positions of ``initial``."""
+        """Starts sequence ``sequence_id`` of ``method`` at the positions of ``initial``."""
         self._method, self._scene_id = method, method.scene_of_sequence[sequence_id]
         self._inner = method.begin(sequence_id)
         positions = initial.positions.to(self._inner.positions)
@@ -144,7 +144,7 @@ class FittedStepper:
 
         Raises:
             ConfigError: a force or held kernels are given.
-            DivergenceError: the prediction left the finite numbers; names the frame.
+            DivergenceError: a predicted position is not finite; names the frame.
         """
         if force is not None or held is not None:
             raise ConfigError(no_forces(self._method))
@@ -159,9 +159,9 @@ class FittedStepper:
         return self.frame
 
     def settle(self) -> None:
-        """Nothing: every step says at once what is wrong."""
+        """Does nothing: every step raises its errors immediately."""
 
 
 def no_forces(method: FittedMethod) -> str:
-    """Why a fitted method cannot be pushed, in words."""
+    """Error message of a fitted method that is given forces."""
     return f"{method.name}: takes no forces. Simulate without them, or with a model that does."

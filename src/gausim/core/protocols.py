@@ -1,4 +1,4 @@
-"""The contracts between rooms: what a method of dynamics offers, also frame by frame, and what a renderer offers."""
+"""Interfaces of methods of dynamics, for whole rollouts and frame by frame, and of renderers."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from torch import Tensor
 from gausim.core.state import SimState, Trajectory
 
 # Forces at a step: step number (0 = the step from frame 0 to 1) -> force per kernel [mass * scene units / s^2],
-# or None where nothing pushes.
+# or None where no force acts.
 Forces = Callable[[int], Tensor | None]
 
 
 @runtime_checkable
 class Dynamics(Protocol):
-    """A method that predicts the motion of one scene. GausSim and every baseline are this."""
+    """A method that predicts the motion of one scene. GausSim and every baseline implement it."""
 
     def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
         """Predicts ``steps`` frames after ``initial``; the result has steps + 1 frames, the initial one first."""
@@ -27,12 +27,12 @@ class Dynamics(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SteppedFrame:
-    """One frame of a scene, as a :class:`gausim.core.Trajectory` holds many.
+    """One frame of a :class:`gausim.core.Trajectory`.
 
     Attributes:
         positions: kernel means [scene units].
         deformation_gradients: accumulated deformation gradients of the N units that carry kernels.
-        rotations: their rotations.
+        rotations: rotations of these units.
     """
 
     positions: Float[Tensor, "K 3"]
@@ -42,7 +42,7 @@ class SteppedFrame:
 
 @runtime_checkable
 class Stepper(Protocol):
-    """Dynamics that go on frame by frame, so that what pushes can depend on what is seen."""
+    """Dynamics computed frame by frame, so that forces can depend on the frames before."""
 
     @property
     def state(self) -> SimState:
@@ -54,7 +54,7 @@ class Stepper(Protocol):
 
     @property
     def unit_of_kernel(self) -> Int[Tensor, " K"]:
-        """The unit of each kernel, a row of the frames' gradients and rotations."""
+        """The unit of each kernel: its row in the frames' deformation gradients and rotations."""
 
     @property
     def fps(self) -> float:
@@ -66,7 +66,7 @@ class Stepper(Protocol):
 
     @property
     def limited(self) -> int:
-        """Frames so far whose forces acted in part only, or that were cut short, to keep within what was learned."""
+        """Frames so far whose forces or motion were reduced to stay within the learned range."""
 
     def step(
         self, force: Float[Tensor, "K 3"] | None = None, *, held: Bool[Tensor, " K"] | None = None
@@ -75,27 +75,27 @@ class Stepper(Protocol):
 
         Args:
             force: per kernel [mass * scene units / s^2].
-            held: kernels that stay where they are during this step, beside those that the scene pins.
+            held: kernels that are kept in place during this step, in addition to the pinned ones.
 
         Raises:
-            ConfigError: a force or held kernels, which this method does not take.
-            DivergenceError: a position or force is not finite; some methods say so only some frames later.
+            ConfigError: a force or held kernels are given, but the method does not support them.
+            DivergenceError: a position or force is not finite; some methods raise it only some frames later.
         """
 
     def settle(self) -> None:
-        """Raises what is still unsaid: a DivergenceError if any frame so far is not finite."""
+        """Raises pending errors: a DivergenceError if any frame so far is not finite."""
 
 
 @runtime_checkable
 class Steppable(Dynamics, Protocol):
-    """Dynamics that can be stepped; their rollout makes the same steps, bit for bit."""
+    """Dynamics that can be stepped; their rollout takes the same steps, bit for bit."""
 
     def stepper(self, initial: SimState) -> Stepper:
-        """Begins at a state, whose frame has identity gradients."""
+        """Stepper at a state; its first frame has identity deformation gradients."""
 
 
 def roll_out(stepper: Stepper, steps: int, forces: Forces | None = None) -> Trajectory:
-    """Makes ``steps`` steps; the result has steps + 1 frames, the stepper's present one first."""
+    """Takes ``steps`` steps; the result has steps + 1 frames, the stepper's current one first."""
     frames = [stepper.frame]
     for number in range(steps):
         frames.append(stepper.step(forces(number) if forces is not None else None))
@@ -104,7 +104,7 @@ def roll_out(stepper: Stepper, steps: int, forces: Forces | None = None) -> Traj
 
 
 def trajectory_of(frames: Sequence[SteppedFrame], stepper: Stepper) -> Trajectory:
-    """Frames of a stepper as one trajectory."""
+    """Joins frames of a stepper to one trajectory."""
     return Trajectory(
         torch.stack([f.positions for f in frames]),
         torch.stack([f.deformation_gradients for f in frames]),
@@ -122,8 +122,8 @@ class Rendered:
         rgb: colour composited over the background, linear in the input colours, not clamped.
         alpha: accumulated opacity in [0, 1].
         depth: accumulated depth sum_i w_i z_i [scene units], where kernel i contributes w_i = alpha_i T_i to the pixel
-            and has depth z_i at its centre along the camera's axis (gsplat's mode "D"): not divided by ``alpha``, 0
-            where nothing is, without the background. None unless it was asked for.
+            and has depth z_i at its centre along the camera's axis (gsplat's mode "D"), not divided by ``alpha``,
+            without the background, 0 where no kernel contributes. None unless requested.
     """
 
     rgb: Float[Tensor, "B V H W 3"]
@@ -133,7 +133,7 @@ class Rendered:
 
 @runtime_checkable
 class Renderer(Protocol):
-    """Draws Gaussians. Differentiable in means, covars, colors, opacities and background."""
+    """Renders Gaussians. Differentiable in means, covars, colors, opacities and background."""
 
     def __call__(
         self,
@@ -148,8 +148,8 @@ class Renderer(Protocol):
         background: Float[Tensor, " 3"] | None = None,
         depth: bool = False,
     ) -> Rendered:
-        """Draws B states (of one scene, or of scenes of equal K) in V views each at ``size`` = (width, height).
+        """Renders B states (of one scene, or of scenes of equal K) in V views each at ``size`` = (width, height).
 
-        Colours are per view because they are already evaluated for its directions. No background means black.
-        ``depth`` asks for the depth as well.
+        Colours are given per view because they are evaluated for its viewing directions. Without a background it is
+        black. ``depth`` requests the depth as well.
         """

@@ -1,4 +1,4 @@
-"""The rest scene: 3D Gaussians with the masks that say what moves, what is held and what is shown."""
+"""The rest scene: 3D Gaussians with masks of simulated, pinned and foreground kernels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SH_COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
 
 @dataclass(frozen=True, eq=False)
 class GaussianScene:
-    """K Gaussians exactly as a 3DGS file stores them (raw parameters: nothing is activated or normalised).
+    """K Gaussians exactly as a 3DGS file stores them (raw parameters, neither activated nor normalised).
 
     Attributes:
         means: rest positions X [scene units].
@@ -23,11 +23,11 @@ class GaussianScene:
         quats: orientation, w x y z, any non-zero length.
         opacity_logits: opacity before the sigmoid.
         sh: spherical-harmonics colour coefficients, ((d+1)^2, RGB) per kernel, d = 0..3.
-        simulated: kernels that the dynamics may move; the others are rendered where they are.
+        simulated: kernels that the dynamics may move; the others stay in place and are rendered.
         pinned: simulated kernels that are held at their rest position (the roots).
         foreground: kernels that are compared with segmented video.
         volume_scale: c of V = prod(c s_i) (METHOD section 1), so that the mean kernel mass is of order 1.
-        name: what the scene is called in messages, tables and checkpoints.
+        name: name of the scene in messages, tables and checkpoints.
     """
 
     means: Float[Tensor, "K 3"]
@@ -57,8 +57,7 @@ class GaussianScene:
     ) -> GaussianScene:
         """Builds a scene; masks default to all simulated, none pinned, all foreground.
 
-        Without ``volume_scale`` it is chosen so that the mean kernel volume, and with unit density the mean
-        mass, is 1.
+        The default ``volume_scale`` makes the mean kernel volume, and with unit density the mean mass, 1.
         """
         count = means.shape[0]
         every = torch.ones(count, dtype=torch.bool, device=means.device)

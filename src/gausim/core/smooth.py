@@ -1,4 +1,4 @@
-"""Smooth motions of a scene: a basis in which it can be placed without any dynamics."""
+"""Smooth motions of a scene: a basis of displacements, independent of any dynamics."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class SmoothMotions:
-    """A basis of M motions of one scene, of sizes at which each costs about the same elastic energy.
+    """A basis of M motions of one scene, scaled to about equal elastic energy.
 
     Attributes:
         kernels: displacement of every kernel by each motion [scene units]; zero where pinned or never simulated.
-        gradients: displacement gradient of every unit; the last row is of what never moves.
-        unit_of_kernel: the unit of each kernel, a row of ``gradients``.
-        sizes: what the sizes are, as multiples of the template's own typical displacement.
+        displacement_gradients: one per unit; the last row belongs to kernels that never move.
+        unit_of_kernel: the unit of each kernel: its row in ``displacement_gradients``.
+        sizes: amplitudes of the motions [typical displacements of the template].
     """
 
     kernels: Float[Tensor, "K 3 M"]
-    gradients: Float[Tensor, "N 3 3 M"]
+    displacement_gradients: Float[Tensor, "N 3 3 M"]
     unit_of_kernel: Int[Tensor, " K"]
     sizes: Float[Tensor, " M"]
 
@@ -37,9 +37,9 @@ class SmoothMotions:
     def deformations(self, coordinates: Float[Tensor, "B M"]) -> Float[Tensor, "B N 3 3"]:
         """Deformation gradients of the units."""
         identity = torch.eye(3, dtype=coordinates.dtype, device=coordinates.device)
-        return identity + torch.einsum("nijm,bm->bnij", self.gradients, coordinates)
+        return identity + torch.einsum("nijm,bm->bnij", self.displacement_gradients, coordinates)
 
     def to(self, like: Tensor) -> SmoothMotions:
-        """The same in the type and on the device of ``like``."""
-        moved = (self.kernels.to(like), self.gradients.to(like), self.unit_of_kernel.to(like.device))
-        return SmoothMotions(*moved, self.sizes.to(like))
+        """The same motions with the data type and device of ``like``."""
+        kernels, gradients, sizes = (x.to(like) for x in (self.kernels, self.displacement_gradients, self.sizes))
+        return SmoothMotions(kernels, gradients, self.unit_of_kernel.to(like.device), sizes)

@@ -1,4 +1,4 @@
-"""State and trajectory: what goes into a step and what comes out of a rollout."""
+"""State and trajectory: the input of a step and the output of a rollout."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class SimState:
     previous: Float[Tensor, "K 3"]
 
     def detach(self) -> SimState:
-        """The same numbers without history (gradients stop here)."""
+        """The same values, detached from the graph of loss gradients."""
         return SimState(self.positions.detach(), self.previous.detach())
 
 
@@ -32,13 +32,14 @@ class SimState:
 class Trajectory:
     """F frames of one scene, frame 0 being the initial state.
 
-    Kernel k of frame f has mean ``positions[f, k]``, covariance G S_k G^T with G =
-    ``gradients[f, unit_of_kernel[k]]`` and its colour is looked up at Q^T d with Q the rotation of the same unit.
+    Kernel k of frame f has mean ``positions[f, k]``, covariance G S_k G^T with
+    G = ``deformation_gradients[f, unit_of_kernel[k]]``, and its colour is looked up at Q^T d with Q the rotation of the
+    same unit.
 
     Attributes:
         positions: kernel means [scene units].
         deformation_gradients: accumulated deformation gradients of the N units that carry kernels.
-        rotations: their accumulated rotations.
+        rotations: accumulated rotations of these units.
         unit_of_kernel: the unit of each kernel; pinned and never-simulated kernels point to an identity unit.
         fps: frames per second.
     """
@@ -66,7 +67,7 @@ class Trajectory:
 
 
 def initial_sway(scene: GaussianScene, fraction: float) -> SimState:
-    """The rest state, about to sway: every free kernel moves along x, farther from the roots faster.
+    """The rest state with an initial sway: every free kernel moves along x, faster when farther from the roots.
 
     Args:
         scene: with at least one pinned kernel.
