@@ -1,4 +1,4 @@
-"""How many steps a training rollout predicts, epoch by epoch."""
+"""Curriculum of training: the number of predicted steps per epoch."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ class Curriculum:
     """T grows by one every few epochs up to ``t_max`` (METHOD section 4)."""
 
     t_start: int = 1  # predicted steps in epoch 0
-    t_max: int = 15  # most predicted steps; 15 steps see frames 0..15 and no unseen one
+    t_max: int = 15  # most predicted steps; 15 steps use frames 0..15 and no unseen one
     epochs_per_increase: int = 1  # epochs between increases
-    # most predicted steps for now, at most ``t_max``; what judges a run holds frames back by it
+    # current limit of predicted steps, at most ``t_max``; the convergence test lowers it to hold frames back
     longest: int = field(default=0, init=False, repr=False)
 
     def __post_init__(self) -> None:

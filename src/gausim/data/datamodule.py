@@ -20,7 +20,7 @@ from gausim.ops.selection import Selection
 
 
 class ReadyDataModule(LightningDataModule):
-    """Streams multi-view sequences of one or several objects, their length set by the curriculum.
+    """Streams multi-view sequences of one or several objects; the curriculum sets their length.
 
     Training batches are lists of :class:`SequenceSample` (frames 0..T of the training views only).
 
@@ -44,21 +44,21 @@ class ReadyDataModule(LightningDataModule):
         names: Sequence[str] | None = None,
         sequences: int | Sequence[str] | None = None,
     ) -> None:
-        """Keeps the settings; the disk is first touched by :attr:`objects` or :meth:`setup`.
+        """Stores the settings; files are first read by :attr:`objects` or :meth:`setup`.
 
         Args:
             root: an object directory, a folder of such, or a list of either; an entry of the list may be a mapping
-                with ``root`` and its own ``scene``, ``masks`` and ``selections``.
+                with ``root`` and separate ``scene``, ``masks`` and ``selections``.
             scene: PLY of the rest scene of a single object; ``scene.ply`` in its directory when None.
             masks: npz of its masks; beside the PLY when None.
-            selections: what replaces its masks, see :func:`gausim.data.objects.select_masks`.
-            batch_size: sequences per optimiser step, divided over the ranks; a third of all, 1 to 4, when None.
+            selections: replacements of its masks, see :func:`gausim.data.objects.select_masks`.
+            batch_size: sequences per optimiser step, divided among the ranks; a third of all, 1 to 4, when None.
             repeats: how many times each sequence is shown per epoch.
-            curriculum: predicted steps per epoch; METHOD's when None.
-            seed: of the order.
-            prefetch: batches read ahead of the one that is trained on; so many more are in memory.
-            names: keep only the objects of these names.
-            sequences: keep only so many sequences per object, or those of these names.
+            curriculum: predicted steps per epoch; that of METHOD section 4 when None.
+            seed: seed of the training order.
+            prefetch: number of batches read ahead, which stay in memory.
+            names: names of the objects to use; all when None.
+            sequences: number of sequences per object to use, or their names; all when None.
         """
         super().__init__()
         self._root, self._names, self._sequences = root, names, sequences
@@ -72,8 +72,8 @@ class ReadyDataModule(LightningDataModule):
         """The objects; their index is the ``scene_id`` of samples.
 
         Raises:
-            ConfigError: a root is not set, or ``names`` asks for an object that is not there.
-            DataError: a root holds no data set.
+            ConfigError: a root is not set, or an object of ``names`` does not exist.
+            DataError: a root contains no data set.
         """
         sources = [self._root] if self._root is None or isinstance(self._root, (str, Path)) else self._root
         found = [item for source in sources for item in self._open(source)]
@@ -93,7 +93,7 @@ class ReadyDataModule(LightningDataModule):
         return SequenceIndex(self.objects)
 
     def setup(self, stage: str | None = None) -> None:
-        """Opens the objects and fixes the order of training (before a checkpoint's position is loaded)."""
+        """Opens the objects and determines the training order, before a checkpoint's position is loaded."""
         if stage in (None, "fit"):
             self._check_curriculum()
             rank, ranks = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
@@ -114,24 +114,24 @@ class ReadyDataModule(LightningDataModule):
     def train_dataloader(self) -> DataLoader:
         """Batches of training samples, read ahead by a thread.
 
-        Image files are decoded once and stay in memory, packed frames are read where they lie: no worker is needed.
+        Image files are decoded once and cached, packed frames are read directly: no worker process is needed.
         """
         return PrefetchingLoader(
             self.index, batch_sampler=self._ready_sampler(), collate_fn=collate, prefetch=self._prefetch
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Epoch and position of the order of training, for an exact resume."""
+        """Epoch and position in the training order, for an exact resume."""
         if self._sampler is None:
             return {}
         state = self._sampler.state_dict()
         if self.trainer is not None:
-            # What was trained on, not what a loader may have fetched ahead.
+            # Batches trained on, without those that the loader has read ahead.
             state["position"] = self.trainer.fit_loop.epoch_loop.batch_progress.current.ready
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Continues the order of training where a checkpoint left it."""
+        """Continues the training order at the position of a checkpoint."""
         if state_dict:
             self._ready_sampler().load_state_dict(state_dict)
 

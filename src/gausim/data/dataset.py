@@ -1,4 +1,4 @@
-"""Samples for training: stretches of one sequence from frame 0 on, as 8-bit frames with their cameras."""
+"""Samples for training: frames 0..T of one sequence in 8 bits, with their cameras."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from gausim.data.records import GroundTruth, SequenceRecord
 
 
 class SampleKey(NamedTuple):
-    """What the batch sampler asks the training dataset for."""
+    """Key by which the batch sampler requests a training sample."""
 
     sequence: int  # global sequence id
-    steps: int  # predicted steps T; frames 0..T are handed out
+    steps: int  # predicted steps T; the sample has frames 0..T
 
 
 @dataclass(frozen=True)
 class SampleFacts:
-    """What ranks tell each other of a sample."""
+    """Description of a sample, exchanged between ranks."""
 
     scene_id: int  # index of the object
     object_name: str  # its name
@@ -36,7 +36,7 @@ class SampleFacts:
 
 @dataclass(frozen=True, eq=False)
 class SequenceSample:
-    """One stretch of one sequence, from frame 0 on."""
+    """Frames 0..T of one sequence."""
 
     scene_id: int  # index of the object
     object_name: str  # its name
@@ -53,7 +53,7 @@ class SequenceSample:
 
     @property
     def facts(self) -> SampleFacts:
-        """All but the images."""
+        """Description of the sample without its images."""
         return SampleFacts(self.scene_id, self.object_name, self.sequence_id, self.sequence_name, self.steps)
 
     def to(self, device: torch.device | str) -> SequenceSample:
@@ -62,13 +62,13 @@ class SequenceSample:
 
 
 class SequenceIndex(Dataset):
-    """The sequences of several objects, numbered: 0.. over the first object, on over the next.
+    """The sequences of several objects, numbered consecutively from 0 over all objects.
 
-    As a data set for training it has nothing but frames 0..T of the training views, whatever is asked.
+    As a data set for training it returns only frames 0..T of the training views.
     """
 
     def __init__(self, objects: Sequence[ObjectData]) -> None:
-        """Lists all sequences of these objects (their transforms are read, no image is)."""
+        """Lists all sequences of these objects (reads their transforms, but no image)."""
         self.objects = list(objects)
         self.entries: list[tuple[int, SequenceRecord]] = [
             (scene_id, record) for scene_id, item in enumerate(self.objects) for record in item.sequences
@@ -82,7 +82,7 @@ class SequenceIndex(Dataset):
         """Frames 0..steps of one sequence in the training views.
 
         Raises:
-            DataError: the steps reach beyond the training frames.
+            DataError: the steps exceed the training frames.
         """
         sequence, steps = key
         item = self.objects[self.entries[sequence][0]]
@@ -114,10 +114,10 @@ class SequenceIndex(Dataset):
 
 
 def collate(samples: list[SequenceSample]) -> list[SequenceSample]:
-    """A batch is the list itself: scenes differ in kernels, views and image size, so nothing is stacked.
+    """Returns the list itself: scenes differ in kernels, views and image size and cannot be stacked.
 
     Raises:
-        ConfigError: the batch mixes lengths (all rollouts of a batch advance together).
+        ConfigError: samples of the batch differ in length (all rollouts of a batch advance together).
     """
     if len({sample.steps for sample in samples}) > 1:
         raise ConfigError(f"a batch needs one number of steps, got {[s.steps for s in samples]}.")

@@ -1,4 +1,4 @@
-"""Where the frames of a sequence come from: image files, or packed frames."""
+"""Sources of the frames of a sequence: image files or packed frames."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from gausim.data.images import read_rgba_into
 from gausim.io.packed import HEADER, is_packed, read_packed
 from gausim.io.transforms import PosedFrame, read_transforms
 
-# A camera stands still through a sequence: its poses may differ by rounding only.
+# Cameras are static during a sequence: their poses may differ by rounding only.
 POSE_TOLERANCE = 1e-5
-# What cameras write, whatever the codec: none is a frame.
+# Suffixes of films, which cannot be frames.
 FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".hevc", ".h265", ".mts")
 
 
@@ -25,8 +25,8 @@ def open_frames(root: Path, views: Sequence[str], fps: float) -> PackedSource | 
     """The frames of a sequence's folder, cameras in the order of ``views``; only headers are read.
 
     Raises:
-        DataError: a file is missing or a field is wrong, ``fps`` is another, a view or a frame is missing, or a camera
-            moves.
+        DataError: a file, view or frame is missing, a field is wrong, the file's frame rate differs from ``fps``, or a
+            camera moves.
     """
     if is_packed(root):
         return PackedSource(root, views, fps)
@@ -40,7 +40,7 @@ def open_frames(root: Path, views: Sequence[str], fps: float) -> PackedSource | 
 
 
 class PackedSource:
-    """Packed frames: every call reads what it asks for, so memory does not grow with the data set.
+    """Packed frames: every call reads only the requested frames, so memory does not grow with the data set.
 
     Attributes:
         count: number of frames.
@@ -48,7 +48,7 @@ class PackedSource:
     """
 
     def __init__(self, root: Path, views: Sequence[str], fps: float) -> None:
-        """Reads the header; no frame is read yet."""
+        """Reads the header only."""
         self._packed = packed = read_packed(root)
         if packed.fps != fps:
             raise DataError(
@@ -66,15 +66,15 @@ class PackedSource:
         return self._packed.read(frames, [self._columns[column] for column in columns])
 
     def absent(self) -> list[Path]:
-        """None: a header is read with its pixels' size."""
+        """An empty list: the header was checked against the size of the pixel file."""
         return []
 
 
 class ImageSource:
-    """Image files, with the attributes of :class:`PackedSource`: each is decoded once and kept in memory."""
+    """Image files, with the attributes of :class:`PackedSource`: each is decoded once and cached."""
 
     def __init__(self, root: Path, views: Sequence[str], fps: float) -> None:
-        """Reads ``transforms.json``; no image is decoded yet."""
+        """Reads ``transforms.json`` only."""
         self._root = root
         posed = read_transforms(root / "transforms.json")
         if posed.fps is not None and posed.fps != fps:
@@ -84,7 +84,7 @@ class ImageSource:
         _check_static(posed.path, posed.cameras, index, views)
         chosen = posed.cameras.select([row[0] for row in index])
         self.cameras = Cameras(chosen.viewmats, chosen.Ks, chosen.width, chosen.height, tuple(views))
-        # np.empty takes no memory before a frame is decoded into it.
+        # np.empty uses no physical memory before a frame is decoded into it.
         self._pixels = np.empty((self.count, len(views), chosen.height, chosen.width, 4), np.uint8)
         self._decoded = np.zeros((self.count, len(views)), bool)
 
@@ -102,14 +102,14 @@ class ImageSource:
         return torch.from_numpy(self._pixels[np.ix_(list(frames), list(columns))])
 
     def absent(self) -> list[Path]:
-        """Files of frames that are named but not there."""
+        """Image files that are named but missing."""
         return [frame.path for row in self._frames for frame in row if not frame.path.is_file()]
 
 
 def _frames_of_views(
     path: Path, frames: Sequence[PosedFrame], views: Sequence[str]
 ) -> tuple[list[list[PosedFrame]], list[list[int]]]:
-    """Entries and their indices, sorted into [view][frame]."""
+    """Entries and their indices, indexed as [view][frame]."""
     table: dict[str, dict[int, int]] = {view: {} for view in views}
     for i, frame in enumerate(frames):
         if frame.camera not in table:

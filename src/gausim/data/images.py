@@ -1,4 +1,4 @@
-"""Image files to tensors: decoding and checking RGBA frames, compositing straight alpha."""
+"""Decoding and checking of RGBA image files, and compositing of straight alpha."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch import Tensor
 from gausim.core import DataError
 from gausim.io.pixels import decode, read_header
 
-# Decoding releases the interpreter lock; more threads than this only queue for the disk.
+# Decoding releases the interpreter lock; more threads than this only wait for the disk.
 DECODER_THREADS = 4
 
 
@@ -41,10 +41,10 @@ def over_black(frames: UInt8[Tensor, "*B H W 4"]) -> tuple[Float[Tensor, "*B H W
 def read_rgba(path: Path, size: tuple[int, int], *, opaque: bool = False) -> np.ndarray:
     """Decodes one 8-bit RGBA image of ``size`` = (width, height) to (H, W, 4).
 
-    ``opaque`` makes alpha 255 everywhere, whatever the file says; RGB will do.
+    ``opaque`` sets alpha to 255 everywhere; then RGB files are accepted, too.
 
     Raises:
-        DataError: the file is missing, no image, of another size or depth, or has no alpha.
+        DataError: the file is missing, is not an image, or has another size or depth or no alpha.
     """
     if not path.is_file():
         raise DataError(f"{path}: no such image, though its transforms.json names it. Restore or re-export it.")
@@ -71,7 +71,7 @@ def read_rgba(path: Path, size: tuple[int, int], *, opaque: bool = False) -> np.
 
 
 def _film_hint(path: Path) -> str:
-    """What to do where the file is a film or a phone's photo (HEVC, MP4, MOV, HEIC), which begin alike."""
+    """Advice where the file is a film or a phone's photo (HEVC, MP4, MOV, HEIC), by its first bytes."""
     with path.open("rb") as stream:
         is_container = stream.read(12)[4:8] == b"ftyp"
     if not is_container:
@@ -85,7 +85,7 @@ def _film_hint(path: Path) -> str:
 def read_rgba_into(
     paths: Sequence[Path], targets: Sequence[np.ndarray], size: tuple[int, int], *, opaque: bool = False
 ) -> None:
-    """Decodes each path into the (H, W, 4) array of the same index, several at a time (see :func:`read_rgba`)."""
+    """Decodes each path into the (H, W, 4) array of the same index, in parallel (see :func:`read_rgba`)."""
 
     def decode(item: tuple[Path, np.ndarray]) -> None:
         item[1][...] = read_rgba(item[0], size, opaque=opaque)

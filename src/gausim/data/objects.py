@@ -1,4 +1,4 @@
-"""One object of a data set: its facts, sequences, stills, true points and rest scene, from one directory."""
+"""One object of a data set: metadata, sequences, stills, true points and rest scene in one directory."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ class ObjectData:
         train_views: cameras to train on.
         heldout_views: cameras never trained on.
         train_frames: the frames that training may see, e.g. range(0, 16).
-        facts: everything else ``dataset.json`` says.
+        facts: all other entries of ``dataset.json``.
         scene_path: the rest scene's PLY file.
-        masks_path: its masks; None means beside the PLY.
-        selections: what replaces them.
+        masks_path: its masks; None: the file beside the PLY.
+        selections: replacements of masks.
     """
 
     def __init__(
@@ -56,17 +56,17 @@ class ObjectData:
         masks: Path | str | None = None,
         selections: Mapping[str, Selection | str] | None = None,
     ) -> None:
-        """Reads ``dataset.json``; everything else is read when first asked for.
+        """Reads ``dataset.json``; all other files are read on first use.
 
         Args:
             root: the object's directory.
-            sequences: only so many sequences, or only those of these names; all when None.
+            sequences: number of sequences to use, or their names; all when None.
             scene: PLY of the rest scene; ``root/scene.ply`` when None.
             masks: npz of its masks; beside the PLY when None.
-            selections: what replaces its masks, see :func:`gausim.data.objects.select_masks`.
+            selections: replacements of its masks, see :func:`gausim.data.objects.select_masks`.
 
         Raises:
-            DataError: ``dataset.json`` is missing or a field of it is wrong.
+            DataError: ``dataset.json`` is missing or has a wrong field.
         """
         self.root = Path(root)
         path = self.root / "dataset.json"
@@ -108,7 +108,7 @@ class ObjectData:
 
     @cached_property
     def rest_points(self) -> Float[Tensor, "P 3"] | None:
-        """Rest positions of the points whose true motion is known [scene units]; None where it is not."""
+        """Rest positions of the points whose true motion is known [scene units]; None where unknown."""
         points, mesh = self.root / "rest_points.npz", self.root / "rest_mesh.npz"
         if points.is_file():
             return torch.from_numpy(read_array(points, "points")).float()
@@ -121,7 +121,7 @@ class ObjectData:
         return sequence.ground_truth(self.rest_points)
 
     def stills(self) -> Stills:
-        """Posed images of the rest state, with the split that reconstruction is measured by."""
+        """Posed images of the rest state, split into those for reconstruction and those for its evaluation."""
         return read_stills(self.root / "static" / "transforms.json")
 
     @property
@@ -131,11 +131,11 @@ class ObjectData:
         return float(value) if isinstance(value, (int, float)) and value > 0 else None
 
     def scene(self) -> GaussianScene:
-        """The rest scene with its masks and the config's selections, named after the object.
+        """The rest scene with its masks and the configured selections, named after the object.
 
         Raises:
-            DataError: there is no scene file yet.
-            SceneError: the scene is unusable or pins nothing.
+            DataError: the scene file does not exist.
+            SceneError: the scene is unusable or has no pinned kernel.
         """
         if not self.scene_path.is_file():
             raise DataError(
@@ -159,7 +159,7 @@ def find_objects(root: Path | str) -> list[Path]:
     """Object directories at ``root``: itself if it has a ``dataset.json``, else its children that have one.
 
     Raises:
-        DataError: there is none.
+        DataError: no ``dataset.json`` was found.
     """
     root = Path(root)
     if (root / "dataset.json").is_file():
@@ -181,8 +181,8 @@ def select_masks(scene: GaussianScene, selections: Mapping[str, Selection | str]
     """Replaces masks by selections, e.g. ``{"pinned": "z=0.33"}`` (below that height) or any ``Selection``.
 
     Raises:
-        ConfigError: a mask that does not exist.
-        SceneError: a selection is malformed or holds no kernel.
+        ConfigError: a mask of this name does not exist.
+        SceneError: a selection is malformed or contains no kernel.
     """
     unknown = sorted(set(selections) - set(MASK_NAMES))
     if unknown:

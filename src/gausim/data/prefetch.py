@@ -1,4 +1,4 @@
-"""Reads ahead of the training by a bounded number of batches, so that the disk works while the processor does."""
+"""Reads a bounded number of batches ahead of training, so that reading and computing overlap."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ T = TypeVar("T")
 
 
 class PrefetchingLoader(DataLoader):
-    """A loader whose next batches are read by one thread while the current one is trained on.
+    """A loader that reads the next batches in one thread while the current one is trained on.
 
-    A thread instead of a worker process, because decoded images stay in memory, where validation reads them too. Order
-    and content are those of a loader that does not read ahead.
+    A thread is used instead of a worker process because validation uses the same cache of decoded images. Order and
+    content equal those of a loader that does not read ahead.
     """
 
     def __init__(self, dataset: Dataset, *, prefetch: int, **options: Any) -> None:
-        """A ``DataLoader`` with these ``options``; ``prefetch`` batches are read ahead, 0 reads each when asked.
+        """A ``DataLoader`` with these ``options``; ``prefetch`` batches are read ahead, 0 reads each on request.
 
         Raises:
             ConfigError: ``prefetch`` is negative.
         """
         if prefetch < 0:
             raise ConfigError(f"data.prefetch: expected 0 or more batches read ahead, got {prefetch}.")
-        # The loader draws a number per epoch; from the global generator, a resumed run would draw another count.
+        # The loader draws one number per epoch; from the global generator, a resumed run would draw a different count.
         super().__init__(dataset, generator=torch.Generator(), **options)
         self.prefetch = prefetch
         self._open: Generator[Any, None, None] | None = None
 
     def __iter__(self) -> Iterator[Any]:  # type: ignore[override]
-        """The batches; what an iteration before this one was still reading ahead is given up."""
+        """The batches; an earlier iteration that still reads ahead is cancelled."""
         if self._open is not None:
             self._open.close()
         self._open = read_ahead(super().__iter__(), self.prefetch) if self.prefetch else None
@@ -44,9 +44,9 @@ class PrefetchingLoader(DataLoader):
 
 
 def read_ahead(source: Iterator[T], most: int) -> Generator[T, None, None]:
-    """The items of ``source``, ``most`` of them read before they are asked for; an error comes where it happened.
+    """The items of ``source``, up to ``most`` of them read in advance; errors are raised at the item that caused them.
 
-    Closing the generator ends the thread that reads.
+    Closing the generator ends the reading thread.
     """
     end = object()
     pool = ThreadPoolExecutor(1, thread_name_prefix="gausim-prefetch")
@@ -55,6 +55,6 @@ def read_ahead(source: Iterator[T], most: int) -> Generator[T, None, None]:
         while (item := ahead.popleft().result()) is not end:
             ahead.append(pool.submit(next, source, end))
             yield item  # type: ignore[misc]
-            del item  # not held while the next one is waited for
+            del item  # free its memory while waiting for the next one
     finally:
         pool.shutdown(cancel_futures=True)

@@ -1,4 +1,4 @@
-"""Records of a data set on disk: one sequence, its true motion, the stills. Frames are read when asked for."""
+"""Records of a data set on disk: sequences, true motion and stills. Frames are read on request."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from gausim.data.images import read_rgba_into
 from gausim.io.npz import read_npz
 from gausim.io.transforms import read_transforms
 
-# Every tenth still is left out of the reconstruction, to measure it on.
+# One still in this many is held out of the reconstruction for its evaluation.
 STILLS_PER_HELDOUT = 10
 
 
@@ -36,14 +36,14 @@ class Stills:
     images: UInt8[Tensor, "N H W 4"]  # straight-alpha RGBA
     cameras: Cameras  # one per image
     train: tuple[int, ...]  # indices to reconstruct from
-    # indices of those left out to measure the reconstruction on, every tenth unless told otherwise
+    # indices of the images held out for evaluation, by default every tenth
     heldout: tuple[int, ...]
 
 
 def read_stills(path: Path, *, every: int = STILLS_PER_HELDOUT, opaque: bool = False) -> Stills:
-    """Reads all images named by a ``transforms.json`` of the rest scene; one in ``every`` is not for training.
+    """Reads all images named by a ``transforms.json`` of the rest scene; one in ``every`` is held out of training.
 
-    ``opaque`` takes all of every image, whatever its alpha says; images without alpha will do.
+    ``opaque`` ignores alpha and uses whole images; then images without alpha are accepted, too.
 
     Raises:
         DataError: an image or pose is unusable.
@@ -70,17 +70,17 @@ class SequenceRecord:
     """
 
     def __init__(self, root: Path, *, views: Sequence[str], fps: float) -> None:
-        """Reads and checks ``transforms.json``, or ``frames.json`` of packed frames; no image is read yet.
+        """Reads and checks ``transforms.json``, or ``frames.json`` of packed frames; but no image.
 
         Raises:
-            DataError: a view of the data set or a frame of a view is not there, or a camera moves.
+            DataError: a view or a frame is missing, or a camera moves.
         """
         self.root, self.name, self.views, self.fps = root, root.name, tuple(views), fps
         self._source = open_frames(root, self.views, fps)
         self.count, self.cameras = self._source.count, self._source.cameras
 
     def camera_indices(self, views: Sequence[str] | None = None) -> list[int]:
-        """Positions of these views in :attr:`views` (all when None), or :class:`DataError`."""
+        """Indices of these views in :attr:`views` (all when None), or :class:`DataError`."""
         unknown = [v for v in views or () if v not in self.views]
         if unknown:
             raise DataError(f"{self.root}: has no view {unknown}; it has {list(self.views)}.")
@@ -101,7 +101,7 @@ class SequenceRecord:
         return self._source.read(frames, self.camera_indices(views))
 
     def absent(self) -> list[Path]:
-        """Images that ``transforms.json`` names but that are not there."""
+        """Images that ``transforms.json`` names but that are missing."""
         return self._source.absent()
 
     def ground_truth(self, rest: Float[Tensor, "P 3"] | None) -> GroundTruth | None:

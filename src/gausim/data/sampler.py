@@ -1,4 +1,4 @@
-"""The order of training: a pure function of seed and epoch, with a position that a resumed run continues from."""
+"""Training order: a pure function of seed and epoch, with a position from which a resumed run continues."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from gausim.data.dataset import SampleKey
 class SequenceBatchSampler(Sampler[list[SampleKey]]):
     """Shows every sequence ``repeats`` times per epoch, in batches without a repeated sequence where possible.
 
-    Lightning announces the epoch only to ``loader.sampler`` and ``loader.batch_sampler.sampler``; this object is its
-    own ``sampler`` so that it hears of it.
+    Lightning announces the epoch only to ``loader.sampler`` and ``loader.batch_sampler.sampler``; this object is
+    therefore also its ``sampler``.
 
-    The batches do not depend on the number of ranks: each is divided over them, place r, r + ranks, ... to rank r. All
-    ranks take equally many steps; of a last batch with fewer sequences than ranks some get none, and nothing is shown
-    twice to fill it up. The trainer needs ``use_distributed_sampler=False``.
+    The batches do not depend on the number of ranks: rank r takes the entries r, r + ranks, ... of each. All ranks take
+    equally many steps; of a last batch with fewer sequences than ranks some ranks get no sequence, and no sequence is
+    repeated to fill it. The trainer needs ``use_distributed_sampler=False``.
     """
 
     def __init__(
@@ -34,10 +34,10 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         rank: int = 0,
         world_size: int = 1,
     ) -> None:
-        """Deals ``count`` sequences into batches of ``batch_size`` over all ranks.
+        """Divides ``count`` sequences into batches of ``batch_size`` over all ranks.
 
         Raises:
-            ConfigError: a number out of range, or fewer sequences per batch than ranks.
+            ConfigError: a number is out of range, or a batch has fewer sequences than ranks.
         """
         if min(count, batch_size, repeats) < 1:
             raise ConfigError(
@@ -52,33 +52,33 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         self._curriculum, self._seed = curriculum, seed
         self._rank, self._world_size = rank, world_size
         self.epoch = 0
-        # One attribute, so that an iteration that is still read ahead cannot move the position of the next epoch.
+        # One attribute, so that a cancelled iteration cannot change the position of the next epoch.
         self._dealt = (0, 0)
 
     @property
     def position(self) -> int:
-        """Batches already dealt in the current epoch."""
+        """Batches already returned in the current epoch."""
         epoch, dealt = self._dealt
         return dealt if epoch == self.epoch else 0
 
     @property
     def sampler(self) -> SequenceBatchSampler:
-        """Itself: where Lightning looks for ``set_epoch``."""
+        """The object itself; Lightning calls its ``set_epoch``."""
         return self
 
     def set_epoch(self, epoch: int) -> None:
-        """Starts an epoch; naming the epoch that is under way (after a resume) keeps the position."""
+        """Starts an epoch; the current epoch (after a resume) keeps its position."""
         if epoch != self.epoch:
             self.epoch, self._dealt = epoch, (epoch, 0)
 
     def __len__(self) -> int:
-        """Batches of a whole epoch."""
+        """Number of batches per epoch."""
         return -(-self._count * self._repeats // self._batch_size)
 
     def order(self, epoch: int) -> list[int]:
         """Sequence ids of an epoch.
 
-        Permutations follow each other; the head of each avoids what the open batch holds already.
+        Permutations are concatenated; the head of each avoids sequences that are already in the unfinished batch.
         """
         generator = torch.Generator().manual_seed(hash_seed(self._seed, epoch))
         order: list[int] = []
@@ -89,7 +89,7 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         return order
 
     def __iter__(self) -> Iterator[list[SampleKey]]:
-        """Yields this rank's share of each batch from the current position on; it may be empty."""
+        """Yields this rank's slice of each batch from the current position on; it may be empty."""
         epoch, position, size = self.epoch, self.position, self._batch_size
         steps, order = self._curriculum.steps(epoch), self.order(epoch)
         batches = [order[i : i + size][self._rank :: self._world_size] for i in range(0, len(order), size)]
@@ -99,11 +99,11 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         self._dealt = (epoch, 0)
 
     def state_dict(self) -> dict[str, int]:
-        """Epoch and number of batches already dealt in it."""
+        """Epoch and number of batches already returned in it."""
         return {"epoch": self.epoch, "position": self.position}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Continues where ``state`` was taken."""
+        """Continues from ``state``."""
         self.epoch = int(state["epoch"])
         self._dealt = (self.epoch, int(state["position"]))
 

@@ -1,4 +1,4 @@
-"""Finds every fault of a data set on disk, instead of the first that training stumbles over."""
+"""Finds all faults of a data set on disk, not only the first that would stop a training."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gausim.io.files import sha256
 from gausim.io.packed import PIXELS, is_packed, read_packed
 from gausim.io.transforms import read_json
 
-# What the stages of data preparation write; a packed store holds nothing else than its manifest lists.
+# Manifest of the data preparation stages; a packed store contains only the files that it lists.
 MANIFEST = "stage.json"
 CLOSED = "pack"
 FRAMES_AT_A_TIME = 8
@@ -23,10 +23,10 @@ FRAMES_AT_A_TIME = 8
 
 @dataclass(frozen=True)
 class Fault:
-    """One thing that is wrong."""
+    """One fault of a data set."""
 
-    where: str  # file or folder, relative to the object where it lies in it
-    what: str  # with the remedy
+    where: str  # file or folder, relative to the object if it is inside
+    what: str  # description and remedy
 
 
 def verify(root: Path, *, quick: bool = False, scene: bool = True) -> list[Fault]:
@@ -34,7 +34,7 @@ def verify(root: Path, *, quick: bool = False, scene: bool = True) -> list[Fault
 
     Args:
         root: its directory.
-        quick: look at headers and sizes only; no image is read and nothing is hashed.
+        quick: check headers and sizes only, without reading images or computing hashes.
         scene: check ``scene.ply`` and its masks too.
     """
     faults = list(_manifest(root, quick=quick))
@@ -86,7 +86,7 @@ def _sequences(data: ObjectData, *, quick: bool) -> Iterator[Fault]:
 
 
 def _images(record: SequenceRecord, where: str) -> Iterator[Fault]:
-    """Reads every image and looks for the object; packed pixels are hashed."""
+    """Reads every image and checks that the object is visible; packed pixels are hashed."""
     if is_packed(record.root):
         packed = read_packed(record.root)
         if sha256(record.root / PIXELS) != packed.sha256:
@@ -107,7 +107,7 @@ def _images(record: SequenceRecord, where: str) -> Iterator[Fault]:
 
 
 def _manifest(root: Path, *, quick: bool) -> Iterator[Fault]:
-    """Files that a manifest lists: there, of their size and content; in a packed store no others."""
+    """Checks presence, size and content of the files of a manifest; a packed store may contain no others."""
     path = root / MANIFEST
     if not path.is_file():
         return
