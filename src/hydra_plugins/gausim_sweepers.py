@@ -1,4 +1,4 @@
-"""Hydra finds sweepers in this namespace only. Every Hydra program loads this file, so the work is in `gausim.cli`."""
+"""Sweepers for Hydra, which searches this namespace. Every Hydra program loads this file, so it imports lazily."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
 
 class GridSweeper(BasicSweeper):
-    """Hydra's grid of all combinations, whose summary tells what became of each job (`hydra/sweeper=grid`).
+    """Hydra's grid of all combinations with a summary of all jobs (`hydra/sweeper=grid`).
 
-    It goes on where it was killed, as every job leaves out a run that is finished and resumes one that is not.
+    A killed sweep can be continued: jobs skip finished runs and resume unfinished ones.
     """
 
     def __init__(self, max_batch_size: int | None = None, params: dict[str, str] | None = None) -> None:
-        """Keeps the settings, which conf/hydra/sweeper/grid.yaml explains."""
+        """Stores the settings, documented in conf/hydra/sweeper/grid.yaml."""
         super().__init__(max_batch_size, params)
 
     def _parse_config(self) -> list[str]:
@@ -30,10 +30,10 @@ class GridSweeper(BasicSweeper):
         return spelled(super()._parse_config())
 
     def sweep(self, arguments: list[str]) -> None:
-        """Trains what the overrides ask for, and tells what became of the jobs.
+        """Trains all combinations of the overrides and prints a summary of the jobs.
 
         Raises:
-            ConfigError: an override gives no value.
+            ConfigError: an override has no value.
             RunError: a job failed.
         """
         from gausim.cli.sweeps.jobs import conclude, launching, result_of
@@ -52,10 +52,10 @@ class GridSweeper(BasicSweeper):
 
 
 class OptunaSweeper(Sweeper):
-    """A search by Optuna that goes on where it was killed (`hydra/sweeper=optuna`)."""
+    """A search by Optuna that can be continued after a kill (`hydra/sweeper=optuna`)."""
 
     def __init__(self, **settings: Any) -> None:
-        """Keeps the settings, which conf/hydra/sweeper/optuna.yaml explains."""
+        """Stores the settings, documented in conf/hydra/sweeper/optuna.yaml."""
         self._settings = settings
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:

@@ -1,4 +1,4 @@
-"""Checkpoints: written so that a crash cannot spoil them, read without executing anything, tied to their scenes."""
+"""Checkpoints: written atomically, read without executing code, and checked against their scenes."""
 
 from __future__ import annotations
 
@@ -19,23 +19,22 @@ from gausim.runs.names import LAST_CHECKPOINT
 from gausim.runs.renamed import with_present_weights
 
 PREVIOUS_CHECKPOINT = "last.previous.ckpt"
-BEFORE_THE_END = "before_the_end.ckpt"  # of a run that was cut short: more time goes on from it
+BEFORE_THE_END = "before_the_end.ckpt"  # of a run stopped by its time limit: it can be continued from there
 DIGEST = "digest"
-# Raise it when a checkpoint holds something new without which a run would not resume bit for bit.
+# Increase it when a bit-exact resume needs additional content in checkpoints.
 RESUME_FORMAT = 2
 
 
 class AtomicCheckpointIO(CheckpointIO):
-    """Writes beside the target, flushes to the disk, reads back, and only then renames.
+    """Writes to a temporary file, flushes it to the disk, verifies it, and only then renames it.
 
-    Whatever fails on the way, the previous file of that name stays, and the run hears of it. ``last.ckpt`` also leaves
-    its predecessor as ``last.previous.ckpt``. Only tensors and plain containers are written: loading needs
-    ``weights_only`` and nothing more. A digest of the content goes with them, because torch reads flipped bits of a
-    tensor without complaint.
+    If a step fails, the previous file of that name stays and an error is raised. The predecessor of ``last.ckpt`` is
+    kept as ``last.previous.ckpt``. Only tensors and plain containers are written, so that ``weights_only`` suffices for
+    loading. A digest of the content is stored with them, because torch does not detect flipped bits of a tensor.
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None) -> None:
-        """Writes a checkpoint; a RunError leaves the previous file untouched."""
+        """Writes a checkpoint; after a RunError the previous file is unchanged."""
         target, buffer = Path(path), io.BytesIO()
         try:
             expected = digest(checkpoint)
@@ -55,7 +54,7 @@ class AtomicCheckpointIO(CheckpointIO):
     def load_checkpoint(
         self, path: str | Path, map_location: Any = None, weights_only: bool | None = None
     ) -> dict[str, Any]:
-        """Reads a checkpoint to the CPU; never executes what is in it."""
+        """Reads a checkpoint to the CPU without executing code from it."""
         return read_checkpoint(Path(path))
 
     def remove_checkpoint(self, path: str | Path) -> None:
@@ -66,19 +65,19 @@ class AtomicCheckpointIO(CheckpointIO):
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Reads a checkpoint that :class:`AtomicCheckpointIO` wrote, to the CPU.
 
-    Files of earlier versions hold no digest; their weights are read as they are.
+    Files of earlier versions have no digest; their weights are read unchecked.
 
     Raises:
-        RunError: it is missing, damaged or no checkpoint of gausim.
+        RunError: the file is missing, damaged or not a checkpoint of gausim.
     """
     try:
         loaded = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise RunError(f"{path}: no such checkpoint. Train first (`gausim train`).") from error
     except pickle.UnpicklingError as error:
-        # Not torch's words: they advise to load it all the same and run what is in it.
+        # torch's message is not passed on: it recommends loading the file with code execution.
         raise _damaged(path, "it is no archive of tensors and plain containers; nothing in it was executed") from error
-    except Exception as error:  # damage inside an archive surfaces as almost anything
+    except Exception as error:  # damage inside an archive can raise almost any exception
         raise _damaged(path, (str(error) or type(error).__name__).splitlines()[0]) from error
     if not isinstance(loaded, dict) or "state_dict" not in loaded or "gausim" not in loaded:
         raise RunError(f"{path}: expected a checkpoint of gausim (entries 'state_dict' and 'gausim').")
@@ -97,10 +96,10 @@ def _damaged(path: Path, reason: str) -> RunError:
 
 
 def check_resumable(path: Path) -> None:
-    """Reads a checkpoint to tell whether a run can continue from it.
+    """Reads a checkpoint to check that a run can continue from it.
 
     Raises:
-        RunError: it is damaged, or of a version that saved other things than an exact resume needs.
+        RunError: the checkpoint is damaged, or its version lacks content that an exact resume needs.
     """
     checkpoint = read_checkpoint(path)
     if DIGEST not in checkpoint or checkpoint["gausim"].get("format") != RESUME_FORMAT:
@@ -116,10 +115,10 @@ def _check_written(path: Path, expected: str) -> None:
 
 
 def digest(content: Any) -> str:
-    """SHA-256 of nested containers of tensors and plain values: bytes, types, shapes and order count.
+    """SHA-256 of nested containers of tensors and plain values: bytes, types, shapes and order enter.
 
     Raises:
-        TypeError: something else is in them, which could not be read back without executing it.
+        TypeError: an object of another type, which could not be read back without executing code.
     """
     running = hashlib.sha256()
     _feed(running, content, "checkpoint")
@@ -147,7 +146,7 @@ def _feed(running: Any, value: Any, where: str) -> None:
 
 
 def fingerprints(scenes: Sequence[GaussianScene]) -> list[dict[str, Any]]:
-    """What tells a scene from another: its name, number of kernels, pinned kernels and a hash of its means."""
+    """Fingerprints of scenes: name, number of kernels, pinned kernels and a hash of the means."""
     return [
         {
             "name": scene.name,
@@ -160,7 +159,7 @@ def fingerprints(scenes: Sequence[GaussianScene]) -> list[dict[str, Any]]:
 
 
 def check_scenes(checkpoint: dict[str, Any], scenes: Sequence[GaussianScene], source: str) -> None:
-    """Refuses a checkpoint that was trained on other scenes, naming those of both."""
+    """Raises RunError for a checkpoint that was trained on other scenes; the message names both."""
     trained, given = checkpoint["gausim"]["scenes"], fingerprints(scenes)
     if trained != given:
         raise RunError(
@@ -170,7 +169,7 @@ def check_scenes(checkpoint: dict[str, Any], scenes: Sequence[GaussianScene], so
 
 
 def tell(prints: Sequence[dict[str, Any]]) -> str:
-    """Fingerprints in words."""
+    """Text of fingerprints for messages."""
     told = (f"'{p['name']}' ({p['kernels']} kernels, {p['pinned']} pinned, means {p['means']})" for p in prints)
     return "; ".join(told)
 
@@ -179,13 +178,13 @@ class WeightAverage:
     """An exponential moving average of the parameters; off where the decay is 0."""
 
     def __init__(self, decay: float) -> None:
-        """``decay`` per optimiser step; it starts smaller so that the beginning is soon forgotten."""
+        """``decay`` per optimiser step; it starts smaller, so that initial weights are soon forgotten."""
         self._decay, self._steps = decay, 0
         self._values: dict[str, Tensor] = {}
 
     @torch.no_grad()
     def update(self, parameters: Iterable[tuple[str, nn.Parameter]]) -> None:
-        """Takes parameters by name in."""
+        """Averages in the current parameters, by name."""
         if self._decay == 0:
             return
         self._steps += 1
@@ -194,11 +193,11 @@ class WeightAverage:
             if name not in self._values:
                 self._values[name] = parameter.detach().clone()
             else:
-                # A loaded average lies on the CPU until its first update.
+                # A loaded average is on the CPU until its first update.
                 self._values[name] = self._values[name].to(parameter).lerp_(parameter.detach(), 1 - decay)
 
     def state_dict(self) -> dict[str, Any]:
-        """The averaged parameters by name (none where it is off) and the steps taken."""
+        """The averaged parameters by name (empty when off) and the number of steps."""
         return {"steps": self._steps, "values": dict(self._values)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -208,12 +207,12 @@ class WeightAverage:
 
 
 def averaged_weights(checkpoint: Mapping[str, Any]) -> dict[str, Tensor]:
-    """The weights of a checkpoint by name, the averaged ones where there are any."""
+    """The weights of a checkpoint by name; averaged weights take precedence."""
     return with_present_weights({**checkpoint["state_dict"], **checkpoint["gausim"]["average"]["values"]})
 
 
 def load_weights(module: nn.Module, checkpoint: dict[str, Any]) -> None:
-    """Loads the weights of a checkpoint into a module of the same parameters, the averaged ones where there are any."""
+    """Loads the weights of a checkpoint into a module of equal parameters; averaged weights take precedence."""
     try:
         module.load_state_dict(averaged_weights(checkpoint))
     except RuntimeError as error:

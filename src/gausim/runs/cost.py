@@ -1,4 +1,4 @@
-"""What training and a prediction cost: seconds and peak memory, measured meanwhile."""
+"""Cost of training and prediction: seconds and peak memory."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 class CostMeter:
     """Collects the costs of one method over sequences.
 
-    Memory is what CUDA allocates where the model lives there, else what the process has resident (Linux), in which
-    libraries and decoded videos outweigh any prediction. So what one prediction adds to what was there before is
-    counted too, after memory that was freed earlier has been given back and could not hide it. The first prediction
-    also builds what stays (the graph, compiled code) and is counted apart.
+    Memory is that allocated by CUDA if the model is on a GPU, otherwise the resident memory of the process (Linux),
+    most of which are libraries and decoded videos. The increase during a prediction is therefore recorded, too, after
+    freed memory has been returned to the system. The first prediction also builds persistent structures (the graph,
+    compiled code) and is recorded separately.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class CostMeter:
         self._drawing, self._images = 0.0, 0
 
     def predict(self, make: Callable[[], T], frames: int) -> T:
-        """Runs ``make``, which predicts ``frames`` frames beyond the first, and counts what it costs."""
+        """Runs ``make``, which predicts ``frames`` frames beyond the first, and records its cost."""
         cuda = torch.cuda.is_initialized()
         before = _begin(cuda)
         start = time.perf_counter()
@@ -52,7 +52,7 @@ class CostMeter:
         return result
 
     def draw(self, make: Callable[[], T], images: int) -> T:
-        """Runs ``make``, which draws ``images`` images, and counts its time."""
+        """Runs ``make``, which renders ``images`` images, and records its time."""
         start = time.perf_counter()
         result = make()
         if torch.cuda.is_initialized():
@@ -62,7 +62,7 @@ class CostMeter:
         return result
 
     def summary(self) -> dict[str, Any]:
-        """Plain data for ``metrics.json``; the first sequence warms up and counts only where it is the only one."""
+        """Plain data for ``metrics.json``; the first sequence is a warm-up, included only if it is the only one."""
         timed = self._seconds[1:] or self._seconds
         return {
             "seconds_per_frame": {"mean": statistics.fmean(timed), "std": statistics.pstdev(timed)},
@@ -82,12 +82,12 @@ class CostMeter:
 
 
 class TrainingCost:
-    """What training has cost so far, over interruptions.
+    """Cost of training so far, summed over interruptions.
 
     Attributes:
         seconds: wall time.
         cpu_seconds: processor time of this process.
-        peak_bytes: the most that CUDA had allocated or this process had resident; 0 where unknown.
+        peak_bytes: peak memory allocated by CUDA, or resident in this process; 0 where unknown.
     """
 
     def __init__(self) -> None:
@@ -95,11 +95,11 @@ class TrainingCost:
         self.begin()
 
     def begin(self) -> None:
-        """Counts from here."""
+        """Starts the measurement."""
         self._mark = time.perf_counter(), time.process_time()
 
     def state_dict(self) -> dict[str, float]:
-        """Counts up to now; plain numbers."""
+        """Cost up to now as plain numbers."""
         wall, processor = self._mark
         self.begin()
         self.seconds += self._mark[0] - wall
@@ -108,16 +108,16 @@ class TrainingCost:
         return self.summary()
 
     def load_state_dict(self, state: Mapping[str, float]) -> None:
-        """Goes on from what :meth:`state_dict` gave."""
+        """Continues from the result of :meth:`state_dict`."""
         self.seconds, self.cpu_seconds = state["seconds"], state["cpu_seconds"]
         self.peak_bytes = state["peak_bytes"]
 
     def summary(self) -> dict[str, float]:
-        """What was counted."""
+        """The recorded cost."""
         return {"seconds": self.seconds, "cpu_seconds": self.cpu_seconds, "peak_bytes": self.peak_bytes}
 
     def notes(self) -> list[str]:
-        """The same in a sentence, if anything was counted."""
+        """The recorded cost in a sentence, if any."""
         if not self.seconds:
             return []
         return [
@@ -127,7 +127,7 @@ class TrainingCost:
 
 
 def peak_bytes() -> int | None:
-    """The most that CUDA had allocated, or the process had resident, since it was last reset; None where unknown."""
+    """Peak memory allocated by CUDA, or resident in the process, since the last reset; None where unknown."""
     return torch.cuda.max_memory_allocated() if torch.cuda.is_initialized() else _resident("VmHWM")
 
 

@@ -1,4 +1,4 @@
-"""Configurations completed by the defaults of the constructors they name: a later default changes no run."""
+"""Completes configurations with the defaults of the constructors they name, so that later defaults change no run."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ OURS = "gausim."
 
 
 def with_defaults(config: Any) -> Any:
-    """A configuration in which every node that builds something of gausim states its arguments' plain defaults.
+    """A configuration in which every node that builds an object of gausim states the plain defaults of its arguments.
 
-    Null is left out: to a constructor it says as much as nothing.
+    Null defaults are left out: a missing argument means the same.
 
     Args:
         config: plain containers, interpolations resolved.
@@ -30,7 +30,7 @@ def _defaults(target: Any) -> Iterator[tuple[str, Any]]:
     try:
         parameters = inspect.signature(pkgutil.resolve_name(target)).parameters
     except (ImportError, AttributeError, TypeError, ValueError):
-        return  # what builds it says what is wrong with it
+        return  # building the node reports the error
     for name, parameter in parameters.items():
         if parameter.default not in (None, inspect.Parameter.empty) and _is_plain(parameter.default):
             yield name, _plain(parameter.default)

@@ -1,4 +1,4 @@
-"""Run directories: what a run was asked, whether it is finished, whether it may be resumed."""
+"""Run directories: configuration, progress, and whether a run is finished or can be resumed."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from gausim.runs.names import MLFLOW_ID, WANDB_ID  # isort: skip
 from gausim.runs.renamed import with_present_names
 
 LOCK, EVENTS = ".lock", "events.jsonl"
-GRANTED = "granted more"  # the event of more epochs and minutes
-FETCHED = "FETCHED"  # in a directory that `gausim fetch` made: from where
+GRANTED = "granted more"  # event: the run was granted further epochs and minutes
+FETCHED = "FETCHED"  # source of a directory made by `gausim fetch`
 DAMAGED_CHECKPOINT = "last.damaged.ckpt"
-# What may differ when a run is resumed: where it is kept, how it is shown and what computes it, not what is learned.
+# Keys that may differ when a run is resumed: paths, display and hardware, which do not change the learned weights.
 FREE_KEYS = (
     "paths", "logger", "callbacks", "sweep", "ablation", "experiment", "task_name", "doctor", "evaluate",
     "trainer.threads", "render.threads",
     "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.timeout_minutes",
     "trainer.log_every_n_steps", "trainer.progress", "overwrite",
 )  # fmt: skip
-# What `overwrite` removes; anything else in the directory is not ours.
+# Files that `overwrite` removes; gausim made no others in the directory.
 OWN_FILES = (
     CONFIG, FINISHED, FAILED, EVENTS, LAST_CHECKPOINT, PREVIOUS_CHECKPOINT, BEFORE_THE_END, DAMAGED_CHECKPOINT, EPOCHS,
     MOTION, WANDB_ID, MLFLOW_ID,
@@ -47,10 +47,10 @@ OWN_FOLDERS = ("panels", "snapshots", "tensorboard", "csv", "wandb")
 
 
 class RunDirectory:
-    """A directory that holds exactly one training run."""
+    """The directory of exactly one training run."""
 
     def __init__(self, path: Path | str) -> None:
-        """Names the directory; :meth:`prepare` makes it."""
+        """Sets the path; :meth:`prepare` makes the directory."""
         self.path = Path(path)
         self._prepared = False
 
@@ -61,17 +61,17 @@ class RunDirectory:
 
     @property
     def has_checkpoint(self) -> bool:
-        """Whether something was learned here."""
+        """Whether there is a checkpoint."""
         return any((self.path / name).is_file() for name in (LAST_CHECKPOINT, PREVIOUS_CHECKPOINT))
 
     @property
     def is_finished(self) -> bool:
-        """Whether the run came to its end."""
+        """Whether the run is complete."""
         return (self.path / FINISHED).is_file()
 
     @property
     def has_failed(self) -> bool:
-        """Whether an error ended the run, and nobody has tried again since."""
+        """Whether an error ended the run, and it was not resumed since."""
         return (self.path / FAILED).is_file()
 
     @property
@@ -80,10 +80,10 @@ class RunDirectory:
         return self.is_finished and bool(self.facts().get("pruned"))
 
     def facts(self) -> dict[str, Any]:
-        """What a finished run says about itself.
+        """Facts recorded by a finished run.
 
         Raises:
-            RunError: it is not finished, or its marker cannot be read.
+            RunError: the run is not finished, or its marker file is unreadable.
         """
         path = self.path / FINISHED
         try:
@@ -125,9 +125,9 @@ class RunDirectory:
 
     @contextmanager
     def writing(self) -> Iterator[None]:
-        """The block that trains: to others it is a BusyError, and what the disk refuses becomes a RunError."""
+        """Context of training: other processes get a BusyError, and errors of the disk become a RunError."""
         try:
-            if getattr(rank_zero_only, "rank", 0):  # the other ranks of a run belong to its first
+            if getattr(rank_zero_only, "rank", 0):  # the first rank locks for all ranks of the run
                 yield
                 return
             with sole_writer(self.path / LOCK):
@@ -143,11 +143,11 @@ class RunDirectory:
 
         Args:
             config: the resolved configuration, plain containers only.
-            overwrite: remove what an earlier run left here.
+            overwrite: remove the files of an earlier run.
 
         Raises:
-            RunError: the run here is finished (one that was cut short goes on, once more for as long), was started with
-                another configuration, or no checkpoint of it is whole.
+            RunError: the run is finished (unless it was cut short: then it gets the same epochs and minutes once more),
+                was started with another configuration, or has no intact checkpoint.
         """
         remove_leftovers(self.path)
         if overwrite:
@@ -170,13 +170,13 @@ class RunDirectory:
 
     @property
     def allowances(self) -> int:
-        """How often this run was granted its epochs and minutes: once, and once more each time it was cut short."""
+        """Number of grants of the configured epochs and minutes: one, and one more each time the run was cut short."""
         path = self.path / EVENTS
-        granted = json.dumps({"event": GRANTED})[1:-1]  # looked for as text: a kill may have torn off the last line
+        granted = json.dumps({"event": GRANTED})[1:-1]  # compared as text: a kill may have truncated the last line
         return 1 + (path.read_text().count(granted) if path.is_file() else 0)
 
     def _was_cut_short(self, config: Mapping[str, Any]) -> bool:
-        """Whether this very configuration ended here before it had learned, and can go on."""
+        """Whether a run of equal configuration was stopped here before convergence and can continue."""
         if not (self.path / BEFORE_THE_END).is_file() or changed_keys(self.config(), config):
             return False
         return bool(dict(self.facts().get("learning") or {}).get("cut_short"))
@@ -189,10 +189,10 @@ class RunDirectory:
         (self.path / FINISHED).unlink()
 
     def check_unchanged(self, config: Mapping[str, Any]) -> None:
-        """Compares the configuration of the run here with one that meets it.
+        """Compares the configuration of this run with another one.
 
         Raises:
-            RunError: they differ in a key that changes what is learned.
+            RunError: they differ in a key that affects training.
         """
         changed = changed_keys(self.config(), config) if (self.path / CONFIG).is_file() else []
         if changed:
@@ -202,33 +202,33 @@ class RunDirectory:
             )
 
     def record(self, event: str) -> None:
-        """Adds a line to the run's history: what happened, when, and in which process."""
+        """Adds an event with time and process to the run's history."""
         with (self.path / EVENTS).open("a") as file:
             file.write(json.dumps({"time": _now(), "event": event, **_who()}) + "\n")
 
     @contextmanager
     def noting_failure(self) -> Iterator[None]:
-        """The block that trains: an error that ends it is kept in ``FAILED``.
+        """Context of training: an error that ends it is written to ``FAILED``.
 
-        One before the run was prepared, as that it is finished, says nothing about the run and is not kept.
+        Errors before :meth:`prepare` succeeded, e.g. that the run is finished, are not written.
         """
         try:
             yield
         except Exception as error:
             if self._prepared and not getattr(rank_zero_only, "rank", 0):
-                with suppress(OSError):  # the disk may be what failed; the error itself matters more
+                with suppress(OSError):  # the disk may have failed; raise the original error
                     self._note(error)
             raise
 
     def _note(self, error: Exception) -> None:
-        # An error meant for people explains itself; of any other the way to it is wanted. The last line says which.
+        # Errors of gausim are self-explanatory; others get a traceback. The last line is the error itself.
         trace = "" if isinstance(error, GausSimError) else "".join(traceback.format_exception(error)) + "\n"
         head = "".join(f"{key}: {value}\n" for key, value in {"time": _now(), **_who()}.items())
         write_durably(self.path / FAILED, f"{head}\n{trace}{one_line(error)}\n".encode())
         self.record("failed")
 
     def _whole_checkpoint(self) -> Path | None:
-        """The last checkpoint, or the one before it where the last is damaged (which is then set aside)."""
+        """The last checkpoint, or the one before it if the last is damaged (which is then renamed)."""
         problems: list[str] = []
         for path in filter(Path.is_file, (self.checkpoint, self.path / PREVIOUS_CHECKPOINT)):
             try:
@@ -252,14 +252,14 @@ class RunDirectory:
         return None
 
     def awaits_evaluation(self, config: Mapping[str, Any]) -> bool:
-        """Whether this very configuration is trained to its end here, and was not evaluated since."""
+        """Whether a run of equal configuration is finished here, but not evaluated."""
         finished, measured = self.path / FINISHED, self.path / EVALUATION
         if not self.is_finished or self.was_pruned or changed_keys(self.config(), config):
             return False
         return not measured.is_file() or measured.stat().st_mtime < finished.stat().st_mtime
 
     def finish(self, facts: Mapping[str, Any]) -> None:
-        """Marks the run as finished, with a few facts about it."""
+        """Marks the run as finished and stores facts about it."""
         write_durably(self.path / FINISHED, (json.dumps(dict(facts), indent=1) + "\n").encode())
         self.record("finished")
 
@@ -285,7 +285,7 @@ def _now() -> str:
 
 
 def changed_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Dotted keys whose values differ between two configurations, those aside that a resumed run may change."""
+    """Dotted keys whose values differ between two configurations, without those that a resumed run may change."""
     return [key for key in differing_keys(old, new) if not is_free(key)]
 
 
@@ -295,7 +295,7 @@ def is_free(key: str) -> bool:
 
 
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Dotted keys whose values differ between two configurations; a key that one leaves out has its default there."""
+    """Dotted keys whose values differ between two configurations; missing keys have their defaults."""
     first, second = dict(_flatten(with_defaults(old))), dict(_flatten(with_defaults(new)))
     return [key for key in sorted({*first, *second}) if first.get(key) != second.get(key)]
 

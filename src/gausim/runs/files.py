@@ -1,4 +1,4 @@
-"""Run directories on a disk: one writer each, errors of the disk told in words."""
+"""Locks of run directories, and messages for errors of the disk."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from gausim.core import BusyError, RunError
 
 try:
     import fcntl
-except ImportError:  # not on Windows; there nothing keeps a second process out
+except ImportError:  # not on Windows; there directories are not locked
     fcntl = None  # type: ignore[assignment]
 
-# What a disk answers that will not take more: full, over quota, over a limit, write-protected, not for this user.
+# Errors on writing to a disk: full, over quota, over a limit, write-protected, no permission.
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
 
 
 @contextmanager
 def sole_writer(lock: Path, *, doing: str = "training here") -> Iterator[None]:
-    """Keeps other processes out of a directory until the block, or this process, ends, however it ends.
+    """Locks a directory for this process until the block or the process ends.
 
     Args:
-        lock: a file in it.
-        doing: what the others are told that this process does.
+        lock: the lock file in the directory.
+        doing: activity of this process, for the message to others.
 
     Raises:
-        BusyError: another process is in it.
+        BusyError: another process has locked the directory.
     """
     lock.parent.mkdir(parents=True, exist_ok=True)
     with lock.open("a+") as file:
@@ -51,7 +51,7 @@ def sole_writer(lock: Path, *, doing: str = "training here") -> Iterator[None]:
 
 
 def unwritable(error: OSError, folder: Path | None = None) -> RunError | None:
-    """An error of the disk for people: full, write-protected, or anything about ``folder``; None if it is another."""
+    """A readable error of the disk (full, write-protected) or of any file in ``folder``; None for other errors."""
     if error.errno not in DISK_ERRORS and (folder is None or str(folder) not in str(error)):
         return None
     return RunError(

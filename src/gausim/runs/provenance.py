@@ -1,4 +1,4 @@
-"""Where numbers come from: the commit of this package and hashes of the data, as stored beside every evaluation."""
+"""Provenance of results: commit of this package and hashes of the data, stored with every evaluation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gausim.data.objects import ObjectData
 from gausim.io.files import sha256
 
 PACKAGE = Path(gausim.__file__).resolve().parent
-# A store's manifest says more than the facts of the object; the first that is there counts.
+# The manifest of a store has more content than ``dataset.json``; the first existing file is used.
 MANIFESTS = ("manifest.json", "dataset.json")
 
 
@@ -26,7 +26,7 @@ def code_provenance(package: Path = PACKAGE) -> dict[str, Any]:
         differ from the commit.
     """
     facts = {"gausim": gausim.__version__, "torch": torch.__version__, "python": platform.python_version()}
-    # Installed into an environment inside somebody else's checkout, the package is not what that repository tracks.
+    # A package installed inside another project's checkout is not tracked by that repository.
     tracked = _git(package, "ls-files", "--error-unmatch", "__init__.py") is not None
     commit = _git(package, "rev-parse", "HEAD") if tracked else None
     status = _git(package, "status", "--porcelain", "--untracked-files=no", "--", ".") if commit else None
@@ -34,7 +34,7 @@ def code_provenance(package: Path = PACKAGE) -> dict[str, Any]:
 
 
 def data_provenance(data: ObjectData) -> dict[str, Any]:
-    """Names and SHA-256 of an object's rest scene, its masks and its manifest (null for what is not there)."""
+    """Names and SHA-256 of an object's rest scene, its masks and its manifest (null for missing files)."""
     manifests = [data.root / name for name in MANIFESTS]
     manifest = next((path for path in manifests if path.is_file()), manifests[-1])
     masks = data.masks_path or data.scene_path.with_suffix(".masks.npz")
@@ -48,7 +48,7 @@ def file_hash(path: Path) -> str | None:
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """What git prints, or None where there is no git, no repository or an error."""
+    """Output of git, or None without git, without a repository or on an error."""
     command = ["git", "-C", str(folder), *arguments]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)

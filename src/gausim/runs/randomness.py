@@ -1,7 +1,7 @@
-"""The state of the global random generators, as plain containers that a checkpoint can hold.
+"""State of the global random generators, as plain containers for checkpoints.
 
-gausim itself draws from private generators seeded by the run's seed and the step. A callback, a model or a library may
-draw from the global ones, and a resumed run must find them where they were.
+gausim itself draws from private generators seeded by the run's seed and the step. Callbacks, models and libraries may
+draw from the global generators, whose state a resumed run must therefore restore.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 
 
 def random_state() -> dict[str, Any]:
-    """Python's, numpy's, torch's and, where they were used, the CUDA devices' generators."""
+    """State of the generators of Python, numpy, torch and, if used, the CUDA devices."""
     version, internal, gauss = random.getstate()
     numpy: Any = np.random.get_state(legacy=False)
     cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() and torch.cuda.is_initialized() else []
@@ -33,7 +33,7 @@ def random_state() -> dict[str, Any]:
 
 
 def restore_random_state(state: dict[str, Any]) -> None:
-    """Continues with what :func:`random_state` returned; CUDA only on as many devices as then."""
+    """Restores the result of :func:`random_state`; CUDA only with the same number of devices."""
     version, internal, gauss = state["python"]
     random.setstate((version, tuple(internal), gauss))
     numpy = state["numpy"]
@@ -45,7 +45,7 @@ def restore_random_state(state: dict[str, Any]) -> None:
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """A block after which the generators stand where they stood, whatever it drew: what only shows must not change."""
+    """Restores the state of the generators after the block, so that visualisation does not affect training."""
     state = random_state()
     try:
         yield

@@ -1,4 +1,4 @@
-"""What has moved since runs were made: modules, settings of the simulator, names of weights. Kept for one version."""
+"""Renamed modules, settings and weights, so that runs of the previous version can be read. Kept for one version."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ MOVED = {
     "gausim.models.simulator": "gausim.models.step.simulator",
     "gausim.training.trainer.make_trainer": "gausim.training.trainer.TrainerSettings",
 }
-# Settings that no longer exist, by the name of what had them: of no effect on what is learned, or off unless asked for.
+# Removed settings by class, which did not affect training or were off by default.
 GONE = {
     "ImageLoss": ("crop",),
     "HierarchySettings": ("edge_bucket",),
     "make_trainer": ("overwrite",),
     "TrainerSettings": ("overwrite",),
 }
-# Constant is what no schedule means; a run that had the cosine can be evaluated, and not be gone on with.
+# No schedule now means a constant rate; a run with the cosine schedule can be evaluated, but not resumed.
 SCHEDULES = ("ConstantSchedule", "CosineSchedule")
-# The same of settings of which one value is left; a false one stands for all that are.
+# Removed settings of which one value is still supported; a false value stands for all false values.
 UNSUPPORTED: dict[str, dict[str, Any]] = {
     "Objective": {"input_noise": None},
     **dict.fromkeys(("PointSupervision", "TrackSupervision", "tracks_or_images"), {"velocity_weight": None}),
@@ -49,7 +49,7 @@ UNSUPPORTED: dict[str, dict[str, Any]] = {
 }
 IMAGES = "gausim.training.supervision.images.training_views"
 SIMULATOR = "gausim.models.step.simulator.GausSim"
-# Where the arguments of the simulator went, and the names they have there.
+# New groups of the arguments of the simulator: class, and new name by old name.
 PARTS: dict[str, tuple[str, dict[str, str]]] = {
     "hierarchy": (
         "gausim.models.settings.HierarchySettings",
@@ -79,10 +79,10 @@ PARTS: dict[str, tuple[str, dict[str, str]]] = {
         {"cuda_graph": "cuda_graph", "passive_frames": "energy_guard_frames"},
     ),
 }  # fmt: skip
-# Settings of the elastic template that are gone, and the value that is left of each.
+# Removed settings of the elastic template with the supported value of each.
 ELASTIC = "gausim.models.template.elastic.ElasticTemplate"
 SETTLED: dict[str, Any] = {"damping": "full", "inertia": "trained", "hidden": 0}
-# The material points' settings that are in groups now; what flowed is gone.
+# Settings of the material point method that are now in groups; plasticity was removed.
 _MATERIAL = ("gausim.baselines.mpm.Material", ("young_modulus", "poisson_ratio", "density"))
 _GRID = (
     "gausim.baselines.material_point.method.Discretisation", ("cells", "damping", "substeps", "courant", "filling"),
@@ -98,15 +98,15 @@ GROUPS: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
     },
     "gausim.baselines.material_point.physgaussian.PhysGaussian": {"material": _MATERIAL, "discretisation": _GRID},
 }
-# What weights of the predictor were called within the model.
+# Old prefixes of the weights of the predictor within the model.
 WEIGHTS = ("network.", "node_normaliser.", "edge_normaliser.")
 
 
 def with_present_names(config: Any) -> Any:
-    """A configuration by the present names; what never moved stays as it is.
+    """Translates a configuration to the current names.
 
     Raises:
-        IndexError, TypeError, ValueError: levels that cannot be read, or a setting that is no longer supported.
+        IndexError, TypeError, ValueError: levels are malformed, or a setting is no longer supported.
     """
     if isinstance(config, dict):
         name = str(config.get("_target_")).rsplit(".", 1)[-1]
@@ -138,7 +138,7 @@ def _present(target: Any) -> Any:
 
 
 def _settled(old: Mapping[str, Any]) -> dict[str, Any]:
-    """The elastic template's settings without those of which one value is left."""
+    """The settings of the elastic template without the removed ones."""
     for name, value in {**SETTLED, "solid": old.get("solid", 0.12), "geometric": old.get("geometric", 1.0)}.items():
         if old.get(name, value) != value or value is None:
             raise ValueError(f"template.{name} is {old.get(name)!r}, which is no longer supported: train the run again")
@@ -146,7 +146,7 @@ def _settled(old: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _grouped(old: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a method of material points in their groups."""
+    """The settings of a material point method in their groups."""
     groups = GROUPS[old["_target_"]]
     if old.get("material", "fixed_corotated") != "fixed_corotated":
         raise ValueError(f"method.material is {old['material']!r}, which is no longer supported: fit the run again")
@@ -159,7 +159,7 @@ def _grouped(old: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _in_parts(old: Mapping[str, Any]) -> dict[str, Any]:
-    """The simulator's arguments by part; what an old configuration leaves out has the default that it had."""
+    """The simulator's arguments in their groups; missing arguments get their former defaults."""
     moved = {name for _, names in PARTS.values() for name in names}
     gone = {"edge_bucket", "radii", "predicted_levels", "graph_radii", *moved}
     new = {name: value for name, value in old.items() if name not in gone}
@@ -175,7 +175,7 @@ def _in_parts(old: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_present_weights(weights: Mapping[str, Any]) -> dict[str, Any]:
-    """Weights by the names that they have now."""
+    """Translates the names of weights to the current ones."""
     old = tuple(f"model.{name}" for name in WEIGHTS)
     return {
         f"model.predictor.{name.removeprefix('model.')}" if name.startswith(old) else name: value
