@@ -1,4 +1,4 @@
-"""Archives: packed to the same bytes on every machine, and unpacked without trust in what they hold."""
+"""Archives: packed reproducibly to the byte, and unpacked without trusting their content."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from gausim.io.files import replacing
 
 _ZIP_BEGINNINGS = (b"PK\x03\x04", b"PK\x05\x06")
 _CHUNK = 1 << 20
-# A published set of 1,000 sequences of 100 frames in 10 views has as many; more is meant to fill the disk's table.
+# As many as a set of 1,000 sequences of 100 frames in 10 views; more suggests an attack on the file system.
 MOST_MEMBERS = 1_000_000
 _DAMAGE = (
     tarfile.TarError,
@@ -38,10 +38,10 @@ _DAMAGE = (
 
 
 def files_below(root: Path) -> list[Path]:
-    """All files of a folder in the order of their names; what begins with a dot is left out.
+    """All files of a folder in the order of their names, without names that begin with a dot.
 
     Raises:
-        DataError: a link or a device is among them, which an archive for others cannot carry.
+        DataError: the folder contains a link or a device, which archives do not support.
     """
     found = []
     for folder, folders, names in os.walk(root):
@@ -57,13 +57,13 @@ def files_below(root: Path) -> list[Path]:
 
 
 def pack(target: Path, files: Mapping[str, Path]) -> int:
-    """Writes files, by their names in it, into a tar archive, whole or not at all; the same files give the same bytes.
+    """Writes files under the given names into a tar archive, atomically and reproducibly.
 
-    Owners, times and permissions are left out, and nothing is compressed: images and weights hardly shrink, and the
-    bytes that a compressor writes depend on its version.
+    Owners, times and permissions are omitted. The archive is not compressed: images and weights hardly shrink, and
+    the output of a compressor depends on its version.
 
     Returns:
-        The bytes of all files together, which :func:`unpack` asks for.
+        The total size of the files [bytes], an argument of :func:`unpack`.
     """
     total = 0
     with replacing(target) as temporary, tarfile.open(temporary, "w", format=tarfile.PAX_FORMAT) as tar:
@@ -78,22 +78,21 @@ def pack(target: Path, files: Mapping[str, Path]) -> int:
 
 
 def unpack(archive: Path, folder: Path, *, most_bytes: int, advance: Callable[[int], None] | None = None) -> None:
-    """Unpacks a tar (also compressed) or zip archive into a new folder; its files and folders only, nothing else.
+    """Unpacks a tar (also compressed) or zip archive into a new folder, regular files and folders only.
 
-    Nothing in the archive decides where or how anything is written: a path that leaves the folder, a link, a device, a
-    name that is there twice, and more than ``most_bytes`` in all files are refused; then the folder is removed again.
-    ``advance`` is told the bytes that were written.
+    An archive with a path that leaves the folder, a link, a device, a duplicate name or more than ``most_bytes`` in all
+    files is refused, and the folder is removed again. ``advance`` is called with the number of bytes written.
 
     Raises:
-        FetchError: the archive holds one of these, or is damaged.
-        OSError: the disk refuses.
+        FetchError: the archive is refused or damaged.
+        OSError: writing to the disk failed.
     """
     folder.mkdir(parents=True)
     try:
         _unpack(archive, folder, most_bytes, advance)
     except BaseException as error:
         remove_tree(folder)
-        # An OSError with a number is the disk's; without one it is gzip's or bzip2's complaint.
+        # An OSError with a number is from the disk, one without from gzip or bzip2.
         if isinstance(error, _DAMAGE) or (isinstance(error, OSError) and error.errno is None):
             raise _damaged(archive, error) from error
         raise
@@ -113,7 +112,7 @@ def _unpack(archive: Path, folder: Path, most_bytes: int, advance: Callable[[int
 
 @dataclass(frozen=True)
 class _Member:
-    """What an archive says it holds; ``kind`` is ``file``, ``folder`` or what else it is."""
+    """A member that an archive declares; ``kind`` is ``file``, ``folder`` or the name of another kind."""
 
     name: str
     size: int
@@ -123,7 +122,7 @@ class _Member:
 
 def _members(archive: Path) -> Iterator[_Member]:
     with archive.open("rb") as file:
-        # By its first bytes: a tar that ends with an .npz would pass for a zip, which is known by its end.
+        # Decided by the first bytes: a zip is recognised by its end, which a tar that ends with an .npz shares.
         is_zip = file.read(4) in _ZIP_BEGINNINGS
     return _of_zip(archive) if is_zip else _of_tar(archive)
 
@@ -149,7 +148,7 @@ def _of_zip(archive: Path) -> Iterator[_Member]:
 
 
 def _place(archive: Path, member: _Member, taken: dict[str, bool]) -> PurePosixPath | None:
-    """Where a member goes below the folder; None for folders. ``taken`` says of every path whether it is a file."""
+    """Path of a member below the folder; None for folders. ``taken`` maps used paths to whether they are files."""
     name, path = member.name, PurePosixPath(member.name)
     if member.kind not in ("file", "folder"):
         raise _unsafe(archive, name, member.kind)
@@ -204,12 +203,12 @@ def _damaged(archive: Path, error: BaseException) -> FetchError:
 
 
 def only_folder(folder: Path) -> Path:
-    """The single folder in a folder, which archives usually begin with; the folder itself where there is more."""
+    """The only subfolder of a folder, as most archives have one; the folder itself if it contains more."""
     inside = list(folder.iterdir())
     return inside[0] if len(inside) == 1 and inside[0].is_dir() else folder
 
 
 def remove_tree(folder: Path) -> None:
-    """Removes a folder with all in it, if it is there."""
+    """Removes a folder with its content, if it exists."""
     with suppress(FileNotFoundError):
         shutil.rmtree(folder)

@@ -1,7 +1,7 @@
 """COLMAP sparse models, binary or text: cameras with their lenses, poses of the images, points.
 
-pycolmap does not replace this reader: of files that were cut off it reads some as if they were whole, and it allocates
-whatever a count in a file claims. Here a count is compared with the bytes that are left before anything is allocated.
+pycolmap does not replace this reader: it reads some truncated files without an error, and it allocates memory for any
+count in a file. This reader compares a count with the remaining bytes before it allocates memory.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ PARAMETERS = dict(MODELS.values())
 # Models with two focal lengths; the others have one for both axes.
 _TWO_FOCAL = ("PINHOLE", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV", "THIN_PRISM_FISHEYE")
 _PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
-# Larger numbers are damage: they would overflow float32 somewhere down the line.
+# Larger numbers indicate damage: they would overflow float32 in later computations.
 _LARGEST = 1e12
 _LARGEST_SIDE = 1 << 20
-# COLMAP writes unit quaternions with all digits; by hand some have six.
+# COLMAP writes unit quaternions with all digits; edited files may have six.
 _UNIT_TOLERANCE = 1e-2
-# What the binary format writes where a keypoint shows no point.
+# Point id of a keypoint without a point in the binary format.
 _NO_POINT = (1 << 64) - 1
 _CAMERA, _IMAGE, _POINT, _COUNT = (struct.Struct(f) for f in ("<IiQQ", "<I7dI", "<Q3d3BdQ", "<Q"))
 _KEYPOINT, _FLOAT = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")]), np.dtype("<f8")
@@ -43,12 +43,12 @@ _POINT_COLUMNS = 8
 
 @dataclass(frozen=True, eq=False)
 class ColmapCamera:
-    """One camera."""
+    """Camera of a sparse model."""
 
     model: str  # a name of :data:`PARAMETERS`
     width: int  # of its images [pixels]
     height: int  # of its images [pixels]
-    # (p,) float64, in COLMAP's order: focal lengths and centre [pixels], then the lens's coefficients
+    # (p,) float64, in COLMAP's order: focal lengths and centre [pixels], then distortion coefficients
     params: np.ndarray
 
     @property
@@ -60,10 +60,10 @@ class ColmapCamera:
 
     @property
     def distorted(self) -> bool:
-        """Whether straight lines are bent: neither a pinhole model nor one whose coefficients are all zero."""
+        """Whether the lens distorts: the model is no pinhole model and has non-zero coefficients."""
         if self.model in _PINHOLES:
             return False
-        # Fisheye models and the field-of-view model bend with coefficients of zero, too.
+        # Fisheye models and the field-of-view model distort even with zero coefficients.
         bent = "FISHEYE" in self.model or self.model == "FOV"
         return bent or bool(self.params[4 if self.model in _TWO_FOCAL else 3 :].any())
 
@@ -85,13 +85,13 @@ class ColmapCamera:
 
 @dataclass(frozen=True, eq=False)
 class ColmapImage:
-    """One registered image."""
+    """Registered image of a sparse model."""
 
     name: str  # its path within the folder of images
     camera: int  # key of the model's cameras
     viewmat: np.ndarray  # (4, 4) float64 world to camera, OpenCV axes
-    xy: np.ndarray  # (m, 2) float64 keypoints that show a point [pixels]
-    point_ids: np.ndarray  # (m,) int64 the points they show
+    xy: np.ndarray  # (m, 2) float64 keypoints with a point [pixels]
+    point_ids: np.ndarray  # (m,) int64 ids of these points
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,14 +112,14 @@ class ColmapModel:
     path: Path  # the folder it was read from
     cameras: dict[int, ColmapCamera]  # by their number
     images: tuple[ColmapImage, ...]  # in the order of their names
-    points: PointTable  # what was triangulated; an empty table where there is no file of points
+    points: PointTable  # triangulated points; empty without a file of points
 
 
 def find_colmap(folder: Path) -> Path:
     """The folder of a sparse model: ``folder`` or ``sparse/0``, ``sparse`` or ``0`` in it.
 
     Raises:
-        DataError: none of them holds one.
+        DataError: none of these folders contains a model.
     """
     for place in (folder, folder / "sparse" / "0", folder / "sparse", folder / "0"):
         if any((place / f"cameras{suffix}").is_file() for suffix in (".bin", ".txt")):
@@ -128,7 +128,7 @@ def find_colmap(folder: Path) -> Path:
 
 
 def colmap_files(folder: Path) -> dict[str, Path]:
-    """The files of the model in ``folder`` by their role: ``cameras``, ``images`` and, if it is there, ``points3D``.
+    """The files of the model in ``folder`` by their role: ``cameras``, ``images`` and optionally ``points3D``.
 
     Raises:
         DataError: a file is missing.
@@ -142,11 +142,11 @@ def colmap_files(folder: Path) -> dict[str, Path]:
 
 
 def read_colmap(folder: Path | str) -> ColmapModel:
-    """Reads the sparse model in a folder, binary where both forms are there.
+    """Reads the sparse model in a folder, in binary form if it has both forms.
 
     Raises:
-        DataError: a file is missing, cut off or malformed, a number is NaN, infinite or impossible, an id stands twice,
-            an image names no camera of the model, or a name leads out of the folder of images.
+        DataError: a file is missing, truncated or malformed, a number is NaN, infinite or out of range, an id is
+            duplicated, an image has an unknown camera, or a name leads out of the folder of images.
     """
     folder = Path(folder)
     files = colmap_files(folder)
@@ -238,13 +238,13 @@ def _check_unique(where: str, value: int | str, known: Collection[int | str]) ->
 
 
 class _Binary:
-    """A binary file that is read forward, with an error where it ends too early."""
+    """Sequential reader of a binary file, with an error at an early end."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.at, self.data = path, 0, _contents(path)
 
     def need(self, count: int, where: str) -> int:
-        """Goes on by ``count`` bytes; returns where they begin."""
+        """Advances by ``count`` bytes; returns the offset of the first."""
         left = len(self.data) - self.at
         if count > left:
             raise DataError(
@@ -267,7 +267,7 @@ class _Binary:
         return _decoded(self.data[self.need(end + 1 - self.at, where) : end], f"{where}: field 'name'")
 
     def records(self) -> Iterator[str]:
-        """What messages call each record of the file, which holds nothing after them."""
+        """Names of the records for messages; after the last one, checks that the file ends."""
         (count,) = self.take(_COUNT, f"{self.path}: number of {self.path.stem}")
         for i in range(count):
             yield f"{self.path}: {self.path.stem}[{i}]"
@@ -276,7 +276,7 @@ class _Binary:
             raise DataError(f"{self.path}: {left} bytes follow the last record. Its counts are wrong; export it again.")
 
 
-# Of each camera where it stands, its number and what it is; of each image its pose (w x y z and translation) besides.
+# Rows: place in the file, number, (of images) pose as w x y z and translation, record.
 _CameraRow = tuple[str, int, ColmapCamera]
 _ImageRow = tuple[str, int, np.ndarray, ColmapImage]
 
@@ -329,7 +329,7 @@ def _images_text(path: Path) -> Iterator[_ImageRow]:
             raise DataError(f"{where}: expected ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {len(words)} words.")
         number, camera = (_whole(where, words[i]) for i in (0, 8))
         pose, name = _numbers(where, words[1:8]), " ".join(words[9:])
-        # Its keypoints stand on the next line, which may be empty, or missing at the end of the file.
+        # Its keypoints are on the next line, which may be empty, or missing at the end of the file.
         below, keypoints = next(lines, (where, []))
         if len(keypoints) % 3:
             raise DataError(f"{below}: keypoints: expected triples X Y POINT3D_ID, got {len(keypoints)} words.")
@@ -357,7 +357,7 @@ def _points_text(path: Path) -> Iterator[tuple[np.ndarray, int]]:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str]]]:
-    """Place and words of every line that is no comment; empty ones too, they mean something in ``images.txt``."""
+    """Place and words of every line except comments; empty lines are kept, as ``images.txt`` needs them."""
     for number, raw in enumerate(_contents(path).split(b"\n"), 1):
         where = f"{path}: line {number}"
         line = _decoded(raw, where).strip()
@@ -380,7 +380,7 @@ def _decoded(raw: bytes, where: str) -> str:
 
 
 def _whole(where: str, word: str) -> int:
-    # ASCII digits only: int() also takes underscores and other alphabets' digits.
+    # ASCII digits only: int() also accepts underscores and digits of other alphabets.
     if not (word.isascii() and word.isdigit()) or len(word) > 18:
         raise DataError(f"{where}: expected a whole number, got {word!r:.40}.")
     return int(word)
@@ -394,7 +394,7 @@ def _numbers(where: str, words: list[str]) -> np.ndarray:
 
 
 def _ids(path: Path, values: np.ndarray) -> np.ndarray:
-    """Ids (n,) as int64, after checking that they are such: whole, not negative, below 2^53."""
+    """Ids (n,) as int64, after checking that they are integers in [0, 2^53)."""
     if not ((values == np.floor(values)) & (values >= 0) & (values < 1 << 53)).all():
         raise DataError(f"{path}: a point's id is no whole number from 0 to 2^53. Export the model again.")
     return values.astype(np.int64)

@@ -1,4 +1,4 @@
-"""One file from an address: continued where it broke off, never longer than it should be."""
+"""Download of one file, with resumption after interruptions and a limit of its size."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from urllib.parse import urlsplit
 import gausim
 from gausim.core.errors import FetchError
 
-ATTEMPTS, PAUSE = 5, 1.0  # connections; seconds before the second, doubled before each later one
+ATTEMPTS, PAUSE = 5, 1.0  # number of attempts; pause before the second [s], doubled before each later one
 _TIMEOUT = 30.0  # seconds without a byte
 _CHUNK = 1 << 18
 _RANGE = re.compile(r"bytes (\d+)-\d+/(\d+|\*)")
-# What goes wrong on the way, as against on our disk.
+# Errors of the connection, as opposed to the local disk.
 _BROKEN = (urllib.error.URLError, http.client.HTTPException, ConnectionError, TimeoutError, ssl.SSLError)
 
 
 def is_url(address: str) -> bool:
-    """Whether an address is of the web; anything else is a path."""
+    """Whether an address is a URL of http or https; otherwise it is a path."""
     return urlsplit(address).scheme in ("http", "https")
 
 
 def read_text(address: str, *, most_bytes: int) -> str:
-    """A short text from the web or a file.
+    """Reads a short text from the web or a file.
 
     Raises:
-        FetchError: it cannot be had, is longer, or is not UTF-8.
+        FetchError: the text is unreachable, too long, or not UTF-8.
     """
     try:
         stream, _, _ = _opened(address, 0)
@@ -50,16 +50,16 @@ def read_text(address: str, *, most_bytes: int) -> str:
 
 
 def continue_download(address: str, part: Path, *, size: int, advance: Callable[[int], None]) -> None:
-    """Brings a file to its size, from the bytes on that are there already if the server can (HTTP Range).
+    """Downloads a file, continuing from its present bytes if the server supports it (HTTP Range).
 
     Args:
         address: a URL of http or https, or a path.
-        part: the file; it stays for the next call where this one is cut short.
-        size: bytes that it is to have.
-        advance: told how many bytes there are now.
+        part: the file; after an interruption it is kept for the next call.
+        size: expected size [bytes].
+        advance: called with the number of bytes so far.
 
     Raises:
-        FetchError: the address cannot be reached or has a file of another size.
+        FetchError: the address is unreachable or has a file of another size.
     """
     tries = 0
     while (have := _length(part)) != size:
@@ -78,7 +78,7 @@ def continue_download(address: str, part: Path, *, size: int, advance: Callable[
 
 
 def _append(address: str, part: Path, have: int, size: int, advance: Callable[[int], None]) -> Exception | None:
-    """Adds what one connection brings; returns what broke it off."""
+    """Appends the bytes of one connection; returns the error that ended it, if any."""
     other = "It is another file: tell whoever keeps the registry."
     try:
         stream, start, total = _opened(address, have)
@@ -94,7 +94,7 @@ def _append(address: str, part: Path, have: int, size: int, advance: Callable[[i
     except _BROKEN as error:
         if isinstance(error, urllib.error.HTTPError):
             error.close()
-            if error.code == 416:  # it has no bytes from there on: begin anew
+            if error.code == 416:  # range not satisfiable: restart the download
                 part.unlink(missing_ok=True)
         return error
     if done > size:
@@ -104,14 +104,14 @@ def _append(address: str, part: Path, have: int, size: int, advance: Callable[[i
 
 
 def _opened(address: str, offset: int) -> tuple[BufferedIOBase, int, int | None]:
-    """A stream from ``offset`` on, or from where the server begins; where that is; the file's size if it is said."""
+    """The stream, its offset in the file (0 if the server ignores ranges), and the file's size if known."""
     if is_url(address):
         return _web(address, offset)
     try:
         stream = Path(address).open("rb")
         stream.seek(offset)
         return stream, offset, Path(address).stat().st_size
-    except OSError as error:  # of what is brought, as against of our disk
+    except OSError as error:  # an error of the source, not of the target disk
         raise urllib.error.URLError(error) from error
 
 

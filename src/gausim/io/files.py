@@ -1,4 +1,4 @@
-"""Files that survive a crash, and their hashes: what every writer and every manifest of this package uses."""
+"""Atomic writing of files, and their hashes."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _LEFTOVER = re.compile(r"\..+\.\d+\.tmp(\.\w+)?")
 def replacing(path: Path, *, previous: Path | None = None, typed: bool = False) -> Iterator[Path]:
     """A temporary file that takes the name ``path`` when the block ends without an error.
 
-    A crash at any moment leaves the old content or the new one, never a mixture: the temporary file lies in the same
-    directory, which is made, and reaches the disk before it takes the name; the directory's entry is flushed too.
+    After a crash the file has either the old or the new content: the temporary file is in the same directory (made if
+    missing) and is flushed to the disk before it is renamed; then the directory entry is flushed, too.
 
     Args:
         path: the file.
-        previous: where a file that ``path`` names already is kept; None replaces it.
-        typed: the temporary name has the same ending, for writers that go by it.
+        previous: new name of an existing file ``path``; None replaces it.
+        typed: give the temporary file the same suffix, for writers that depend on it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp{path.suffix if typed else ''}")
@@ -43,9 +43,9 @@ def replacing(path: Path, *, previous: Path | None = None, typed: bool = False) 
 def write_durably(
     path: Path, data: bytes, *, check: Callable[[Path], None] | None = None, previous: Path | None = None
 ) -> None:
-    """Writes a file so that it is there whole or as it was, see :func:`replacing`.
+    """Writes a file atomically, see :func:`replacing`.
 
-    ``check`` is called with the temporary file and raises if what was written is not good.
+    ``check`` is called with the temporary file and raises if its content is wrong.
     """
     with replacing(path, previous=previous) as temporary:
         temporary.write_bytes(data)
@@ -54,10 +54,10 @@ def write_durably(
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Writes plain data as readable JSON, whole or not at all.
+    """Writes plain data as indented JSON, atomically.
 
     Raises:
-        ValueError: a number is NaN or infinite, which JSON cannot say.
+        ValueError: a number is NaN or infinite, which JSON cannot represent.
     """
     write_durably(path, json.dumps(data, indent=1, allow_nan=False).encode() + b"\n")
 
@@ -69,9 +69,9 @@ def sha256(path: Path) -> str:
 
 
 def remove_leftovers(folder: Path, *, deep: bool = False) -> None:
-    """Removes the temporary files of processes that were killed while writing, those in folders below (``deep``) too.
+    """Removes the temporary files of processes that were killed while writing, with ``deep`` in subfolders, too.
 
-    Call it as the only writer.
+    No other process may write to the folder at the same time.
     """
     for path in folder.rglob(".*.tmp*") if deep else folder.glob(".*.tmp*"):
         if _LEFTOVER.fullmatch(path.name):
@@ -79,18 +79,18 @@ def remove_leftovers(folder: Path, *, deep: bool = False) -> None:
 
 
 def _keep(path: Path, previous: Path) -> None:
-    """Names a file ``previous`` as well, so that ``path`` is there at every moment."""
+    """Gives a file the second name ``previous``, so that ``path`` exists at every moment."""
     link = previous.with_name(f".{previous.name}.{os.getpid()}.tmp")
     link.unlink(missing_ok=True)
     try:
         os.link(path, link)
     except OSError:
-        os.replace(path, previous)  # a file system without hard links: for a moment there is `previous` only
+        os.replace(path, previous)  # a file system without hard links: for a moment only `previous` exists
         return
     try:
         os.replace(link, previous)
     finally:
-        link.unlink(missing_ok=True)  # still there if both are one file already
+        link.unlink(missing_ok=True)  # still exists if both names were already the same file
 
 
 def _sync_directory(folder: Path) -> None:

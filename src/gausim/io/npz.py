@@ -1,4 +1,4 @@
-"""Archives of numpy arrays, read without pickles: nothing in them can run, nothing is allocated that is not there."""
+"""Archives of numpy arrays, read without pickles and without trusting the declared sizes."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 
 _SUFFIX, _MAGIC = ".npy", b"\x93NUMPY"
-# Deflate packs no more than 1032 bytes into one; what claims more is damaged.
+# Highest compression ratio of deflate; a member that claims more is damaged.
 _MOST_PACKED = 1100
 
 
 def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of an npz file, or those of these names that are there, in this machine's byte order.
+    """The arrays of an npz file, optionally only existing ones of these names, in native byte order.
 
     Raises:
-        ValueError: it is missing, no npz, damaged, or holds anything but plain arrays; says why, not which file.
+        ValueError: the file is missing, damaged, not npz, or has other content than arrays; without the file name.
     """
     try:
         with path.open("rb") as file:
@@ -36,7 +36,7 @@ def read_npz(path: Path, names: Collection[str] | None = None) -> dict[str, np.n
 
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> np.ndarray:
-    """One member, after its header and its size were compared."""
+    """One member, after a check of its header against its size."""
     if info.file_size > _MOST_PACKED * (info.compress_size + 1):
         raise ValueError(f"member '{name}' claims {info.file_size} bytes, packed into {info.compress_size}")
     with archive.open(info) as member:
@@ -52,7 +52,7 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, name: str) -> np.nda
 
 
 def _header(member: Any, name: str) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and type that a member states."""
+    """Shape and type declared by a member."""
     try:
         version = np.lib.format.read_magic(member)
         read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]

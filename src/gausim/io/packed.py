@@ -1,8 +1,7 @@
 """Frames of one sequence in two files: ``frames.bin``, 8-bit pixels as they lie in memory, and ``frames.json``.
 
-A view holds only the part of the image that its foreground ever touches, all frames one after the other: a block of
-(F, h, w, 4) bytes, straight-alpha RGBA, from ``offset`` on. Outside it everything is transparent. Frames are read where
-they are needed; nothing is decoded.
+Of each view only the bounding box of its foreground over all frames is stored: a block of (F, h, w, 4) bytes,
+straight-alpha RGBA, from ``offset`` on. Pixels outside are transparent. Frames are read on request without decoding.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ from gausim.io.plain_json import checked
 from gausim.io.transforms import read_json
 
 HEADER, PIXELS = "frames.json", "frames.bin"
-# Sequences beyond these sizes are a broken file rather than a film.
+# Larger sizes indicate a damaged file.
 _Count = Annotated[int, Meta(ge=1, le=1_000_000)]
 _Side = Annotated[int, Meta(ge=1, le=1 << 16)]
 _Natural = Annotated[int, Meta(ge=0, le=1 << 62)]
@@ -55,11 +54,11 @@ class _Header(Struct):
 
 @dataclass(frozen=True)
 class Crop:
-    """The part of a view that is stored."""
+    """The stored part of a view."""
 
     left: int  # first column [pixels]
     top: int  # first row [pixels]
-    width: int  # of the part; 0 where the view never shows any foreground
+    width: int  # of the part [pixels]; 0 if the view has no foreground
     height: int  # of the part
     offset: int  # of its first byte in ``frames.bin``
 
@@ -73,7 +72,7 @@ class Crop:
 class PackedFrames:
     """A sequence's header."""
 
-    folder: Path  # where both files lie
+    folder: Path  # folder of both files
     count: int  # number of frames
     fps: float  # frames per second
     cameras: Cameras  # one per view
@@ -82,9 +81,9 @@ class PackedFrames:
     sha256: str  # of ``frames.bin``
 
     def read(self, frames: range, columns: Sequence[int]) -> UInt8[Tensor, "F V H W 4"]:
-        """Whole images of consecutive frames of these views, transparent black outside the crops.
+        """Full images of consecutive frames of these views, transparent black outside the crops.
 
-        Only the bytes asked for are read, and nothing stays in memory.
+        Only the requested bytes are read, and they are not cached.
         """
         path, (height, width) = self.folder / PIXELS, (self.cameras.height, self.cameras.width)
         images = np.zeros((len(frames), len(columns), height, width, 4), np.uint8)
@@ -101,7 +100,7 @@ class PackedFrames:
 
 
 def is_packed(folder: Path) -> bool:
-    """Whether a sequence's folder holds packed frames."""
+    """Whether a sequence's folder contains packed frames."""
     return (folder / HEADER).is_file()
 
 
@@ -109,7 +108,7 @@ def read_packed(folder: Path) -> PackedFrames:
     """Reads and checks ``frames.json`` against the size of ``frames.bin``.
 
     Raises:
-        DataError: a file is missing or a field is wrong; names both.
+        DataError: a file is missing or a field is wrong; names the file and the field.
     """
     path, pixels, remedy = folder / HEADER, folder / PIXELS, "Pack the sequence again."
     found = checked(read_json(path), _Header, str(path), remedy)
@@ -137,10 +136,10 @@ def read_packed(folder: Path) -> PackedFrames:
 def write_packed(
     folder: Path, cameras: Cameras, views: Iterable[UInt8[np.ndarray, "F H W 4"]], fps: float, *, margin: int
 ) -> None:
-    """Writes one sequence; ``frames.json``, which makes it one, comes last and whole.
+    """Writes one sequence; ``frames.json``, which completes it, is written last and atomically.
 
-    The views are the straight-alpha RGBA of each camera, asked for one by one; ``margin`` is how many transparent
-    pixels are kept around what the foreground ever touches.
+    The views are the straight-alpha RGBA of each camera, requested one by one; ``margin`` is the number of transparent
+    pixels stored around the bounding box of the foreground.
 
     Raises:
         DataError: a view has another size than its camera or another number of frames than the first.
@@ -165,7 +164,7 @@ def write_packed(
 
 
 def bounding_crop(alpha: UInt8[np.ndarray, "F H W"], margin: int, offset: int) -> Crop:
-    """The smallest box around all pixels with alpha > 0 in any of the frames, and ``margin`` pixels more."""
+    """The bounding box of all pixels with alpha > 0 in any frame, enlarged by ``margin`` pixels."""
     touched = np.asarray(np.any(alpha > 0, axis=0))
     if not touched.any():
         return Crop(0, 0, 0, 0, offset)

@@ -1,4 +1,4 @@
-"""Decodes image files by OpenCV, after a look at their size: a few bytes may claim gigabytes."""
+"""Decoding of image files by OpenCV, after a check of the declared size, which a damaged file may exaggerate."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ def decode(path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What an image file states before its pixels."""
+    """Header of an image file."""
 
     width: int  # as stored [pixels]
     height: int  # as stored [pixels]
     mode: str  # Pillow's name of the channels, e.g. ``RGBA``
-    exif: Mapping[int, Any]  # camera's facts by tag, those of the sub-directory included
+    exif: Mapping[int, Any]  # EXIF entries by tag, including those of the sub-directory
 
 
 def read_header(path: Path) -> ImageHeader | None:
-    """Reads the header of an image file, without decoding it; None where it is no image.
+    """Reads the header of an image file without decoding it; None if the file is not an image.
 
-    Nor is one of more than 178 million pixels, where Pillow takes the header for damaged.
+    None also above 178 million pixels, where Pillow considers the header damaged.
     """
     from PIL import Image
 
@@ -49,5 +49,5 @@ def read_header(path: Path) -> ImageHeader | None:
                 tags = image.getexif()
                 exif = {**tags, **tags.get_ifd(_EXIF)}
                 return ImageHeader(image.width, image.height, image.mode, exif)
-    except Exception:  # Pillow's readers raise whatever a damaged file makes them run into
+    except Exception:  # Pillow's readers raise many kinds of exceptions on damaged files
         return None

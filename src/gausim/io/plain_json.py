@@ -1,4 +1,4 @@
-"""JSON as its standard has it: no NaN, no infinity, no numbers that no machine number holds, nesting within reason."""
+"""Strict JSON: no NaN, no infinity, no numbers beyond 64 bits, limited nesting."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ T = TypeVar("T")
 
 
 def parse_json(text: str | bytes) -> Any:
-    """What a JSON text says.
+    """Parses a JSON text.
 
     Raises:
-        ValueError: it is no JSON, or holds NaN, infinity, a number beyond 64 bits or thousands of nested brackets.
+        ValueError: the text is not JSON, or has NaN, infinity, a number beyond 64 bits or thousands of nested brackets.
     """
     try:
         data = msgspec.json.decode(text)
-        msgspec.msgpack.encode(data)  # msgspec reads integers of any length, MessagePack writes those of 64 bits
+        msgspec.msgpack.encode(data)  # msgspec reads integers of any length; MessagePack refuses those beyond 64 bits
     except RecursionError:
         raise ValueError("brackets are nested too deep") from None
     except OverflowError:
@@ -28,10 +28,10 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def checked(value: Any, kind: type[T], where: str, remedy: str) -> T:
-    """Plain data as a record or another annotated ``kind``; messages begin with ``where`` and end with ``remedy``.
+    """Converts plain data to a record or another annotated ``kind``; messages start with ``where``, end in ``remedy``.
 
     Raises:
-        DataError: a value is missing, of another type or out of its range; names the field.
+        DataError: a value is missing, of another type or out of range; names the field.
     """
     try:
         return msgspec.convert(value, kind)

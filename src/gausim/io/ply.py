@@ -1,7 +1,7 @@
 """Gaussian scenes as 3DGS PLY files (INRIA layout) with a side file of masks.
 
-The PLY holds what every 3DGS viewer reads; what the dynamics needs besides (masks and the volume constant) lies in
-``<stem>.masks.npz`` next to it, so that the PLY itself stays readable everywhere.
+The PLY is a standard 3DGS file that every viewer reads; the masks and the volume constant, which only the dynamics
+needs, are in ``<stem>.masks.npz`` next to it.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from gausim.io.npz import read_npz
 MASK_SUFFIX = ".masks.npz"
 MASK_NAMES = ("simulated", "pinned", "foreground")
 
-# Names of the PLY specification and the ones that later writers use for the same types.
+# Type names of the PLY specification, and synonyms of later writers.
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
     "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _BYTE_ORDER = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
-# f_rest holds (d + 1)^2 - 1 coefficients for each of three channels.
+# f_rest has (d + 1)^2 - 1 coefficients for each of three channels.
 _REST_COUNTS = (0, 9, 24, 45)
 _POSITION, _COLOR = ("x", "y", "z"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _SHAPE = ("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3")
-# No header of a Gaussian scene comes near this; a binary file without end_header must not be read whole as text.
+# Far above any header of a Gaussian scene; a binary file without end_header must not be read whole as text.
 _HEADER_LIMIT = 1 << 16
 
 
 @dataclass(frozen=True)
 class _Header:
-    """What a PLY header declares about its vertices."""
+    """Vertex declaration of a PLY header."""
 
     encoding: str
     count: int
     dtype: np.dtype
-    offset: int  # where their data starts [bytes]
+    offset: int  # start of the vertex data [bytes]
     only_element: bool
 
 
@@ -57,12 +57,12 @@ def masks_path(path: Path | str) -> Path:
 def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str | None = None) -> GaussianScene:
     """Reads a 3DGS PLY with SH degree 0..3 in any property order, as little endian, big endian or text.
 
-    Normals and properties that 3DGS does not know are skipped; doubles are rounded to float32.
+    Normals and unknown properties are skipped; doubles are rounded to float32.
 
     Args:
         path: the PLY file.
-        masks: its masks; without it ``<stem>.masks.npz`` is used if it lies next to the PLY, and otherwise every
-            kernel is simulated and foreground and none is pinned.
+        masks: the file of masks; by default ``<stem>.masks.npz`` next to the PLY if it exists, otherwise every kernel
+            is simulated and foreground and none is pinned.
         name: name of the scene in messages and checkpoints, default the file's stem.
 
     Raises:
@@ -90,7 +90,7 @@ def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str |
 
 
 def load_points(path: Path | str) -> np.ndarray:
-    """Positions (P, 3) float32 of a PLY's vertices, whatever else they have (point clouds, meshes, scenes).
+    """Positions (P, 3) float32 of a PLY's vertices (of point clouds, meshes, scenes).
 
     Raises:
         SceneError: naming the file and the property that is missing, malformed, NaN or infinite.
@@ -157,7 +157,7 @@ def load_masks(scene: GaussianScene, path: Path | str) -> GaussianScene:
 
 
 def _rest_names(path: Path, names: tuple[str, ...]) -> list[str]:
-    """The f_rest properties in order, after checking that nothing 3DGS needs is missing."""
+    """The f_rest properties in order, after checking that all properties of 3DGS exist."""
     missing = [n for n in (*_POSITION, *_COLOR, *_SHAPE) if n not in names]
     if missing:
         raise SceneError(
@@ -178,7 +178,7 @@ def _rest_names(path: Path, names: tuple[str, ...]) -> list[str]:
 
 def _columns(path: Path, table: np.ndarray, names: list[str]) -> np.ndarray:
     """These properties of all vertices, (K, n) float32, all finite."""
-    # Overflow to infinity of a double beyond float32 is reported by the check below, not by a warning.
+    # Doubles beyond float32 overflow to infinity, which the check below reports instead of a warning.
     with np.errstate(over="ignore"):
         values = structured_to_unstructured(table[names], np.float32)
     bad = ~np.isfinite(values)
@@ -193,7 +193,7 @@ def _columns(path: Path, table: np.ndarray, names: list[str]) -> np.ndarray:
 
 
 def _read_vertices(path: Path) -> np.ndarray:
-    """The vertex table, after checking that the file holds as many bytes (or lines) as its header promises."""
+    """The vertex table, after checking the number of bytes (or lines) against the header."""
     if not path.is_file():
         raise SceneError(f"{path}: no such file. Expected a 3DGS scene or points in PLY format.")
     header = _read_header(path)
@@ -203,7 +203,7 @@ def _read_vertices(path: Path) -> np.ndarray:
         return _read_text(path, header)
     expected = header.count * header.dtype.itemsize
     actual = path.stat().st_size - header.offset
-    # Some writers end the file with a line break; a whole vertex too many means that the count is wrong.
+    # Some writers end the file with a line break; a whole extra vertex means that the count is wrong.
     too_long = header.only_element and actual >= expected + header.dtype.itemsize
     if actual < expected or too_long:
         raise SceneError(

@@ -1,4 +1,4 @@
-"""A motion as numbered PLY files, name_0001.ply, name_0002.ply, ...: what SuperSplat's timeline plays."""
+"""A motion as numbered PLY files, name_0001.ply, name_0002.ply, ..., the format of SuperSplat's timeline."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def save_ply_sequence(folder: Path | str, name: str, frames: Iterable[GaussianSc
     """Writes one PLY per frame, NAME_0001.ply first, with NAME.masks.npz (of the first) and NAME.json (fps) beside.
 
     Raises:
-        DataError: there are frames of this name already, or none to write.
+        DataError: files of this name exist already, or there are no frames to write.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -39,13 +39,13 @@ def save_ply_sequence(folder: Path | str, name: str, frames: Iterable[GaussianSc
 
 
 def load_ply_sequence(folder: Path | str, *, fps: float | None = None) -> tuple[Iterator[GaussianScene], int, float]:
-    """Reads numbered PLY files, one at a time as they are asked for.
+    """Reads numbered PLY files one at a time, on request.
 
     Returns:
-        The scenes in the order of their numbers, how many there are, and frames per second (``fps`` or NAME.json).
+        The scenes in the order of their numbers, their count, and frames per second (``fps`` or NAME.json).
 
     Raises:
-        DataError: there are no such files, those of several sequences, a number is missing, or the frame rate is
+        DataError: there are no such files or files of several sequences, a number is missing, or the frame rate is
             unknown or wrong.
         SceneError: (while reading) a file is unusable, or has another number of Gaussians than the first.
     """

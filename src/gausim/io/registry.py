@@ -1,6 +1,6 @@
-"""Registries: TOML files that say where published runs and data sets lie, and by what hash they are known.
+"""Registries: TOML files with the addresses and hashes of published runs and data sets.
 
-docs/reference/files.md shows one.
+docs/reference/files.md has an example.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gausim.io.download import is_url, read_text
 SCHEMA = "gausim.registry/1"
 SHIPPED = Path(__file__).with_name("registry.toml")
 MOST_BYTES = 1 << 20
-# Names become those of files and folders.
+# Names are also used for files and folders.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _FILE = r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}"
 _Bytes = Annotated[int, Meta(gt=0)]
@@ -34,22 +34,22 @@ _Address = Annotated[str, Meta(min_length=1)]
 class Entry(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One published archive."""
 
-    name: str  # how it is asked for
+    name: str  # name on the command line
     kind: Annotated[str, Meta(pattern=r"^(run|data)\Z")]  # ``run`` or ``data``
-    title: _Line  # what it is, in one line
+    title: _Line  # description in one line
     file: Annotated[str, Meta(pattern=rf"^{_FILE}\Z")]  # name of the archive
-    addresses: tuple[_Address, ...] = ()  # where it lies, in the order to try: URLs or paths
+    addresses: tuple[_Address, ...] = ()  # URLs or paths, in the order to try
     sha256: Annotated[str, Meta(pattern=r"^[0-9a-f]{64}\Z")]  # of the archive, in hexadecimal
     size: _Bytes  # of the archive [bytes]
     unpacked: _Bytes  # of all files in it [bytes]
-    licence: _Line  # an SPDX identifier, or words
+    licence: _Line  # an SPDX identifier or free text
     card: str = ""  # URL or path of its card; empty without one
-    data: str = ""  # of a run, the entry of its data set; empty where none is named
+    data: str = ""  # of a run, the entry of its data set, or empty
 
 
 @dataclass(frozen=True)
 class Registry:
-    """What a registry lists."""
+    """Content of a registry."""
 
     source: str  # its file or URL
     entries: dict[str, Entry]  # by name, in the file's order
@@ -58,7 +58,7 @@ class Registry:
         """The entry of a name.
 
         Raises:
-            FetchError: there is none; the nearest name is told.
+            FetchError: there is no such entry; the message suggests the nearest name.
         """
         if name in self.entries:
             return self.entries[name]
@@ -69,10 +69,10 @@ class Registry:
 
 
 def read_registry(source: str | Path = SHIPPED) -> Registry:
-    """Reads a registry from a path or a URL of http or https; relative addresses in it start where it lies.
+    """Reads a registry from a path or a URL of http or https; relative addresses start at its location.
 
     Raises:
-        FetchError: it cannot be had, or a field is missing or wrong.
+        FetchError: the registry is unreachable, or a field is missing or wrong.
     """
     source = str(source)
     text = read_text(source, most_bytes=MOST_BYTES)
@@ -103,7 +103,7 @@ def _entry(source: str, name: str, fields: Any) -> Entry:
 
 
 def _absolute(where: str, address: str, source: str) -> str:
-    """An address as seen from where the registry lies; a registry of the web can name nothing on this machine."""
+    """An address, made absolute by the registry's location; registries on the web cannot refer to local files."""
     if is_url(source):
         address = urljoin(source, address)
     elif not is_url(address) and "://" not in address:
@@ -114,7 +114,7 @@ def _absolute(where: str, address: str, source: str) -> str:
 
 
 def mirrored(entry: Entry, mirror: str) -> str:
-    """Where a mirror, a folder or the URL of one, has the archive of an entry.
+    """Address of the archive of an entry on a mirror, which is a folder or the URL of one.
 
     Raises:
         FetchError: the mirror is neither a folder nor a URL of http or https.
@@ -128,18 +128,18 @@ def mirrored(entry: Entry, mirror: str) -> str:
 
 
 def check_name(name: str) -> None:
-    """Refuses what no registry may call an entry.
+    """Checks the name of an entry.
 
     Raises:
-        FetchError: naming it.
+        FetchError: the name is invalid.
     """
     if not _NAME.fullmatch(name):
         raise FetchError(f"--name {name}: expected up to 64 letters, digits, '-' and '_', a letter or digit first.")
 
 
 def entry_text(entry: Entry) -> str:
-    """An entry as it stands in a registry."""
+    """TOML text of an entry."""
     fields = {key: value for key, value in msgspec.structs.asdict(entry).items() if value != "" or key == "card"}
-    # JSON's texts, numbers and lists of texts are TOML's too.
+    # JSON's strings, numbers and lists of strings are valid TOML.
     lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in fields.items() if key != "name"]
     return "\n".join([f"[entry.{entry.name}]", *lines, ""])

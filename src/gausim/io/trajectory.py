@@ -1,4 +1,4 @@
-"""Trajectories as safetensors: every number comes back bit for bit, and nothing in the file can run."""
+"""Trajectories as safetensors files: bit-exact, and without executable content."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gausim.core import DataError, Trajectory
 from gausim.io.files import write_durably
 
 FORMAT = "gausim.trajectory/1"
-# Names in the file, and those of Trajectory.
+# Names in the file, which users have on disk, and those of Trajectory.
 _TENSORS = {"positions": "positions", "gradients": "deformation_gradients", "rotations": "rotations",
             "unit_of_kernel": "unit_of_kernel"}  # fmt: skip
 

@@ -17,12 +17,12 @@ from gausim.core import Cameras, DataError
 from gausim.io.pixels import read_header
 from gausim.io.plain_json import parse_json
 
-# Camera models without distortion, or whose distortion is checked to be zero.
+# Camera models without distortion, or with distortion that is checked to be zero.
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _LONGEST_NAME = 255
 _Row = tuple[float, float, float, float]
-# OpenGL looks along -z with y up, OpenCV along +z with y down.
+# OpenGL cameras look along -z with y up, OpenCV cameras along +z with y down.
 OPENGL_TO_OPENCV = (1.0, -1.0, -1.0, 1.0)
 
 
@@ -31,30 +31,30 @@ class PosedFrame:
     """One entry of ``frames``."""
 
     path: Path  # image file
-    camera: str  # name of the camera; the image's folder where the entry names none
+    camera: str  # name of the camera; by default the image's folder
     frame: int | None  # frame number within its sequence; None for a still
-    heldout: bool  # the entry is marked as never to be trained on
+    heldout: bool  # whether the entry is excluded from training
 
 
 @dataclass(frozen=True, eq=False)
 class PosedImages:
-    """A whole ``transforms.json``."""
+    """Content of a ``transforms.json``."""
 
     path: Path  # the file it was read from
     frames: tuple[PosedFrame, ...]  # its N entries
     cameras: Cameras  # their N cameras, in the same order
-    fps: float | None  # frames per second, where the file says so
+    fps: float | None  # frames per second, if stated
 
 
 def read_transforms(path: Path) -> PosedImages:
     """Reads a ``transforms.json`` of undistorted pinhole images of one size.
 
     Intrinsics may be global or per frame, as ``fl_x`` (``fl_y``, ``cx``, ``cy``) or ``camera_angle_x`` [radian];
-    without ``w`` and ``h`` the first image's size counts (Blender's own layout).
+    without ``w`` and ``h`` the size of the first image is used (Blender's layout).
 
     Raises:
-        DataError: the file is missing or no JSON, a field is missing, malformed or of another size, the lens is
-            distorted, or a pose is not a rotation plus a translation.
+        DataError: the file is missing or not JSON, a field is missing, malformed or of another size, the lens distorts,
+            or a pose is not a rotation plus a translation.
     """
     data = read_json(path)
     entries = data.get("frames")
@@ -81,7 +81,7 @@ def read_transforms(path: Path) -> PosedImages:
 def write_transforms(path: Path, cameras: Cameras, entries: list[dict[str, Any]], *, fps: float | None = None) -> None:
     """Writes entries (``file_path`` and further keys) with the pose of the camera of the same index.
 
-    One K of all cameras becomes the file's global intrinsics; otherwise every entry carries its own.
+    Intrinsics are written globally if all cameras have equal K, otherwise per entry.
     """
     if len(entries) != len(cameras.names):
         raise DataError(f"{path}: expected one camera per entry, got {len(entries)} for {len(cameras.names)}.")
@@ -133,15 +133,15 @@ def positive_field(fields: dict[str, Any], key: str, where: str) -> float:
 
 
 def image_name(entry: dict[str, Any], field: str) -> str:
-    """The image that an entry names, with its extension (Blender's own files leave it out).
+    """File name of an entry's image, with its extension (Blender omits it).
 
     Raises:
-        DataError: it names none, or what no file can be called.
+        DataError: the entry has no file name or an invalid one.
     """
     name = entry.get("file_path")
     if not isinstance(name, str) or not name:
         raise DataError(f"{field}: field 'file_path' must name an image, got {name!r:.80}.")
-    # A file system holds no longer names; asking it for one is an error of its own kind.
+    # File systems have no longer names, and querying one raises an OSError.
     if any(len(part.encode()) > _LONGEST_NAME for part in name.split("/")) or not name.isprintable():
         raise DataError(f"{field}: field 'file_path' is no name of a file: {name!r:.60}.")
     return name if Path(name).suffix else f"{name}.png"
@@ -170,7 +170,7 @@ def _size(fields: dict[str, Any], image: Path, field: str, *, fallback: tuple[in
 
 
 def viewmat_of(entry: dict[str, Any], field: str) -> Float[Tensor, "4 4"]:
-    """World to camera (OpenCV) of an entry's ``transform_matrix``; whether it is a rotation is checked elsewhere.
+    """World to camera (OpenCV) of an entry's ``transform_matrix``; its rotation is checked elsewhere.
 
     Raises:
         DataError: the field is missing, or not a finite 4 x 4 matrix with the last row of a pose.
@@ -185,8 +185,8 @@ def viewmat_of(entry: dict[str, Any], field: str) -> Float[Tensor, "4 4"]:
     if max(abs(a - b) for a, b in zip(rows[3], (0, 0, 0, 1), strict=True)) > 1e-6:
         raise DataError(wrong)
     pose = torch.tensor(rows, dtype=torch.float64) * torch.tensor(OPENGL_TO_OPENCV, dtype=torch.float64)
-    # The transpose is the inverse of a rotation, and unlike a general inverse it keeps whatever is wrong with the
-    # matrix visible to Cameras.validated (a singular pose must reach that message, not a linear-algebra error).
+    # The transpose is the inverse of a rotation, and unlike a general inverse it preserves errors of the matrix for
+    # Cameras.validated (a singular pose must reach that message, not a linear-algebra error).
     rotation = pose[:3, :3].T
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ pose[:3, 3]
@@ -204,10 +204,10 @@ def _intrinsics(fields: dict[str, Any], size: tuple[int, int], field: str) -> Fl
 
 
 def pinhole_of(fields: dict[str, Any], size: tuple[int, int], field: str) -> Float[Tensor, "3 3"]:
-    """K [pixels] of an image of ``size`` (width, height) by the fields of its entry and file, whatever its lens does.
+    """K [pixels] of an image of ``size`` (width, height) by the fields of its entry and file; distortion is ignored.
 
     Raises:
-        DataError: no focal length is given, or a number is malformed or impossible.
+        DataError: no focal length is given, or a number is malformed or out of range.
     """
     if "fl_x" in fields:
         fl_x = number_field(fields, "fl_x", field)

@@ -1,6 +1,6 @@
 """Moving Gaussians as OpenUSD: one ParticleField3DGaussianSplat with a time sample per frame (usd-core >= 26.3).
 
-Kept in float32: positions, orientations, scales, opacities, spherical harmonics. The schema knows no masks.
+Stored in float32: positions, orientations, scales, opacities, spherical harmonics. The schema has no masks.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ _EDGE = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class UsdClip:
-    """Moving Gaussians of a file, read frame by frame."""
+    """Reader of the moving Gaussians of a file, frame by frame."""
 
     path: Path  # the file
     fps: float  # frames per second
-    frames: int  # their number
+    frames: int  # number of frames
     up: str  # vertical axis, ``y`` or ``z``
     stage: Any  # the open stage
-    splats: Any  # its ParticleField3DGaussianSplat
+    splats: Any  # the ParticleField3DGaussianSplat of the stage
     times: tuple[float, ...]  # time code of every frame
 
     def scenes(self) -> Iterator[GaussianScene]:
         """The frames, one at a time; masks are the defaults (all simulated, none pinned).
 
         Raises:
-            DataError: an attribute is missing, of another length than the others or out of range; names it.
+            DataError: an attribute is missing, out of range or differs in length from the others; names it.
         """
         count = None
         for number, time in enumerate(self.times):
@@ -64,7 +64,7 @@ def save_usd(path: Path | str, frames: Iterable[GaussianScene], fps: float, *, u
         up: vertical axis, ``y`` or ``z``.
 
     Raises:
-        ConfigError: usd-core is not installed, or the suffix or the axis is another.
+        ConfigError: usd-core is not installed, or the suffix or axis is not supported.
         DataError: there are no frames, or they differ in size.
     """
     pxr, path = _pxr(), Path(path)
@@ -88,8 +88,8 @@ def load_usd(path: Path | str) -> UsdClip:
 
     Raises:
         ConfigError: usd-core is not installed.
-        DataError: the file is missing, no USD, refers to other files, or holds not exactly one
-            ParticleField3DGaussianSplat with a sensible frame rate.
+        DataError: the file is missing, is not USD, refers to other files, or does not contain exactly one
+            ParticleField3DGaussianSplat with a valid frame rate.
     """
     pxr, path = _pxr(), Path(path)
     if path.suffix not in SUFFIXES or not path.is_file():
@@ -102,7 +102,7 @@ def load_usd(path: Path | str) -> UsdClip:
         raise DataError(f"{path}: cannot be read as USD ({str(error).strip()[-200:]}). Export it again.") from error
     if layer is None:
         raise DataError(f"{path}: cannot be read as USD. Export it again.")
-    # Nothing that a file names is opened: it could be any file of this machine.
+    # Files to which the stage refers are not opened: they could be any file of this machine.
     if layer.GetCompositionAssetDependencies():
         raise DataError(f"{path}: refers to other files; expected one that holds all by itself. Flatten it first.")
     stage = pxr.Usd.Stage.Open(layer)
@@ -145,7 +145,7 @@ def _write(pxr: Any, stage: Any, frames: Iterable[GaussianScene], path: Path) ->
         reach = 3 * lengths.max(-1, keepdims=True)
         box = np.stack([(means - reach).min(0), (means + reach).max(0)]).astype(np.float32)
         extent.Set(vt.Vec3fArray.FromNumpy(box), time)
-        # Colours that do not turn are written once.
+        # Constant colours are written once.
         if last_sh is None or not torch.equal(last_sh, scene.sh):
             sh.Set(vt.Vec3fArray.FromNumpy(_numpy(scene.sh).reshape(-1, 3)), time)
             last_sh = scene.sh
@@ -182,7 +182,7 @@ def _scene(clip: UsdClip, time: float, source: str) -> GaussianScene:
 
 
 def _array(attribute: Any, time: float, source: str, *, width: int, count: int | None = None) -> np.ndarray:
-    """Values of an attribute at a time code, (count, width) float32, the sample before it where it has none there."""
+    """Values of an attribute at a time code, (count, width) float32, or those of the sample before it."""
     name = attribute.GetName()
     samples = attribute.GetTimeSamples()
     held = max((t for t in samples if t <= time), default=samples[0] if samples else None)

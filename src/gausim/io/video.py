@@ -1,4 +1,4 @@
-"""Video files through PyAV (no system ffmpeg needed): MP4 for people, GIF for pages; nothing to train from."""
+"""Video files through PyAV (no system ffmpeg needed): MP4 for players, GIF for web pages, not for training."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from av.error import FFmpegError
 
 from gausim.core import DataError
 
-H264 = "libx264"  # in the wheels of PyAV
-# Constant rate factor of H.264, lower is better: visually lossless, and half the bytes of that, for pages.
+H264 = "libx264"  # included in the wheels of PyAV
+# Constant rate factors of H.264 (lower is better): visually lossless, and half its size for web pages.
 FINE, SMALL = 16, 21
 
 
 def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float, *, quality: int = FINE) -> int:
-    """Writes (H, W, 3) uint8 RGB frames as MP4 (H.264), one at a time as they come; returns their number.
+    """Writes (H, W, 3) uint8 RGB frames as MP4 (H.264), one at a time; returns their number.
 
-    Odd sizes grow by one repeated row or column, because the chroma planes have half the size. ``quality`` is the
+    Odd sizes are padded by one repeated row or column, because the chroma planes have half the size. ``quality`` is the
     constant rate factor.
 
     Raises:
@@ -69,7 +69,7 @@ def read_video(path: Path | str) -> Iterator[np.ndarray]:
     """Decodes the first video stream, one (H, W, 3) uint8 RGB frame at a time.
 
     Raises:
-        DataError: the file is missing, holds no video or cannot be decoded.
+        DataError: the file is missing, has no video stream or cannot be decoded.
     """
     with _opened(path) as container:
         for frame in container.decode(video=0):
@@ -80,7 +80,7 @@ def video_rate(path: Path | str) -> float:
     """Frames per second of the first video stream.
 
     Raises:
-        DataError: the file is missing, holds no video or cannot be read.
+        DataError: the file is missing, has no video stream or cannot be read.
     """
     with _opened(path) as container:
         rate = container.streams.video[0].average_rate
@@ -92,8 +92,8 @@ def video_rate(path: Path | str) -> float:
 def write_gif(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> int:
     """Writes (H, W, 3) uint8 RGB frames as an endless GIF with one palette for all; returns their number.
 
-    GIF times are whole hundredths of a second and most programs slow down below 0.02 s, so at more than 50 fps
-    it plays at 50.
+    GIF times are whole hundredths of a second, and most programs slow down below 0.02 s; the rate is therefore limited
+    to 50 fps.
 
     Raises:
         DataError: no frames, or frames of different size or type.
@@ -106,7 +106,7 @@ def write_gif(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> int
     for pixels in frames:
         _check(path, pixels, first.shape)
         images.append(Image.fromarray(pixels))
-    # The palette of a picture of all frames serves the whole animation: no flicker between palettes.
+    # One palette, computed from all frames, avoids flicker between palettes.
     step = max(1, len(images) // 8)
     overview = Image.fromarray(np.concatenate([np.asarray(i) for i in images[::step]], axis=1))
     palette = overview.quantize(colors=256)
