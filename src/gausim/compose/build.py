@@ -1,4 +1,4 @@
-"""From a configuration to a training module, and from a run directory back to its trained module."""
+"""Builds training modules from configurations, and loads trained modules from run directories."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from gausim.training.supervision.images import Sources, Supervision
 
 @dataclass(frozen=True, eq=False)
 class LoadedRun:
-    """A trained run, ready to be measured or played.
+    """A trained run, loaded for evaluation or simulation.
 
     Attributes:
-        config: its resolved configuration.
-        module: in evaluation mode with the run's weights (the averaged ones where it averaged).
-        objects: its objects; their index is the ``scene_id`` of the module's scenes.
-        datamodule: its data.
-        renderer: what it was trained with.
-        run_dir: where it lies.
+        config: the resolved configuration.
+        module: the module in evaluation mode, with the run's weights (averaged ones if there are any).
+        objects: the objects; their index is the ``scene_id`` of the module's scenes.
+        datamodule: the data.
+        renderer: the renderer of the training.
+        run_dir: the run directory.
     """
 
     config: dict[str, Any]
@@ -49,7 +49,7 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
     """Builds the module and the data of a training configuration.
 
     Raises:
-        GausSimError: a node is wrong, or the model cannot be trained; the data or a rest scene are missing or broken.
+        GausSimError: a node is wrong, the model cannot be trained, or the data or a rest scene is missing or damaged.
     """
     config = cfg if isinstance(cfg, DictConfig) else OmegaConf.create(dict(cfg))
     if "method" in config.model:
@@ -86,11 +86,11 @@ def _supervision(config: DictConfig, sources: Sources) -> Supervision | None:
 
 
 def _build_fit(config: DictConfig) -> tuple[GausSimModule, ReadyDataModule]:
-    """The module and the data of a method that is fitted in stages; T and shows per epoch are those of its plan."""
+    """The module and data of a method that is fitted in stages; its plan sets T and the shows per epoch."""
     plan = instantiate(config.model.plan)
     seen = int(config.data.curriculum.t_max)
     curriculum = StagedCurriculum(t_start=1, t_max=seen, plan=plan)
-    alone = config.data.batch_size or 1  # the fits of the sequences do not see each other
+    alone = config.data.batch_size or 1  # sequences are fitted independently
     datamodule = instantiate(config.data, curriculum=curriculum, repeats=plan.shows, batch_size=alone)
     objects = datamodule.objects
     scenes = [item.scene() for item in objects]
@@ -117,13 +117,13 @@ def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mappin
     """Loads a run.
 
     Args:
-        run_dir: its directory.
-        checkpoint: file in it.
+        run_dir: the run directory.
+        checkpoint: file in this directory.
         data: keys of the data configuration to replace, e.g. ``{"root": "/elsewhere"}``.
 
     Raises:
-        RunError: there is no run or checkpoint, or the data holds another scene than it was trained on.
-        DataError: the data set or scene of the configuration is not on this machine, and no other is given.
+        RunError: the run or checkpoint is missing, or the scene differs from the one it was trained on.
+        DataError: the data set or scene of the configuration is not on this machine, and no replacement is given.
     """
     directory = RunDirectory(run_dir)
     config = directory.config()

@@ -1,4 +1,4 @@
-"""Hydra at one place: where the configurations lie, how they are composed, run and turned into objects."""
+"""Interface to Hydra: composition and running of configurations, and construction of objects from them."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def compose(config_name: str, overrides: Sequence[str] = ()) -> DictConfig:
         The composed configuration; unknown keys cannot be set on it.
 
     Raises:
-        ConfigError: an unknown key, group or option.
+        ConfigError: a key, group or option is unknown.
     """
     with _readable_errors(config_name):
         return _compose(config_name, overrides)
 
 
 def compose_leniently(config_name: str, overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
-    """Composes what can be composed of the overrides, and says of every other what is wrong with it.
+    """Composes a configuration from the valid overrides, and reports the errors of the others.
 
     Args:
         config_name: file in conf/, without its suffix.
@@ -57,12 +57,12 @@ def compose_leniently(config_name: str, overrides: Sequence[str]) -> tuple[DictC
         The configuration without the wrong overrides, and a sentence for each of these.
 
     Raises:
-        ConfigError: the file in conf/ is broken by itself.
+        ConfigError: the file in conf/ is invalid without overrides.
     """
     try:
         return _compose(config_name, overrides), []
     except (ConfigError, HydraException, OmegaConfBaseException):
-        pass  # now one by one, groups first: they decide which keys there are
+        pass  # try them one by one, groups first: they decide which keys exist
     taken: list[str] = []
     faults: list[str] = []
     for override in sorted(overrides, key=_turn):
@@ -77,13 +77,13 @@ def compose_leniently(config_name: str, overrides: Sequence[str]) -> tuple[DictC
 
 
 def _turn(override: str) -> int:
-    """When an override is tried: where files are searched, then groups, then keys."""
+    """Priority in which overrides are tried: search path, then groups, then keys."""
     key = override.lstrip("+~").split("=")[0]
     return 0 if key == "hydra.searchpath" else 1 if (conf_dir() / key).is_dir() else 2
 
 
 def _fault(config_name: str, taken: Sequence[str], override: str, error: Exception) -> str:
-    """What is wrong with one override beside those that are right."""
+    """Error message of one override, composed together with the valid ones."""
     unknown = re.search(_UNKNOWN_KEY, str(error))
     if unknown is None:
         why = f"{error.__cause__ or error}".partition("Config search path")[0]
@@ -102,7 +102,7 @@ def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
 
 
 def _check_more(config: DictConfig, overrides: Sequence[str]) -> None:
-    """Refuses settings of what is not there, as that of a network where the model has none."""
+    """Refuses settings of absent objects, e.g. of a network if the model has none."""
     for key in (override.partition("=")[0] for override in overrides if override.startswith("++")):
         parent = OmegaConf.select(config, key[2:].rpartition(".")[0])
         built = parent is None or (isinstance(parent, DictConfig) and "_target_" in parent)  # None: switched off
@@ -112,12 +112,12 @@ def _check_more(config: DictConfig, overrides: Sequence[str]) -> None:
 
 @dataclass
 class Job:
-    """What Hydra calls for every job. Of this module, so that a process that is sent one has our resolvers too."""
+    """Callable for every job of Hydra; defined here so that unpickling it in a worker registers our resolvers."""
 
     task: Callable[[DictConfig], float | None]
 
     def __call__(self, config: DictConfig) -> float | None:
-        """Does the work."""
+        """Runs the job."""
         return self.task(config)
 
 
@@ -126,19 +126,19 @@ def run_hydra(config_name: str, task: Callable[[DictConfig], float | None], argv
 
     Args:
         config_name: file in conf/, without its suffix.
-        task: what to do with the composed configuration; its return value is a sweeper's objective.
+        task: function of the composed configuration; its return value is a sweeper's objective.
         argv: the arguments after the command's name.
 
     Returns:
         The exit status.
 
     Raises:
-        ConfigError: an unknown key, group or option, or a value missing.
+        ConfigError: a key, group or option is unknown, or a value is missing.
     """
     decorate = hydra.main(version_base=HYDRA_VERSION_BASE, config_path=str(conf_dir()), config_name=config_name)
     runner = decorate(Job(task))
     saved_argv, saved_flag = sys.argv, os.environ.get("HYDRA_FULL_ERROR")
-    # Hydra reads sys.argv; with its full errors on it raises them, which are then told in our way, instead of exiting.
+    # Hydra reads sys.argv; with full errors enabled it raises exceptions, which are reworded, instead of exiting.
     sys.argv = [saved_argv[0], *spelled(argv)]
     os.environ["HYDRA_FULL_ERROR"] = "1"
     try:
@@ -154,7 +154,7 @@ def run_hydra(config_name: str, task: Callable[[DictConfig], float | None], argv
 
 
 def run_dir() -> Path:
-    """Returns the directory of the running job (inside `run_hydra` only; of a sweep, the job's own)."""
+    """Returns the directory of the running job (only inside `run_hydra`; in a sweep that of the job)."""
     return Path(HydraConfig.get().runtime.output_dir)
 
 
@@ -165,7 +165,7 @@ def in_sweep() -> bool:
 
 @contextmanager
 def _guarded() -> Iterator[None]:
-    """Has the node `hydra` of a configuration checked before Hydra builds its logging, callbacks and launcher of it."""
+    """Checks the node `hydra` of a configuration before Hydra builds its logging, callbacks and launcher from it."""
     load = ConfigLoaderImpl.load_configuration
 
     def checked(self: ConfigLoaderImpl, *args: Any, **kwargs: Any) -> DictConfig:
@@ -183,11 +183,11 @@ def _guarded() -> Iterator[None]:
 
 @contextmanager
 def _readable_errors(config_name: str) -> Iterator[None]:
-    """Turns Hydra's and OmegaConf's complaints into ConfigError, with the keys that were perhaps meant."""
+    """Converts errors of Hydra and OmegaConf to ConfigError and suggests similar keys."""
     try:
         yield
     except InstantiationException:
-        raise  # `instantiate` has already told those that are the configuration's fault
+        raise  # `instantiate` has already converted errors of the configuration
     except (HydraException, OmegaConfBaseException) as error:
         message = str(error).strip()
         cause = str(error.__cause__).strip() if error.__cause__ else ""
@@ -208,7 +208,7 @@ def _close_keys(config_name: str, message: str) -> str:
     try:
         known = [*_keys(_compose(config_name, ())), *more_settings()]
     except (HydraException, OmegaConfBaseException):
-        return ""  # the configuration is broken without the override as well; the message at hand says how
+        return ""  # the configuration is invalid without the override, too; the present message explains it
     matches = difflib.get_close_matches(key, known, n=3, cutoff=0.6)
     return f"\nDid you mean {' or '.join(matches)}?" if matches else f"\n`--cfg job` shows every key of {config_name}."
 
@@ -223,20 +223,20 @@ def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
 
 
 def instantiate(node: DictConfig | ListConfig | Mapping[str, Any], **kwargs: Any) -> Any:
-    """Builds the objects that a configuration names in `_target_`; nothing else in gausim does.
+    """Builds the objects that a configuration names in `_target_`; the only place in gausim that does so.
 
-    Objects in `kwargs` reach the constructor as they are (Hydra itself would copy them).
+    Objects in `kwargs` are passed to the constructor without the copies that Hydra would make.
 
     Args:
         node: a node with `_target_`, or a dict or list of such nodes (then without `kwargs`).
-        **kwargs: further constructor arguments; they win over the node's.
+        **kwargs: further constructor arguments; they take precedence over the node's.
 
     Returns:
-        The object; a `functools.partial` where the node says `_partial_: true`; a dict or list for a dict or list.
+        The object; a `functools.partial` for `_partial_: true`; a dict or list for a dict or list.
 
     Raises:
-        ConfigError: a target outside the allow-list, one that does not exist, or arguments it does not take.
-        GausSimError: whatever the constructor raises on purpose.
+        ConfigError: a target is not in the allow-list, does not exist, or does not take its arguments.
+        GausSimError: the constructor refuses its arguments.
     """
     config = node if isinstance(node, DictConfig | ListConfig) else OmegaConf.create(dict(node))
     target = config.get("_target_") if isinstance(config, DictConfig) else None
@@ -254,12 +254,12 @@ def instantiate(node: DictConfig | ListConfig | Mapping[str, Any], **kwargs: Any
         raise _blame(error, where) from error
     except TypeError as error:
         if not _is_wrong_call(error):
-            raise  # from inside the constructor: a defect there, not a wrong configuration
+            raise  # raised inside the constructor: a defect, not a wrong configuration
         raise ConfigError(f"{where}: {error}. Compare the keys with {target}.") from error
 
 
 def _is_wrong_call(error: TypeError) -> bool:
-    """Tells arguments that the target does not take from a TypeError inside its body, by where it was raised."""
+    """Whether the target does not take its arguments, as opposed to a TypeError raised in its body."""
     frame = error.__traceback__
     while frame is not None and frame.tb_next is not None:
         frame = frame.tb_next
@@ -269,7 +269,7 @@ def _is_wrong_call(error: TypeError) -> bool:
 
 
 def _blame(error: InstantiationException, where: str) -> Exception:
-    """Finds what Hydra wrapped: our own error, a wrong argument or name (the configuration's fault), or a defect."""
+    """Unwraps an error of Hydra: a GausSimError, a ConfigError for a wrong argument or name, or a defect."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, GausSimError):

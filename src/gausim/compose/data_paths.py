@@ -1,4 +1,4 @@
-"""Where the data of a run lies on this machine: what its configuration says, and what replaces that."""
+"""Paths of a run's data on this machine, by its configuration and its replacements."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 
 from gausim.core.errors import ConfigError, DataError
 
-# Rest scenes that a packed run brings along, if they lay apart from its data set.
+# Folder in a packed run for rest scenes from outside its data set.
 SCENES = "scenes"
 _KEYS = ("root", "scene", "masks")
 _FILES = ("scene", "masks")
 
 
 def data_option(words: Sequence[str]) -> dict[str, Any]:
-    """What the words of ``--data`` say, as keys of the data configuration.
+    """Parses the words of ``--data`` to keys of the data configuration.
 
     Raises:
         ConfigError: a key is given twice.
@@ -37,18 +37,18 @@ def data_option(words: Sequence[str]) -> dict[str, Any]:
 
 
 def located(run_dir: Path, data: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """The data configuration of a run, with every path that this machine has.
+    """The data configuration of a run with the paths on this machine.
 
-    A scene or masks that are not where the configuration says are looked for in ``RUN/scenes``, which a packed run
-    brings along. The checkpoint knows its scenes, so that a wrong file is refused later.
+    A missing scene or masks file is searched in ``RUN/scenes``, a folder of packed runs. The checkpoint contains
+    fingerprints of its scenes, so that a wrong file is refused later.
 
     Args:
-        run_dir: the run.
-        data: its data configuration.
-        given: keys that replace its own.
+        run_dir: the run directory.
+        data: the data configuration of the run.
+        given: keys to replace.
 
     Raises:
-        DataError: a path is not there; what to give instead is told.
+        DataError: a path does not exist; the message names the option to set it.
     """
     merged = {**data, **given, "root": _roots(data.get("root"), given.get("root"))}
     if isinstance(merged["root"], list):
@@ -65,10 +65,10 @@ def located(run_dir: Path, data: Mapping[str, Any], given: Mapping[str, Any]) ->
 
 
 def outside_files(run_dir: Path, data: Mapping[str, Any]) -> list[Path]:
-    """Scenes and masks that a data configuration names apart from the data set, masks beside their scene included.
+    """Scenes and masks outside the data set that a data configuration names, including masks beside their scene.
 
     Raises:
-        DataError: one is not there.
+        DataError: a file does not exist.
     """
     data = located(run_dir, data, {})
     entries = [entry for entry in listed(data["root"]) if isinstance(entry, Mapping)]
@@ -82,12 +82,12 @@ def outside_files(run_dir: Path, data: Mapping[str, Any]) -> list[Path]:
 
 
 def listed(root: Any) -> list[Any]:
-    """The entries of ``data.root``, which may be one alone."""
+    """The entries of ``data.root`` as a list, also if it is a single one."""
     return list(root) if isinstance(root, list) else [root]
 
 
 def _roots(own: Any, given: Any) -> Any:
-    """The given directories; of as many entries as the configuration has, each keeps what else it says."""
+    """The given directories; if their number matches the configuration, entries keep their other keys."""
     if given is None:
         return own
     entries, replaced = listed(own), listed(given)
@@ -126,7 +126,7 @@ def _missing(run_dir: Path, field: str, path: Any, option: str, kind: str) -> st
 
 
 def _fetched_with(run_dir: Path) -> str | None:
-    """The data set that a fetched run's registry names."""
+    """Registry entry of the data set of a fetched run, if any."""
     from gausim.runs.directory import FETCHED
 
     try:

@@ -1,4 +1,4 @@
-"""From a run to an object that can be pushed about: what `simulate`, `view` and the Python interface share."""
+"""Interactive objects of runs, for `simulate`, `view` and the Python interface."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from gausim.interaction.interaction import Interaction
 
 REST = "rest"
-# Forces may give an object so many times the energy with which recorded motions begin; far beyond, nothing was learned.
+# Limit of the energy from forces, as a multiple of the initial energy of recorded motions; training covers little more.
 ENERGY_ROOM = 2.0
-# Where recorded motions are slower than this, a sway of this speed counts [diagonals per frame of the farthest kernel].
+# Least speed of the motion that defines the limit of energy [diagonals per frame of the farthest kernel].
 _LEAST_SWAY = 0.02
 
 
@@ -34,20 +34,20 @@ def open_interaction(
     seed: int = 0,
     keep: int | None = 0,
 ) -> Interaction:
-    """An object of a run, ready to be pushed.
+    """Opens an object of a run for interaction.
 
     Args:
         run: the loaded run.
-        name: of the object; the first one when None.
-        sequence: whose beginning is the initial state, or ``rest``.
-        gravity: acceleration that makes a weight of a mass [scene units / s^2]; 9.81 when None.
-        most_force: the largest force [weights]; the interaction's own limit when None.
-        seed: of the gusts of wind.
-        keep: so many of the latest frames are kept; None keeps all.
+        name: name of the object; the first one when None.
+        sequence: sequence that gives the initial state, or ``rest``.
+        gravity: acceleration that defines the unit of weight [scene units / s^2]; 9.81 when None.
+        most_force: the largest force [weights]; the default of interactions when None.
+        seed: seed of the gusts of wind.
+        keep: number of latest frames to keep; None keeps all.
 
     Raises:
-        DataError: there is no such object or sequence.
-        ConfigError: the model cannot be simulated on its own.
+        DataError: the object or sequence does not exist.
+        ConfigError: the model does not support simulation.
     """
     from gausim.compose.predict import TrainedPrediction, run_objects, scene_of
     from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
@@ -75,15 +75,15 @@ def open_interaction(
 
 
 def energy_ceiling(model: object, scene_id: int, previous: Sequence[Tensor]) -> float | None:
-    """The energy that forces may give a scene: :data:`ENERGY_ROOM` times that of its liveliest beginning.
+    """The energy that forces may give a scene: :data:`ENERGY_ROOM` times the largest initial energy.
 
     Args:
         model: the simulator.
-        scene_id: of the scene.
+        scene_id: index of the scene.
         previous: positions one frame before rest of every recorded sequence; may be empty.
 
     Returns:
-        The energy; None for models that know none.
+        The energy; None for models without an energy.
     """
     import torch
 
@@ -104,7 +104,7 @@ def energy_ceiling(model: object, scene_id: int, previous: Sequence[Tensor]) -> 
 def _method(
     run: LoadedRun, item: RunObject, scene: GaussianScene, sequence: str
 ) -> tuple[SimState, Steppable, Tensor, float | None]:
-    """Initial state, dynamics, masses and the ceiling of the energy."""
+    """Initial state, dynamics, masses and the limit of the energy."""
     from gausim.core import FittedDynamics, SimState
     from gausim.models.rollout.dynamics import SceneDynamics
     from gausim.models.step.simulator import GausSim
@@ -130,5 +130,5 @@ def _method(
 
 
 def _name(path: Path) -> str:
-    """A run by its last folders: the last one is often a seed only."""
+    """Name of a run: its last two folders, as the last one is often only the seed."""
     return "/".join(path.resolve().parts[-2:])

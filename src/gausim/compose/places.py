@@ -1,4 +1,4 @@
-"""What conf/ sets, where, and what it says about it: the keys of all its files, their targets and their comments."""
+"""Keys of all files of conf/, with their targets and comments."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ import yaml
 from gausim.compose.root import conf_dir
 
 ROOT_FILE, GLOBAL_PACKAGE = "train", "# @package _global_"
-# Settings that have another name since the last version.
+# Settings renamed since the last version.
 RENAMED = {"trainer.overwrite": "overwrite"}
-# The defaults list composes; the node `hydra` is Hydra's own.
+# Not settings: the defaults list, and the node `hydra`, which belongs to Hydra.
 _NOT_OURS = ("defaults", "hydra")
-BASE = "base"  # what files of groups inherit from; no group to choose from
-MORE = f"{BASE}/more.yaml"  # settings that no configuration lists: their values are the constructors' defaults
+BASE = "base"  # files that others include; not a group of choices
+MORE = f"{BASE}/more.yaml"  # settings that no configuration lists, with the defaults of their constructors
 
 
 @dataclass
@@ -26,9 +26,9 @@ class Place:
     """One key of the configuration, over all files that set it.
 
     Attributes:
-        targets: what is built there, by any of the files.
+        targets: the targets that any file builds there.
         children: the keys below.
-        comment: what stands behind the key, in the first file that comments on it.
+        comment: comment behind the key, from the first file that has one.
     """
 
     targets: list[str] = field(default_factory=list)
@@ -36,14 +36,14 @@ class Place:
     comment: str = ""
 
     def merged(self) -> Place:
-        """All children as one, where their names are free."""
+        """All children merged to one, for mappings with arbitrary names."""
         whole = Place()
         for child in self.children.values():
             whole.take(child)
         return whole
 
     def take(self, other: Place) -> None:
-        """Adds what another place knows."""
+        """Adds the targets, children and comment of another place."""
         self.targets += [target for target in other.targets if target not in self.targets]
         self.comment = self.comment or other.comment
         for name, child in other.children.items():
@@ -60,7 +60,7 @@ def choices() -> dict[str, list[str]]:
 
 
 def read_places() -> Place:
-    """The root of all places that conf/ knows."""
+    """The root place of conf/."""
     root = Place()
     for path in sorted(conf_dir().rglob("*.yaml")):
         text = path.read_text()
@@ -81,7 +81,7 @@ def more_settings() -> dict[str, Any]:
 
 
 def spelled(overrides: Sequence[str]) -> list[str]:
-    """Overrides as Hydra takes them: settings that no configuration lists are added, those of old names renamed."""
+    """Converts overrides to Hydra's syntax: unlisted settings are added with ++, old names are replaced."""
     more, found = more_settings(), []
     for override in overrides:
         key, equals, value = override.partition("=")
@@ -113,7 +113,7 @@ def _read(node: yaml.MappingNode, place: Place, lines: list[str]) -> None:
 
 
 def _comment(key: yaml.Node, value: yaml.Node, lines: list[str]) -> str:
-    """The comment behind a value on one line, or behind the key of a longer one."""
+    """The comment behind a value of one line, or behind the key of a longer value."""
     end = value.end_mark if value.end_mark.line == key.start_mark.line else key.end_mark
     found = re.match(r":?\s*#\s*(.*)", lines[end.line][end.column :])
     return found.group(1).strip() if found else ""

@@ -1,4 +1,4 @@
-"""Predictions of a trained run, its facts, and choices of its objects and sequences."""
+"""Predictions of a trained run, and selection of its objects and sequences."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from gausim.data.objects import ObjectData
     from gausim.data.records import SequenceRecord
 
-# Random pushes of `gausim evaluate --endurance` go on for so many frames.
+# Duration of the random pushes of `gausim evaluate --endurance` [frames].
 PUSHED_FRAMES = 240
 
 
@@ -25,9 +25,9 @@ class RunObject:
     """One object of a run.
 
     Attributes:
-        scene_id: its index in the run.
-        data: its sequences.
-        first_sequence: running number of its first sequence over all objects.
+        scene_id: index of the object in the run.
+        data: data of the object.
+        first_sequence: index of its first sequence over all objects.
     """
 
     scene_id: int
@@ -39,7 +39,7 @@ def run_objects(run: LoadedRun, names: list[str] | None = None) -> list[RunObjec
     """The run's objects, or those of these names.
 
     Raises:
-        DataError: the run has no object of a name.
+        DataError: the run has no object of such a name.
     """
     found, first = [], 0
     for scene_id, data in enumerate(run.objects):
@@ -56,7 +56,7 @@ def sequence_of(item: RunObject, name: str) -> SequenceRecord:
     """A sequence of an object by its name.
 
     Raises:
-        DataError: there is none.
+        DataError: the object has no sequence of this name.
     """
     records = {record.name: record for record in item.data.sequences}
     if name not in records:
@@ -70,9 +70,9 @@ def scene_of(run: LoadedRun, item: RunObject) -> GaussianScene:
 
 
 def state_of(run: LoadedRun) -> dict[str, Any]:
-    """How far the run has come: ``finished``, ``epoch`` and ``updates`` of the checkpoint in use.
+    """Progress of the run: ``finished``, and ``epoch`` and ``updates`` of the checkpoint in use.
 
-    An unfinished run is said to be so on the standard error.
+    Prints a warning to the standard error if the run is unfinished.
     """
     from gausim.runs.checkpoint import read_checkpoint
     from gausim.runs.directory import RunDirectory
@@ -85,12 +85,12 @@ def state_of(run: LoadedRun) -> dict[str, Any]:
 
 
 class TrainedPrediction:
-    """Predicts sequences of one object with the trained model, each once.
+    """Predicts sequences of one object with the trained model, and caches them.
 
     Args:
         run: the loaded run.
         item: the object.
-        frames: frames to predict at least, also where the recording is shorter.
+        frames: least number of frames to predict, also if the recording is shorter.
     """
 
     def __init__(self, run: LoadedRun, item: RunObject, *, frames: int = 0) -> None:
@@ -112,13 +112,13 @@ class TrainedPrediction:
 
     @property
     def units(self) -> tuple[Tensor, ...]:
-        """The unit of every kernel at each level, the small ones first; nothing for a model without a hierarchy."""
+        """The unit of every kernel at each level, the finest first; empty for a model without a hierarchy."""
         units_of_kernels = getattr(self._run.module.model, "units_of_kernels", lambda scene_id: ())
         return tuple(units_of_kernels(self._item.scene_id))
 
     @property
     def footnotes(self) -> dict[str, Any] | None:
-        """What the method says of itself (see :attr:`GausSimModule.footnotes`), and whether small motions grow."""
+        """Remarks on the method (see :attr:`GausSimModule.footnotes`), with the largest eigenvalue of the step."""
         from gausim.evaluation.stability import largest_eigenvalue
         from gausim.models.step.simulator import GausSim
 
@@ -130,7 +130,7 @@ class TrainedPrediction:
         return {**said, "largest_eigenvalue": largest, "notes": [*said["notes"], note]}
 
     def __call__(self, record: SequenceRecord, frames: int | None = None) -> Trajectory:
-        """The first frames of a sequence, by default exactly the recorded ones."""
+        """The predicted first frames of a sequence, by default as many as recorded."""
         count = frames or record.count
         known = self._known.get(record.name)
         if known is None or known.frames < count:
@@ -145,7 +145,7 @@ class TrainedPrediction:
 
 
 def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
-    """How the first sequence of an object goes on for so many frames: free, and under random pushes from rest."""
+    """Long rollouts of an object: its first sequence without forces, and random pushes from rest."""
     from gausim.core import ConfigError, SimState
     from gausim.evaluation.endurance import RandomPushes, endure
     from gausim.models.rollout.dynamics import SceneDynamics

@@ -1,6 +1,6 @@
-"""What Hydra has to know before it composes: where conf/ lies, its root keys, the functions its values may call.
+"""Setup of Hydra before composition: directory of conf/, schema of the root keys, and resolvers.
 
-Nothing here loads torch, so that completions come at once.
+This module does not load torch, so that shell completion is fast.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ LONGEST_FOLDER_NAME = 120
 
 @dataclass
 class SweepConfig:
-    """What the jobs of a sweep do about runs that are there already.
+    """Handling of existing runs by the jobs of a sweep.
 
     Attributes:
-        retry_failed: train those again that an error ended; otherwise they are left out.
+        retry_failed: resume runs that ended with an error; otherwise they are skipped.
     """
 
     retry_failed: bool = False
@@ -37,31 +37,31 @@ class SweepConfig:
 
 @dataclass
 class RootConfig:
-    """Schema of the root keys of a training configuration: a misspelt root key fails instead of being ignored.
+    """Schema of the root keys of a training configuration: a misspelt root key is an error.
 
     Attributes:
         data: the data module: which set, views, frames and batches.
         model: the dynamics.
-        supervision: what predictions are compared with; the images unless it names something else.
+        supervision: reference of the predictions: images by default, or points or motion tracks.
         loss: the terms and their weights.
-        optimizer: the optimiser (partial, it awaits the parameters) and its schedule.
+        optimizer: the optimiser (partial, without its parameters) and its schedule.
         render: the renderer.
         trainer: arguments of the Lightning trainer.
         logger: loggers by name.
         callbacks: callbacks by name.
-        paths: where data is read and runs are written.
-        ablation: what the chosen ablation records about itself.
-        experiment: what the chosen experiment records about itself.
-        sweep: what the jobs of a sweep do about runs that are there already.
-        seed: of every random generator.
-        init_from: run whose network, with the statistics of its inputs, this one starts from; null starts anew.
-        freeze: `network` keeps that network as it is, so that only what a scene has of its own is learned; `model`
-            takes all of the simulator from that run and keeps it, so that only initial states are learned.
-        doctor: whether what `gausim doctor` would find wrong with the data is told before training (not in sweeps).
-        evaluate: whether the run is evaluated once it is trained (`gausim evaluate`), for reports.
-        overwrite: remove the run that the directory holds already.
-        name: of the run; its directory is `${paths.output_root}/${name}/seed_${seed}`.
-        task_name: what is being done, for logs and dashboards.
+        paths: directory to which runs are written.
+        ablation: record of the chosen ablation.
+        experiment: record of the chosen experiment.
+        sweep: handling of existing runs by the jobs of a sweep.
+        seed: seed of every random generator.
+        init_from: run from which the network and its input statistics are copied; null: random initialisation.
+        freeze: `network` freezes that network, so that only parameters of scenes are trained; `model` copies the whole
+            simulator of that run and freezes it, so that only initial states are trained.
+        doctor: whether the findings of `gausim doctor` are printed before training (not in sweeps).
+        evaluate: whether the run is evaluated after training (`gausim evaluate`), for reports.
+        overwrite: remove an existing run in the directory.
+        name: name of the run; its directory is `${paths.output_root}/${name}/seed_${seed}`.
+        task_name: name of the task, for logs and dashboards.
     """
 
     data: Any = MISSING
@@ -88,7 +88,7 @@ class RootConfig:
 
 
 def folder_name(text: str) -> str:
-    """Returns a text as the name of one directory: the same if it can be, else legible, short and with a hash."""
+    """Returns a directory name for a text: the text itself if valid, else a short form with a hash."""
     text = re.sub(r"(^|,)\+\+", r"\1", text)
     plain = re.sub(r"[^\w.,=+~:-]+", "_", text)
     if plain == text and len(text) <= LONGEST_FOLDER_NAME:
@@ -97,19 +97,19 @@ def folder_name(text: str) -> str:
 
 
 def job_threads(most: int) -> int:
-    """Returns the threads of one job: `most`, or its share of the cores where a sweep runs several at a time."""
+    """Returns the threads of one job: `most`, or fewer where a sweep divides the cores among parallel jobs."""
     if not HydraConfig.initialized() or HydraConfig.get().mode != RunMode.MULTIRUN:
         return most
     launcher = HydraConfig.get().launcher
-    if "cpus_per_task" in launcher:  # submitit: what the scheduler grants
+    if "cpus_per_task" in launcher:  # submitit: cores granted by the scheduler
         return min(most, int(launcher.cpus_per_task or 1))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    jobs = int(launcher.get("n_jobs") or 1)  # joblib; negative: all cores but so many
+    jobs = int(launcher.get("n_jobs") or 1)  # joblib; -1: all cores, -2: all but one, ...
     return min(most, max(1, cores // (jobs if jobs > 0 else max(1, cores + 1 + jobs))))
 
 
 def chosen(group: str) -> str:
-    """Returns what was chosen of a group: `no_mass`, of a list all of it, as `no_mass+no_momentum`, or `none`."""
+    """Returns the choice of a group: `no_mass`, of a list `no_mass+no_momentum`, or `none`."""
     if not HydraConfig.initialized():
         return "none"  # composed without a job
     job = HydraConfig.get()
@@ -122,12 +122,12 @@ def chosen(group: str) -> str:
 
 
 def job_group(name: str) -> str:
-    """Returns what dashboards list a run under: NAME/ABLATION/MODEL, of which seeds and settings are variants."""
+    """Returns the group of a run on dashboards, NAME/ABLATION/MODEL, common to its seeds and settings."""
     return "/".join([name, chosen("ablation"), chosen("model")]) if HydraConfig.initialized() else name
 
 
 def job_name(seed: int) -> str:
-    """Returns what dashboards call a run within its group: of a sweep, its overrides and its seed."""
+    """Returns the name of a run within its group on dashboards: its seed, in a sweep after its overrides."""
     hydra_config = HydraConfig.get() if HydraConfig.initialized() else None
     sweeps = hydra_config is not None and hydra_config.mode == RunMode.MULTIRUN
     overrides = folder_name(hydra_config.job.override_dirname) if hydra_config is not None and sweeps else ""
@@ -140,17 +140,17 @@ for resolver in (chosen, folder_name, job_threads, job_group, job_name):
 
 
 def conf_dir() -> Path:
-    """Returns the directory of the configurations: the wheel's own copy, or conf/ of the checkout.
+    """Returns the directory of the configurations: the copy in the wheel, or conf/ of the checkout.
 
     Raises:
-        ConfigError: neither is there.
+        ConfigError: neither exists.
     """
     package = Path(gausim.__file__).resolve().parent
     candidates = (package / "conf", package.parents[1] / "conf")
     for candidate in candidates:
         if candidate.is_dir():
             return candidate
-    from gausim.core.errors import ConfigError  # loads torch, which a completion must not wait for
+    from gausim.core.errors import ConfigError  # loads torch, which would delay completions
 
     raise ConfigError(
         f"expected the configurations in {candidates[0]} or {candidates[1]}, found neither. Reinstall gausim, or run "

@@ -1,4 +1,4 @@
-"""The JSON schema of a training configuration, made of conf/, the root keys and the signatures of what is built."""
+"""The JSON schema of a training configuration, derived from conf/, the root keys and the signatures of targets."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from gausim.compose.root import RootConfig, SweepConfig
 
 Schema = dict[str, Any]
 
-# What may stand for any value: another key's, or nothing yet.
+# Placeholder for any value: an interpolation, or ??? for a missing value.
 INTERPOLATION = r"\$\{|^\?\?\?$"
-# What Hydra itself reads of a node that builds something.
+# Keys that Hydra reads from a node with a target.
 _SPECIAL: Schema = {
     "_target_": {"type": "string"},
     "_partial_": {"type": "boolean"},
@@ -29,9 +29,9 @@ _SPECIAL: Schema = {
     "_args_": {"type": "array"},
 }
 _PLAIN = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null", Path: "string"}
-# A file may note there what it likes.
+# Keys with arbitrary content.
 _RECORDS = ("ablation", "experiment")
-# Whoever adds an entry names it, and it builds something.
+# Mappings with arbitrary names, whose entries have targets.
 _NAMED = ("callbacks", "logger")
 
 
@@ -39,7 +39,7 @@ def training_schema() -> Schema:
     """The schema of every file that sets training keys: an experiment, or the saved `config.yaml` of a run.
 
     Every key is optional, as an experiment sets only what it changes. Unknown keys are errors wherever conf/ or a
-    signature says which are known. It is of draft 7.
+    signature defines the known ones. The schema follows draft 7.
     """
     builder = _Builder()
     root, notes = read_places(), documented(RootConfig)
@@ -65,12 +65,12 @@ def training_schema() -> Schema:
 
 
 def required_keys() -> list[str]:
-    """The root keys without which nothing can be trained."""
+    """The root keys that a training requires."""
     return [entry.name for entry in fields(RootConfig) if entry.default == MISSING]
 
 
 def documented(subject: Any) -> dict[str, str]:
-    """What a Google docstring says of every argument or attribute, in one line each."""
+    """Descriptions of arguments or attributes in a Google docstring, in one line each."""
     text = inspect.getdoc(subject) or ""
     section = re.search(r"^(?:Args|Attributes):\n((?:[ ]{4}.*\n?|\n)+)", text, re.MULTILINE)
     entries = re.findall(r"^ {4}(\w+): (.*(?:\n {8}.*)*)", section.group(1) if section else "", re.MULTILINE)
@@ -78,7 +78,7 @@ def documented(subject: Any) -> dict[str, str]:
 
 
 class _Builder:
-    """Schemas of places, by their path, so that each is written once."""
+    """Builder of the schemas of places; each is defined once, by its path."""
 
     def __init__(self) -> None:
         self.definitions: Schema = {}
@@ -86,19 +86,19 @@ class _Builder:
     def place(self, path: str, place: Place) -> Schema:
         """A reference to the schema of a place."""
         if path not in self.definitions:
-            self.definitions[path] = {}  # its turn comes before its children's
+            self.definitions[path] = {}  # reserves the position before its children
             self.definitions[path] = self._built(path, place) if place.targets else self._plain(path, place)
         return _or_interpolation({"$ref": f"#/definitions/{path}"})
 
     def _plain(self, path: str, place: Place) -> Schema:
-        """A mapping that builds nothing itself."""
+        """Schema of a mapping without a target."""
         found = _closed({name: self._child(f"{path}.{name}", child, {}) for name, child in place.children.items()})
         if path in _NAMED:
             found["additionalProperties"] = {"type": ["object", "null"], "required": ["_target_"]}
         return found
 
     def _built(self, path: str, place: Place) -> Schema:
-        """A node that builds something: the target says which arguments there are; without one, any of them."""
+        """Schema of a node with targets: the target defines the arguments; without one, those of all targets."""
         known = {target: self._arguments(path, place, target) for target in place.targets}
         every: Schema = {}
         for properties, _ in known.values():
@@ -119,7 +119,7 @@ class _Builder:
         }
 
     def _arguments(self, path: str, place: Place, target: str) -> tuple[Schema, bool]:
-        """Schemas of the arguments that a target takes from a configuration, and whether these are all."""
+        """Schemas of the arguments that a target takes from a configuration, and whether the list is complete."""
         found = pkgutil.resolve_name(target)
         init = inspect.unwrap(found.__init__ if isinstance(found, type) else found)  # type: ignore[misc]
         notes = {**documented(found), **documented(init)}
@@ -127,11 +127,11 @@ class _Builder:
         for name, parameter in inspect.signature(found).parameters.items():
             child = place.children.get(name)
             if parameter.kind is parameter.VAR_KEYWORD:
-                # Named arguments of a TypedDict are given by the code; others may be anything.
+                # The code passes the named arguments of a TypedDict; others may be anything.
                 is_closed = is_closed and str(parameter.annotation).startswith("Unpack[")
             elif parameter.kind is parameter.VAR_POSITIONAL:
                 continue
-            elif child is not None or parameter.default is not parameter.empty:  # the others are given by the code
+            elif child is not None or parameter.default is not parameter.empty:  # the code passes the others
                 hint = _hint(parameter.annotation, getattr(init, "__globals__", {}))
                 schema = self._child(f"{path}.{name}", child or Place(), hint)
                 properties[name] = _described(schema, (child.comment if child else "") or notes.get(name, ""))
@@ -144,7 +144,7 @@ class _Builder:
             return _described(_leaf(hint), place.comment)
         if hint == {}:
             return self.place(path, place)
-        whole = place.merged()  # an argument that is a mapping has names of its own
+        whole = place.merged()  # a mapping with arbitrary names
         if whole.targets or whole.children:
             inner = self.place(f"{path}.*", whole)
         else:
@@ -171,11 +171,11 @@ def _leaf(hint: Any) -> Schema:
 
 
 def _hint(annotation: Any, names: dict[str, Any]) -> Any:
-    """An annotation as a type; {} where it names what exists for type checkers only, so that anything goes."""
+    """The type of an annotation; {} (any value) if its names exist for type checkers only."""
     if annotation is inspect.Parameter.empty:
         return {}
     try:
-        return eval(annotation, dict(names)) if isinstance(annotation, str) else annotation  # of what conf/ names
+        return eval(annotation, dict(names)) if isinstance(annotation, str) else annotation  # of targets in conf/
     except (NameError, TypeError, AttributeError):
         return {}
 
@@ -190,7 +190,7 @@ def _mapped(hint: Any) -> Any:
 
 
 def _of_hint(hint: Any) -> Schema:
-    """The schema of a type as YAML writes it; {} where YAML has no such thing."""
+    """The schema of a type in YAML; {} if YAML cannot represent it."""
     origin, inner = get_origin(hint), get_args(hint)
     if isinstance(hint, type) and hint in _PLAIN:
         return {"type": _PLAIN[hint]}
@@ -217,7 +217,7 @@ def _sequence(inner: tuple[Any, ...], *, is_tuple: bool) -> Schema:
 
 
 def _one_of(options: list[Schema]) -> Schema:
-    """Alternatives; those that say no more than their type are joined, which reads better."""
+    """Schema of alternatives; those that consist of a type alone are joined, for readability."""
     plain = list(dict.fromkeys(option["type"] for option in options if option.keys() == {"type"}))
     rest = [option for option in options if option.keys() != {"type"}]
     kinds: list[Schema] = [{"type": plain if len(plain) > 1 else plain[0]}] if plain else []
@@ -225,7 +225,7 @@ def _one_of(options: list[Schema]) -> Schema:
 
 
 def _defaults() -> Schema:
-    """The list that composes a file: groups and the names of their files."""
+    """Schema of the defaults list: groups and the names of their files."""
     names: Schema = {}
     for group, files in choices().items():
         schema = {"anyOf": [{"enum": [*files, None]}, {"type": "array", "items": {"enum": files}}]}

@@ -1,4 +1,4 @@
-"""What a configuration may build: it may come from other people with their runs, and must not call what it likes."""
+"""Allow-list of the targets of configurations, which may come from others and must not call arbitrary code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from gausim.core.errors import ConfigError
 
-# Whole packages will not do: torch alone runs programs (torch.distributed.run), text (torch.fx) and pickles.
+# Not whole packages: torch alone can run programs (torch.distributed.run), source text (torch.fx) and pickles.
 ALLOWED_PACKAGES = (
     "gausim",
     "torch.nn",
@@ -31,7 +31,7 @@ ALLOWED_PACKAGES = (
     "optuna.samplers",
 )
 ALLOWED_TARGETS = ("builtins.dict", "builtins.list")
-# Inside the allowed packages these start programs or write files.
+# Exceptions inside the allowed packages, which start programs or write files.
 REFUSED_MODULES = (
     "gausim.benchmark",
     "gausim.cli",
@@ -43,31 +43,31 @@ REFUSED_MODULES = (
     "gausim.report",
     "lightning.pytorch.strategies.launchers",
 )
-# What the node `hydra` may name: launchers, sweepers, what these search by, and callbacks.
+# Allowed in the node `hydra`: launchers, sweepers, samplers and pruners, and callbacks.
 HYDRA_PACKAGES = ("hydra._internal.core_plugins", "hydra_plugins", "gausim", "optuna.pruners", "optuna.samplers")
 _LOGGING_CLASS = re.compile(r"(logging|logging\.handlers|colorlog)\.[A-Z]\w*")
 _STREAMS = ("ext://sys.stdout", "ext://sys.stderr")
 
 
 def check_targets(node: DictConfig | ListConfig) -> None:
-    """Refuses every `_target_` outside the allow-list, however deep, before anything is built.
+    """Refuses every `_target_` outside the allow-list, at any depth, before any object is built.
 
-    A name is judged by where its object really lives: `torch.nn.modules.module.torch.load` begins well, but is not of
-    torch.nn. Methods are refused: a configuration names classes and functions.
+    A name is judged by the module that defines its object: `torch.nn.modules.module.torch.load` does not belong to
+    torch.nn. Methods are refused: targets are classes and functions.
 
     Raises:
-        ConfigError: naming the key and the target.
+        ConfigError: a target is not allowed; names its key.
     """
     for fault in target_faults(OmegaConf.to_container(node, resolve=True), str(node._get_full_key(None) or "")):
         raise ConfigError(fault)
 
 
 def target_faults(config: Any, root: str = "") -> Iterator[str]:
-    """Every `_target_` of plain containers below the key ``root`` that may not be built or does not exist, in words."""
+    """Messages for every `_target_` of plain containers, below key ``root``, that is not allowed or does not exist."""
     for key, target in _targets(config, root):
         try:
             allowed = target in ALLOWED_TARGETS or _is_allowed(target, ALLOWED_PACKAGES, REFUSED_MODULES)
-        except ConfigError as error:  # it does not exist
+        except ConfigError as error:  # the target does not exist
             yield f"{key}: {error}"
             continue
         if not allowed:
@@ -78,13 +78,13 @@ def target_faults(config: Any, root: str = "") -> Iterator[str]:
 
 
 def check_hydra(node: DictConfig) -> None:
-    """Refuses a node `hydra` that would make Hydra itself call something before the configuration is looked at.
+    """Refuses a node `hydra` that would make Hydra call other code before the configuration is checked.
 
-    Its launcher, sweeper and callbacks must be of Hydra, its plugins or gausim, its logging of the module logging, and
-    it may not set environment variables, which choose the programs that are started later.
+    Launcher, sweeper and callbacks must belong to Hydra, its plugins or gausim, logging to the module logging, and
+    environment variables may not be set, because they can change which programs are started.
 
     Raises:
-        ConfigError: naming the key and its value.
+        ConfigError: a value is not allowed; names its key.
     """
     content: Any = OmegaConf.to_container(node, resolve=False)
     for key, target in _targets(content, "hydra"):
@@ -97,7 +97,7 @@ def check_hydra(node: DictConfig) -> None:
         )
     for name in ("hydra_logging", "job_logging"):
         for key, text in _nodes(content[name], f"hydra.{name}"):
-            # No factories, no classes outside of logging, and no object but the standard streams.
+            # No factories, only classes of logging, and no objects except the standard streams.
             names_code = key.endswith((".()", ".class")) and not _LOGGING_CLASS.fullmatch(str(text))
             protocol = isinstance(text, str) and text.startswith("ext://") and text not in _STREAMS
             if names_code or protocol:
@@ -105,7 +105,7 @@ def check_hydra(node: DictConfig) -> None:
 
 
 def _nodes(value: Any, key: str) -> Iterator[tuple[str, Any]]:
-    """A value and all below it, by their keys."""
+    """A value and all values below it, with their keys."""
     yield key, value
     if isinstance(value, dict):
         for name, child in value.items():
@@ -129,7 +129,7 @@ def _is_allowed(target: Any, packages: Sequence[str], refused: Sequence[str]) ->
         return False
     try:
         found = hydra.utils.get_object(target)
-    except Exception as error:  # importing the target may fail in any way; the name is what the reader can mend
+    except Exception as error:  # importing the target may fail in any way; the user can correct the name
         raise ConfigError(f"_target_ {target!r} cannot be found: {error}. Check its spelling.") from error
     home, name = getattr(found, "__module__", None), getattr(found, "__qualname__", ".")
     return isinstance(home, str) and "." not in name and _within(home, packages) and not _within(home, refused)

@@ -1,4 +1,4 @@
-"""Checks a training configuration without training: every wrong key by its name, with the nearest right one."""
+"""Checks training configurations without training; reports every wrong key with the nearest valid one."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ from gausim.compose.targets import target_faults
 from gausim.core.errors import ConfigError, GausSimError
 
 RUN_CONFIG = "config.yaml"
-# Built as a training does, for what only their constructors know; none of these reads data or writes files.
+# Nodes that are built for the checks of their constructors; none of them reads data or writes files.
 _BUILT = ("data", "supervision", "loss", "optimizer", "render")
 
 
 def faults(arguments: Sequence[str]) -> list[str]:
-    """What is wrong with a configuration, key by key.
+    """Errors of a configuration, key by key.
 
     Args:
-        arguments: one saved configuration (a YAML file, or a run directory); or what `gausim train` would be given:
-            overrides, names of experiments, and files of conf/ or of a folder like it (`MINE/experiment/NAME.yaml`).
+        arguments: one saved configuration (a YAML file, or a run directory); or arguments of `gausim train`: overrides,
+            names of experiments, and files of conf/ or of a folder like it (`MINE/experiment/NAME.yaml`).
 
     Returns:
-        A sentence for every fault; none if it can be trained, its data aside.
+        A sentence per error; empty if the configuration is valid. Data sets are not checked.
 
     Raises:
-        ConfigError: an argument is no configuration, or a file is beside other arguments.
+        ConfigError: an argument is not a configuration, or a saved one is combined with other arguments.
     """
     saved = [path for path in map(_saved, arguments) if path is not None]
     if saved and len(arguments) > 1:
@@ -53,17 +53,17 @@ def faults(arguments: Sequence[str]) -> list[str]:
 
 
 def check(config: Any) -> list[str]:
-    """The faults of a whole configuration in plain containers, its interpolations resolved."""
+    """The errors of a whole configuration in plain containers with resolved interpolations."""
     found = list(target_faults(config))
     if found:
-        return found  # of what cannot be built no arguments are known
+        return found  # arguments of invalid targets are unknown
     schema = training_schema()
     found = sorted({told for error in Draft7Validator(schema).iter_errors(config) for told in _told(error, schema)})
     return found or list(_contradictions(config))
 
 
 def _saved(argument: str) -> Path | None:
-    """The file of a saved configuration, if the argument names one: a run's directory, or a file of no group."""
+    """The file of a saved configuration, if the argument names one: a run directory, or a file outside of groups."""
     path = Path(argument)
     path = path / RUN_CONFIG if (path / RUN_CONFIG).is_file() else path
     is_file = path.suffix in (".yaml", ".yml") and path.is_file()
@@ -71,7 +71,7 @@ def _saved(argument: str) -> Path | None:
 
 
 def _group(path: Path) -> str | None:
-    """The group whose choice a file is, by its folder in conf/ or its folder's name elsewhere; "" of conf/ itself."""
+    """The group of a file, by its folder in conf/ or its folder's name elsewhere; "" for conf/ itself."""
     folder = path.resolve().parent
     if folder.is_relative_to(conf_dir()):
         return folder.relative_to(conf_dir()).as_posix().removeprefix(".")
@@ -79,14 +79,14 @@ def _group(path: Path) -> str | None:
 
 
 def _search_path(arguments: Sequence[str]) -> list[str]:
-    """What `--config-dir` is to `gausim train`: where the groups of files outside of conf/ lie."""
+    """Override of Hydra's search path for files outside of conf/, like `--config-dir` of `gausim train`."""
     files = [Path(argument).resolve() for argument in arguments if Path(argument).is_file()]
     roots = sorted({f"'file://{file.parent.parent}'" for file in files if not file.is_relative_to(conf_dir())})
     return [f"hydra.searchpath=[{','.join(roots)}]"] if roots else []
 
 
 def _override(argument: str) -> str:
-    """What an argument is on the command line of `gausim train`; nothing, if it is conf/train.yaml itself."""
+    """The argument as an override of `gausim train`; empty for conf/train.yaml itself."""
     path, experiments = Path(argument), choices()["experiment"]
     if path.is_file() and (group := _group(path)) is not None:
         return f"{group}={path.stem}" if group else ""
@@ -115,7 +115,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _contradictions(config: dict[str, Any]) -> Iterator[str]:
-    """What the constructors say themselves."""
+    """Errors that the constructors raise."""
     for key in _BUILT:
         if isinstance(config.get(key), dict) and "_target_" in config[key]:
             try:
@@ -125,7 +125,7 @@ def _contradictions(config: dict[str, Any]) -> Iterator[str]:
 
 
 def _told(error: ValidationError, whole: Mapping[str, Any]) -> Iterator[str]:
-    """One violation of the schema, in words."""
+    """Messages for one violation of the schema."""
     path = ".".join(map(str, error.absolute_path))
     schema, instance = error.schema, error.instance
     assert isinstance(schema, dict)
@@ -145,8 +145,8 @@ def _told(error: ValidationError, whole: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _expected(schema: Any) -> str:
-    """A schema in words."""
-    schema = schema.get("else", schema)  # where an interpolation may stand for it
+    """Text of a schema for messages."""
+    schema = schema.get("else", schema)  # skip the alternative of an interpolation
     if "enum" in schema:
         return f"one of {', '.join(map(str, schema['enum']))}"
     if "anyOf" in schema:
