@@ -1,1 +1,1 @@
-"""The command line: the one room that imports Hydra and builds objects from configurations."""
+"""The commands of gausim."""

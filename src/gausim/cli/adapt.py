@@ -1,4 +1,4 @@
-"""`gausim adapt RUN`: find how new sequences begin, with everything that the run has learned as it is."""
+"""`gausim adapt RUN`: fit the initial states of new sequences with the trained simulator of a run frozen."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Only frames 0 .. FRAMES - 1 of the training views are looked at.
   gausim adapt outputs/bunny/seed_0 --data NEW_STORE --frames 3
   gausim adapt outputs/bunny/seed_0 --data NEW_STORE --set trainer.threads=1 optimizer.initial_lr=0.02"""
 EPOCHS, REPEATS = 60, 4
-# What `--supervision` stands for (the defaults of these are those of conf/supervision).
+# Targets of `--supervision`, with the same defaults as conf/supervision.
 SUPERVISIONS = {
     "images": "gausim.training.supervision.images.training_views",
     "points": "gausim.training.supervision.points.PointSupervision",
@@ -61,13 +61,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _beside(run: Path, frames: int) -> Path:
-    """outputs/bunny/seed_0 -> outputs/bunny_adapted_16/seed_0: seeds stay seeds of one experiment."""
+    """outputs/bunny/seed_0 -> outputs/bunny_adapted_16/seed_0, so that seeds stay in the folder of one experiment."""
     path = run.resolve()
     return path.parent.with_name(f"{path.parent.name}_adapted_{frames}") / path.name
 
 
 def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) -> dict[str, Any]:
-    """The run's configuration with what adapting changes, then the overrides."""
+    """The run's configuration with the settings of adaptation, then the overrides."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
@@ -119,7 +119,7 @@ def _checked(overrides: Sequence[str]) -> list[str]:
 
 
 def _roots(config: dict[str, Any], run: Path, stores: Sequence[str] | None) -> list[dict[str, Any]]:
-    """Entries of data.root: the stores' objects that the run knows, each with the rest scene that it was trained on."""
+    """Entries of data.root: the stores' objects that are in the run, each with the rest scene of its training."""
     from gausim.compose.config import instantiate
     from gausim.compose.data_paths import located
     from gausim.core.errors import DataError

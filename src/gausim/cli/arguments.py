@@ -1,4 +1,4 @@
-"""What the command lines of several commands share."""
+"""Common arguments of several commands."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def command_parser(name: str, more: str = "", epilog: str = "") -> argparse.ArgumentParser:
-    """The parser of a command, described by its line of `gausim --help` and more; line breaks of the texts stay."""
+    """The parser of a command, described by its line of `gausim --help` and ``more``; line breaks are kept."""
     raw: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter} if "\n" in more + epilog else {}
     return argparse.ArgumentParser(prog=f"gausim {name}", description=COMMANDS[name] + more, epilog=epilog, **raw)
 
@@ -36,7 +36,7 @@ def add_pin_options(parser: argparse.ArgumentParser) -> None:
 
 
 def pinned_by(scene: GaussianScene, arguments: argparse.Namespace) -> GaussianScene:
-    """The scene with its pins replaced by --pin-below and --pin-above (either side counts); as it is without them."""
+    """The scene with its pins replaced by the union of --pin-below and --pin-above, if given."""
     from gausim.ops.selection import apply_masks, parse_half_space
 
     sides = ((arguments.pin_below, False), (arguments.pin_above, True))
@@ -56,7 +56,7 @@ def parse_background(text: str) -> Tensor | None:
     """Reads a background colour; None is black.
 
     Raises:
-        ConfigError: it is neither a name nor three numbers in 0..1.
+        ConfigError: the text is neither a name nor three numbers in 0..1.
     """
     import torch
 

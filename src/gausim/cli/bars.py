@@ -1,4 +1,4 @@
-"""Progress bars on the standard error, which vanish when they are done."""
+"""Progress bars on the standard error, removed on completion."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def bars(*columns: ProgressColumn) -> Progress:
-    """A context manager that shows tasks: what they are called, a bar, and the columns; by default counts and time."""
+    """A context manager that shows tasks with name, bar and the given columns; by default counts and time."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -23,7 +23,7 @@ def bars(*columns: ProgressColumn) -> Progress:
 
 @contextmanager
 def named_bar(total: int, title: str) -> Iterator[Callable[[str], None]]:
-    """A bar of ``total`` items; what it gives advances it by one, whose name is shown."""
+    """A bar of ``total`` items; yields a function that advances it by one item and shows its name."""
     with bars() as shown:
         task = shown.add_task(title, total=total)
         yield lambda name: shown.update(task, advance=1, description=f"{title}: {name}")
@@ -31,7 +31,7 @@ def named_bar(total: int, title: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def byte_bar(total: int, title: str, *, pieces: bool = False) -> Iterator[Callable[[int], None]]:
-    """A bar of ``total`` bytes; what it gives takes the bytes so far, or those of each of the ``pieces``."""
+    """A bar of ``total`` bytes; yields a function of the bytes so far, or of each piece with ``pieces``."""
     from rich.progress import DownloadColumn, TransferSpeedColumn
 
     with bars(DownloadColumn(), TransferSpeedColumn()) as shown:

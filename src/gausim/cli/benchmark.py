@@ -1,4 +1,4 @@
-"""`gausim benchmark`: how fast this machine runs the renderer, the step, training and clustering."""
+"""`gausim benchmark`: speed of the renderer, the step, training and clustering on this machine."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CASES = {
     "cluster": "clusters of bounded diameter, against scipy",
 }
 DEFAULT_OVERRIDES = ("experiment=demo", "model=gausim")
-RIVAL = "model=gausim_elastic"  # what the speed of training is compared with
+RIVAL = "model=gausim_elastic"  # reference for the speed of training
 
 
 def main(argv: list[str]) -> int:
@@ -117,8 +117,8 @@ def simulator_of(preset: str, scene: GaussianScene, *settings: str) -> GausSim:
 
     Args:
         preset: name of the file.
-        scene: what it simulates.
-        settings: KEY=VALUE of the simulator's own keys.
+        scene: the scene to simulate.
+        settings: KEY=VALUE with keys of the simulator.
     """
     from gausim.compose.config import compose, instantiate
 
@@ -138,7 +138,7 @@ def _print(name: str, rows: list[Row]) -> None:
 
 
 def _readable(value: float, unit: str) -> tuple[str, str]:
-    """A figure with three significant digits and a prefix where its unit takes one."""
+    """A figure with three significant digits, and its unit with an SI prefix if it takes one."""
     if unit == "s" and value < 1:
         return f"{1000 * value:.3g}", "ms"
     if unit in ("B", "FLOP/s", "B/s"):

@@ -1,4 +1,4 @@
-"""How an archive of a registry becomes a directory: downloaded, verified, unpacked, and only then named."""
+"""Fetching of an archive of a registry: download, verification, unpacking, and renaming at the end."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def default_folder(entry: Entry) -> Path:
-    """Where an entry goes unless told otherwise."""
+    """Default directory of an entry."""
     return (Path("outputs", "fetched") if entry.kind == "run" else Path("data")) / entry.name
 
 
 def fetch(entry: Entry, target: Path, addresses: Sequence[str]) -> bool:
-    """Makes the directory ``target`` of an entry, whole or not at all; False where it was fetched before.
+    """Makes the directory ``target`` of an entry atomically; returns False if it was fetched before.
 
-    What is downloaded lies in a hidden folder beside it, from which the same call goes on after an interruption.
+    Downloads are kept in a hidden folder beside it, from which the same call continues after an interruption.
 
     Args:
-        entry: what is fetched.
-        target: the directory; it may not be there.
-        addresses: of the archive, in the order to try.
+        entry: the entry to fetch.
+        target: the directory, which must not exist.
+        addresses: addresses of the archive, in the order to try.
 
     Raises:
-        FetchError: something else lies there, no address has the file, it is not what the registry says, its archive is
+        FetchError: the target has other content, no address has the file, its size or hash is wrong, the archive is
             unsafe, or the disk is full.
-        BusyError: another process fetches it.
+        BusyError: another process is fetching the entry.
     """
     if _is_there(entry, target):
         return False
@@ -97,7 +97,7 @@ def _check_room(entry: Entry, archive: Path, target: Path) -> None:
 
 
 def _download(entry: Entry, archive: Path, addresses: Sequence[str]) -> None:
-    """Tries the addresses until one gives the file of the entry's size and hash."""
+    """Tries the addresses until one has a file of the entry's size and hash."""
     refused: list[str] = []
     for address in addresses:
         try:
@@ -119,7 +119,7 @@ def _download(entry: Entry, archive: Path, addresses: Sequence[str]) -> None:
 
 
 def _unpack(entry: Entry, archive: Path, unpacked: Path) -> Path:
-    """The folder with what was in the archive; an archive that is not what it should be is removed."""
+    """The folder with the unpacked content; an invalid archive is removed."""
     remove_tree(unpacked)
     with byte_bar(entry.unpacked, f"unpack {entry.name}", pieces=True) as bar:
         try:
@@ -154,7 +154,7 @@ def _take_name(folder: Path, target: Path) -> None:
 
 @contextmanager
 def _disk_errors(target: Path, work: Path) -> Iterator[None]:
-    """Tells what the disk refuses in words; a full one is left without anything of ours."""
+    """Converts errors of the disk to readable ones; if the disk is full, our files are removed."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""`gausim card RUN`: what others must know of a run before they use it, from what its directory records."""
+"""`gausim card RUN`: the card of a run for its users, made from the records in its directory."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ if TYPE_CHECKING:
     from gausim.report.card import CardFacts
     from gausim.report.gather.runs import RunRecord
 
-# Groups of the configuration in which a run chooses; the rest says where and how it is shown.
+# Groups of the configuration with a choice per run; others concern paths and display.
 _GROUPS = (
     "data", "model", "supervision", "loss", "optimizer", "render", "trainer", "logger", "callbacks", "budget",
     "experiment", "ablation",
 )  # fmt: skip
-# Paths of the machine that trained, and what changes neither the run nor its figures.
+# Keys omitted from cards: paths of the training machine, and keys without effect on the run or its figures.
 _PATHS = ("data.root", "data.scene", "data.masks", "paths")
 _UNTOLD = (
     *_PATHS, "data.seed", "logger", "callbacks", "name", "task_name", "evaluate", "trainer.progress", "ablation",
@@ -92,7 +92,7 @@ def _facts(run: RunRecord, arguments: argparse.Namespace) -> CardFacts:
 
 
 def _data(run: RunRecord, words: list[str]) -> dict[str, Mapping[str, Any]] | None:
-    """What ``dataset.json`` of every object says; None where the data set is not on this machine."""
+    """Content of ``dataset.json`` per object; None if the data set is not on this machine."""
     from gausim.compose.data_paths import data_option, listed, located
     from gausim.core.errors import DataError
     from gausim.data.objects import find_objects
@@ -126,7 +126,7 @@ def _endurance(path: Path) -> dict[str, Any]:
 
 
 def _about(preset: str | None) -> str:
-    """The comment at the head of a model's preset."""
+    """The comment at the head of a model's file in conf/."""
     from gausim.compose.config import conf_dir
 
     path = conf_dir() / "model" / f"{preset}.yaml"
@@ -152,7 +152,7 @@ def _is_one_of(key: str, keys: Sequence[str]) -> bool:
 
 
 def _differences(run: RunRecord) -> tuple[str, list[tuple[str, str, str]]]:
-    """With what the configuration is compared, and every key that differs."""
+    """The configuration for comparison, and every key that differs."""
     from omegaconf import OmegaConf
 
     import gausim
@@ -165,11 +165,11 @@ def _differences(run: RunRecord) -> tuple[str, list[tuple[str, str, str]]]:
     words = f"`gausim train {' '.join(chosen)}`" if chosen else "`gausim train`"
     try:
         default = compose("train", chosen)
-    except ConfigError:  # a preset of a version that is gone
+    except ConfigError:  # a file of an earlier version
         default, words = compose("train"), "`gausim train` (its own presets are not of this version)"
     base_config = OmegaConf.to_container(default, resolve=True)
     own, base = (dict(flatten(with_defaults(config))) for config in (run.config, base_config))
     keys = [key for key in own if own[key] != base.get(key)] + [key for key in base if key not in own]
     rows = [(k, own.get(k, _ABSENT), base.get(k, _ABSENT)) for k in keys if not _is_one_of(k, _UNTOLD)]
-    rows = [row for row in rows if {*row[1:]} != {"None", _ABSENT}]  # null says as much as nothing
+    rows = [row for row in rows if {*row[1:]} != {"None", _ABSENT}]  # null and absent mean the same
     return f"{words} of gausim {gausim.__version__}", rows

@@ -1,6 +1,6 @@
-"""What may stand at the cursor of a command line that begins with `gausim`; the scripts in shells/ ask for it.
+"""Completions of a command line of `gausim`, called by the scripts in shells/.
 
-Nothing here loads torch: the answer is awaited with a finger on the key.
+This module does not load torch, so that completion is fast.
 """
 
 from __future__ import annotations
@@ -12,22 +12,22 @@ from pathlib import Path
 
 from gausim.cli.main import COMMANDS
 
-# In the name of an argument that takes Hydra's overrides.
+# Part of the name of arguments that take Hydra's overrides.
 OVERRIDES = "KEY=VALUE"
 
 
 def complete(words: Sequence[str]) -> list[str]:
-    """Returns what the last word may become; nothing where it names a file or is anybody's guess.
+    """Returns the completions of the last word; none for files and free text.
 
     Args:
-        words: those after `gausim`, the one at the cursor last (empty after a space).
+        words: the words after `gausim`; the last is the one at the cursor (empty after a space).
     """
     *before, word = words or [""]
     if not before:
         offered = [*COMMANDS, *(("--help", "--version") if word.startswith("-") else ())]
     elif before[0] in COMMANDS:
         module = importlib.import_module(f"gausim.cli.{before[0]}")
-        make = getattr(module, "_parser", _hydra_parser)  # of `gausim train` Hydra reads the arguments
+        make = getattr(module, "_parser", _hydra_parser)  # Hydra parses the arguments of `gausim train`
         offered = list(_arguments(make(), before[1:], word))
     else:
         offered = []
@@ -45,7 +45,7 @@ def _hydra_parser() -> argparse.ArgumentParser:
 
 
 def _arguments(parser: argparse.ArgumentParser, before: Sequence[str], word: str) -> Iterator[str]:
-    """What a parser takes after some words; those of a sub-command if they name one."""
+    """Arguments that a parser, or the sub-command in ``before``, accepts next."""
     places = [action for action in parser._actions if not action.option_strings]
     taking: argparse.Action | None = None  # the option that the words after it belong to
     taken = 0
@@ -71,7 +71,7 @@ def _arguments(parser: argparse.ArgumentParser, before: Sequence[str], word: str
 
 
 def _most(action: argparse.Action) -> float:
-    """How many words belong to an argument at most."""
+    """Largest number of words of an argument."""
     return action.nargs if isinstance(action.nargs, int) else float("inf") if action.nargs in ("*", "+") else 1
 
 
@@ -87,7 +87,7 @@ def _values(action: argparse.Action, before: Sequence[str], word: str) -> Iterat
 
 
 def _overrides(before: Sequence[str], word: str) -> list[str]:
-    """Groups, their files, keys and values that Hydra knows beside the other overrides; of a list, its last entry."""
+    """Groups, their files, keys and values that Hydra offers given the other overrides; of a list, its last entry."""
     import hydra
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
@@ -108,7 +108,7 @@ def _overrides(before: Sequence[str], word: str) -> list[str]:
             found = plugin._query("train", " ".join([*spelled(chosen), asked]) if asked else f"{' '.join(chosen)} ")
             if begun and plugin._query("train", " ".join([*spelled(chosen), f"{begun}."])):
                 found = sorted({*found, *_more(key, asked)})
-        except (HydraException, OmegaConfBaseException):  # a word before this one is wrong, or a value stands nowhere
+        except (HydraException, OmegaConfBaseException):  # an earlier word is wrong, or a value is missing
             return []
     if comma:
         return [f"{key}={listed},{choice.removeprefix(f'{key}=')}" for choice in found]
@@ -116,7 +116,7 @@ def _overrides(before: Sequence[str], word: str) -> list[str]:
 
 
 def _more(key: str, asked: str) -> list[str]:
-    """Settings that Hydra does not list: those that begin so, or the value of the one that is asked for."""
+    """Settings that Hydra does not list: those with this prefix, or the value of the requested one."""
     from gausim.compose.places import more_settings
 
     more = more_settings()
@@ -126,7 +126,7 @@ def _more(key: str, asked: str) -> list[str]:
 
 
 def _either(choice: str) -> tuple[str, ...]:
-    """Of a truth value both, where Hydra offers the present one; behind a directory what is in it."""
+    """Both truth values, where Hydra offers only the current one; for a directory its content."""
     key, _, value = choice.partition("=")
     if value.startswith(("/", ".")) and Path(value).is_dir():
         return (f"{choice}/",)
@@ -134,6 +134,6 @@ def _either(choice: str) -> tuple[str, ...]:
 
 
 def _is_for_people(choice: str, word: str) -> bool:
-    """Whether somebody would type this: not Hydra's inner keys, unless they have begun to."""
+    """Whether a completion is offered: not Hydra's internal keys, unless the word begins like one."""
     name, begun = choice.partition("=")[0].rpartition(".")[2], word.rpartition(".")[2]
     return (not name.startswith("_") or begun.startswith("_")) and (choice != "hydra")

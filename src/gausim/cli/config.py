@@ -36,7 +36,7 @@ What is offered is what the installed version has; the script itself does not ch
 
 def main(argv: Sequence[str]) -> int:
     """Runs the command; returns the exit status."""
-    if argv[:1] == ["complete"]:  # the scripts ask this way; words of any kind follow, so no parser can have them
+    if argv[:1] == ["complete"]:  # called by the shell scripts; any words may follow, so they bypass the parser
         from gausim.cli.completion import complete
 
         sys.stdout.writelines(f"{choice}\n" for choice in complete(argv[1:]))

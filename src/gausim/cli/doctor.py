@@ -1,4 +1,4 @@
-"""`gausim doctor`: what is wrong with a data set, and how to mend it, before hours of training are spent on it."""
+"""`gausim doctor`: faults of a data set and their remedies, to be used before a training."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command; returns 0 where a training may begin, 1 where a fault would ruin it."""
+    """Runs the command; returns 0 if the data can be trained on, 1 if there are faults."""
     arguments = _parser().parse_args(argv)
     import torch
 
@@ -51,13 +51,13 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[str, Any]:
-    """Examines one object, prints what was found and returns it as plain data."""
+    """Examines one object, prints the findings and returns them as plain data."""
     from gausim.data.objects import ObjectData
     from gausim.data.verify import verify
     from gausim.doctor.examine import examine
     from gausim.doctor.page import findings_text, plain_findings
 
-    # Masks and pins are judged below: they may be given here, and no pin is a finding among others.
+    # Masks and pins are checked below: options may set them, and missing pins are one of the findings.
     faults = verify(root, quick=True, scene=False)
     if faults:
         if not arguments.json:
@@ -74,7 +74,7 @@ def _one(root: Path, arguments: argparse.Namespace, out: Path | None) -> dict[st
 
 
 def _scene(data: ObjectData, arguments: argparse.Namespace) -> GaussianScene | None:
-    """The rest scene with the pins that were asked for; None where the object has none yet."""
+    """The rest scene with the requested pins; None if the object has no scene yet."""
     from gausim.core.errors import DataError
     from gausim.io.ply import load_scene
 

@@ -1,4 +1,4 @@
-"""How a command ends on the terminal: sentences of result, one address, the next commands. No lists of files."""
+"""Final output of commands: sentences on the result, one address and the next commands, without lists of files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-# Of several objects so many are told of; the page or the table has them all.
+# Limit of sentences on the terminal; the page or table covers all objects.
 MOST_SENTENCES = 3
 PUSH = "--force on=tip weights=3 direction=x"
 OWN_OBJECT = ("train", "data=object", "data.root=ROOT", "name=mine")
@@ -19,10 +19,10 @@ def end(sentences: Sequence[str], kind: str, address: Path, *commands: Sequence[
     """Prints the end of a command, at most three lines, one, and one per next command.
 
     Args:
-        sentences: the result, one line each; of more than three, the number of the others is told.
-        kind: what lies at the address: ``page``, ``tables``, ``videos``, ``run``.
+        sentences: the result, one line each; beyond three only the number of the others is printed.
+        kind: kind of the address: ``page``, ``tables``, ``videos``, ``run``.
         address: file or directory.
-        commands: the next ones: arguments of gausim.
+        commands: the next commands, as arguments of gausim.
     """
     lines = list(sentences[:MOST_SENTENCES])
     left = len(sentences) - len(lines)
@@ -33,7 +33,7 @@ def end(sentences: Sequence[str], kind: str, address: Path, *commands: Sequence[
 
 
 def program() -> str:
-    """What gausim is called here: by its name where the shell finds it, else by the path it was called by."""
+    """The command to call gausim: its name if the shell finds it, else the path of the current call."""
     called = Path(sys.argv[0])
     return shlex.quote(str(called)) if called.name == "gausim" and shutil.which("gausim") is None else "gausim"
 
@@ -44,7 +44,7 @@ def push(run: Path | str, name: str | None = None) -> list[object]:
 
 
 def told(entries: Mapping[str, dict[str, Any]]) -> list[str]:
-    """One sentence per object of ``metrics.json``: how far off its first method is in frames never seen."""
+    """One sentence per object of ``metrics.json`` on the error of its first method in unseen frames."""
     from gausim.report.tables.verdict import outcome, sentences
 
     return [f"{name}: {sentences(outcome([entry], str(entry['methods'][0])))[0]}" for name, entry in entries.items()]

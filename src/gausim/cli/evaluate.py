@@ -52,7 +52,7 @@ def main(argv: list[str]) -> int:
         print((folder / "metrics.json").read_text(), end="")
         return 0
     if arguments.verbose:
-        # Rich would cut columns at 80 characters where the output goes to a file.
+        # Rich would truncate columns at 80 characters in files.
         Console(width=None if sys.stdout.isatty() else 200).print(Markdown((folder / "table.md").read_text()))
         print("\n".join(f"wrote {folder / name}" for name in [*WRITTEN, *drawn]))
     commands = [["report", arguments.run], ["simulate", arguments.run]] if whole else [["evaluate", arguments.run]]
@@ -102,7 +102,7 @@ def _evaluate(run: LoadedRun, arguments: argparse.Namespace) -> list[ObjectCurve
 
 
 def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list[str]:
-    """Writes what long rollouts of each object's first sequence tell; returns the names of the files."""
+    """Evaluates long rollouts of each object's first sequence; returns the names of the written files."""
     from gausim.compose.predict import endurance, run_objects
     from gausim.report.pictures.motion import endurance_figure
 
@@ -126,7 +126,7 @@ def _views(data: ObjectData, group: str) -> list[str]:
 
 
 def _folder(run: LoadedRun, arguments: argparse.Namespace) -> tuple[bool, Path]:
-    """Whether this is the run's whole evaluation, which that of a part never overwrites; and where it goes."""
+    """Whether the evaluation covers the whole run (a partial one never overwrites it), and its folder."""
     whole = run.run_dir / "evaluation"
     partial = arguments.object or arguments.sequences or arguments.views != "all"
     folder = arguments.out or (whole / "partial" if partial else whole)

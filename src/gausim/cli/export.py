@@ -1,4 +1,4 @@
-"""`gausim export`: a motion as files for other programs, and from their files back."""
+"""`gausim export`: conversion of motions to and from files of other programs."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """What is exported.
+    """A motion to export.
 
     Attributes:
-        name: of its files.
+        name: base name of the files.
         fps: frames per second.
-        frames: their number.
-        scenes: makes the deformed scenes, one at a time.
-        first: the first of them, or the rest scene.
-        trajectory: the same as a trajectory, where it came as one.
-        cameras: of the data set, where there is one.
-        renderer: of the run, where there is one.
+        frames: number of frames.
+        scenes: generator function of the deformed scenes.
+        first: the first deformed scene, or the rest scene.
+        trajectory: the motion as a trajectory, if it was read as one.
+        cameras: cameras of the data set, if any.
+        renderer: renderer of the run, if any.
     """
 
     name: str
@@ -229,7 +229,7 @@ def _camera(motion: Motion, arguments: argparse.Namespace) -> Cameras:
 
 
 class Format(NamedTuple):
-    """A kind of file: its suffix (empty for a folder), what of a motion is in it and what not, and who reads it."""
+    """A file format: suffix (empty for a folder), writer, content that it keeps and loses, and readers."""
 
     suffix: str
     write: Callable[[Motion, Path, argparse.Namespace], int]
@@ -242,7 +242,7 @@ FORMATS = {
     "safetensors": Format(
         ".safetensors",
         _write_safetensors,
-        "every number of the trajectory, bit for bit: positions, gradients and rotations per unit",
+        "every number of the trajectory, bit for bit: positions, deformation gradients and rotations per unit",
         "the rest scene (keep SCENE.ply beside it)",
         "gausim (--scene SCENE.ply), any safetensors reader",
     ),
@@ -251,7 +251,7 @@ FORMATS = {
         _write_ply,
         "one 3DGS PLY per frame, name_0001.ply as SuperSplat's timeline plays; covariances as axes and lengths, turned "
         "spherical harmonics, masks of the first frame",
-        "which unit a kernel belongs to; gradients",
+        "units of the kernels, deformation gradients",
         "gausim, SuperSplat, every 3DGS viewer",
     ),
     "usd": Format(
@@ -259,7 +259,7 @@ FORMATS = {
         _write_usd,
         "one ParticleField3DGaussianSplat with time samples: positions, orientations, scales, opacities, turned "
         "spherical harmonics, float32",
-        "masks, units, gradients",
+        "masks, units, deformation gradients",
         "gausim, OpenUSD 26.3 or newer",
     ),
     "viser": Format(

@@ -1,4 +1,4 @@
-"""`gausim fetch NAME`: published runs and data sets, verified before they are unpacked; and how to publish one."""
+"""`gausim fetch NAME`: fetches published runs and data sets, verified before unpacking, or packs one."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def main(argv: list[str]) -> int:
     if arguments.list:
         _print_list(registry)
         return 0
-    entries = [registry.find(name) for name in arguments.names]  # all, before the first is downloaded
+    entries = [registry.find(name) for name in arguments.names]  # check all names before the first download
     for entry in entries:
         _fetch(entry, arguments, registry)
     return 0
@@ -116,5 +116,5 @@ def _pack(arguments: argparse.Namespace) -> int:
 
 
 def megabytes(count: int) -> str:
-    """A number of bytes for people."""
+    """A number of bytes in MB, as text."""
     return f"{count / 1e6:,.1f} MB" if count < 1e9 else f"{count / 1e9:,.2f} GB"

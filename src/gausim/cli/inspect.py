@@ -1,4 +1,4 @@
-"""`gausim inspect`: what a scene holds and what hierarchy it gets."""
+"""`gausim inspect`: statistics of a scene and of its hierarchy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from gausim.core.scene import GaussianScene
     from gausim.models.hierarchy.clusters import Hierarchy
 
-# The hierarchy of the model configurations (conf/model), which take a while to compose.
+# The hierarchy of the model configurations in conf/model; composing them here would be slow.
 DEFAULT_RADII = (0.13, 0.4)
 DEFAULT_CLUSTERING = "agglomerative"
 
@@ -94,8 +94,8 @@ def _print_hierarchy(hierarchy: Hierarchy, radii: list[float]) -> None:
         print(f"{number:<5} {units}  {bound:<15} {total:<15.8g} {total:.8g}")
     predicted = list(range(len(levels) - 1, 0, -1))
     kernels, count = levels[0].count, hierarchy.predictions(predicted)
-    share = f"{count} / {kernels} = {100 * count / kernels:.2f} %"
-    print(f"N_F / N_K  {share} (units predicted per step, levels {predicted})")
+    fraction = f"{count} / {kernels} = {100 * count / kernels:.2f} %"
+    print(f"N_F / N_K  {fraction} (units predicted per step, levels {predicted})")
     print("levels     " + " -> ".join(str(level.count) for level in levels))
 
 

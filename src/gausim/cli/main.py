@@ -1,4 +1,4 @@
-"""The `gausim` command: picks a sub-command and imports only that one, so that `gausim --help` stays instant."""
+"""The `gausim` command: imports only the chosen sub-command, so that `gausim --help` is fast."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from gausim import __version__
 
 EXIT_OK = 0
 EXIT_USAGE = 2
-# 128 + SIGINT, what shells report for an interrupted program.
+# 128 + SIGINT, the exit status that shells report for an interrupted program.
 EXIT_INTERRUPTED = 130
-# Each is a module beside this one, whose `main(argv)` runs it.
+# Each command is a module of this package with a function `main(argv)`.
 COMMANDS = {
-    "prepare": "Make a data set of films and photos, stage by stage; fetch the LPIPS weights.",
+    "prepare": "Make a data set from films and photos, stage by stage; fetch the LPIPS weights.",
     "inspect": "Print a scene's kernels and hierarchy and draw its clusters.",
     "reconstruct": "Fit the Gaussians of the rest scene to posed stills.",
     "verify": "Check a data set and name every fault.",
-    "doctor": "Look at cameras, masks, clock and motion of a data set before training: what to mend.",
+    "doctor": "Check cameras, masks, frame rate and motion of a data set before training.",
     "train": "Learn an object's dynamics from multi-view videos.",
-    "adapt": "Fit how new sequences begin to their first frames, with a trained run as it is.",
+    "adapt": "Fit initial states of new sequences to their first frames, with a trained run frozen.",
     "evaluate": "Measure a run on seen, unseen and held-out frames.",
     "benchmark": "Measure the speed of rendering, stepping, training and clustering as ratios within one run.",
     "simulate": "Roll a run forward and write videos, figures and trajectories.",
-    "view": "Show a run or a scene in the browser and pull it about.",
+    "view": "Simulate a run or a scene interactively in the browser.",
     "export": "Write a motion as PLY, OpenUSD, safetensors, viser, HTML, MP4 or GIF, and read it back.",
     "config": "Check a training configuration, print its JSON schema, complete it in the shell.",
     "card": "Write the card of a run: data, figures, cost, limitations, licence.",
@@ -51,7 +51,7 @@ def usage() -> str:
 
 
 def command(name: str) -> Callable[[list[str]], int]:
-    """Imports a command; what is returned runs it."""
+    """Imports a command and returns its main function."""
     run: Callable[[list[str]], int] = importlib.import_module(f"gausim.cli.{name}").main
     return run
 
@@ -63,7 +63,7 @@ def _unknown(name: str) -> str:
 
 
 def _run(name: str, argv: list[str]) -> int:
-    """Runs a command; an error meant for people becomes one line, a defect keeps its traceback."""
+    """Runs a command; errors of gausim are printed in one line, other exceptions with their traceback."""
     try:
         return int(command(name)(argv))
     except (Exception, KeyboardInterrupt) as error:
@@ -72,7 +72,7 @@ def _run(name: str, argv: list[str]) -> int:
         if isinstance(error, KeyboardInterrupt):
             print("interrupted", file=sys.stderr)
             return EXIT_INTERRUPTED
-        # Imported only now: gausim.core loads torch, which `gausim --help` must not wait for.
+        # Imported here so that `gausim --help` loads no other package.
         from gausim.core.errors import GausSimError
 
         if not isinstance(error, GausSimError):
@@ -88,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments without the program's name; the process's own by default.
 
     Returns:
-        The exit status: 0 done, 2 wrong usage or unusable input, 130 interrupted, else the command's own.
+        The exit status: 0 done, 2 wrong usage or unusable input, 130 interrupted, else that of the command.
     """
     name, *rest = list(sys.argv[1:] if argv is None else argv) or [""]
     if name in ("-h", "--help", "help"):
@@ -100,8 +100,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(_unknown(name) if name else usage(), file=sys.stderr)
         return EXIT_USAGE
-    # torch's operators are small here and gain little from a second thread, which spins while it waits and takes the
-    # core from whoever else runs. The renderer's workers (render.threads) sleep.
+    # The operators here are small and gain little from a second thread of torch, which occupies a core while it waits.
+    # The renderer's workers (render.threads) sleep instead.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     return _run(name, rest)
 

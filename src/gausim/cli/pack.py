@@ -1,4 +1,4 @@
-"""How a finished run or a data set becomes an archive that others fetch, and the entry that a registry needs of it."""
+"""Packing of a finished run or a data set for publication, with its entry for a registry."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from gausim.runs.checkpoint import LAST_CHECKPOINT, read_checkpoint
 from gausim.runs.directory import CONFIG, FETCHED, FINISHED, RunDirectory
 from gausim.runs.names import EPOCHS, MOTION
 
-# What of a run others need; logs, panels and films stay: they say on which machine and by whom it was made.
+# Files of a run to publish; logs, panels and films are excluded, as they identify the machine and its user.
 _OF_A_RUN = (CONFIG, LAST_CHECKPOINT, FINISHED, EPOCHS, MOTION, CARD)
 _LICENCES = ("licence", "license")
 
@@ -31,19 +31,19 @@ def pack_published(source: Path, out: Path, *, name: str, title: str | None, lic
 
     Args:
         source: a run directory, or a directory of an object or of several.
-        out: where the archive goes.
-        name: of the entry.
-        title: what it is; made from its objects when None.
-        licence: of the archive's content; what ``dataset.json`` says when None.
-        data: of a run, the entry of its data set; empty without one.
+        out: directory of the archive.
+        name: name of the entry.
+        title: title of the entry; made from the names of the objects when None.
+        licence: licence of the content; that of ``dataset.json`` when None.
+        data: of a run, the entry of its data set, or empty.
 
     Returns:
-        The entry of a registry, its addresses left to fill in.
+        The TOML entry for a registry, without addresses.
 
     Raises:
-        FetchError: the name cannot be one, or no licence is known.
-        RunError: the run is not finished or its checkpoint damaged.
-        DataError: there is no data set, or a link in it.
+        FetchError: the name is invalid, or the licence is unknown.
+        RunError: the run is not finished, or its checkpoint is damaged.
+        DataError: there is no data set, or it contains a link.
     """
     archive = out / f"{name}.tar"
     check_name(name)
@@ -81,7 +81,7 @@ def _of_run(source: Path) -> tuple[dict[str, Path], list[str]]:
 
 
 def _scenes(source: Path, data: Mapping[str, Any]) -> dict[str, Path]:
-    """Rest scenes and masks that the configuration names apart from the data set; they travel with the run."""
+    """Rest scenes and masks from outside the data set, which are packed with the run."""
     found: dict[str, Path] = {}
     for path in outside_files(source, data):
         name = f"{SCENES}/{path.name}"
@@ -98,7 +98,7 @@ def _of_data(source: Path) -> tuple[dict[str, Path], list[str]]:
 
 
 def _licence_of(source: Path) -> str | None:
-    """What every ``dataset.json`` of a set says, if all say the same."""
+    """The licence in the ``dataset.json`` of every object, if it is the same for all."""
     said = set()
     for root in find_objects(source):
         facts = read_json(root / "dataset.json")
@@ -107,11 +107,11 @@ def _licence_of(source: Path) -> str | None:
 
 
 def _say_what(source: Path, archive: Path, count: int, *, is_run: bool, has_card: bool) -> None:
-    """What the packing person should know, on the standard error: the entry alone goes to the standard output."""
+    """Prints remarks on the archive to the standard error; only the entry goes to the standard output."""
     print(f"wrote {archive} ({archive.stat().st_size / 1e6:,.1f} MB, {count} files)", file=sys.stderr)
     if not is_run:
         return
     root = json.dumps(RunDirectory(source).config()["data"].get("root"))
-    print(f"note: {CONFIG} in it says where your data lies: {root}", file=sys.stderr)
+    print(f"note: its {CONFIG} contains the path of your data: {root}", file=sys.stderr)
     if not has_card:
-        print(f"note: it has no card. Write one with `gausim card {source}` and pack again.", file=sys.stderr)
+        print(f"note: the run has no card. Write one with `gausim card {source}` and pack again.", file=sys.stderr)

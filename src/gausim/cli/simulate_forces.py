@@ -1,4 +1,4 @@
-"""`gausim simulate RUN --force ...` and `--session FILE`: an object that is pushed."""
+"""`gausim simulate RUN --force ...` and `--session FILE`: simulation of an object under forces."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 
 def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -> int:
-    """Pushes one object of a run and writes its trajectory, session, videos and pictures; returns the exit status.
+    """Simulates one object under forces; writes trajectory, session, videos and pictures; returns the exit status.
 
     Raises:
-        ConfigError: options that do not go together, or an event that cannot be done.
-        DataError: a session that is broken or of another scene; an object, sequence or view that is not there.
-        DivergenceError: the simulation left the finite numbers.
+        ConfigError: options conflict, or an event is invalid.
+        DataError: the session is malformed or of another scene, or an object, sequence or view does not exist.
+        DivergenceError: a simulated position is not finite.
     """
     from gausim.cli.end import end
     from gausim.interaction.arrows import arrows_of
@@ -46,7 +46,7 @@ def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) ->
     item, interaction = _opened(run, arguments, found)
     session = _new_session(item, interaction, arguments) if found is None else _known(interaction, found, arguments)
     views = arguments.view or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
-    item.data.sequences[0].camera_indices(views)  # an unknown view ends it before the long work
+    item.data.sequences[0].camera_indices(views)  # raises on an unknown view before the simulation
     arrows: list[list[Arrow]] = []
     trajectory = replay(interaction, session, other_model=True, watch=lambda live: arrows.append(arrows_of(live)))
     folder = out / item.data.name / (Path(arguments.session).stem if arguments.session else "forces")
@@ -62,7 +62,7 @@ def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) ->
 
 
 def _opened(run: LoadedRun, arguments: argparse.Namespace, found: ForceSession | None) -> tuple[RunObject, Interaction]:
-    """The object that is pushed; where none is named, that of the session, or the first."""
+    """The named object and its interaction; by default the object of the session, or the first."""
     from gausim.compose.live import REST, open_interaction
     from gausim.compose.predict import run_objects
     from gausim.interaction.interaction import STANDARD_GRAVITY
@@ -91,7 +91,7 @@ def _new_session(item: RunObject, interaction: Interaction, arguments: argparse.
 
 
 def _known(interaction: Interaction, found: ForceSession, arguments: argparse.Namespace) -> ForceSession:
-    """A session that is played again, or as many frames of it as are asked for."""
+    """The session to replay, cut to the requested number of frames."""
     from msgspec.structs import replace
 
     from gausim.interaction.interaction import differences
@@ -107,7 +107,7 @@ def _known(interaction: Interaction, found: ForceSession, arguments: argparse.Na
 
 
 def write_trajectory(run: LoadedRun, item: RunObject, sequence: str, trajectory: Trajectory, folder: Path) -> None:
-    """Writes ``trajectory.safetensors`` of an object that began as a sequence did."""
+    """Writes ``trajectory.safetensors`` of an object that started from a sequence's initial state."""
     from gausim.io.trajectory import save_trajectory
 
     facts = {"object": item.data.name, "sequence": sequence, "run": run.run_dir.name}
@@ -156,7 +156,7 @@ def _write_view(
 
 
 def _sharp(cameras: Cameras) -> Cameras:
-    """The same views with as many pixels as a video's panel has, where the data set's have fewer."""
+    """The same views, enlarged to the size of a video panel if they are smaller."""
     from gausim.core import Cameras
     from gausim.report.pictures.frames import PANEL_HEIGHT
 
@@ -167,7 +167,7 @@ def _sharp(cameras: Cameras) -> Cameras:
 
 
 def _told(interaction: Interaction, trajectory: Trajectory) -> list[str]:
-    """How far it went, and what kept it from going further."""
+    """Sentences on the largest displacement and on limits that applied."""
     scene = interaction.scene
     away = (trajectory.positions - scene.means.to(trajectory.positions)).norm(dim=-1) / scene.diagonal
     held = ~scene.simulated | scene.pinned

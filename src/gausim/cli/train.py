@@ -39,7 +39,7 @@ checkpoint; cut short by trainer.max_minutes or max_epochs before it had learned
 again; once finished it is refused, unless overwrite=true. A sweep (-m) that is started again leaves out
 what is finished, resumes what is not, and tries again what failed if sweep.retry_failed=true."""
 
-# Largest motion from frame to frame that small pushes were seen to begin with [diagonals]; others begin with less.
+# Largest first displacement per frame observed for small pushes [diagonals].
 FIRST_STEP = 0.065
 
 COMPARED = {
@@ -59,7 +59,7 @@ def main(argv: Sequence[str]) -> int:
 
     try:
         return run_hydra("train", train, argv)
-    except OSError as error:  # Hydra makes the run's directory before it calls us
+    except OSError as error:  # Hydra makes the run directory before it calls the task
         explained = unwritable(error)
         if explained is None:
             raise
@@ -69,10 +69,10 @@ def main(argv: Sequence[str]) -> int:
 def train(cfg: DictConfig) -> float | None:
     """Trains one run; returns its last loss above the floor as a fraction of the static prediction's.
 
-    In a sweep no error stops the other jobs: it is told, and told again in the summary at the end.
+    In a sweep errors do not stop the other jobs: they are logged and repeated in the summary at the end.
 
     Raises:
-        GausSimError: the run is finished, of another configuration, damaged or another process's; training diverged.
+        GausSimError: the run is finished, has another configuration, is damaged or in use, or training diverged.
     """
     from gausim.cli.sweeps.jobs import do_job
     from gausim.compose.config import in_sweep, run_dir
@@ -86,7 +86,7 @@ def train(cfg: DictConfig) -> float | None:
 
 
 def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
-    """Trains into a run directory that this process holds, and evaluates if the configuration says so."""
+    """Trains into a run directory locked by this process, and evaluates the run if configured."""
     if cfg.evaluate and not cfg.overwrite and run.awaits_evaluation(_plain(cfg)):
         objective = run.facts()["last_epoch"].get("excess_static")
     else:
@@ -106,7 +106,7 @@ def _plain(cfg: DictConfig) -> dict[str, Any]:
 
 
 def _evaluate(run: RunDirectory) -> None:
-    """`gausim evaluate RUN` in a process of its own, so that its times and memory are those of a prediction alone."""
+    """`gausim evaluate RUN` in a separate process, so that it measures time and memory of predictions alone."""
     import os
     import subprocess
 
@@ -131,7 +131,7 @@ def _train(cfg: DictConfig, run: RunDirectory) -> float | None:
     from gausim.training.ranks.launch import Crew
 
     with run.noting_failure(), Crew(instantiate(cfg.trainer), follow) as crew:
-        if not crew.is_first:  # a scheduler has started it beside the first
+        if not crew.is_first:  # started by a scheduler beside the first rank
             return follow(crew)
         config = _plain(cfg)
         task = crew.ranks.first(lambda: (config, str(run.path), run.prepare(config, overwrite=cfg.overwrite)))
@@ -141,7 +141,7 @@ def _train(cfg: DictConfig, run: RunDirectory) -> float | None:
 
 
 def follow(crew: Crew) -> float | None:
-    """Trains as one of the other ranks: what the first one says, into nothing."""
+    """Trains as one of the other ranks, with the configuration of the first one and without writing files."""
     from omegaconf import OmegaConf
 
     from gausim.runs.directory import RunDirectory
@@ -186,7 +186,7 @@ def _fit(
         if cfg.doctor and not in_sweep():
             faults = _warn_of_data(datamodule)
     trainer.fit(module, datamodule=datamodule, ckpt_path=resume, weights_only=True)
-    if plan is not None and not plan.order:  # nothing to learn: no epoch has saved it
+    if plan is not None and not plan.order:  # no trained stage, so no epoch has saved a checkpoint
         trainer.save_checkpoint(run.checkpoint, weights_only=False)
     if trainer.interrupted:
         raise KeyboardInterrupt
@@ -200,11 +200,11 @@ def _fit(
 
 
 def _facts(trainer: Trainer, module: GausSimModule) -> dict[str, Any]:
-    """What a finished run says of itself."""
+    """Facts that a finished run records."""
     from gausim.training.callbacks.convergence import Convergence
     from gausim.training.fitted.fitting import StagedFit
 
-    # Counted by `processed`: of a run that is resumed after its last save, `current_epoch` lags behind.
+    # `processed` counts them; `current_epoch` lags behind in a run that is resumed after its last save.
     epochs = cast(Any, trainer.fit_loop.epoch_progress.current).processed
     facts: dict[str, Any] = {"epochs": epochs, "optimizer_steps": module.global_step, "last_epoch": module.summary}
     if isinstance(module.method, StagedFit):
@@ -214,7 +214,7 @@ def _facts(trainer: Trainer, module: GausSimModule) -> dict[str, Any]:
 
 
 def _result(facts: dict[str, Any]) -> list[str]:
-    """How long it trained, how near it came on the frames shown, faults of the data, and whether more would help."""
+    """Sentences on the training time, the error on training frames, faults of the data, and convergence."""
     more = [
         f"The data are faulty, and so is what it learned from them. {fault} Mend that and train again: "
         "`gausim doctor ROOT` has the remedy."
@@ -223,7 +223,7 @@ def _result(facts: dict[str, Any]) -> list[str]:
     more += [facts["learning"]["verdict"]] if "learning" in facts else []
     excess = facts["last_epoch"].get("excess_static")
     begin = f"Trained for {facts['epochs']} epochs ({facts['optimizer_steps']} steps)"
-    if excess is None or excess < -1:  # no frame shows more than what the reconstruction misses already
+    if excess is None or excess < -1:  # the motion is smaller than the error of the reconstruction
         return [f"{begin}.", *more]
     return [
         f"{begin}: on the frames shown, the loss beyond that of the reconstruction is {excess:.2f} times that of a "
@@ -233,7 +233,7 @@ def _result(facts: dict[str, Any]) -> list[str]:
 
 
 def _warn_of_data(datamodule: ReadyDataModule) -> list[str]:
-    """Prints faults and warnings that `gausim doctor` finds in the objects; returns the faults, a sentence each."""
+    """Prints faults and warnings of `gausim doctor` on the objects; returns one sentence per fault."""
     from gausim.doctor.examine import examine
     from gausim.doctor.page import findings_text
 
@@ -247,7 +247,7 @@ def _warn_of_data(datamodule: ReadyDataModule) -> list[str]:
 
 
 def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None:
-    """Takes weights of another run over (a resumed run has its own in its checkpoint), and freezes them if asked to."""
+    """Copies weights of another run (unless resumed from a checkpoint), and freezes them if configured."""
     from gausim.core import ConfigError
     from gausim.training.fitted.fitting import StagedFit
     from gausim.training.transfer import load_shared, load_simulator
@@ -269,7 +269,7 @@ def _take_over(cfg: DictConfig, module: GausSimModule, *, resumed: bool) -> None
 
 
 def _take_over_fit(cfg: DictConfig, method: FittedMethod, *, resumed: bool) -> None:
-    """The same for a fitted method, if it is one that takes over what another has found."""
+    """The same for a fitted method that supports initialisation from another run."""
     from gausim.compose.build import load_run
     from gausim.core import ConfigError, TakesOver
     from gausim.training.fitted.fitting import StagedFit
@@ -292,7 +292,7 @@ def _take_over_fit(cfg: DictConfig, method: FittedMethod, *, resumed: bool) -> N
 def _trainer(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | None) -> Trainer:
     """The trainer of a configuration, with its callbacks and, on the first rank, loggers that write into the run.
 
-    A plan's epochs, if given, take the place of ``trainer.max_epochs``.
+    The epochs of a plan, if given, replace ``trainer.max_epochs``.
     """
     from gausim.compose.config import instantiate
     from gausim.training.trainer import make_trainer
@@ -308,7 +308,7 @@ def _trainer(cfg: DictConfig, run: RunDirectory, crew: Crew, *, epochs: int | No
 
 
 def _judges(cfg: DictConfig) -> list[EpochJudge]:
-    """What may end the running job early: the pruner of its search, where there is one."""
+    """Callbacks that may end the running job early: the pruner of its search, if any."""
     from hydra.core.hydra_config import HydraConfig
 
     from gausim.compose.config import in_sweep
@@ -364,7 +364,7 @@ def _introduce(
 
 
 def _slow_beginnings(module: GausSimModule, shows: int) -> list[str]:
-    """A warning where the initial states cannot come to the first step of a common motion in so many shows."""
+    """A warning if initial states cannot reach the first step of a typical motion within ``shows``."""
     states, rate = cast(Any, module.initial_states), module.settings.initial_lr
     reach = states.reach(rate * shows)
     if reach >= FIRST_STEP:

@@ -1,4 +1,4 @@
-"""`gausim verify`: names every fault of a data set."""
+"""`gausim verify`: lists all faults of a data set."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gausim.cli.arguments import command_parser
 
 
 def main(argv: list[str]) -> int:
-    """Runs the command; returns 0 if all is well, 1 if there are faults."""
+    """Runs the command; returns 1 if there are faults, else 0."""
     arguments = _parser().parse_args(argv)
     from gausim.data.objects import find_objects
     from gausim.data.verify import verify

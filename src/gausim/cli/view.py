@@ -1,4 +1,4 @@
-"""`gausim view RUN|SCENE`: the object in the browser, to be pulled about."""
+"""`gausim view RUN|SCENE`: interactive simulation of an object in the browser."""
 
 from __future__ import annotations
 

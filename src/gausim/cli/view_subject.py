@@ -1,4 +1,4 @@
-"""From a run or a bare scene to what the viewer shows: interactions, recordings, videos, cameras."""
+"""Content of the viewer for a run or a bare scene: interactions, recordings, videos, cameras."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from gausim.viewer.shown import Take
     from gausim.viewer.subject import Subject
 
-# The model of a bare scene: untrained, its network is silent and the elastic template moves the object alone.
+# The model of a bare scene: its untrained network outputs zero, so that only the elastic template acts.
 BARE_MODEL = "gausim"
 
 
 @dataclass(frozen=True, eq=False)
 class Playable:
-    """A method, bound to one object.
+    """A method for one object.
 
     Attributes:
-        interaction: what is pushed.
-        item: the run's object; None for a bare scene.
+        interaction: the interactive simulation of the object.
+        item: the object of the run; None for a bare scene.
         run: the run; None for a bare scene.
     """
 
@@ -39,7 +39,7 @@ class Playable:
     run: LoadedRun | None = None
 
     def predictions(self) -> dict[str, Callable[[], Trajectory]]:
-        """What it foresees of the recorded sequences, by their names, each made when it is asked for."""
+        """Functions that predict the recorded sequences, by name."""
         from gausim.compose.predict import TrainedPrediction
 
         if self.item is None or self.run is None:
@@ -66,10 +66,10 @@ def playable_run(
 def playable_scene(
     scene: GaussianScene, *, fps: float, seed: int, gravity: float | None = None, keep: int | None = 0
 ) -> Playable:
-    """A scene without a run: the elastic template of the default model, its network silent.
+    """A scene without a run: the elastic template of the default model with a network that outputs zero.
 
     Raises:
-        SceneError: nothing is pinned.
+        SceneError: no kernel is pinned.
         ConfigError: the frame rate is not positive and finite.
     """
     import torch
@@ -95,7 +95,7 @@ def playable_scene(
 
 
 def takes_of(made: Playable, beside: Playable | None) -> list[Take]:
-    """The recorded sequences as the method foresees them, and as the one beside it does."""
+    """Predictions of the recorded sequences by the method, and by the method beside it."""
     from gausim.viewer.shown import Take
 
     other = {} if beside is None else beside.predictions()
@@ -103,7 +103,7 @@ def takes_of(made: Playable, beside: Playable | None) -> list[Take]:
 
 
 def subject_of(made: Playable, *, title: str, beside: Playable | None, up: str, sessions: Path) -> Subject:
-    """Everything the viewer shows."""
+    """The complete content of the viewer."""
     from gausim.viewer.companion import Companion
     from gausim.viewer.films import Films
     from gausim.viewer.subject import Subject

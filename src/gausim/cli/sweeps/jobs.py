@@ -1,4 +1,4 @@
-"""Jobs of a sweep: what each does about a run that is there already, how they are launched, and the summary."""
+"""Jobs of a sweep: handling of existing runs, launching, and the summary."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from gausim.runs.directory import RunDirectory, one_line
 
 log = logging.getLogger(__name__)
 
-# What became of a job.
+# Outcomes of a job.
 TRAINED, PRUNED, FINISHED_BEFORE, BUSY = "trained", "pruned", "finished before", "trained by another process"
 FAILED, FAILED_BEFORE = "failed", "failed before"
-# The metric that searches minimise: the last epoch's loss above the floor, as a fraction of the static prediction's.
+# The metric that searches minimise: the last epoch's loss above the floor, over that of the static prediction.
 OBJECTIVE = "excess_static"
 
 
 class JobResult(float):
-    """The objective of a job, which any sweeper can read (nan where there is none), and what became of the job.
+    """The objective of a job as a float for any sweeper (nan if it has none), with the outcome of the job.
 
     Attributes:
         state: one of the constants of this module.
-        directory: its run directory.
-        detail: the error, of one that failed.
+        directory: the run directory.
+        detail: the error of a failed job.
     """
 
     state: str
@@ -42,22 +42,22 @@ class JobResult(float):
 
     @classmethod
     def of(cls, objective: float | None, state: str, run: RunDirectory, detail: str = "") -> JobResult:
-        """Puts the two together."""
+        """Makes a result; an objective of None becomes nan."""
         result = cls(math.nan if objective is None else objective)
         result.state, result.directory, result.detail = state, str(run.path), detail
         return result
 
 
 def do_job(cfg: DictConfig, run: RunDirectory, train: Callable[[DictConfig, RunDirectory], Any]) -> JobResult:
-    """Does one job of a sweep, unless its run is finished, has failed, or is another process's.
+    """Runs one job of a sweep, unless its run is finished, has failed, or is in use by another process.
 
     Args:
-        cfg: the job's configuration.
-        run: its directory.
+        cfg: configuration of the job.
+        run: run directory of the job.
         train: trains the run to its end, from its last checkpoint where there is one, and evaluates it if asked to.
 
     Returns:
-        What became of it. No error is raised, so that the other jobs go on.
+        The result. Errors are not raised, so that the other jobs continue.
     """
     try:
         with run.writing():
@@ -65,19 +65,19 @@ def do_job(cfg: DictConfig, run: RunDirectory, train: Callable[[DictConfig, RunD
             if left_out is not None:
                 return left_out
             objective = train(cfg, run)
-            # Of several ranks that a scheduler started, only the first has surely written the marker by now.
+            # Of several ranks started by a scheduler, only the first has certainly written the marker.
             return _finished(run, TRAINED) if run.is_finished else JobResult.of(objective, TRAINED, run)
     except BusyError as error:
         print(f"left out, {error}", flush=True)
         return JobResult.of(None, BUSY, run)
     except Exception as error:
-        # The traceback of a defect goes to the job's log; an error meant for people explains itself.
+        # The log of the job gets a traceback, except for errors of gausim, which are self-explanatory.
         log.error("%s: %s", run.path, one_line(error), exc_info=not isinstance(error, GausSimError))
         return JobResult.of(None, FAILED, run, one_line(error))
 
 
 def _left_out(cfg: DictConfig, run: RunDirectory) -> JobResult | None:
-    """The result of a run that is not to be trained (again)."""
+    """The result of a run that is skipped; None if it must be trained."""
     if cfg.overwrite:
         return None
     if run.is_finished:
@@ -100,7 +100,7 @@ def _finished(run: RunDirectory, state: str) -> JobResult:
 
 @contextmanager
 def launching(folder: Path) -> Iterator[None]:
-    """The block in which jobs run: what is no fault of the configuration is the launcher's."""
+    """Context of running jobs: errors other than those of the configuration are attributed to the launcher."""
     try:
         yield
     except (GausSimError, HydraException, OmegaConfBaseException):
@@ -113,7 +113,7 @@ def launching(folder: Path) -> Iterator[None]:
 
 
 def result_of(returned: JobReturn) -> JobResult:
-    """What became of a job that a launcher has run; raises what ended it outside our hands."""
+    """The result of a job that a launcher has run; raises an error from outside :func:`do_job`."""
     value = returned.return_value
     if isinstance(value, JobResult):
         return value

@@ -1,4 +1,4 @@
-"""Searches by Optuna: trials are asked for, trained by Hydra's launcher and told; all of it can be killed."""
+"""Searches by Optuna: trials are trained by Hydra's launcher; a killed search can be continued."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ RETRY_OF = "retry_of"
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """The node `hydra.sweeper` of a search; conf/hydra/sweeper/optuna.yaml explains its keys."""
+    """The node `hydra.sweeper` of a search; its keys are documented in conf/hydra/sweeper/optuna.yaml."""
 
     n_trials: int
     n_jobs: int
@@ -64,23 +64,23 @@ class SearchSettings:
 
 
 class Search:
-    """One study: its trials and how they are trained."""
+    """One study: selection and training of its trials."""
 
     def __init__(self, config: DictConfig, context: HydraContext, launcher: Launcher, settings: SearchSettings) -> None:
-        """Keeps what Hydra gives a sweeper; :meth:`run` does everything."""
+        """Stores the arguments that Hydra passes to a sweeper."""
         self._config, self._context, self._launcher, self._settings = config, context, launcher, settings
         self._folder = Path(str(config.hydra.sweep.dir))
         self._results: list[JobResult] = []
 
     def run(self, arguments: Sequence[str]) -> None:
-        """Trains trials until there are enough, then prints and writes the best.
+        """Trains trials until ``n_trials`` are complete, then prints and writes the best.
 
         Args:
             arguments: overrides of the command line.
 
         Raises:
-            ConfigError: nothing is searched, or the study in the storage is another one.
-            BusyError: another process works on the study.
+            ConfigError: no parameter is searched, or the stored study has other parameters.
+            BusyError: another process is running the study.
             RunError: a trial failed.
         """
         overrides = self._overrides(arguments)
@@ -109,14 +109,14 @@ class Search:
         conclude(self._folder, self._results)
 
     def _overrides(self, arguments: Sequence[str]) -> dict[str, Override]:
-        """The parsed overrides by their keys: those of the command line win over the configuration's."""
+        """The parsed overrides by their keys: the command line takes precedence over the configuration."""
         parser = OverridesParser.create(config_loader=self._context.config_loader)
         own = spelled([f"{key}={value}" for key, value in (self._settings.params or {}).items()])
         return {override.get_key_element(): override for override in parser.parse_overrides([*own, *arguments])}
 
     def _launch(self, jobs: Sequence[Sequence[str]]) -> list[JobResult]:
-        """Starts jobs, waits for them, and returns what became of each."""
-        for overrides in jobs:  # all at first: a misspelt value must not show after hours
+        """Starts jobs, waits for them, and returns their results."""
+        for overrides in jobs:  # check all first: a misspelt value must not fail after hours
             self._context.config_loader.load_sweep_config(self._config, list(overrides))
         with launching(self._folder):
             results = [result_of(one) for one in self._launcher.launch(jobs, initial_job_idx=len(self._results))]
@@ -124,7 +124,7 @@ class Search:
         return results
 
     def _open(self, space: Mapping[str, BaseDistribution], fixed: Sequence[str]) -> optuna.Study:
-        """The study, new or as it was left; another one under the same name is refused."""
+        """The study, new or continued; a study with other parameters under the same name is refused."""
         wanted = self._settings
         study = optuna.create_study(
             storage=wanted.storage, study_name=wanted.study_name, direction=wanted.direction, load_if_exists=True
@@ -148,7 +148,7 @@ class Search:
     def _next(self, study: optuna.Study, space: Mapping[str, BaseDistribution]) -> list[Trial]:
         """The next trials: those that were under way when the search was killed, then new ones.
 
-        New ones come in full batches of n_jobs, whenever it was killed, so that they are chosen knowing the same.
+        New trials come in full batches of n_jobs, also after a kill, so that they are chosen from the same results.
         """
         known = study.get_trials(deepcopy=False)
         batch = [self._ready(study, space, t) for t in known if t.state == TrialState.RUNNING]
@@ -163,10 +163,10 @@ class Search:
     def _ready(
         self, study: optuna.Study, space: Mapping[str, BaseDistribution], known: FrozenTrial | None = None
     ) -> Trial:
-        """A trial with a value for every parameter: a new one, or one that was asked for before.
+        """A trial with a value for every parameter: a new one, or a known unfinished one.
 
-        The sampler is made anew for every trial, from the seed and its number: a search that was killed goes on with
-        what it would have tried undisturbed.
+        The sampler is seeded anew for every trial by the seed and the number of the trial, so that a continued search
+        tries the same values as an uninterrupted one.
         """
         number = len(study.get_trials(deepcopy=False)) if known is None else known.number
         with warnings.catch_warnings():
@@ -174,7 +174,7 @@ class Search:
             study.sampler = self._sampler(self._settings.seed + number)
             trial = study.ask() if known is None else Trial(study, known._trial_id)
             for name, one in space.items():
-                trial._suggest(name, one)  # which gives a value that it has already again
+                trial._suggest(name, one)  # which returns an existing value unchanged
         return trial
 
     def _sampler(self, seed: int) -> optuna.samplers.BaseSampler:
@@ -184,9 +184,9 @@ class Search:
         return instantiate(node, **({"seed": seed} if takes_seed and "seed" not in node else {}))
 
     def _do(self, study: optuna.Study, batch: Sequence[Trial], fixed: Sequence[str]) -> bool:
-        """Trains trials and tells what came out; False if none of them could be done."""
+        """Trains trials and reports their results to the study; False if none could be run."""
         jobs: dict[tuple[str, ...], list[Trial]] = {}
-        for trial in batch:  # two that try the same are one job
+        for trial in batch:  # trials with equal values are one job
             jobs.setdefault(tuple(f"{k}={_text(v)}" for k, v in trial.params.items()), []).append(trial)
         orders = [[*fixed, *values, f"hydra.sweeper.trial={same[0].number}"] for values, same in jobs.items()]
         results = self._launch(orders)
@@ -198,7 +198,7 @@ class Search:
         return any(result.state != BUSY for result in results)
 
     def _write(self, study: optuna.Study) -> FrozenTrial | None:
-        """Writes what is known so far; returns the best trial."""
+        """Writes the results so far; returns the best trial."""
         trials = study.get_trials(deepcopy=False)
         done = [t for t in trials if t.state == TrialState.COMPLETE]
         choose = min if self._settings.direction == "minimize" else max
@@ -230,7 +230,7 @@ class Search:
 def distribution(override: Override) -> BaseDistribution:
     """Optuna's distribution of an override: a choice, `range` or `interval` of Hydra, `tag(log, …)` for logarithmic.
 
-    A range ends before its stop, as everywhere in Hydra; an interval has whole numbers as `int(interval(…))`.
+    A range excludes its stop, as always in Hydra; `int(interval(…))` is an interval of integers.
     """
     value: Any = override.value()
     log_scale = "log" in getattr(value, "tags", ())
@@ -248,13 +248,13 @@ def distribution(override: Override) -> BaseDistribution:
 
 
 def _text(value: Any) -> str:
-    """A parameter as the value of an override; floats to the last digit."""
+    """A parameter as the value of an override; floats with all digits."""
     return repr(value) if isinstance(value, float) else str(value)
 
 
 def _tell(study: optuna.Study, trial: Trial, result: JobResult) -> None:
     if result.state == BUSY:
-        return  # it stays under way; a later start learns what came of it
+        return  # the trial stays unfinished; a later start reads its result
     trial.set_user_attr("directory", result.directory)
     if result.state == PRUNED:
         study.tell(trial.number, state=TrialState.PRUNED)
@@ -265,7 +265,7 @@ def _tell(study: optuna.Study, trial: Trial, result: JobResult) -> None:
 
 
 def _failed(study: optuna.Study) -> list[FrozenTrial]:
-    """Trials that failed and were not tried again."""
+    """Trials that failed and were not repeated."""
     trials = study.get_trials(deepcopy=False)
     again = {t.user_attrs.get(RETRY_OF) for t in trials}
     return [t for t in trials if t.state == TrialState.FAIL and t.number not in again]
@@ -287,19 +287,19 @@ def _row(trial: FrozenTrial) -> dict[str, Any]:
 
 
 def pruning_judge() -> EpochJudge:
-    """What ends the running job, a trial of a search that prunes, when the pruner thinks so."""
+    """Callback that ends the running job, a trial of a search, when its pruner decides so."""
     sweeper = HydraConfig.get().sweeper
     study = optuna.load_study(
         storage=sweeper.storage,
         study_name=sweeper.study_name,
-        sampler=optuna.samplers.RandomSampler(seed=0),  # asked for nothing
+        sampler=optuna.samplers.RandomSampler(seed=0),  # not used
         pruner=instantiate(sweeper.pruner),
     )
     (known,) = (t for t in study.get_trials(deepcopy=False) if t.number == sweeper.trial)
     trial = Trial(study, known._trial_id)
 
     def judge(epoch: int, value: float) -> bool:
-        trial.report(value, epoch)  # of an epoch that is done again, Optuna keeps what it has
+        trial.report(value, epoch)  # for a repeated epoch, Optuna keeps the earlier value
         return trial.should_prune()
 
     return EpochJudge(judge=judge, metric=OBJECTIVE)
