@@ -65,18 +65,18 @@ def test_settings_out_of_range_are_refused() -> None:
 
 def test_an_error_leaves_its_last_line_and_is_gone_when_tried_again(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path)
-    with pytest.raises(ZeroDivisionError), run.noting_failure():
+    with pytest.raises(ZeroDivisionError), run.recording_failure():
         1 / 0  # noqa: B018
     assert not run.has_failed  # nothing was begun
     run.prepare(CONFIG)
-    with pytest.raises(ZeroDivisionError), run.noting_failure():
+    with pytest.raises(ZeroDivisionError), run.recording_failure():
         1 / 0  # noqa: B018
     assert run.has_failed and run.failure() == "ZeroDivisionError: division by zero"
     assert "Traceback" in (tmp_path / "FAILED").read_text()
-    with pytest.raises(RunError), run.noting_failure():
+    with pytest.raises(RunError), run.recording_failure():
         raise RunError("two\nlines")
     assert run.failure() == "RunError: two lines" and "Traceback" not in (tmp_path / "FAILED").read_text()
-    with pytest.raises(KeyboardInterrupt), run.noting_failure():
+    with pytest.raises(KeyboardInterrupt), run.recording_failure():
         run.prepare(CONFIG)
         raise KeyboardInterrupt
     assert not run.has_failed

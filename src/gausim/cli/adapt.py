@@ -50,13 +50,13 @@ def _parser() -> argparse.ArgumentParser:
     add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
     add("--data", metavar="STORE", nargs="+", help="directories of the same objects (default: those of the run)")
     add("--sequences", nargs="+", metavar="NAME", help="only these sequences (default: all)")
-    add("--frames", type=int, default=16, help="frames of each sequence that are looked at (default: 16)")
+    add("--frames", type=int, default=16, help="frames of each sequence to fit (default: 16)")
     add("--epochs", type=int, default=EPOCHS, help=f"rounds over the sequences, {REPEATS} steps each (default: "
         f"{EPOCHS})")  # fmt: skip
     add("--out", metavar="DIR", type=Path, help="run directory to write (default: NAME_adapted_FRAMES beside RUN's)")
     add("--set", metavar="KEY=VALUE", nargs="+", default=[], help="settings other than the run's, e.g. "
         "trainer.threads=1")  # fmt: skip
-    add("--supervision", choices=tuple(SUPERVISIONS), help="what is compared (default: as in the run)")
+    add("--supervision", choices=tuple(SUPERVISIONS), help="reference of the predictions (default: as in the run)")
     return parser
 
 

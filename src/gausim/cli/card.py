@@ -38,7 +38,7 @@ def main(argv: list[str]) -> int:
     run = _record(arguments.run)
     path = arguments.out or arguments.run / CARD
     if path.exists() and not arguments.force:
-        raise RunError(f"{path}: is there already, perhaps with words of yours. --force replaces it, --out FILE writes "
+        raise RunError(f"{path}: is there already, perhaps with manual edits. --force replaces it, --out FILE writes "
                        "elsewhere.")  # fmt: skip
     write_durably(path, card(run, _facts(run, arguments)).encode())
     print(f"wrote {path}")
@@ -56,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--licence", metavar="ID", help="under which others may use the run, e.g. CC-BY-4.0")
     add_data_option(parser)
     add("--out", metavar="FILE", type=Path, help="default RUN/README.md")
-    add("--force", action="store_true", help="replace a card that is there")
+    add("--force", action="store_true", help="replace an existing card")
     return parser
 
 

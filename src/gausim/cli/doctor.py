@@ -24,13 +24,13 @@ def main(argv: list[str]) -> int:
 
     torch.set_num_threads(arguments.threads)
     roots = find_objects(arguments.root)
-    told: dict[str, Any] = {}
+    findings: dict[str, Any] = {}
     for root in roots:
         out = arguments.out / root.name if arguments.out and len(roots) > 1 else arguments.out
-        told[str(root)] = _one(root, arguments, out)
+        findings[str(root)] = _one(root, arguments, out)
     if arguments.json:
-        print(json.dumps(told, indent=1))
-    return 1 if any(entry["ruinous"] for entry in told.values()) else 0
+        print(json.dumps(findings, indent=1))
+    return 1 if any(entry["ruinous"] for entry in findings.values()) else 0
 
 
 def _parser() -> argparse.ArgumentParser:

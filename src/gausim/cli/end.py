@@ -43,7 +43,7 @@ def push(run: Path | str, name: str | None = None) -> list[object]:
     return ["simulate", run, *(["--object", name] if name else []), *PUSH.split()]
 
 
-def told(entries: Mapping[str, dict[str, Any]]) -> list[str]:
+def error_sentences(entries: Mapping[str, dict[str, Any]]) -> list[str]:
     """One sentence per object of ``metrics.json`` on the error of its first method in unseen frames."""
     from gausim.report.tables.verdict import outcome, sentences
 

@@ -27,7 +27,7 @@ def main(argv: list[str]) -> int:
     from rich.console import Console
     from rich.markdown import Markdown
 
-    from gausim.cli.end import end, told
+    from gausim.cli.end import end, error_sentences
     from gausim.compose.build import load_run
     from gausim.compose.data_paths import data_option
     from gausim.compose.predict import state_of
@@ -56,7 +56,7 @@ def main(argv: list[str]) -> int:
         Console(width=None if sys.stdout.isatty() else 200).print(Markdown((folder / "table.md").read_text()))
         print("\n".join(f"wrote {folder / name}" for name in [*WRITTEN, *drawn]))
     commands = [["report", arguments.run], ["simulate", arguments.run]] if whole else [["evaluate", arguments.run]]
-    end(told(summary["objects"]), "tables", folder / "table.md", *commands)
+    end(error_sentences(summary["objects"]), "tables", folder / "table.md", *commands)
     return 0
 
 
@@ -110,8 +110,8 @@ def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list
     (folder / "endurance.json").write_text(json.dumps(found, indent=1) + "\n")
     for name, rollouts in found.items():
         endurance_figure(name, rollouts, folder / f"endurance_{name}.png")
-        for kind, told in rollouts.items():
-            growth, late = told["growth"], told["late"]
+        for kind, rollout in rollouts.items():
+            growth, late = rollout["growth"], rollout["late"]
             print(f"{name}, {kind}: highest energy later over before {growth:.3f}, of the last tenth {late:.2g}")
     return ["endurance.json", *(f"endurance_{name}.png" for name in found)]
 

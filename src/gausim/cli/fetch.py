@@ -63,8 +63,8 @@ def _parser() -> argparse.ArgumentParser:
     add = packing.add_argument
     add("--pack", metavar="RUN|DIR", type=Path, help="write NAME.tar of a finished run or a data set, and its entry")
     add("--name", metavar="NAME", help="of the entry")
-    add("--licence", metavar="ID", help="under which others may use it, e.g. CC-BY-4.0; default what dataset.json says")
-    add("--title", metavar="TEXT", help="what it is, in one line")
+    add("--licence", metavar="ID", help="under which others may use it, e.g. CC-BY-4.0; default that of dataset.json")
+    add("--title", metavar="TEXT", help="description in one line")
     add("--data", metavar="NAME", default="", help="of a run: the entry of its data set")
     return parser
 

@@ -99,11 +99,11 @@ def _of_data(source: Path) -> tuple[dict[str, Path], list[str]]:
 
 def _licence_of(source: Path) -> str | None:
     """The licence in the ``dataset.json`` of every object, if it is the same for all."""
-    said = set()
+    licences = set()
     for root in find_objects(source):
         facts = read_json(root / "dataset.json")
-        said.add(next((facts[key] for key in _LICENCES if isinstance(facts.get(key), str)), None))
-    return said.pop() if len(said) == 1 else None
+        licences.add(next((facts[key] for key in _LICENCES if isinstance(facts.get(key), str)), None))
+    return licences.pop() if len(licences) == 1 else None
 
 
 def _say_what(source: Path, archive: Path, count: int, *, is_run: bool, has_card: bool) -> None:

@@ -92,7 +92,7 @@ def _fetch(folder: Path) -> Path:
 def _last_words(text: str) -> str:
     """The last message of pip, without warnings about its retries."""
     lines = [line for line in text.strip().splitlines() if line.strip() and not line.startswith("WARNING: Retrying")]
-    return "\n".join(f"  {line}" for line in lines[-8:]) or "  (pip said nothing)"
+    return "\n".join(f"  {line}" for line in lines[-8:]) or "  (no output of pip)"
 
 
 def _write(path: Path, weights: dict[str, Tensor]) -> None:

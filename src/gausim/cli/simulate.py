@@ -75,7 +75,7 @@ def _parser() -> argparse.ArgumentParser:
 def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namespace, folder: Path) -> str:
     """Writes all results on an object's sequences; returns a sentence on their errors."""
     from gausim.cli.bars import named_bar
-    from gausim.cli.end import told
+    from gausim.cli.end import error_sentences
     from gausim.cli.simulate_forces import write_trajectory
     from gausim.compose.predict import TrainedPrediction, scene_of, sequence_of
     from gausim.data.records import SequenceRecord
@@ -106,7 +106,7 @@ def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namesp
         for name in names:
             print("\n".join(f"wrote {path}" for path in sorted((folder / name).iterdir())))
     of = names[0] if len(names) == 1 else f"{len(names)} sequences"
-    return told({f"{item.data.name} {of}": summarise(curves)})[0]
+    return error_sentences({f"{item.data.name} {of}": summarise(curves)})[0]
 
 
 def _write_view(

@@ -130,7 +130,7 @@ def _train(cfg: DictConfig, run: RunDirectory) -> float | None:
     from gausim.compose.config import instantiate
     from gausim.training.ranks.launch import Crew
 
-    with run.noting_failure(), Crew(instantiate(cfg.trainer), follow) as crew:
+    with run.recording_failure(), Crew(instantiate(cfg.trainer), follow) as crew:
         if not crew.is_first:  # started by a scheduler beside the first rank
             return follow(crew)
         config = _plain(cfg)

@@ -130,7 +130,7 @@ def _fetched_with(run_dir: Path) -> str | None:
     from gausim.runs.directory import FETCHED
 
     try:
-        said = json.loads((run_dir / FETCHED).read_text())["data"]
+        found = json.loads((run_dir / FETCHED).read_text())["data"]
     except (OSError, ValueError, KeyError, TypeError):
         return None
-    return said if isinstance(said, str) and said.isprintable() and said else None
+    return found if isinstance(found, str) and found.isprintable() and found else None

@@ -122,12 +122,12 @@ class TrainedPrediction:
         from gausim.evaluation.stability import largest_eigenvalue
         from gausim.models.step.simulator import GausSim
 
-        said, model = self._run.module.footnotes, self._run.module.model
+        footnotes, model = self._run.module.footnotes, self._run.module.model
         if not isinstance(model, GausSim):
-            return said
+            return footnotes
         largest = largest_eigenvalue(model, self._item.scene_id)
         note = f"Largest eigenvalue of the step, linearised at rest: {largest:.4f}; small motions grow above 1."
-        return {**said, "largest_eigenvalue": largest, "notes": [*said["notes"], note]}
+        return {**footnotes, "largest_eigenvalue": largest, "notes": [*footnotes["notes"], note]}
 
     def __call__(self, record: SequenceRecord, frames: int | None = None) -> Trajectory:
         """The predicted first frames of a sequence, by default as many as recorded."""

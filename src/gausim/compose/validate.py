@@ -58,7 +58,8 @@ def check(config: Any) -> list[str]:
     if found:
         return found  # arguments of invalid targets are unknown
     schema = training_schema()
-    found = sorted({told for error in Draft7Validator(schema).iter_errors(config) for told in _told(error, schema)})
+    errors = Draft7Validator(schema).iter_errors(config)
+    found = sorted({message for error in errors for message in _messages(error, schema)})
     return found or list(_contradictions(config))
 
 
@@ -124,7 +125,7 @@ def _contradictions(config: dict[str, Any]) -> Iterator[str]:
                 yield f"{key}: {error}"
 
 
-def _told(error: ValidationError, whole: Mapping[str, Any]) -> Iterator[str]:
+def _messages(error: ValidationError, whole: Mapping[str, Any]) -> Iterator[str]:
     """Messages for one violation of the schema."""
     path = ".".join(map(str, error.absolute_path))
     schema, instance = error.schema, error.instance
@@ -139,7 +140,7 @@ def _told(error: ValidationError, whole: Mapping[str, Any]) -> Iterator[str]:
         *parent, key = map(str, error.absolute_path)
         siblings = whole["definitions"].get(".".join(parent), {}).get("properties", {})
         near = _nearest(key, [name for name in siblings if name != key])
-        yield f"{path}: expected a node with `_target_`, which says what to build.{near}"
+        yield f"{path}: expected a node with `_target_`, the class or function to build.{near}"
     else:
         yield f"{path or 'configuration'}: expected {_expected(schema)}, got {_short(instance)}."
 

@@ -163,15 +163,15 @@ def check_scenes(checkpoint: dict[str, Any], scenes: Sequence[GaussianScene], so
     trained, given = checkpoint["gausim"]["scenes"], fingerprints(scenes)
     if trained != given:
         raise RunError(
-            f"{source} was trained on {tell(trained)}, but the data holds {tell(given)}. Give the scene it was "
-            "trained on (data.root, data.scene), or train anew under another name."
+            f"{source} was trained on {scene_text(trained)}, but the data holds {scene_text(given)}. Give the "
+            "scene it was trained on (data.root, data.scene), or train anew under another name."
         )
 
 
-def tell(prints: Sequence[dict[str, Any]]) -> str:
+def scene_text(prints: Sequence[dict[str, Any]]) -> str:
     """Text of fingerprints for messages."""
-    told = (f"'{p['name']}' ({p['kernels']} kernels, {p['pinned']} pinned, means {p['means']})" for p in prints)
-    return "; ".join(told)
+    texts = (f"'{p['name']}' ({p['kernels']} kernels, {p['pinned']} pinned, means {p['means']})" for p in prints)
+    return "; ".join(texts)
 
 
 class WeightAverage:

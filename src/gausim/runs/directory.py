@@ -207,7 +207,7 @@ class RunDirectory:
             file.write(json.dumps({"time": _now(), "event": event, **_who()}) + "\n")
 
     @contextmanager
-    def noting_failure(self) -> Iterator[None]:
+    def recording_failure(self) -> Iterator[None]:
         """Context of training: an error that ends it is written to ``FAILED``.
 
         Errors before :meth:`prepare` succeeded, e.g. that the run is finished, are not written.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gausim.core import ConfigError, RunError
 from gausim.models.step.simulator import GausSim
-from gausim.runs.checkpoint import averaged_weights, fingerprints, read_checkpoint, tell
+from gausim.runs.checkpoint import averaged_weights, fingerprints, read_checkpoint, scene_text
 from gausim.runs.directory import RunDirectory, differing_keys
 
 # Prefix of the simulator's weights in a checkpoint of the training module.
@@ -52,7 +52,8 @@ def load_simulator(simulator: GausSim, run_dir: Path | str, model: Mapping[str, 
     for scene_id, scene in enumerate(fingerprints(simulator.scenes)):
         if scene not in trained:
             raise RunError(
-                f"{RunDirectory(run_dir).checkpoint} was trained on {tell(trained)}, not on {tell([scene])}."
+                f"{RunDirectory(run_dir).checkpoint} was trained on {scene_text(trained)}, not on "
+                f"{scene_text([scene])}."
             )
         for old, new in zip(simulator.own(trained.index(scene)), simulator.own(scene_id), strict=True):
             found |= {new + name[len(old) :]: value for name, value in there.items() if _is_below(name, old)}

@@ -128,10 +128,10 @@ def conclude(folder: Path, results: Sequence[JobResult]) -> None:
         RunError: a job failed, now or before.
     """
     counts = Counter(result.state for result in results)
-    told = [f"{counts[s]} {s}" for s in (TRAINED, PRUNED, FINISHED_BEFORE, BUSY) if counts[s]]
+    parts = [f"{counts[s]} {s}" for s in (TRAINED, PRUNED, FINISHED_BEFORE, BUSY) if counts[s]]
     failed = {r.directory: r for r in results if r.state in (FAILED, FAILED_BEFORE)}
-    told += [f"{len(failed)} failed"] if failed else []
-    shown = ", ".join(told) or "nothing left to do"
+    parts += [f"{len(failed)} failed"] if failed else []
+    shown = ", ".join(parts) or "nothing left to do"
     print(f"\nsweep of {len(results)} jobs: {shown}\nnext: gausim report {folder}", flush=True)
     if failed:
         lines = [f"\n  {r.directory}: {r.detail}" for r in failed.values()]
