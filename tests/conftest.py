@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -83,6 +84,21 @@ def toy_run(trainings: Trainings) -> Path:
 def own_toy_run(toy_run: Path, tmp_path: Path) -> Path:
     """A copy of :func:`toy_run`, for commands that write into it."""
     return Path(shutil.copytree(toy_run, tmp_path / "toy_run" / "seed_0"))
+
+
+@pytest.fixture(scope="session")
+def _played(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    from helpers.played import played_run
+
+    return played_run(tmp_path_factory.mktemp("played"))
+
+
+@pytest.fixture
+def played(_played: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """A run that was never trained, which is what loading any run gives; not to be changed."""
+    for home in ("gausim.compose.build", "gausim.api"):
+        monkeypatch.setattr(f"{home}.load_run", lambda path, data=None: _played)
+    return _played
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

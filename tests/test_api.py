@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from helpers import played
 
 import gausim
 from gausim.core import ConfigError, DataError
@@ -18,20 +17,7 @@ from gausim.ops.orbit import orbit_cameras
 ROOT = Path(__file__).resolve().parents[1]
 
 
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory: pytest.TempPathFactory):
-    return played.played_run(tmp_path_factory.mktemp("played"))
-
-
-@pytest.fixture
-def run(loaded, monkeypatch):
-    from gausim import api
-
-    monkeypatch.setattr(api, "load_run", lambda path, data=None: loaded)
-    return loaded
-
-
-def test_the_example_of_the_documentation(run, tmp_path: Path, monkeypatch) -> None:
+def test_the_example_of_the_documentation(played, tmp_path: Path, monkeypatch) -> None:
     text = (ROOT / "docs" / "reference" / "python.md").read_text()
     code = re.search(r"```python\n(import gausim\n.*?)```", text, re.DOTALL)
     assert code is not None
@@ -44,14 +30,14 @@ def test_the_example_of_the_documentation(run, tmp_path: Path, monkeypatch) -> N
     assert isinstance(image, np.ndarray) and image.dtype == np.uint8 and image.shape == (32, 32, 3) and image.any()
     assert (tmp_path / "push.json").is_file()
     recorded = sim.trajectory
-    again = gausim.load(run.run_dir).replay("push.json")
+    again = gausim.load(played.run_dir).replay("push.json")
     assert torch.equal(again.positions, recorded.positions) and torch.equal(
         again.deformation_gradients, recorded.deformation_gradients
     )
 
 
-def test_pushes_draws_and_resets(run) -> None:
-    sim = gausim.load(run.run_dir, object="toy", sequence="seq_000")
+def test_pushes_draws_and_resets(played) -> None:
+    sim = gausim.load(played.run_dir, object="toy", sequence="seq_000")
     rest = sim.interaction.scene.means
     still = sim.render()
     sim.apply_force(direction="x", weights=5)
@@ -71,12 +57,12 @@ def test_pushes_draws_and_resets(run) -> None:
     with pytest.raises(ConfigError, match="on=head"):
         sim.apply_force("head", direction="x", weights=1)
     with pytest.raises(DataError, match="no object"):
-        gausim.load(run.run_dir, object="cup")
+        gausim.load(played.run_dir, object="cup")
 
 
-def test_it_is_the_rollout_where_nothing_acts(run, tmp_path: Path) -> None:
-    sim = gausim.load(run.run_dir, sequence="seq_001")
+def test_it_is_the_rollout_where_nothing_acts(played, tmp_path: Path) -> None:
+    sim = gausim.load(played.run_dir, sequence="seq_001")
     sim.step(10)
-    whole = run.module.predict(1, 10)
+    whole = played.module.predict(1, 10)
     assert torch.equal(sim.trajectory.positions, whole.positions)
     save_scene(sim.interaction.scene, tmp_path / "s.ply")

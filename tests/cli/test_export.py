@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
-from helpers import played
 from PIL import Image
 
 from gausim.cli import export
-from gausim.compose import build as _run
 from gausim.core import ConfigError, DataError
 from gausim.io.ply import save_scene
 from gausim.io.ply_sequence import load_ply_sequence
@@ -22,16 +21,10 @@ from gausim.render.draw import film
 FIELDS = ("means", "log_scales", "quats", "opacity_logits", "sh", "pinned")
 
 
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory: pytest.TempPathFactory):
-    return played.played_run(tmp_path_factory.mktemp("played"))
-
-
 @pytest.fixture
-def run(loaded, monkeypatch, tmp_path: Path):
-    monkeypatch.setattr(_run, "load_run", lambda path, data=None: loaded)
+def run(played: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     monkeypatch.chdir(tmp_path)
-    return loaded
+    return played
 
 
 def test_a_trajectory_and_ply_files_come_back_bit_for_bit(run, tmp_path: Path, capsys) -> None:

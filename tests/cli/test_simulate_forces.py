@@ -8,28 +8,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import played
 from msgspec.structs import replace
 
 from gausim.cli import main, simulate
-from gausim.compose import build as _run
 from gausim.core import DataError
 from gausim.interaction import words as _force_words
 from gausim.interaction.selections import Ball, Kernels, Unit, Whole
 from gausim.interaction.session import Force, Impulse, load_session, save_session
 from gausim.io.trajectory import load_trajectory
 from gausim.io.video import read_video
-
-
-@pytest.fixture(scope="module")
-def loaded(tmp_path_factory: pytest.TempPathFactory):
-    return played.played_run(tmp_path_factory.mktemp("played"))
-
-
-@pytest.fixture
-def run(loaded, monkeypatch):
-    monkeypatch.setattr(_run, "load_run", lambda path, data=None: loaded)
-    return loaded
 
 
 def same(a: Path, b: Path) -> bool:
@@ -39,11 +26,11 @@ def same(a: Path, b: Path) -> bool:
     )
 
 
-def test_forces_write_files_and_their_session_replays_them(run, tmp_path: Path, capsys) -> None:
+def test_forces_write_files_and_their_session_replays_them(played, tmp_path: Path, capsys) -> None:
     words = ["--force", "on=tip", "weights=3", "direction=x", "at=2", "frames=4", "--wind", "weights=0.5",
              "direction=0,1,0", "gusts=0.5", "--pin", "on=kernels:3", "at=6"]  # fmt: skip
     options = ["--frames", "8", "--view", "cam_1", "--background", "white"]
-    assert simulate.main([str(run.run_dir), *words, *options, "--gif", "--out", str(tmp_path / "a")]) == 0
+    assert simulate.main([str(played.run_dir), *words, *options, "--gif", "--out", str(tmp_path / "a")]) == 0
     folder = tmp_path / "a" / "toy" / "forces"
     names = {"trajectory.safetensors", "session.json", "cam_1.mp4", "cam_1.gif", "cam_1_sheet.png"}
     assert {p.name for p in folder.iterdir()} == names
@@ -53,7 +40,7 @@ def test_forces_write_files_and_their_session_replays_them(run, tmp_path: Path, 
     assert event["do"] == "force" and event["weights"] == 3.0 and event["on"]["radius"] == 0.15
     assert session.made_with.run == "demo/seed_0" and session.made_with.initial == "rest"
     trajectory = load_trajectory(folder / "trajectory.safetensors")
-    scene = run.module.model.scenes[0]
+    scene = played.module.model.scenes[0]
     moved = (trajectory.positions - scene.means).norm(dim=-1)
     assert trajectory.frames == 8 and float(moved[5].max()) > 1e-3
     assert float(moved[:, scene.pinned].max()) == 0
@@ -64,7 +51,7 @@ def test_forces_write_files_and_their_session_replays_them(run, tmp_path: Path, 
     shown = list(read_video(folder / "cam_1.mp4"))
     assert len(shown) == 8 and (shown[3] != shown[0]).mean() > 0.01
 
-    again = [str(run.run_dir), "--session", str(folder / "session.json"), "--view", "cam_1"]
+    again = [str(played.run_dir), "--session", str(folder / "session.json"), "--view", "cam_1"]
     assert simulate.main([*again, "--out", str(tmp_path / "b")]) == 0
     assert "warning" not in capsys.readouterr().err
     assert same(folder / "trajectory.safetensors", tmp_path / "b" / "toy" / "session" / "trajectory.safetensors")
@@ -73,15 +60,23 @@ def test_forces_write_files_and_their_session_replays_them(run, tmp_path: Path, 
     assert torch.equal(short.positions, trajectory.positions[:3])
 
 
-def test_an_initial_state_and_a_changed_model(run, tmp_path: Path, capsys) -> None:
+def test_an_initial_state_and_a_changed_model(played, tmp_path: Path, capsys) -> None:
     words = ["--gravity", "weights=1", "direction=-z", "--sequence", "seq_001", "--frames", "4", "--view", "cam_0"]
-    assert simulate.main([str(run.run_dir), *words, "--out", str(tmp_path)]) == 0
+    assert simulate.main([str(played.run_dir), *words, "--out", str(tmp_path)]) == 0
     path = tmp_path / "toy" / "forces" / "session.json"
     session = load_session(path)
     assert session.made_with.initial == "seq_001"
     other = replace(session, made_with=replace(session.made_with, model_hash="0", run="elsewhere/seed_3"))
     save_session(other, tmp_path / "other.json")
-    replayed = [str(run.run_dir), "--session", str(tmp_path / "other.json"), "--view", "cam_0", "--out", str(tmp_path)]
+    replayed = [
+        str(played.run_dir),
+        "--session",
+        str(tmp_path / "other.json"),
+        "--view",
+        "cam_0",
+        "--out",
+        str(tmp_path),
+    ]
     assert simulate.main(replayed) == 0
     assert "another method or training (run 'elsewhere/seed_3')" in capsys.readouterr().err
     folder = tmp_path / "toy"
@@ -111,18 +106,18 @@ def test_an_initial_state_and_a_changed_model(run, tmp_path: Path, capsys) -> No
         (["--session", "none.json"], "none.json: no such file"),
     ],
 )
-def test_wrong_words_are_named(run, monkeypatch, capsys, options: list[str], message: str) -> None:
+def test_wrong_words_are_named(played, monkeypatch, capsys, options: list[str], message: str) -> None:
     monkeypatch.delenv("GAUSIM_DEBUG", raising=False)
     try:
-        assert main.main(["simulate", str(run.run_dir), *options]) == 2
+        assert main.main(["simulate", str(played.run_dir), *options]) == 2
     except SystemExit as stop:
         assert stop.code == 2
     error = capsys.readouterr().err
     assert re.search(message, error) and "Traceback" not in error
 
 
-def test_parts_and_directions(run) -> None:
-    scene = run.module.model.scenes[0]
+def test_parts_and_directions(played) -> None:
+    scene = played.module.model.scenes[0]
     entry = _force_words.entry_of("force", ["weights=2", "direction=-y", "at=3"], scene)
     assert entry.at == 3 and entry.event == Force(Whole(), (0.0, -1.0, 0.0), 2.0)
     parts = {
