@@ -127,17 +127,15 @@ METHOD = {"_target_": "lightning.fabric.plugins.io.torch_io.TorchCheckpointIO.lo
 
 
 @pytest.mark.parametrize("node", [SYSTEM, PROGRAM, TEXT, METHOD], ids=lambda node: node["_target_"])
-@pytest.mark.parametrize("key", ["data", "callbacks"])
 def test_a_run_of_other_people_builds_nothing_else(
-    key: str, node: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    node: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("evil.py").write_text("open('canary', 'w')")
     torch.save(Payload(Path("canary")), "evil.ckpt")
     parts = {name: {} for name in ("model", "loss", "optimizer", "render", "trainer", "paths")}
     parts["model"] = {"simulator": node, "initial_states": {}}
-    config = {**parts, "seed": 0, "name": "evil", key: node if key == "data" else {"evil": node}}
-    config.setdefault("data", node)
+    config = {**parts, "seed": 0, "name": "evil", "data": node, "callbacks": {"evil": node}}
     Path("run").mkdir()
     Path("run/config.yaml").write_text(yaml.safe_dump(config))
     torch.save({"state_dict": {}, "gausim": {}}, "run/last.ckpt")

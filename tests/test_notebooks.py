@@ -25,19 +25,11 @@ def test_the_four_are_there() -> None:
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_outputs_are_stripped(path: Path) -> None:
+def test_outputs_are_stripped_any_environment_has_the_kernel_and_named_files_exist(path: Path) -> None:
     for cell in cells(path, "code"):
         assert cell["outputs"] == [] and cell["execution_count"] is None, f"{path.name}: run nbstripout"
         assert "execution" not in cell["metadata"]
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_any_environment_has_the_kernel(path: Path) -> None:
     assert json.loads(path.read_text())["metadata"]["kernelspec"]["name"] == "python3"
-
-
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_the_words_name_files_that_exist(path: Path) -> None:
     named = re.findall(r"`((?:docs|notebooks|conf)/[\w./-]+|README\.md)`", text(path))
     assert named, f"{path.name} points nowhere"
     for name in named:

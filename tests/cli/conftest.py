@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from helpers import joint_runs
 from helpers.shared import Shared
+from helpers.sweeps import Sweeps
+from helpers.toy_runs import Trainings
 
 from gausim.cli import evaluate
 from gausim.cli import train as command
@@ -28,6 +30,11 @@ def joint(toy: Path, other: Path, shared: Shared) -> Path:
         assert command.main([*joint_runs.TINY, *asked, "optimizer.ema_decay=0.5"]) == 0
 
     return shared("joint", train)
+
+
+@pytest.fixture(scope="module")
+def do(trainings: Trainings, tmp_path_factory: pytest.TempPathFactory) -> Sweeps:
+    return Sweeps(trainings, tmp_path_factory.mktemp("sweeps"))
 
 
 @pytest.fixture

@@ -47,6 +47,7 @@ def test_only_initial_states_are_learned_and_the_result_is_a_run(joint: Path, pu
     assert simulate.main([str(out), *videos]) == 0
 
 
+@pytest.mark.slow
 def test_the_second_scene_of_a_joint_run_keeps_its_own_weights(joint: Path, other: Path, tmp_path: Path) -> None:
     out = tmp_path / "adapted"
     asked = ["--data", str(other), "--sequences", "c", "--epochs", "1", "--frames", "3", "--out", str(out)]

@@ -69,30 +69,27 @@ _gausim 2>/dev/null; printf '%s\\n' "${COMPREPLY[@]}"
 """
 
 
-def in_bash(tmp_path: Path, line: str, *, breaks: str = " \t\n\"'><=;|&(:") -> list[str]:
-    """COMPREPLY of a real bash at the end of a line."""
-    done = subprocess.run([sys.executable, "-m", "gausim.cli.main", "config", "completion", "bash"],
-                          capture_output=True, text=True, check=True)  # fmt: skip
-    script = tmp_path / "gausim.bash"
-    script.write_text(done.stdout)
-    told = subprocess.run(
-        ["bash", "--norc", "-c", ASK, "bash", str(script), line, breaks],
-        capture_output=True, text=True, check=True, env={**os.environ, "PYTHON": sys.executable},
-    )  # fmt: skip
-    registered, *reply = told.stdout.splitlines()
-    assert registered == "complete -o default -F _gausim gausim"
-    return [choice for choice in reply if choice]
-
-
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
-def test_the_script_in_bash(tmp_path: Path) -> None:
-    assert in_bash(tmp_path, "gausim eval") == ["evaluate"]
-    assert in_bash(tmp_path, "gausim evaluate RUN --views ") == ["all", "train", "heldout"]
-    # Readline has `model` and `=` behind it already, unless = breaks no words.
-    assert in_bash(tmp_path, "gausim train model=gausim_p") == ["gausim_paper"]
-    assert in_bash(tmp_path, "gausim train model=gausim_p", breaks=" \t\n") == ["model=gausim_paper"]
-    assert in_bash(tmp_path, "gausim train trainer.max_e") == ["trainer.max_epochs="]
-    assert in_bash(tmp_path, "gausim evaluate outp") == []
+def test_the_script_in_bash(tmp_path: Path, capsys) -> None:
+    assert main(["config", "completion", "bash"]) == 0
+    script = tmp_path / "gausim.bash"
+    script.write_text(capsys.readouterr().out)
+    breaks = " \t\n\"'><=;|&(:"
+    for line, where, expected in (
+        ("gausim eval", breaks, ["evaluate"]),
+        ("gausim evaluate RUN --views ", breaks, ["all", "train", "heldout"]),
+        # Readline has `model` and `=` behind it already, unless = breaks no words.
+        ("gausim train model=gausim_p", breaks, ["gausim_paper"]),
+        ("gausim train model=gausim_p", " \t\n", ["model=gausim_paper"]),
+        ("gausim evaluate outp", breaks, []),
+    ):
+        told = subprocess.run(
+            ["bash", "--norc", "-c", ASK, "bash", str(script), line, where],
+            capture_output=True, text=True, check=True, env={**os.environ, "PYTHON": sys.executable},
+        )  # fmt: skip
+        registered, *reply = told.stdout.splitlines()
+        assert registered == "complete -o default -F _gausim gausim"
+        assert [choice for choice in reply if choice] == expected, line
 
 
 @pytest.mark.parametrize("shell", ["zsh", "fish"])

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from gausim.cli.main import main
 from gausim.compose import validate as _validate
 from gausim.compose.config import compose
-from gausim.compose.places import GLOBAL_PACKAGE, read_places
+from gausim.compose.places import read_places
 from gausim.compose.root import conf_dir
 from gausim.compose.schema import training_schema
 from gausim.core import ConfigError
@@ -39,18 +39,6 @@ def plain(*overrides: str) -> dict[str, Any]:
 
 def violations(schema: dict[str, Any], config: Any) -> list[str]:
     return [f"{error.json_path}: {error.message}" for error in Draft7Validator(schema).iter_errors(config)]
-
-
-def test_every_file_of_conf_fits_the_schema(schema) -> None:
-    Draft7Validator.check_schema(schema)
-    files = [path for path in conf_dir().rglob("*/*.yaml") if "hydra" not in path.parts[-3:]]
-    assert len(files) > 40
-    for path in files:
-        text = path.read_text()
-        config = yaml.safe_load(text)
-        if GLOBAL_PACKAGE not in text:
-            config = {path.relative_to(conf_dir()).parts[0]: {k: v for k, v in config.items() if k != "defaults"}}
-        assert violations(schema, config) == [], path
 
 
 @pytest.mark.parametrize(
@@ -103,6 +91,7 @@ def test_arguments_are_those_of_the_signatures(schema) -> None:
 
 def test_the_schema_is_printed(capsys, schema, monkeypatch) -> None:
     monkeypatch.setattr("gausim.compose.schema.training_schema", lambda: schema)
+    Draft7Validator.check_schema(schema)
     assert main(["config", "schema"]) == 0
     assert json.loads(capsys.readouterr().out) == schema
 

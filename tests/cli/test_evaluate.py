@@ -4,14 +4,12 @@ import json
 from types import SimpleNamespace
 
 import pytest
-import torch
 from helpers import toy_object
+from helpers.played import stand_in
 
 from gausim.cli import evaluate
 from gausim.compose import build as _run
 from gausim.core import DataError, SimState
-from gausim.data.objects import ObjectData
-from gausim.render.reference import ReferenceRenderer
 
 
 @pytest.fixture
@@ -29,15 +27,7 @@ def run(toy, tmp_path, monkeypatch):
     def predict(sequence, steps):
         return rollout(SimState(toy.scene.means, initial.previous(sequence)), steps)
 
-    module = SimpleNamespace(
-        model=model, simulator=model, initial_states=initial, predict=predict, method_name="gausim", footnotes=None
-    )
-    directory = tmp_path / "run"
-    directory.mkdir()
-    torch.save({"state_dict": {}, "gausim": {}, "epoch": 3, "global_step": 40}, directory / "last.ckpt")
-    (directory / "FINISHED").write_text("{}")
-    loaded = SimpleNamespace(config={"name": "toy", "seed": 5}, module=module, objects=[ObjectData(toy.root)],
-                             renderer=ReferenceRenderer(), run_dir=directory)  # fmt: skip
+    loaded = stand_in(tmp_path / "run", toy.root, model=model, initial_states=initial, predict=predict)
     monkeypatch.setattr(_run, "load_run", lambda path, data=None: loaded)
     return loaded
 

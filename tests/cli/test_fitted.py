@@ -94,7 +94,8 @@ def test_stages_set_frames_and_what_learns(arguments: list[str]) -> None:
     assert torch.equal(short["model.method.velocity.1"], made["model.method.velocity.1"])
 
 
-@pytest.mark.parametrize("model", METHODS[2:5])
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["spring_mass", "deformation_field", "physdreamer"])
 def test_a_resumed_fit_equals_an_uninterrupted_one(
     model: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

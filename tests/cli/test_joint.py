@@ -14,6 +14,7 @@ from gausim.cli import evaluate
 from gausim.cli import train as command
 from gausim.compose.build import load_run
 from gausim.core import ConfigError, RunError
+from gausim.training.callbacks.resume import RunCheckpoint
 
 NETWORK = "model.predictor.network."
 
@@ -44,12 +45,8 @@ def test_objects_of_different_stores_share_the_network_and_nothing_else(joint: P
     assert errors[0] != errors[1] and min(errors) > 0
 
 
-def test_a_frozen_network_stays_bit_by_bit_and_a_free_one_learns_even_if_it_is_cut(
-    joint: Path, other: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from gausim.training.callbacks.resume import RunCheckpoint
-
-    source, saved = weights(joint), RunCheckpoint.on_train_epoch_end
+def test_a_frozen_network_stays_bit_by_bit_and_a_free_one_learns(joint: Path, other: Path, tmp_path: Path) -> None:
+    source = weights(joint)
     shared = [name for name in source if name.startswith("model.predictor.")]
     assert {name.split(".")[2] for name in shared} == {"network", "node_normaliser", "edge_normaliser"}
     frozen = tune(other, joint, tmp_path / "frozen", "freeze=network")
@@ -60,6 +57,13 @@ def test_a_frozen_network_stays_bit_by_bit_and_a_free_one_learns_even_if_it_is_c
     own = [name for name in frozen if name.startswith(("model.attributes", "model.log_density", "initial_states."))]
     assert len(own) == 2 + 3 and all(bool(frozen[name].any()) for name in own)  # of one scene and its three sequences
 
+
+@pytest.mark.slow
+def test_a_network_that_was_taken_over_is_trained_on_after_a_cut(
+    joint: Path, other: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved = RunCheckpoint.on_train_epoch_end
+
     def crash(self: RunCheckpoint, trainer: object, pl_module: object) -> None:
         saved(self, trainer, pl_module)  # type: ignore[arg-type]
         raise MemoryError("power cut")
@@ -68,7 +72,7 @@ def test_a_frozen_network_stays_bit_by_bit_and_a_free_one_learns_even_if_it_is_c
         patch.setattr(RunCheckpoint, "on_train_epoch_end", crash)
         with pytest.raises(MemoryError):
             tune(other, joint, tmp_path / "cut")
-    resumed = tune(other, joint, tmp_path / "cut")
+    resumed, free = (tune(other, joint, tmp_path / name) for name in ("cut", "free"))
     assert all(torch.equal(value, free[name]) for name, value in resumed.items())
 
 

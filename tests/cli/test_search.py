@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import random
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import optuna
 import pytest
 import yaml
-from helpers.sweeps import dying, history, sweeper, write_toy_object
+from helpers.sweeps import Sweeps, dying, history, write_toy_object
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
 
@@ -24,27 +21,18 @@ RATES = (
     "model.simulator.network.layers=range(1,3)",
 )
 FINISH = "gausim.runs.directory.RunDirectory.finish"
-STEP = "gausim.training.module.GausSimModule.training_step"
-
-Do = Callable[..., "tuple[int, str]"]
 
 
-@pytest.fixture(scope="module")
-def do(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Do]:
-    with sweeper(tmp_path_factory.mktemp("searches")) as order:
-        yield order
+def results(do: Sweeps, name: str) -> dict[str, Any]:
+    return yaml.safe_load((do.folder / name / "optimization_results.yaml").read_text())
 
 
-def results(do: Do, name: str) -> dict[str, Any]:
-    return yaml.safe_load((do.folder / name / "optimization_results.yaml").read_text())  # type: ignore[attr-defined]
-
-
-def tried(do: Do, name: str) -> list[tuple[str, dict[str, Any], float]]:
+def tried(do: Sweeps, name: str) -> list[tuple[str, dict[str, Any], float]]:
     return [(t["state"], t["params"], t["value"]) for t in results(do, name)["trials"]]
 
 
 @pytest.mark.slow
-def test_a_killed_search_goes_on_with_what_it_would_have_tried(do: Do) -> None:
+def test_a_killed_search_goes_on_with_what_it_would_have_tried(do: Sweeps) -> None:
     few = (*RATES, "hydra.sweeper.n_trials=4", "hydra.sweeper.sampler.n_startup_trials=1")
     status, output = do("whole", *few)
     assert status == 0, output
@@ -73,9 +61,9 @@ def test_a_killed_search_goes_on_with_what_it_would_have_tried(do: Do) -> None:
 
 
 @pytest.mark.slow  # that jobs of a sweep are tried again is a default test of test_sweep.py
-def test_a_trial_that_fails_stops_no_other_and_is_tried_again_on_demand(do: Do, tmp_path: Path) -> None:
+def test_a_trial_that_fails_stops_no_other_and_is_tried_again_on_demand(do: Sweeps, tmp_path: Path) -> None:
     late = tmp_path / "late"
-    search = ("hydra/sweeper=optuna", f"data.root=choice({late},{do.folder}/toy)",  # type: ignore[attr-defined]
+    search = ("hydra/sweeper=optuna", f"data.root=choice({late},{do.folder}/toy)",
               "hydra.sweeper.n_trials=3", "hydra.sweeper.n_jobs=3", "hydra.sweeper.seed=1", "data.repeats=1",
               "trainer.max_epochs=1")  # fmt: skip
     status, output = do("mixed", *search)
@@ -92,7 +80,7 @@ def test_a_trial_that_fails_stops_no_other_and_is_tried_again_on_demand(do: Do, 
 
 
 @pytest.mark.slow
-def test_poor_trials_are_ended_early(do: Do) -> None:
+def test_poor_trials_are_ended_early(do: Sweeps) -> None:
     pruner = "hydra.sweeper.pruner={_target_:optuna.pruners.ThresholdPruner,upper:0.0,n_warmup_steps:2}"
     search = (*RATES, "hydra.sweeper.n_trials=2", pruner, "trainer.max_epochs=4", "evaluate=true")
     # Killed once it was decided, before the run was marked as finished: the decision stays.
@@ -139,27 +127,7 @@ def test_hydras_notation_becomes_optunas_distributions(text: str, expected: Base
 
 
 @pytest.mark.slow
-def test_six_trials_two_at_a_time_killed_once_are_those_of_an_undisturbed_search(do: Do) -> None:
-    six = (*RATES, "hydra.sweeper.n_trials=6", "hydra.sweeper.n_jobs=2", "hydra.sweeper.sampler.n_startup_trials=2",
-           "data.repeats=5", "trainer.max_epochs=6")  # fmt: skip
-    status, output = do("undisturbed", *six)
-    assert status == 0, output
-    status, output = do("disturbed", *six, **dying(STEP, random.Random(3).randint(70, 290)))  # of 360 steps
-    assert status == -9, output
-    storage = f"sqlite:///{do.folder}/disturbed/optuna.db"  # type: ignore[attr-defined]
-    before = optuna.load_study(storage=storage, study_name="study").trials
-    assert 0 < len(before) <= 6 and any(t.state.name == "RUNNING" for t in before)
-    status, output = do("disturbed", *six)
-    assert status == 0, output
-    assert tried(do, "disturbed") == tried(do, "undisturbed") and len(tried(do, "disturbed")) == 6
-    for trial in results(do, "disturbed")["trials"]:
-        assert history(Path(trial["directory"])).count("finished") == 1
-    runs = {t["directory"] for t in results(do, "disturbed")["trials"]}
-    assert runs == {str(p.parent) for p in (do.folder / "disturbed").rglob("FINISHED")}  # type: ignore[attr-defined]
-
-
-@pytest.mark.slow
-def test_a_search_through_joblib(do: Do) -> None:
+def test_a_search_through_joblib(do: Sweeps) -> None:
     side_by_side = ("hydra/launcher=joblib", "hydra.launcher.n_jobs=2")
     search = (*RATES, "hydra.sweeper.n_trials=4", "hydra.sweeper.n_jobs=2")
     assert do("alone", *search)[0] == 0

@@ -6,12 +6,11 @@ import json
 import os
 import random
 from collections import Counter
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import hydra
 import pytest
-from helpers.sweeps import dying, history, sweeper, write_toy_object
+from helpers.sweeps import Sweeps, dying, history, write_toy_object
 from hydra.core.hydra_config import HydraConfig
 
 from gausim.cli import train as command
@@ -24,17 +23,9 @@ FINISH = "gausim.runs.directory.RunDirectory.finish"
 SAVED = "gausim.runs.checkpoint._check_written"
 STEP = "gausim.training.module.GausSimModule.training_step"
 
-Do = Callable[..., "tuple[int, str]"]
 
-
-@pytest.fixture(scope="module")
-def do(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Do]:
-    with sweeper(tmp_path_factory.mktemp("sweeps")) as order:
-        yield order
-
-
-def runs_of(do: Do, name: str) -> list[Path]:
-    return sorted((do.folder / name).rglob("seed_*"))  # type: ignore[attr-defined]
+def runs_of(do: Sweeps, name: str) -> list[Path]:
+    return sorted((do.folder / name).rglob("seed_*"))
 
 
 def steps(run: Path) -> int:
@@ -42,7 +33,7 @@ def steps(run: Path) -> int:
     return json.loads((run / "FINISHED").read_text())["optimizer_steps"]
 
 
-def test_a_killed_sweep_goes_on_where_it_was_and_leaves_out_what_is_not_its_own(do: Do) -> None:
+def test_a_killed_sweep_goes_on_where_it_was_and_leaves_out_what_is_not_its_own(do: Sweeps) -> None:
     assert do("cut", "seed=0,1", **dying(FINISH, 2))[0] == -9
     status, output = do("cut", "seed=0,1")
     assert status == 0 and "sweep of 2 jobs: 1 trained, 1 finished before" in output, output
@@ -61,9 +52,9 @@ def test_a_killed_sweep_goes_on_where_it_was_and_leaves_out_what_is_not_its_own(
     assert [history(run) for run in (first, second)] == expected and steps(first) == 8
 
 
-def test_a_job_that_fails_stops_no_other_and_is_tried_again_on_demand(do: Do, tmp_path: Path) -> None:
+def test_a_job_that_fails_stops_no_other_and_is_tried_again_on_demand(do: Sweeps, tmp_path: Path) -> None:
     late = tmp_path / "late"
-    swept = (f"data.root={late},{do.folder}/toy", "seed=0")  # type: ignore[attr-defined]
+    swept = (f"data.root={late},{do.folder}/toy", "seed=0")
     status, output = do("mixed", *swept)
     assert status == 2 and "sweep of 2 jobs: 1 trained, 1 failed" in output, output
     failed, trained = sorted(runs_of(do, "mixed"), key=lambda run: (run / "FINISHED").exists())
@@ -122,7 +113,7 @@ def learned(run: Path) -> str:
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", [("hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
                                       ("hydra/launcher=submitit_local", "hydra.launcher.cpus_per_task=1")])  # fmt: skip
-def test_jobs_side_by_side_leave_what_one_after_another_would(do: Do, launcher: tuple[str, str]) -> None:
+def test_jobs_side_by_side_leave_what_one_after_another_would(do: Sweeps, launcher: tuple[str, str]) -> None:
     name = launcher[0].split("=")[1]
     assert do("in_turn", "seed=0,1")[0] == 0
     status, output = do(name, "seed=0,1", *launcher)
@@ -134,7 +125,7 @@ def test_jobs_side_by_side_leave_what_one_after_another_would(do: Do, launcher: 
 
 
 @pytest.mark.slow
-def test_a_sweep_of_six_killed_five_times_completes_every_run_once(do: Do) -> None:
+def test_a_sweep_of_six_killed_five_times_completes_every_run_once(do: Sweeps) -> None:
     swept = ("seed=0,1,2,3,4,5", "data.repeats=5", "trainer.max_epochs=6")
     status, output = do("undisturbed", *swept)
     assert status == 0, output

@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 from helpers.joint_runs import PAPER, weights
+from helpers.shared import Shared
 from helpers.toy_object import toy_scene
 from helpers.toy_runs import rows
 
@@ -28,12 +29,14 @@ def arguments(toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> lis
     return [f"data.root={toy}", *PAPER]
 
 
-@pytest.fixture(scope="module")
-def finished(toy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="session")
+def finished(toy: Path, shared: Shared) -> Path:
     """A run of one epoch, which tests copy."""
-    root = tmp_path_factory.mktemp("finished")
-    assert command.main([f"data.root={toy}", *PAPER, "trainer.max_epochs=1", f"paths.output_root={root}"]) == 0
-    return root
+
+    def train(root: Path) -> None:
+        assert command.main([f"data.root={toy}", *PAPER, "trainer.max_epochs=1", f"paths.output_root={root}"]) == 0
+
+    return shared("finished", train)
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers import toy_object
 
 from gausim.core import Cameras, GaussianScene
-from gausim.io.ply import save_scene
 from gausim.io.transforms import write_transforms
 
 VIEWS = ("cam_0", "cam_1", "cam_2")
@@ -45,15 +45,22 @@ def write_png(path: Path, rgba: np.ndarray) -> None:
     assert cv2.imwrite(str(path), cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))
 
 
+class Blob(toy_object.ToyObject):
+    """Its points move by 1/64 per frame along every axis."""
+
+    def images(self, sequence: str) -> torch.Tensor:
+        number = int(sequence.removeprefix("seq_"))
+        frames = [[frame_pixels(number, v, f) for v in range(len(VIEWS))] for f in range(FRAMES)]
+        return torch.from_numpy(np.array(frames))
+
+    def displacement(self, sequence: str) -> torch.Tensor:
+        return (torch.arange(FRAMES) / 64).half()[:, None, None].expand(FRAMES, POINTS, 3)
+
+
 def make_object(root: Path, *, name: str = "blob", sequences: int = SEQUENCES) -> Path:
     """Writes the whole directory."""
-    root.mkdir(parents=True)
-    facts = {"name": name, "fps": 24, "views": VIEWS, "train_views": VIEWS[:2], "heldout_views": VIEWS[2:]}
-    (root / "dataset.json").write_text(json.dumps({**facts, "train_frames": [0, 16], "object_diagonal": 1.5}))
-    generator = torch.Generator().manual_seed(0)
-    means = torch.rand(POINTS, 3, generator=generator)
     scene = GaussianScene.create(
-        means=means,
+        means=torch.rand(POINTS, 3, generator=torch.Generator().manual_seed(0)),
         log_scales=torch.full((POINTS, 3), -3.0),
         quats=torch.tensor([1.0, 0, 0, 0]).repeat(POINTS, 1),
         opacity_logits=torch.zeros(POINTS),
@@ -61,29 +68,16 @@ def make_object(root: Path, *, name: str = "blob", sequences: int = SEQUENCES) -
         pinned=torch.arange(POINTS) == 0,
         name=name,
     )
-    save_scene(scene, root / "scene.ply")
-    np.savez(root / "rest_points.npz", points=means.numpy())
-    for s in range(sequences):
-        _write_sequence(root / "sequences" / f"seq_{s:03d}", s)
+    names = dict.fromkeys((f"seq_{s:03d}" for s in range(sequences)), 0.0)
+    cameras = ring_of_cameras(VIEWS)
+    toy_object.write_object(Blob(root, scene, FRAMES, first_unseen=16, amplitudes=names, cameras=cameras))
+    edit_json(root / "dataset.json", lambda facts: facts.update(object_diagonal=1.5))
     stills = tuple(f"{i:04d}" for i in range(12))
     for i, still in enumerate(stills):
         write_png(root / "static" / "images" / f"{still}.png", frame_pixels(0, 0, i))
     entries = [{"file_path": f"images/{still}.png"} for still in stills]
     write_transforms(root / "static" / "transforms.json", ring_of_cameras(stills), entries)
     return root
-
-
-def _write_sequence(folder: Path, number: int) -> None:
-    cameras, entries, index = ring_of_cameras(VIEWS), [], []
-    for v, view in enumerate(VIEWS):
-        for f in range(FRAMES):
-            write_png(folder / view / f"{f:04d}.png", frame_pixels(number, v, f))
-            entries.append({"file_path": f"{view}/{f:04d}.png", "camera": view, "frame": f, "heldout": v == 2})
-            index.append(v)
-    write_transforms(folder / "transforms.json", cameras.select(index), entries, fps=24)
-    displacement = np.zeros((FRAMES, POINTS, 3), np.float16)
-    displacement[:] = np.arange(FRAMES)[:, None, None] / 64
-    np.savez(folder / "ground_truth.npz", displacement=displacement)
 
 
 @pytest.fixture(scope="session")

@@ -10,20 +10,17 @@ from torch import Tensor
 from gausim.core import Cameras, GaussianScene
 from gausim.runs.checkpoint import averaged_weights, read_checkpoint
 from helpers import toy_object
-from helpers.simulators import LEVELS
+from helpers.simulators import SMALLEST
 
 TINY = (
-    "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
-    "data.curriculum.t_start=2", "data.curriculum.t_max=2", "data.repeats=1", "trainer.max_epochs=2",
-    "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1", "render=reference",
-    "callbacks.panels=null", "logger=none", "doctor=false",
+    *SMALLEST, "data.curriculum.t_start=2", "data.curriculum.t_max=2", "data.repeats=1", "trainer.max_epochs=2",
+    "trainer.accelerator=cpu", "render=reference", "logger=none",
 )  # fmt: skip
 # One of the paper's model, without pictures and dashboards.
 PAPER = (
-    "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
-    "data.curriculum.t_max=2", "data.curriculum.t_start=1", "data.repeats=1", "data.batch_size=2",
-    "trainer.max_epochs=2", "trainer.accelerator=cpu", "trainer.progress=false", "trainer.threads=1",
-    "render=reference", "doctor=false", "name=toy", "callbacks.panels=null", "logger=none",
+    *SMALLEST, "model=gausim_paper", "data.curriculum.t_start=1", "data.curriculum.t_max=2", "data.repeats=1",
+    "data.batch_size=2", "trainer.max_epochs=2", "trainer.accelerator=cpu", "render=reference", "logger=none",
+    "name=toy",
 )  # fmt: skip
 
 

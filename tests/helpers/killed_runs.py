@@ -1,7 +1,8 @@
 """Runs `gausim train` in forked children, so that one start of Python serves many runs, and has them die.
 
-A program, not a test: it reads one JSON object per line (argv, die, kill_after, limit) and answers with the child's
-exit status (negative: the signal) and output. Nothing here runs a backward pass: after one, torch refuses to fork.
+A program, not a test: it reads one JSON object per line. Of a run (argv, die, kill_after, limit) it answers the child's
+exit status (negative: the signal) and output, of a check of ranks what ``rank_checks.py`` finds. Nothing here runs a
+backward pass: after one, torch refuses to fork.
 """
 
 from __future__ import annotations
@@ -87,8 +88,12 @@ def child(order: dict[str, Any]) -> int:
         sys.stderr.flush()
 
 
-def answer(order: dict[str, Any]) -> dict[str, Any]:
+def answer(order: dict[str, Any]) -> Any:
     """Forks, waits, and kills after ``kill_after`` seconds where that is asked for."""
+    if "check" in order:
+        from helpers import rank_checks  # which takes a while
+
+        return rank_checks.run(order)
     with tempfile.TemporaryFile() as log:
         pid = os.fork()
         if pid == 0:

@@ -17,6 +17,19 @@ from helpers import toy_object
 from helpers.simulators import gausim
 
 
+def stand_in(directory: Path, root: Path, *, model: object, **parts: object) -> SimpleNamespace:
+    """What loading a finished run gives, with a model and parts of a module of our own."""
+    directory.mkdir(parents=True)
+    torch.save({"state_dict": {}, "gausim": {}, "epoch": 3, "global_step": 40}, directory / "last.ckpt")
+    (directory / "FINISHED").write_text("{}")
+    (directory / "config.yaml").write_text("name: toy\n")
+    facts = {"method_name": "gausim", "footnotes": None, "method": None}
+    return SimpleNamespace(
+        config={"name": "toy", "seed": 5, "model": {"modes": 6}}, run_dir=directory, objects=[ObjectData(root)],
+        module=SimpleNamespace(model=model, simulator=model, **facts, **parts), renderer=ReferenceRenderer(),
+    )  # fmt: skip
+
+
 def played_run(folder: Path) -> SimpleNamespace:
     """Two sequences of one object; the network has random weights, the template a firm block."""
     toy = toy_object.write_toy_object(folder / "data" / "toy")
@@ -37,21 +50,4 @@ def played_run(folder: Path) -> SimpleNamespace:
         with torch.no_grad():
             return SceneDynamics(model).rollout(SimState(toy.scene.means, states.previous(sequence)), steps)
 
-    module = SimpleNamespace(
-        model=model,
-        simulator=model,
-        initial_states=states,
-        predict=predict,
-        method_name="gausim",
-        footnotes=None,
-        method=None,
-    )
-    directory = folder / "demo" / "seed_0"
-    directory.mkdir(parents=True)
-    torch.save({"state_dict": {}, "gausim": {}, "epoch": 1, "global_step": 1}, directory / "last.ckpt")
-    (directory / "FINISHED").write_text("{}")
-    (directory / "config.yaml").write_text("name: toy\n")
-    return SimpleNamespace(
-        config={"name": "toy", "seed": 0, "model": {"modes": 6}}, module=module, objects=[ObjectData(toy.root)],
-        renderer=ReferenceRenderer(), run_dir=directory,
-    )  # fmt: skip
+    return stand_in(folder / "demo" / "seed_0", toy.root, model=model, initial_states=states, predict=predict)

@@ -1,8 +1,4 @@
-"""Checks that several ranks run together: a program, not a test. It forks N processes, which meet by gloo.
-
-One start of Python serves all checks: it reads one JSON object per line (check, ranks, options) and answers with what
-each rank found. Nothing here runs a backward pass before it forks: after one, torch refuses to fork.
-"""
+"""Checks that several ranks run together, for ``killed_runs.py``: it forks as many processes, which meet by gloo."""
 
 from __future__ import annotations
 
@@ -160,7 +156,7 @@ def child(order: dict[str, Any], rank: int, store: str, answer: int) -> None:
 
 
 def run(order: dict[str, Any]) -> list[Any]:
-    """Forks the ranks and collects what they answer; None from one that died."""
+    """Forks the ranks of an order (check, ranks, options); what each found, None from one that died."""
     readers, pids = [], []
     with tempfile.TemporaryDirectory() as folder:
         for rank in range(order["ranks"]):
@@ -177,11 +173,6 @@ def run(order: dict[str, Any]) -> list[Any]:
     return [json.loads(text) if text else None for text in texts]
 
 
-if __name__ == "__main__":
-    torch.set_num_threads(1)
-    # What is loaded here, every fork has; a forward pass leaves no threads behind.
-    real_module(Objective(), torch.float32, OptimizerSettings()).predict_images(samples(1, 1, torch.float32)[0])
-    answers = os.fdopen(os.dup(1), "w")
-    for line in sys.stdin:
-        answers.write(json.dumps(run(json.loads(line))) + "\n")
-        answers.flush()
+torch.set_num_threads(1)
+# What is loaded here, every fork has; a forward pass leaves no threads behind.
+real_module(Objective(), torch.float32, OptimizerSettings()).predict_images(samples(1, 1, torch.float32)[0])

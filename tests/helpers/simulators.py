@@ -29,6 +29,11 @@ PARTS: dict[str, tuple[str, ...]] = {
 
 # As an override of `gausim train`: two levels for an object of a few kernels.
 LEVELS = "model.simulator.hierarchy.levels=[{diameter: 0.7, edge_length: 2.0},{diameter: 0.3, edge_length: 0.4}]"
+# The smallest run of `gausim train`, in silence.
+SMALLEST = (
+    "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS, "trainer.progress=false",
+    "trainer.threads=1", "callbacks.panels=null", "doctor=false",
+)  # fmt: skip
 
 
 def levels(

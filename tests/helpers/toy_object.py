@@ -45,6 +45,13 @@ class ToyObject:
         return Trajectory(self.scene.means + shift, identity, identity,
                           torch.zeros(self.scene.count, dtype=torch.long), self.fps)  # fmt: skip
 
+    def images(self, sequence: str) -> Tensor:
+        """Frames of a sequence from all views, RGBA."""
+        return rgba(self.scene, self.truth(sequence), self.views)
+
+    def displacement(self, sequence: str) -> Tensor:
+        return self.truth(sequence).positions - self.scene.means
+
 
 def toy_scene() -> GaussianScene:
     axis = torch.tensor([-0.3, 0.0, 0.3])
@@ -93,9 +100,7 @@ def write_object(toy: ToyObject) -> ToyObject:
 
 
 def _write_sequence(toy: ToyObject, name: str) -> None:
-    folder, trajectory = toy.root / "sequences" / name, toy.truth(name)
-    images = rgba(toy.scene, trajectory, toy.views)
-    entries = []
+    folder, images, entries = toy.root / "sequences" / name, toy.images(name), []
     for v, view in enumerate(toy.views.names):
         (folder / view).mkdir(parents=True)
         for f in range(toy.frames):
@@ -103,7 +108,7 @@ def _write_sequence(toy: ToyObject, name: str) -> None:
             entries.append({"file_path": f"{view}/{f:04d}.png", "camera": view, "frame": f})
     every = toy.views.select([v for v in range(len(toy.views.names)) for _ in range(toy.frames)])
     write_transforms(folder / "transforms.json", every, entries, fps=toy.fps)
-    np.savez(folder / "ground_truth.npz", displacement=(trajectory.positions - toy.scene.means).numpy())
+    np.savez(folder / "ground_truth.npz", displacement=toy.displacement(name).numpy())
 
 
 def rgba(scene: GaussianScene, trajectory: Trajectory, views: Cameras | None = None) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,15 +13,13 @@ from typing import Any, Self
 from gausim.runs.checkpoint import digest, read_checkpoint
 from helpers import toy_object
 from helpers.shared import Shared
-from helpers.simulators import LEVELS
+from helpers.simulators import SMALLEST
 
 # The smallest run in which everything happens that a resumed run could get wrong.
 TINY = (
-    "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
-    "data.repeats=2", "data.curriculum.t_max=3", "data.curriculum.t_start=1", "trainer.convergence.held_back=1",
-    "trainer.convergence.window=2", "optimizer.schedule.warmup=0.5", "data.batch_size=1",
-    "render=reference", "optimizer.ema_decay=0.9", "trainer.threads=1",
-    "trainer.progress=false", "trainer.log_every_n_steps=1", "callbacks.panels=null", "doctor=false",
+    *SMALLEST, "model=gausim_paper", "data.repeats=2", "data.curriculum.t_max=3", "data.curriculum.t_start=1",
+    "trainer.convergence.held_back=1", "trainer.convergence.window=2", "optimizer.schedule.warmup=0.5",
+    "data.batch_size=1", "render=reference", "optimizer.ema_decay=0.9", "trainer.log_every_n_steps=1",
 )  # fmt: skip
 
 
@@ -30,15 +29,22 @@ class Server:
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
 
+    def ask(self, **order: Any) -> Any:
+        if self._process is None:
+            here = Path(__file__)
+            path = os.pathsep.join([str(here.parents[1]), os.environ.get("PYTHONPATH", "")])
+            self._process = subprocess.Popen(
+                [sys.executable, str(here.with_name("killed_runs.py"))], stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path},
+            )  # fmt: skip
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self._process.stdin.write(json.dumps(order) + "\n")
+        self._process.stdin.flush()
+        return json.loads(self._process.stdout.readline())
+
     def order(self, argv: list[str], **death: Any) -> tuple[int, str]:
         """Exit status (negative: the signal) and output of `gausim train`."""
-        if self._process is None:
-            program = [sys.executable, str(Path(__file__).with_name("killed_runs.py"))]
-            self._process = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write(json.dumps({"argv": argv, **death}) + "\n")
-        self._process.stdin.flush()
-        found = json.loads(self._process.stdout.readline())
+        found = self.ask(argv=argv, **death)
         return found["status"], found["output"]
 
     def __enter__(self) -> Self:

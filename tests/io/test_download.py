@@ -35,16 +35,11 @@ def test_a_file_is_brought_whole_and_told_on_the_way(mirror, tmp_path):
     assert bring(str(mirror / "x.tar"), tmp_path / "other")[-1] == len(DATA)
 
 
-def test_a_connection_that_ends_early_is_continued_where_it_was(mirror, tmp_path):
-    with serving(mirror, cut_after=[300_000, 100_000]) as server:
+@pytest.mark.parametrize("ranges", [True, False])
+def test_a_connection_that_ends_early_is_continued_or_begun_anew_without_range(mirror, tmp_path, ranges):
+    with serving(mirror, ranges=ranges, cut_after=[300_000, 100_000][: 1 + ranges]) as server:
         bring(f"{server.url}/x.tar", tmp_path / "part")
-    assert [asked for _, asked in server.asked] == [None, "bytes=300000-", "bytes=400000-"]
-
-
-def test_without_range_it_begins_anew(mirror, tmp_path):
-    with serving(mirror, ranges=False, cut_after=[300_000]) as server:
-        bring(f"{server.url}/x.tar", tmp_path / "part")
-    assert [asked for _, asked in server.asked] == [None, "bytes=300000-"]
+    assert [asked for _, asked in server.asked] == [None, "bytes=300000-", "bytes=400000-"][: 2 + ranges]
 
 
 def test_what_an_earlier_call_left_is_not_asked_for_again_and_what_is_too_long_thrown_away(mirror, tmp_path):

@@ -23,10 +23,12 @@ def two_cameras() -> Cameras:
     return Cameras(viewmats, k.expand(2, 3, 3).clone(), 20, 16, ("a/0.png", "a/1.png"))
 
 
-def written(tmp_path: Path, **changes: object) -> Path:
+def written(tmp_path: Path, second: dict[str, object] | None = None, **changes: object) -> Path:
+    """A file of two entries, the second with some fields of its own."""
     path = tmp_path / "transforms.json"
     write_transforms(path, two_cameras(), [{"file_path": f"a/{i}.png", "camera": "a", "frame": i} for i in (0, 1)])
     data = json.loads(path.read_text())
+    data["frames"][1].update(second or {})
     for key, value in changes.items():
         if value is None:
             del data[key]
@@ -69,31 +71,16 @@ def test_blenders_own_layout(tmp_path: Path) -> None:
     assert posed.frames[0].path.is_file() and posed.frames[0].frame is None
 
 
-def edited(tmp_path: Path, **fields: object) -> Path:
-    """A file whose second entry has these fields."""
-    path = written(tmp_path)
-    data = json.loads(path.read_text())
-    data["frames"][1].update(fields)
-    path.write_text(json.dumps(data))
-    return path
-
-
 def test_what_an_entry_says_itself_wins(tmp_path: Path) -> None:
-    assert read_transforms(edited(tmp_path, fl_x=77.0)).cameras.Ks[:, 0, 0].tolist() == [30.0, 77.0]
-    with pytest.raises(DataError, match=r"frames\[1\]: is 21x16, frames\[0\] is 20x16"):
-        read_transforms(edited(tmp_path, w=21))
-
-
-@pytest.mark.parametrize("diagonal", [(1.1, 1.1, 1.1), (1.0, 1.0, -1.0), (0.0, 0.0, 0.0)])
-def test_pose_that_is_no_rotation(tmp_path: Path, diagonal: tuple[float, float, float]) -> None:
-    path = edited(tmp_path, transform_matrix=np.diag([*diagonal, 1.0]).tolist())
-    with pytest.raises(DataError, match=r"transforms.json: transform_matrix of 'a/1.png' is not a rotation"):
-        read_transforms(path)
+    assert read_transforms(written(tmp_path, second={"fl_x": 77.0})).cameras.Ks[:, 0, 0].tolist() == [30.0, 77.0]
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"second": {"w": 21}}, r"frames\[1\]: is 21x16, frames\[0\] is 20x16"),
+        *(({"second": {"transform_matrix": np.diag([*d, 1.0]).tolist()}}, "matrix of 'a/1.png' is not a rotation")
+          for d in ((1.1, 1.1, 1.1), (1.0, 1.0, -1.0), (0.0, 0.0, 0.0))),
         ({"frames": []}, "field 'frames' must be a non-empty list"),
         ({"fl_x": None, "camera_angle_x": None}, "neither field 'fl_x'"),
         ({"fl_x": "wide"}, "field 'fl_x' must be a finite number"),
@@ -108,7 +95,7 @@ def test_pose_that_is_no_rotation(tmp_path: Path, diagonal: tuple[float, float, 
         ({"frames": [{"file_path": "a.png", "transform_matrix": [[1, 2], [3, 4]]}]}, "finite 4 x 4 matrix"),
         ({"frames": [{"file_path": "a.png", "transform_matrix": "eye"}]}, "finite 4 x 4 matrix"),
     ],
-)
+)  # fmt: skip
 def test_malformed_fields_are_named(tmp_path: Path, changes: dict[str, object], message: str) -> None:
     path = written(tmp_path, **changes)
     with pytest.raises(DataError, match=message) as error:

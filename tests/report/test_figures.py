@@ -56,15 +56,6 @@ def test_video_frames_have_one_size_and_mark_what_is_foreseen():
     assert (foreseen == orange).all(-1).sum() < (beyond == orange).all(-1).sum()
 
 
-def test_prediction_stands_in_the_middle_panel():
-    truth = np.zeros((20, 30, 3), np.uint8)
-    prediction = np.full_like(truth, 200)
-    picture = video_frame(truth, prediction, 0, Timeline(12, 5), "seq")
-    third = picture.shape[1] // 3
-    middle = picture[picture.shape[0] // 2]
-    assert (middle[: third - 2] == 0).all() and (middle[third + 2 : 2 * third - 2] == 200).all()
-
-
 def test_contact_frames_hold_the_turning_points():
     assert {0, 15, 16, 59} <= set(contact_frames(60, 16)) and len(contact_frames(60, 16)) <= 12
     assert contact_frames(10, 16)[-1] == 9

@@ -64,30 +64,23 @@ def test_a_good_run_is_called_good():
 
 
 @pytest.mark.parametrize(
-    ("error", "seen", "words"),
+    ("sentence", "error", "seen", "energy", "words"),
     [
-        (0.1, 0.1, "it foresees the motion closely"),
-        (0.199, 0.1, "it foresees most of the motion"),  # printed as 0.20
-        (0.7, 0.3, "it foresees part of the motion"),
-        (0.97, 0.5, "no better than predicting no motion, although it learned the frames it was trained on"),
-        (1.4, 0.95, "worse than predicting no motion, and it learned no more of the frames it was trained on"),
-        (1.4, None, "that is worse than predicting no motion"),
+        (0, 0.1, 0.1, 0.9, "it foresees the motion closely"),
+        (0, 0.199, 0.1, 0.9, "it foresees most of the motion"),  # printed as 0.20
+        (0, 0.7, 0.3, 0.9, "it foresees part of the motion"),
+        (0, 0.97, 0.5, 0.9, "no better than predicting no motion, although it learned the frames it was trained on"),
+        (0, 1.4, 0.95, 0.9, "worse than predicting no motion, and it learned no more of the frames it was trained on"),
+        (0, 1.4, None, 0.9, "that is worse than predicting no motion"),
+        (1, 0.9, 0.2, 0.02, "it all but stands still"),
+        (1, 0.4, 0.2, 0.6, "it dies down sooner than the object does"),
+        (1, 0.95, 0.2, 1.0, "it moves as much as the object, but not as the object does"),
+        (1, 0.4, 0.2, 1.5, "it is livelier than the object"),
+        (1, 2.0, 0.2, 7.0, "it gains energy that the object does not have"),
     ],
 )
-def test_mediocre_and_failed_runs_are_called_so(error: float, seen: float | None, words: str):
-    assert said(entry(error, seen))[0].endswith(f"{words}.")
-
-
-@pytest.mark.parametrize(
-    ("energy", "error", "words"),
-    [
-        (0.02, 0.9, "it all but stands still"), (0.6, 0.4, "it dies down sooner than the object does"),
-        (1.0, 0.95, "it moves as much as the object, but not as the object does"),
-        (1.5, 0.4, "it is livelier than the object"), (7.0, 2.0, "it gains energy that the object does not have"),
-    ],
-)  # fmt: skip
-def test_too_still_and_too_lively(energy: float, error: float, words: str):
-    assert said(entry(error, energy=energy))[1].endswith(f"{words}.")
+def test_mediocre_failed_and_too_lively_runs_are_called_so(sentence, error, seen, energy, words):
+    assert said(entry(error, seen, energy))[sentence].endswith(f"{words}.")
 
 
 def test_views_that_are_worse_or_missing():

@@ -1,29 +1,24 @@
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.report_runs import FRAMES, METRICS, make_curves
 
 from gausim.core import RunError
-from gausim.results.curves import ImageMetricInfo, ObjectCurves, ObjectFacts, load_curves
+from gausim.results.curves import ImageMetricInfo, ObjectCurves, load_curves
 from gausim.results.summary import frame_splits, load_summary, summarise, write_summary
 from gausim.results.table import LEGEND, markdown, object_tables
-
-FRAMES = 60
 
 
 def curves(**changes) -> ObjectCurves:
     """Two sequences, two views (one held out): errors and energies of round numbers."""
-    facts = ObjectFacts(
-        name="toy", fps=24.0, sequences=("a", "b"), frames=(FRAMES, FRAMES), views=("x", "y"), train_views=("x",),
-        first_unseen=16, methods=("ours",), mean_color=(0.3, 0.0, 0.4), max_l2=0.9,
-        metrics=(ImageMetricInfo("l2", "l2", 1e3, "1e-3", False), ImageMetricInfo("psnr", "PSNR", 1.0, "dB", True)),
-    )  # fmt: skip
-    late = (np.arange(FRAMES) >= 16).astype(float)
-    per_sequence = np.array([1.0, 3.0])[:, None]
-    error = per_sequence * (0.001 + 0.004 * late)  # (S, F): seen 1e-3 and 3e-3, unseen 5e-3 and 15e-3
-    both_views = np.stack((error, 2 * error), -1)
+    made = make_curves()
+    metrics = (METRICS[0], ImageMetricInfo("psnr", "PSNR", 1.0, "dB", True))
+    facts = replace(made.facts, name="toy", methods=("ours",), metrics=metrics)
+    both_views = made.values["gausim"]["l2"] * [1, 2]
+    error = both_views[..., 0]  # (S, F): seen 1e-3 and 3e-3, unseen 5e-3 and 15e-3
     energy = np.full((2, FRAMES), 4.0) * np.array([[1.0], [9.0]])
     energy[:, 0] = np.nan
     values = {
@@ -102,15 +97,8 @@ def test_still_truth_has_no_ratio_and_the_file_stays_valid_json(tmp_path):
 
 
 def test_files_that_are_not_ours_are_refused(tmp_path):
-    path = tmp_path / "metrics.json"
     with pytest.raises(RunError, match="no such file"):
-        load_summary(path)
-    path.write_text("{")
-    with pytest.raises(RunError, match="cannot be read as JSON"):
-        load_summary(path)
-    path.write_text(json.dumps({"schema": "other/2"}))
-    with pytest.raises(RunError, match="field 'schema' is 'other/2'"):
-        load_summary(path)
+        load_summary(tmp_path / "metrics.json")
     with pytest.raises(RunError, match="cannot be read"):
         load_curves(tmp_path / "metrics.npz")
     np.savez(tmp_path / "metrics.npz", a=np.zeros(3))
@@ -134,10 +122,3 @@ def test_tables_hold_the_numbers(tmp_path):
     assert LEGEND in text and "name exp/seed_0, epoch 3" in text and "(0.30, 0.00, 0.40) | 0.50 | 0.90" in text
     for table in tables:
         assert len({len(row) for row in [table.head, *table.rows]}) == 1
-
-
-def test_tables_without_lpips_say_how_to_get_it(tmp_path):
-    lacking = write_summary(tmp_path / "metrics.json", [curves()], {})
-    assert "gausim prepare lpips" not in markdown(lacking)  # an old evaluation, which does not say why
-    lacking["objects"]["toy"]["absent"] = {"lpips": "no weights"}
-    assert "`gausim prepare lpips` gets them; then evaluate again." in markdown(lacking)

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import toy_object
-from helpers.simulators import LEVELS, silence
+from helpers.simulators import SMALLEST, silence
 from helpers.toy_runs import rows as rows_of
 
 from gausim.cli import train as command
@@ -19,16 +18,10 @@ from gausim.runs.checkpoint import read_checkpoint
 from gausim.training.callbacks.convergence import Convergence, forecast, verdict
 
 TINY = (
-    "model=gausim_paper", "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS,
-    "data.curriculum.t_max=3", "data.repeats=2", "trainer.accelerator=cpu", "trainer.progress=false",
-    "trainer.threads=1", "trainer.convergence.held_back=1", "trainer.convergence.window=4", "render=cpu",
-    "doctor=false", "callbacks.panels=null", "callbacks.motion=null", "logger=none", "evaluate=false",
+    *SMALLEST, "model=gausim_paper", "data.curriculum.t_max=3", "data.repeats=2", "trainer.accelerator=cpu",
+    "trainer.convergence.held_back=1", "trainer.convergence.window=4", "render=cpu", "callbacks.motion=null",
+    "logger=none", "evaluate=false",
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return toy_object.write_toy_object(tmp_path_factory.mktemp("data") / "toy").root
 
 
 @pytest.fixture(autouse=True)
@@ -126,7 +119,9 @@ def test_the_verdict(error: float | None, moving: float | None, rate: float | No
     assert re.search(said, verdict(found)), verdict(found)
 
 
-@pytest.mark.parametrize("override", ["optimizer=paper", "optimizer.schedule.decay=1"])
+@pytest.mark.parametrize(
+    "override", ["optimizer=paper", pytest.param("optimizer.schedule.decay=1", marks=pytest.mark.slow)]
+)
 def test_what_cannot_be_judged_has_its_epochs_and_frames(toy: Path, override: str) -> None:
     run = train(toy, "unjudged", override, "trainer.max_epochs=2")
     rows = rows_of(run / "epochs.csv")

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from helpers.toy_runs import Trainings
 
 from gausim.core import ConfigError
 from gausim.training.ranks.launch import Crew
 from gausim.training.ranks.layout import Layout
-from gausim.training.ranks.ranks import interleave, is_lost_connection
+from gausim.training.ranks.ranks import is_lost_connection
 from gausim.training.trainer import TrainerSettings, make_trainer
 
-TESTS = Path(__file__).parents[1]
-PROGRAM = [sys.executable, str(TESTS / "helpers" / "rank_checks.py")]
 # The static loss is one rank's: all that could depend on which rank computes a sequence.
 ALL = {"static_probability": 1.0}
 
@@ -28,19 +22,9 @@ Ask = Callable[..., list[Any]]
 
 
 @pytest.fixture(scope="module")
-def ask() -> Iterator[Ask]:
+def ask(trainings: Trainings) -> Ask:
     """Asks for a check in so many ranks; returns what each found."""
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])}
-    with subprocess.Popen(PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=env) as server:
-        assert server.stdin is not None and server.stdout is not None
-
-        def order(check: str, ranks: int, **options: Any) -> list[Any]:
-            server.stdin.write(json.dumps({"check": check, "ranks": ranks, "options": options}) + "\n")
-            server.stdin.flush()
-            return json.loads(server.stdout.readline())
-
-        yield order
-        server.stdin.close()
+    return lambda check, ranks, **options: trainings.ask(check=check, ranks=ranks, options=options)
 
 
 def distance(found: dict[str, Any], expected: dict[str, Any]) -> float:
@@ -124,13 +108,6 @@ def test_what_the_first_rank_finds_the_others_hear(ask: Ask) -> None:
 def test_weights_that_drift_apart_are_noticed(ask: Ask) -> None:
     found = ask("drifted", 4)
     assert all("weights: expected the same on all ranks" in text and "ranks [2, 3]" in text for text in found)
-
-
-def test_shares_are_put_back_in_order() -> None:
-    for count in (1, 4, 7):
-        for ranks in (1, 2, 3, 5):
-            order = list(range(count))
-            assert interleave([order[r::ranks] for r in range(ranks)]) == order
 
 
 def test_wrong_layouts_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:

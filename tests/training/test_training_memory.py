@@ -14,7 +14,6 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gausim.benchmark.train import peak_saved_bytes
-from gausim.core import DivergenceError
 from gausim.losses import Objective
 from gausim.render.reference import ReferenceRenderer
 from gausim.training import step
@@ -51,9 +50,9 @@ def held(objective: Objective, steps: int) -> int:
 
 def test_memory_does_not_grow_with_the_rollout_where_gradients_stop(one_state_at_once: None) -> None:
     stopped = Objective(backprop_steps=1, static_weight=0.0)
-    assert held(stopped, 16) == held(stopped, 4) > 0
+    assert held(stopped, 8) == held(stopped, 3) > 0
     whole = Objective(backprop_steps=0, static_weight=0.0)
-    assert held(whole, 32) > 2 * held(whole, 4)
+    assert held(whole, 12) > 2 * held(whole, 3)
 
 
 def test_checkpointing_the_steps_keeps_the_gradients_and_the_statistics() -> None:
@@ -78,7 +77,7 @@ def test_checkpointing_the_steps_keeps_the_gradients_and_the_statistics() -> Non
 def test_checkpointing_the_steps_makes_the_graph_small(one_state_at_once: None) -> None:
     def grown(*, checkpoint: bool) -> int:
         objective = Objective(backprop_steps=0, static_weight=0.0, checkpoint_steps=checkpoint)
-        return held(objective, 12) - held(objective, 4)
+        return held(objective, 8) - held(objective, 4)
 
     assert 0 <= grown(checkpoint=True) < 0.1 * grown(checkpoint=False)
 
@@ -106,15 +105,6 @@ def test_reads_put_off_change_nothing(backprop_steps: int, drift: float) -> None
         assert stats[1][name] == pytest.approx(value, rel=1e-5, abs=1e-12), name
     for name, value in parameters(now).items():
         torch.testing.assert_close(parameters(later)[name], value, rtol=1e-5, atol=1e-8)
-
-
-def test_positions_that_break_are_named_when_reads_are_put_off() -> None:
-    _, later = pair(Objective(static_weight=0.0), 0.0)
-    later.model.poison = float("inf")
-    before = parameters(later)
-    with pytest.raises(DivergenceError, match=r"predicted step 1 of 3, sequence toy/seq_0: positions"):
-        optimise(later)
-    assert all(torch.equal(before[name], value) for name, value in parameters(later).items())
 
 
 class Reads(TorchDispatchMode):
