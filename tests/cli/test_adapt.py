@@ -66,7 +66,7 @@ def test_the_second_scene_of_a_joint_run_keeps_its_own_weights(joint: Path, othe
 def test_without_a_store_the_runs_own_data_and_default_place(joint: Path) -> None:
     asked = [str(joint), "--epochs", "1", "--frames", "2", "--set", "evaluate=false", "doctor=true"]
     assert adapt.main(asked) == 0
-    out = joint.parent.with_name(f"{joint.parent.name}_adapted_2") / "seed_0"
+    out = joint.parent.with_name(f"{joint.parent.name}_adapted_2") / joint.name
     assert [o.name for o in load_run(out).objects] == ["toy", "other"]
     with pytest.raises(RunError, match="finished"):
         adapt.main(asked)
