@@ -36,7 +36,7 @@ def fuzz(count: int, file: Path) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("count", [120, pytest.param(20000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [300, pytest.param(20000, marks=pytest.mark.slow)])
 def test_damaged_files_are_refused_in_words_and_the_runner_sees_faults(count: int, tmp_path: Path) -> None:
     told = fuzz(count, tmp_path / "x.bin")
     found = json.loads(told.splitlines()[0])
