@@ -15,6 +15,7 @@ import numpy as np
 
 from data_prep.blender.surface import SIZE, UP_AXES, Surface, farthest_points
 from data_prep.common.command import Options, option
+from data_prep.common.spread import dome
 from gausim.core import ConfigError
 
 FPS = 24
@@ -30,7 +31,6 @@ ROOM = 1.05  # times the distance from which the sphere around the object fills 
 FALLOFF = {"poke": 4.0, "drag": 2.0, "double": 4.0}
 KINDS = ("poke", "drag", "double", "poke", "drag")
 SITES = 8
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 TRAIN_ELEVATIONS, HELDOUT_ELEVATION, STILL_ELEVATION = (18.0, 22.0, 16.0, 24.0), 32.0, 80.0
 
 
@@ -168,9 +168,8 @@ def video_poses(plan: Plan, surface: Surface) -> list[list[list[float]]]:
 
 def still_poses(plan: Plan, surface: Surface) -> list[list[list[float]]]:
     """Camera to world of each still, spread evenly over the upper dome."""
-    highest, distance = math.sin(math.radians(STILL_ELEVATION)), _distance(surface)
-    elevations = [math.asin((i + 0.5) / plan.pictures.stills * highest) for i in range(plan.pictures.stills)]
-    return [_pose(surface, i * GOLDEN_ANGLE, elevation, distance) for i, elevation in enumerate(elevations)]
+    distance = _distance(surface)
+    return [_pose(surface, *angles, distance) for angles in dome(plan.pictures.stills, STILL_ELEVATION)]
 
 
 def _distance(surface: Surface) -> float:

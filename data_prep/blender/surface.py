@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from data_prep.blender.meshes import Array, Indices, Mesh
+from data_prep.common.spread import farthest
 from gausim.core import DataError
 
 # The largest extent of every object [scene units]; forces and lights are made for it.
@@ -145,9 +146,4 @@ def farthest_points(vertices: Array, count: int) -> Indices:
     """Sorted indices of ``count`` vertices (all where there are fewer) that lie far from each other, the top first."""
     if count >= len(vertices):
         return np.arange(len(vertices))
-    chosen = [int(vertices[:, 2].argmax())]
-    distance = ((vertices - vertices[chosen[0]]) ** 2).sum(1)
-    while len(chosen) < count and distance.max() > 0:
-        chosen.append(int(distance.argmax()))
-        np.minimum(distance, ((vertices - vertices[chosen[-1]]) ** 2).sum(1), out=distance)
-    return np.sort(np.array(chosen))
+    return np.sort(farthest(vertices, count, int(vertices[:, 2].argmax())))

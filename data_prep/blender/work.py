@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import json
 import shutil
@@ -34,10 +33,10 @@ from data_prep.blender.plan import (
 from data_prep.blender.surface import Surface, make_surface
 from data_prep.common.photos import write_image
 from data_prep.common.progress import Tick
-from data_prep.common.stage import PLAN, files_in
+from data_prep.common.stage import PLAN, files_in, write_npz
 from gausim.core import DataError
 from gausim.data.images import read_rgba
-from gausim.io.files import write_durably, write_json
+from gausim.io.files import write_json
 from gausim.io.npz import read_npz
 
 FACTS = "dataset.json"
@@ -60,9 +59,7 @@ def make_images(mesh: Path, work: Path, plan: Plan, blender: Blender, *, workers
     root = work.absolute()
     versions = blender.versions()
     _start(root, {**dataset_facts(plan, surface), "blender": versions})
-    held = io.BytesIO()
-    np.savez_compressed(held, **vars(surface))
-    write_durably(root / "rest_mesh.npz", held.getvalue())
+    write_npz(root / "rest_mesh.npz", **vars(surface))
     stills = [
         range(i, min(i + STILLS_PER_JOB, plan.pictures.stills)) for i in range(0, plan.pictures.stills, STILLS_PER_JOB)
     ]

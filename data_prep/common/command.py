@@ -36,13 +36,12 @@ class Options:
     """Options of a stage; the fields that :func:`option` made are options of its command line."""
 
     def __post_init__(self) -> None:
-        """Checks the numbers.
-
-        Raises:
-            ConfigError: one is out of its range; names the option.
-        """
+        """Checks choices and numbers; a :class:`ConfigError` names the option."""
         for each in fields(self):
             value, (least, most) = getattr(self, each.name), each.metadata.get("range", (-math.inf, math.inf))
+            choices = each.metadata.get("argument", {}).get("choices")
+            if choices and value not in choices:
+                raise ConfigError(f"{_flag(each.name)}: expected one of {', '.join(choices)}, got '{value}'.")
             for number in value if isinstance(value, tuple) else (value,):
                 if isinstance(number, (int, float)) and not (math.isfinite(number) and least <= number <= most):
                     expected = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"

@@ -21,6 +21,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import gausim
 from gausim.core.errors import DataError
 from gausim.io.files import remove_leftovers, replacing, sha256, write_durably, write_json
@@ -137,6 +139,12 @@ def copy_missing(source: Path, target: Path) -> None:
     elif source.is_file() and not target.is_file():
         with replacing(target) as temporary:
             shutil.copyfile(source, temporary)
+
+
+def write_npz(path: Path, **arrays: np.ndarray) -> None:
+    """Writes compressed arrays, all of them or nothing."""
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
 def _versions(packages: Sequence[str]) -> dict[str, str]:

@@ -10,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from data_prep.common.spread import farthest
 from data_prep.synthetic.bodies import CORNERS, Array, Body, Ints
 from gausim.core import GaussianScene
 from gausim.ops.spherical_harmonics import C0, C1
@@ -41,10 +42,18 @@ class Embedding:
     @cached_property
     def _slopes(self) -> Array:
         """(K, 8, 3) derivatives of the weights by the rest position."""
+        return self._local_slopes @ np.linalg.inv(self.jacobian)
+
+    @cached_property
+    def _local_slopes(self) -> Array:
+        """(K, 8, 3) derivatives of the weights by the trilinear coordinates."""
         factors, sign = self._factors, 2.0 * CORNERS - 1
-        slopes = np.stack([np.prod(np.delete(factors, a, -1), -1) * sign[:, a] for a in range(3)], -1)
-        rest = np.einsum("kca,kcx->kxa", slopes, self.body.nodes[self.body.cells[self.cell]])
-        return slopes @ np.linalg.inv(rest)
+        return np.stack([np.prod(np.delete(factors, a, -1), -1) * sign[:, a] for a in range(3)], -1)
+
+    @cached_property
+    def jacobian(self) -> Array:
+        """(K, 3, 3) derivatives of the rest position by the trilinear coordinates."""
+        return np.einsum("kca,kcx->kxa", self._local_slopes, self.body.nodes[self.body.cells[self.cell]])
 
     def positions(self, nodes: Array) -> Array:
         """(..., K, 3) positions of the points when the nodes are at (..., N, 3)."""
@@ -69,16 +78,16 @@ def cover_surface(body: Body, count: int, rng: np.random.Generator) -> tuple[Emb
     # Many candidates, uniform per area, thinned to the farthest ones.
     center = np.full((len(cell), 3), 0.5)
     center[np.arange(len(cell)), axis] = side
-    area = np.linalg.norm(_area_vector(body, cell, axis, side, center), axis=1)
+    area = np.linalg.norm(_area_vector(Embedding(body, cell, center), axis, side), axis=1)
     pick = rng.choice(len(cell), size=CANDIDATES * count, p=area / area.sum())
     local = rng.random((len(pick), 3))
     local[np.arange(len(pick)), axis[pick]] = side[pick]
     points = Embedding(body, cell[pick], local)
-    normal = _area_vector(body, cell[pick], axis[pick], side[pick], local)
+    normal = _area_vector(points, axis[pick], side[pick])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     x = points.positions(body.nodes)
     seen = np.flatnonzero(~((normal[:, 2] < -0.9) & (x[:, 2] < 1e-6)))
-    chosen = seen[_farthest(x[seen], count)]
+    chosen = seen[farthest(x[seen], count)]
     tangent = np.cross(normal[chosen], np.where(np.abs(normal[chosen, 2:]) < 0.9, [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]))
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     frames = np.stack((tangent, np.cross(normal[chosen], tangent), normal[chosen]), -1)
@@ -120,21 +129,8 @@ def _outer_faces(body: Body) -> tuple[Ints, Ints, Array]:
     return cell, axis_of, side_of.astype(float)
 
 
-def _area_vector(body: Body, cell: Ints, axis: Ints, side: Array, local: Array) -> Array:
-    """Outward normal times area element of cell faces at trilinear coordinates ``local``."""
-    factors = np.where(CORNERS == 1, local[:, None], 1 - local[:, None])
-    slopes = np.stack([np.prod(np.delete(factors, a, -1), -1) * (2.0 * CORNERS[:, a] - 1) for a in range(3)], -1)
-    jacobian = np.einsum("kca,kcx->kxa", slopes, body.nodes[body.cells[cell]])
-    row = np.arange(len(cell))
-    vector = np.cross(jacobian[row, :, (axis + 1) % 3], jacobian[row, :, (axis + 2) % 3])
+def _area_vector(points: Embedding, axis: Ints, side: Array) -> Array:
+    """Outward normal times area element, at points on the faces of their cells across ``axis``."""
+    row = np.arange(len(points.cell))
+    vector = np.cross(points.jacobian[row, :, (axis + 1) % 3], points.jacobian[row, :, (axis + 2) % 3])
     return vector * (2 * side - 1)[:, None]
-
-
-def _farthest(x: Array, count: int) -> Ints:
-    """Greedy even covering: each next point is the one farthest from all chosen ones."""
-    chosen = [0]
-    distance = np.full(len(x), np.inf)
-    for _ in range(count - 1):
-        distance = np.minimum(distance, ((x - x[chosen[-1]]) ** 2).sum(1))
-        chosen.append(int(distance.argmax()))
-    return np.array(chosen)

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import UInt8
 from torch import Tensor
 
+from data_prep.common.spread import dome
 from data_prep.synthetic.bodies import Array
 from gausim.core import Cameras, GaussianScene
 from gausim.render.draw import draw
@@ -16,7 +17,6 @@ from gausim.render.reference import ReferenceRenderer
 
 FIELD_OF_VIEW = math.radians(40.0)
 MARGIN = 1.0  # the sphere around the bounding box overstates the object; what is left is room for its motion
-GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 # Azimuth and elevation [degree] of the five video cameras; the last one is never trained on.
 VIDEO_ANGLES = ((-60.0, 18.0), (30.0, 18.0), (120.0, 18.0), (210.0, 40.0), (75.0, 30.0))
 
@@ -45,11 +45,8 @@ def video_cameras(center: Array, radius: float, size: int, names: tuple[str, ...
 
 def still_cameras(center: Array, radius: float, size: int, count: int) -> Cameras:
     """Cameras spread evenly over the upper dome, from level to 70 degrees up."""
-    highest = math.sin(math.radians(70.0))
-    elevation = np.array([math.asin((i + 0.5) / count * highest) for i in range(count)])
-    names = tuple(f"{i:04d}" for i in range(count))
-    azimuth = np.array([i * GOLDEN_ANGLE for i in range(count)])
-    return look_at(azimuth, elevation, center, radius, size, names)
+    azimuth, elevation = np.array(dome(count, 70.0)).T
+    return look_at(azimuth, elevation, center, radius, size, tuple(f"{i:04d}" for i in range(count)))
 
 
 def photograph(

@@ -59,7 +59,7 @@ def answer(order: dict[str, Any]) -> dict[str, Any]:
             count_places(order.get("die"), told.fileno())
             status = 1
             try:
-                status = importlib.import_module(f"data_prep.{order['stage']}").main(order["argv"])
+                status = importlib.import_module(f"data_prep.{order['stage'].partition('-')[0]}").main(order["argv"])
             finally:
                 sys.stdout.flush()
                 sys.stderr.flush()

@@ -102,7 +102,8 @@ def test_the_set_is_read_and_verified(mesh: Path, tmp_path: Path) -> None:
     truth = data.ground_truth(data.sequences[2])
     assert truth is not None and truth.positions.shape == (4, 40, 3)
     assert (truth.positions[0] == truth.rest).all() and verify(tmp_path / "set") == []
-    told = manifest["results"]
+    told, settings = manifest["results"], manifest["settings"]
+    assert (settings["stills"], settings["stiffness"]) == (23, 0.7) and not {"pictures", "soft"} & set(settings)
     assert told["images"] == 23 + 3 * 4 * 3 and told["blender"]["bpy"] == "4.5"
     assert [s["kind"] for s in told["sequences"]] == ["poke", "drag", "double"]
     for entry in told["sequences"]:
@@ -113,25 +114,18 @@ def test_the_set_is_read_and_verified(mesh: Path, tmp_path: Path) -> None:
     assert make_set(mesh, tmp_path / "set", PLAN, lambda: pytest.fail("asked for Blender"))["made"] is False
 
 
-@pytest.mark.parametrize("die_at", [5, 30])
-def test_what_was_interrupted_goes_on_with_what_is_missing(mesh: Path, tmp_path: Path, die_at: int) -> None:
-    make_set(mesh, tmp_path / "whole", PLAN, FakeBlender)
+@pytest.mark.parametrize(("die_at", "version", "left"), [(5, "4.5", 54), (30, "4.5", 29), (30, "4.5.16", 59)])
+def test_what_the_same_blender_was_interrupted_at_goes_on_with_what_is_missing(
+    mesh: Path, tmp_path: Path, die_at: int, version: str, left: int
+) -> None:
+    make_set(mesh, tmp_path / "whole", PLAN, lambda: FakeBlender(version=version))
     with pytest.raises(BlenderError, match="gave up"):
         make_set(mesh, tmp_path / "set", PLAN, lambda: FakeBlender(die_at=die_at))
     assert not (tmp_path / "set").exists()
-    second = FakeBlender()
+    second = FakeBlender(version=version)
     make_set(mesh, tmp_path / "set", PLAN, lambda: second)
-    assert second.taken == 23 + 36 - die_at
+    assert second.taken == left
     assert contents(tmp_path / "set") == contents(tmp_path / "whole")
-
-
-def test_work_of_another_blender_is_not_taken_over(mesh: Path, tmp_path: Path) -> None:
-    with pytest.raises(BlenderError):
-        make_set(mesh, tmp_path / "set", PLAN, lambda: FakeBlender(die_at=30))
-    newer = FakeBlender(version="4.5.16")
-    make_set(mesh, tmp_path / "set", PLAN, lambda: newer)
-    make_set(mesh, tmp_path / "whole", PLAN, lambda: FakeBlender(version="4.5.16"))
-    assert newer.taken == 59 and contents(tmp_path / "set") == contents(tmp_path / "whole")
 
 
 def test_several_workers_give_the_same_bytes_and_the_first_error_ends_all(mesh: Path, tmp_path: Path) -> None:
@@ -159,12 +153,6 @@ def test_several_workers_give_the_same_bytes_and_the_first_error_ends_all(mesh: 
 def test_impossible_plans_are_refused(make: Callable[[], object], what: str) -> None:
     with pytest.raises(ConfigError, match=what):
         make()
-
-
-def test_manifest_names_settings_as_the_command_does() -> None:
-    settings = PLAN.settings()
-    assert settings["stills"] == 23 and settings["stiffness"] == 0.7 and settings["name"] == "box"
-    assert not {"pictures", "soft"} & set(settings)
 
 
 def test_pushes_are_of_their_number_and_act_on_the_upper_part(surface: Surface) -> None:
@@ -233,15 +221,12 @@ def test_environment_is_created_once(tmp_path: Path) -> None:
 
 
 def test_failed_installation_says_why_and_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / ".blender.making" / "bin").mkdir(parents=True)  # of an installation that was killed
+    with pytest.raises(ConfigError, match=r"needs Python 3\.11(.|\n)*--blender-python"):
+        create_environment(tmp_path / "blender", say=lambda _: None, run=FakeRunner(version="3.12"))
     with pytest.raises(BlenderError, match="no matching distribution(.|\n)*--blender-python"):
         create_environment(tmp_path / "blender", say=lambda _: None, run=FakeRunner(pip=1))
     assert [p.name for p in tmp_path.iterdir()] == [".blender.lock"]
-    create_environment(tmp_path / "blender", say=lambda _: None, run=FakeRunner())
-
-
-def test_leftovers_of_a_killed_installation_are_replaced(tmp_path: Path) -> None:
-    (tmp_path / ".blender.making" / "bin").mkdir(parents=True)
-    (tmp_path / ".blender.making" / "half").write_text("")
     create_environment(tmp_path / "blender", say=lambda _: None, run=FakeRunner())
     assert sorted(p.name for p in (tmp_path / "blender").iterdir()) == ["bin", blender_env.MARKER]
 
@@ -252,11 +237,6 @@ def test_a_folder_of_something_else_is_not_touched(tmp_path: Path) -> None:
         with pytest.raises(DataError, match="--blender-env"):
             create_environment(tmp_path, say=lambda _: None, run=FakeRunner())
         assert (tmp_path / blender_env.MARKER).read_text() == content
-
-
-def test_without_the_right_python_the_remedy_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"needs Python 3\.11(.|\n)*--blender-python"):
-        create_environment(tmp_path / "blender", say=lambda _: None, run=FakeRunner(version="3.12"))
 
 
 # ---------------------------------------------------------------------------------------------------------- processes

@@ -86,29 +86,24 @@ def _edit(path: Path, change: Callable[[dict], object]) -> None:
     path.write_text(json.dumps(data))
 
 
+def _header(change: Callable[[dict], object]) -> Callable[[Path], object]:
+    return lambda store: _edit(store / "sequences/seq_000" / HEADER, change)
+
+
 FAULTS: dict[str, tuple[Callable[[Path], object], str, str]] = {
-    "pixels changed": (lambda s: _flip(s / "sequences/seq_000" / PIXELS), "seq_000/frames.bin", "not those"),
     "pixels cut": (lambda s: _cut(s / "sequences/seq_001" / PIXELS), "seq_001", "expected .* bytes"),
-    "header gone": (lambda s: (s / "sequences/seq_001" / HEADER).unlink(), "seq_001", "transforms.json: no such file"),
-    "schema": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d.update(schema=9)), "seq_000", "schema"),
-    "nan": (lambda s: _edit(s / "sequences/seq_000" / HEADER,
-                            lambda d: d["views"][1]["viewmat"][0].__setitem__(3, float("nan"))), "seq_000", "as JSON"),
-    "crop": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d["views"][0].update(crop=[30, 0, 9, 9])),
-             "seq_000", "leaves the image"),
-    "offset": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d["views"][2].update(offset=10**9)),
-               "seq_000", "offset"),
-    "frames": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d.update(frames=10**9)),
-               "seq_000", "frames"),
-    "focal": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d["views"][0]["K"][0].__setitem__(0, -1.0)),
-              "seq_000", "focal"),
-    "fps": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d.update(fps=25)), "seq_000", "fps"),
-    "view": (lambda s: _edit(s / "sequences/seq_000" / HEADER, lambda d: d["views"][0].update(name="cam_9")),
-             "seq_000", "cam_9"),
+    "schema": (_header(lambda d: d.update(schema=9)), "seq_000", "schema"),
+    "nan": (_header(lambda d: d["views"][1]["viewmat"][0].__setitem__(3, float("nan"))), "seq_000", "as JSON"),
+    "crop": (_header(lambda d: d["views"][0].update(crop=[30, 0, 9, 9])), "seq_000", "leaves the image"),
+    "offset": (_header(lambda d: d["views"][2].update(offset=10**9)), "seq_000", "offset"),
+    "frames": (_header(lambda d: d.update(frames=10**9)), "seq_000", "frames"),
+    "focal": (_header(lambda d: d["views"][0]["K"][0].__setitem__(0, -1.0)), "seq_000", "focal"),
+    "fps": (_header(lambda d: d.update(fps=25)), "seq_000", "fps"),
+    "view": (_header(lambda d: d["views"][0].update(name="cam_9")), "seq_000", "cam_9"),
     "facts": (lambda s: _edit(s / "dataset.json", lambda d: d.update(fps=-1)), "dataset.json", "fps"),
-    "scene": (lambda s: (s / "scene.ply").write_bytes(b"ply\n"), "scene.ply", ""),
     "stranger": (lambda s: (s / "notes.txt").write_text("x"), "notes.txt", "not in stage.json"),
     "no sequences": (lambda s: shutil.rmtree(s / "sequences"), "sequences", "holds no sequence"),
-}  # fmt: skip
+}
 
 
 def _flip(path: Path) -> None:

