@@ -1,22 +1,29 @@
-"""Reads surfaces from OBJ and PLY files (text and binary): triangles and polygons, nothing else of what they hold."""
+"""Reads surfaces from OBJ and PLY files (text and binary): triangles and polygons, nothing else of what they hold.
+
+Every fault of a file is an error that names file and place; nothing is read beyond what the file's size can hold.
+"""
 
 from __future__ import annotations
 
-import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData
 
 from gausim.core import DataError
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+PLY_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+PLY_ORDER = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}
 HEADER_LIMIT = 1 << 16
 FACE_FIELDS = ("vertex_indices", "vertex_index")
 # Larger than any index of a file that fits into memory, and small enough for every integer type used here.
@@ -94,34 +101,181 @@ def _fan(corners: Sequence[int]) -> list[tuple[int, int, int]]:
     return [(corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1)]
 
 
+@dataclass
+class _Element:
+    """One kind of thing in a PLY file: how many; of each field its name, its type, and the type of a list's length."""
+
+    name: str
+    count: int
+    fields: list[tuple[str, str, str | None]]
+
+    def dtype(self, lengths: Sequence[int]) -> np.dtype:
+        """Memory layout of one of them whose lists have these lengths."""
+        parts: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+        remaining = iter(lengths)
+        for i, (_, kind, counter) in enumerate(self.fields):
+            if counter is not None:
+                parts += [(f"n{i}", counter), (f"f{i}", kind, (next(remaining),))]
+            else:
+                parts.append((f"f{i}", kind))
+        return np.dtype(parts)
+
+    def lists(self) -> list[int]:
+        """Positions of the fields that are lists."""
+        return [i for i, field in enumerate(self.fields) if field[2] is not None]
+
+
 def _read_ply(path: Path) -> tuple[Array, Indices]:
     data = path.read_bytes()
-    for name, count in re.findall(rb"^element\s+(\S+)\s+(\S+)", data[:HEADER_LIMIT], re.MULTILINE):
-        # Every element takes at least a byte, so that a file's size bounds what it may declare.
-        if not count.isdigit() or len(count) > 18 or int(count) > len(data):
-            told = f"declares {count.decode('latin-1'):.40} of '{name.decode('latin-1'):.40}'"
-            raise DataError(f"{path}: {told}, but has {len(data)} bytes. Export it again.")
-    try:
-        found = _parsed_ply(path, data)
-        if "face" not in found:
-            return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-        vertices = np.stack([np.asarray(found["vertex"][axis], np.float64) for axis in "xyz"], 1)
-        lists = {each.name: each for each in found["face"].properties if each.name in FACE_FIELDS}
+    encoding, elements, start = _header(path, data)
+    body = _Text(path, data[start:]) if encoding == "ascii" else _Binary(path, memoryview(data)[start:])
+    vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    for element in elements:
+        columns = body.take(element)
+        if element.name == "vertex":
+            vertices = _positions(path, element, columns)
+        elif element.name == "face":
+            triangles = _faces(path, element, columns)
+    return vertices, triangles
+
+
+def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
+    """Encoding, elements and where their data starts [bytes]."""
+    end = re.search(rb"\nend_header[ \t]*\r?\n", data[:HEADER_LIMIT])
+    if not data.startswith(b"ply") or end is None:
+        raise DataError(f"{path}: expected a PLY file ('ply' first, 'end_header' within {HEADER_LIMIT} bytes).")
+    encoding, elements = "", []
+    for line in data[: end.start()].decode("latin-1").splitlines()[1:]:
+        words = line.split()
+        try:
+            if words[:1] == ["format"]:
+                encoding = words[1]
+            elif words[:1] == ["element"]:
+                elements.append(_Element(words[1], int(words[2]), []))
+            elif words[:1] == ["property"]:
+                elements[-1].fields.append(_field(words[1:], PLY_ORDER[encoding]))
+        except (IndexError, KeyError, ValueError) as error:
+            raise DataError(f"{path}: the header's line '{line[:60]}' is not of a PLY file ({error}).") from None
+    if encoding not in PLY_ORDER:
+        raise DataError(f"{path}: field 'format' is '{encoding}', expected one of {', '.join(PLY_ORDER)}.")
+    for element in elements:
+        # Every thing takes at least a byte, so that a file's size bounds what it may declare.
+        if not 0 <= element.count <= len(data) or (element.count and not element.fields):
+            raise DataError(f"{path}: declares {element.count} of '{element.name}', but has {len(data)} bytes.")
+    return encoding, elements, end.end()
+
+
+def _field(words: Sequence[str], order: str) -> tuple[str, str, str | None]:
+    if words[0] == "list":
+        counter = PLY_TYPES[words[1]]
+        if counter.startswith("f") or (words[3] in FACE_FIELDS and PLY_TYPES[words[2]].startswith("f")):
+            raise ValueError("lengths and indices are whole numbers")
+        return words[3], order + PLY_TYPES[words[2]], order + counter
+    return words[1], order + PLY_TYPES[words[0]], None
+
+
+def _positions(path: Path, element: _Element, columns: list[Iterable[object]]) -> Array:
+    names = [name for name, _, counter in element.fields if counter is None]
+    if not {"x", "y", "z"} <= set(names):
+        raise DataError(f"{path}: vertices have fields {names}, expected x, y and z.")
+    order = [field[0] for field in element.fields]
+    return np.stack([np.asarray(columns[order.index(axis)], np.float64) for axis in "xyz"], 1)
+
+
+def _faces(path: Path, element: _Element, columns: list[Iterable[object]]) -> Indices:
+    names = [name for name, _, counter in element.fields if counter is not None]
+    chosen = [name for name in FACE_FIELDS if name in names]
+    if not chosen:
+        raise DataError(f"{path}: faces have lists {names}, expected '{FACE_FIELDS[0]}'.")
+    column = columns[[field[0] for field in element.fields].index(chosen[0])]
+    if isinstance(column, np.ndarray) and column.ndim == 2 and column.shape[1] == 3:
+        return column.astype(np.int64)
+    triangles: list[tuple[int, int, int]] = []
+    for i, corners in enumerate(column):
+        try:
+            triangles += _fan([int(corner) for corner in corners])  # type: ignore[attr-defined]
+        except (ValueError, OverflowError) as error:
+            raise DataError(f"{path}: face {i}: {error}.") from None
+    if triangles and max(abs(corner) for triangle in triangles for corner in triangle) > LARGEST_INDEX:
+        raise DataError(f"{path}: a face uses a vertex beyond {LARGEST_INDEX}. Export the mesh again.")
+    return np.array(triangles, np.int64).reshape(-1, 3)
+
+
+class _Binary:
+    """Elements one after another in memory."""
+
+    def __init__(self, path: Path, data: memoryview) -> None:
+        self.path, self.data, self.at = path, data, 0
+
+    def take(self, element: _Element) -> list[Iterable[object]]:
+        """The fields of the next ``element.count`` things: arrays, or lists of arrays where lengths differ."""
+        lists = element.lists()
+        if not element.count:
+            return [np.zeros(0) for _ in element.fields]
+        layout = element.dtype(self._lengths(element))
+        if layout.itemsize * element.count <= len(self.data) - self.at:
+            rows = np.frombuffer(self.data, layout, element.count, self.at)
+            if all((rows[f"n{i}"] == rows[f"f{i}"].shape[1]).all() for i in lists):
+                self.at += layout.itemsize * element.count
+                return [rows[f"f{i}"] for i in range(len(element.fields))]
         if not lists:
-            raise ValueError(f"its faces have no list {' or '.join(FACE_FIELDS)}")
-        name, kind = next((name, each.val_dtype) for name, each in lists.items())
-        if np.dtype(kind).kind not in "iu":
-            raise ValueError("indices of vertices are whole numbers")
-        corners = found["face"][name]
-        if corners.ndim == 2:
-            return vertices, corners.astype(np.int64)
-        return vertices, np.array([t for face in corners for t in _fan(face.tolist())], np.int64).reshape(-1, 3)
-    except Exception as error:  # plyfile lets those of numpy through
-        raise DataError(f"{path}: cannot be read as a PLY file ({error}). Copy or export it again.") from error
+            raise DataError(f"{self.path}: is cut off: {element.count} of '{element.name}' do not fit. Copy it again.")
+        found: list[list[object]] = [[] for _ in element.fields]
+        for _ in range(element.count):
+            row = np.frombuffer(self.data, layout := element.dtype(self._lengths(element)), 1, self.at)[0]
+            self.at += layout.itemsize
+            for i, values in enumerate(found):
+                values.append(row[f"f{i}"])
+        return list(found)
+
+    def _lengths(self, element: _Element) -> list[int]:
+        """Lengths of the lists of the thing that comes next; all of it is there."""
+        at, lengths = self.at, []
+        for _, kind, counter in element.fields:
+            size = np.dtype(kind).itemsize
+            if counter is not None:
+                self._need(at + np.dtype(counter).itemsize, element)
+                lengths.append(int(np.frombuffer(self.data, counter, 1, at)[0]))
+                at += np.dtype(counter).itemsize
+                size *= lengths[-1]
+            if size < 0:
+                raise DataError(f"{self.path}: a list of '{element.name}' has length {lengths[-1]}.")
+            at += size
+            self._need(at, element)
+        return lengths
+
+    def _need(self, end: int, element: _Element) -> None:
+        if end > len(self.data):
+            raise DataError(f"{self.path}: is cut off within '{element.name}'. Copy or export it again.")
 
 
-def _parsed_ply(path: Path, data: bytes) -> PlyData:
-    try:  # in one piece, where all faces are triangles
-        return PlyData.read(path, known_list_len={"face": dict.fromkeys(FACE_FIELDS, 3)})
-    except Exception:
-        return PlyData.read(io.BytesIO(data))
+class _Text:
+    """Elements as words."""
+
+    def __init__(self, path: Path, data: bytes) -> None:
+        self.path, self.words, self.at = path, data.split(), 0
+
+    def take(self, element: _Element) -> list[Iterable[object]]:
+        """The fields of the next ``element.count`` things."""
+        try:
+            if not element.lists():
+                width = len(element.fields)
+                table = np.array(self._next(width * element.count), np.float64).reshape(element.count, width)
+                return [table[:, i] for i in range(width)]
+            found: list[list[object]] = [[] for _ in element.fields]
+            for _ in range(element.count):
+                for values, (_, _, counter) in zip(found, element.fields, strict=True):
+                    values.append(
+                        float(self._next(1)[0])
+                        if counter is None
+                        else [int(word) for word in self._next(int(self._next(1)[0]))]
+                    )
+        except ValueError as error:
+            raise DataError(f"{self.path}: '{element.name}' cannot be read ({error}). Export it again.") from None
+        return list(found)
+
+    def _next(self, count: int) -> list[bytes]:
+        if not 0 <= count <= len(self.words) - self.at:
+            raise ValueError(f"{count} values expected, {len(self.words) - self.at} are left")
+        self.at += count
+        return self.words[self.at - count : self.at]

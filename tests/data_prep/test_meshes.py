@@ -111,6 +111,29 @@ def test_hostile_ply(tmp_path: Path, encoding: str) -> None:
             read_mesh(path)
 
 
+def test_random_damage_never_crashes(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    path = tmp_path / "bad.ply"
+    whole = [ply(path, encoding, QUADS).read_bytes() for encoding in ("ascii", "binary_little_endian")]
+    whole.append(box_obj(tmp_path / "bad.obj").read_bytes())
+    refused = 0
+    for i in range(600):
+        data = bytearray(whole[i % 3])
+        for _ in range(rng.integers(1, 4)):
+            data[rng.integers(len(data))] = rng.integers(256)
+        target = path if i % 3 < 2 else path.with_suffix(".obj")
+        target.write_bytes(data)
+        try:
+            found = read_mesh(target)
+        except DataError as error:
+            assert str(target) in str(error)
+            refused += 1
+        else:
+            assert np.isfinite(found.vertices).all()
+            assert 0 <= found.triangles.min() and found.triangles.max() < len(found.vertices)
+    assert 100 < refused < 600
+
+
 def test_other_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such file"):
         read_mesh(tmp_path / "absent.obj")

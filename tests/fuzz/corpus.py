@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from helpers import colmap_files, toy_object
 
-from data_prep.blender.meshes import read_mesh
 from data_prep.capture.cameras.sources import read_lens_transforms, read_projections
 from data_prep.capture.films.film import pictures, probe, upright
 from data_prep.capture.films.takes import find_takes
@@ -89,22 +88,6 @@ def _scenes(folder: Path) -> Iterator[Reader]:
     yield Reader("masks", path.with_name("scene.masks.npz"), "npz", lambda p: load_masks(SCENE, p))
     save_trajectory(folder / "scene" / "t.safetensors", toy.truth("seq_000", 3), facts={"object": "toy"})
     yield Reader("trajectory", folder / "scene" / "t.safetensors", "binary", load_trajectory, 8)
-    box = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    quads = np.array([(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)])
-    corners, faces = ("\n".join(" ".join(map(str, row)) for row in rows.tolist()) for rows in (box, quads))
-    declared = "element vertex 8\nproperty float x\nproperty float y\nproperty float z\nelement face 6\n"
-    declared += "property list uchar int vertex_indices\nend_header\n"
-    listed = faces.replace("\n", "\n4 ")
-    (folder / "scene" / "box.ply").write_text(f"ply\nformat ascii 1.0\n{declared}{corners}\n4 {listed}\n")
-    body = box.astype("<f4").tobytes() + b"".join(b"\4" + face.astype("<i4").tobytes() for face in quads)
-    (folder / "scene" / "box_binary.ply").write_bytes(
-        f"ply\nformat binary_little_endian 1.0\n{declared}".encode() + body
-    )
-    (folder / "scene" / "box.obj").write_text(
-        "v " + corners.replace("\n", "\nv ") + "\n" + "".join(f"f {' '.join(map(str, f))}\n" for f in quads + 1)
-    )
-    for name, kind in (("box.ply", "text"), ("box_binary.ply", "binary"), ("box.obj", "text")):
-        yield Reader(f"mesh {name}", folder / "scene" / name, kind, read_mesh, 2)
     save_session(SESSION, folder / "scene" / "pull.json")
     yield Reader("session of forces", folder / "scene" / "pull.json", "json", load_session, 6)
     frames = save_ply_sequence(folder / "frames", "toy", [SCENE, SCENE], 24.0)
