@@ -17,7 +17,8 @@ from gausim.render.reference import ReferenceRenderer
 QUICK = Options(torch.device("cpu"), quick=True, rounds=1)
 
 
-@pytest.mark.parametrize("first_call", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("first_call", [False, True])
 def test_every_figure_is_reported(first_call: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """New processes import everything and compile, which takes half a minute; the rest is quick."""
     monkeypatch.setattr(render, "SHORT_CALLS", 0.0)

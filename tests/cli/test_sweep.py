@@ -52,6 +52,7 @@ def test_a_killed_sweep_goes_on_where_it_was_and_leaves_out_what_is_not_its_own(
     assert [history(run) for run in (first, second)] == expected and steps(first) == 8
 
 
+@pytest.mark.slow
 def test_a_job_that_fails_stops_no_other_and_is_tried_again_on_demand(do: Sweeps, tmp_path: Path) -> None:
     late = tmp_path / "late"
     swept = (f"data.root={late},{do.folder}/toy", "seed=0")
