@@ -143,7 +143,7 @@ def test_a_sweep_of_six_killed_five_times_completes_every_run_once(do: Sweeps) -
     assert status == 0 and "finished before" in output, output
     told.update(line for line in output.splitlines() if line.startswith("run: "))
     runs = runs_of(do, "disturbed")
-    assert told == Counter(f"run: {run}" for run in runs) and len(runs) == 6  # each came to its end once
+    assert told == Counter(f"run: {run.as_uri()}" for run in runs) and len(runs) == 6  # each came to its end once
     resumed = 0
     for run, whole in zip(runs, runs_of(do, "undisturbed"), strict=True):
         events = history(run)
