@@ -194,7 +194,7 @@ def _fit(
         facts = _facts(trainer, module) | ({"data_faults": faults} if faults else {})
         pruned = any(isinstance(callback, EpochJudge) and callback.stopped for callback in cast(Any, trainer).callbacks)
         run.finish(facts | ({"pruned": True} if pruned else {}))
-        commands = [] if cfg.evaluate else [["evaluate", run.path], ["report", run.path]]
+        commands = [] if cfg.evaluate or not datamodule.has_videos else [["evaluate", run.path], ["report", run.path]]
         end(_result(facts), "run", run.path, *commands)
     return module.summary.get("excess_static")
 
@@ -339,12 +339,9 @@ def _introduce(
     ranks = f"{trainer.world_size} ranks, " if trainer.world_size > 1 else ""
     threads = f"({ranks}{count} torch thread{'s' if count != 1 else ''})"
     print(f"{'resuming' if resumed else 'training'} on {trainer.strategy.root_device} {threads}: {run.path}")
-    for item, scene in zip(datamodule.objects, module.simulator.scenes, strict=True):
-        cameras = item.sequences[0].cameras
-        print(
-            f"  {item.name}: {scene.count} kernels ({int(scene.pinned.sum())} pinned), {len(item.sequences)} "
-            f"sequences, {len(item.train_views)} views of {cameras.width}x{cameras.height}, {item.fps:g} fps"
-        )
+    kernels = sum(scene.count for scene in module.simulator.scenes)
+    pinned = sum(int(scene.pinned.sum()) for scene in module.simulator.scenes)
+    print("".join(f"  {line}\n" for line in datamodule.introduction()) + f"  {kernels} kernels ({pinned} pinned)")
     sizes = {name: sum(p.numel() for p in own) for name, own in module.groups().items()}
     print("  parameters: " + (", ".join(f"{name} {count}" for name, count in sizes.items()) or "none"))
     if isinstance(module.method, StagedFit):
@@ -366,6 +363,8 @@ def _introduce(
 def _slow_beginnings(module: GausSimModule, shows: int) -> list[str]:
     """A warning if initial states cannot reach the first step of a typical motion within ``shows``."""
     states, rate = cast(Any, module.initial_states), module.settings.initial_lr
+    if states is None:
+        return []
     reach = states.reach(rate * shows)
     if reach >= FIRST_STEP:
         return []

@@ -14,6 +14,7 @@ from gausim.compose.data_paths import located
 from gausim.core import ConfigError, Renderer
 from gausim.data.datamodule import ReadyDataModule
 from gausim.data.objects import ObjectData
+from gausim.data.pretraining import CorpusDataModule
 from gausim.losses.objective import Objective
 from gausim.runs.checkpoint import check_scenes, load_weights, read_checkpoint
 from gausim.runs.directory import RunDirectory
@@ -21,7 +22,11 @@ from gausim.training.fitted.fitting import StagedFit
 from gausim.training.fitted.stages import StagedCurriculum
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
+from gausim.training.pretraining import KnownStates
 from gausim.training.supervision.images import Sources, Supervision
+
+# Target of the data of pretraining, which runs are not loaded with.
+PRETRAINING = "gausim.data.pretraining.CorpusDataModule"
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +72,13 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
     scene_of_sequence = [scene_id for scene_id, _ in datamodule.index.entries]
     renderer, objective = instantiate(config.render), instantiate(config.loss)
     sources = Sources(scenes, datamodule.index.ground_truth, model.smooth_motions, renderer, objective.image)
-    states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
+    if isinstance(datamodule, CorpusDataModule):
+        method: SharedSimulator = KnownStates(model, datamodule, scene_of_sequence)
+    else:
+        states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
+        method = SharedSimulator(model, states, scene_of_sequence)
     module = GausSimModule(
-        method=SharedSimulator(model, states, scene_of_sequence),
+        method=method,
         renderer=renderer,
         objective=objective,
         optimizer=instantiate(config.optimizer),
@@ -129,6 +138,11 @@ def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mappin
     config = directory.config()
     loaded = read_checkpoint(directory.path / checkpoint)
     config["data"] = located(directory.path, config.get("data", {}), data or {})
+    if config["data"].get("_target_") == PRETRAINING:
+        raise ConfigError(
+            f"{directory.path}: pretrained on a corpus of bodies, of which there are no videos. Start a training from "
+            f"it: `gausim train experiment=finetune model=gausim init_from={directory.path} data.root=OBJECT`."
+        )
     module, datamodule = build(config)
     check_scenes(loaded, module.simulator.scenes, str(directory.path / checkpoint))
     load_weights(module, loaded)

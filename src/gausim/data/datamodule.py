@@ -27,7 +27,10 @@ class ReadyDataModule(LightningDataModule):
     Attributes:
         repeats: how many times each sequence is shown per epoch.
         curriculum: predicted steps per epoch.
+        has_videos: whether its objects were filmed.
     """
+
+    has_videos = True
 
     def __init__(
         self,
@@ -97,11 +100,32 @@ class ReadyDataModule(LightningDataModule):
         if stage in (None, "fit"):
             self._check_curriculum()
             rank, ranks = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-            size = max(ranks, min(4, len(self.index) // 3)) if self._batch_size is None else self._batch_size
+            count, frames = self.trained()
+            size = max(ranks, min(4, count // 3)) if self._batch_size is None else self._batch_size
             self._sampler = SequenceBatchSampler(
-                len(self.index), batch_size=size, repeats=self.repeats, curriculum=self.curriculum, seed=self._seed,
-                rank=rank, world_size=ranks,
+                count, batch_size=size, repeats=self.repeats, curriculum=self.curriculum, seed=self._seed,
+                rank=rank, world_size=ranks, frames=frames,
             )  # fmt: skip
+
+    def trained(self) -> tuple[int, list[int] | None]:
+        """The number of sequences to train on and, where samples start at any frame, their numbers of frames."""
+        return len(self.index), None
+
+    @property
+    def watched(self) -> range:
+        """Indices of the objects whose motion is measured during training."""
+        return range(len(self.objects))
+
+    def introduction(self) -> list[str]:
+        """One line per object."""
+        lines = []
+        for item in self.objects:
+            cameras = item.sequences[0].cameras
+            lines.append(
+                f"{item.name}: {len(item.sequences)} sequences, {len(item.train_views)} views of "
+                f"{cameras.width}x{cameras.height}, {item.fps:g} fps"
+            )
+        return lines
 
     def training_sample(self, sequence: int, steps: int) -> SequenceSample:
         """Frames 0..``steps`` of a sequence in the training views."""

@@ -20,7 +20,8 @@ class SampleKey(NamedTuple):
     """Key by which the batch sampler requests a training sample."""
 
     sequence: int  # global sequence id
-    steps: int  # predicted steps T; the sample has frames 0..T
+    steps: int  # predicted steps T; the sample has frames start..start + T
+    start: int = 0  # first frame
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class SampleFacts:
     sequence_id: int  # running index of the sequence over all objects
     sequence_name: str  # its name within the object
     steps: int  # predicted steps T
+    start: int = 0  # number of its first frame in its sequence
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +47,7 @@ class SequenceSample:
     frames: UInt8[Tensor, "F V H W 4"]  # straight-alpha RGBA of T + 1 frames in V views
     cameras: Cameras  # the V cameras
     fps: float  # frames per second
+    start: int = 0  # number of the first of these frames in its sequence
 
     @property
     def steps(self) -> int:
@@ -54,7 +57,9 @@ class SequenceSample:
     @property
     def facts(self) -> SampleFacts:
         """Description of the sample without its images."""
-        return SampleFacts(self.scene_id, self.object_name, self.sequence_id, self.sequence_name, self.steps)
+        return SampleFacts(
+            self.scene_id, self.object_name, self.sequence_id, self.sequence_name, self.steps, self.start
+        )
 
     def to(self, device: torch.device | str) -> SequenceSample:
         """The same sample on another device (Lightning moves batches through this)."""
@@ -84,7 +89,7 @@ class SequenceIndex(Dataset):
         Raises:
             DataError: the steps exceed the training frames.
         """
-        sequence, steps = key
+        sequence, steps, _ = key
         item = self.objects[self.entries[sequence][0]]
         if not 1 <= steps < len(item.train_frames):
             raise DataError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch.utils.data import Sampler
@@ -33,8 +33,11 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         seed: int,
         rank: int = 0,
         world_size: int = 1,
+        frames: Sequence[int] | None = None,
     ) -> None:
         """Divides ``count`` sequences into batches of ``batch_size`` over all ranks.
+
+        ``frames`` are the numbers of frames of the sequences, if samples may start at any frame; else at the first.
 
         Raises:
             ConfigError: a number is out of range, or a batch has fewer sequences than ranks.
@@ -50,7 +53,7 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
             )
         self._count, self._batch_size, self._repeats = count, batch_size, repeats
         self._curriculum, self._seed = curriculum, seed
-        self._rank, self._world_size = rank, world_size
+        self._rank, self._world_size, self._frames = rank, world_size, frames
         self.epoch = 0
         # One attribute, so that a cancelled iteration cannot change the position of the next epoch.
         self._dealt = (0, 0)
@@ -93,10 +96,19 @@ class SequenceBatchSampler(Sampler[list[SampleKey]]):
         epoch, position, size = self.epoch, self.position, self._batch_size
         steps, order = self._curriculum.steps(epoch), self.order(epoch)
         batches = [order[i : i + size][self._rank :: self._world_size] for i in range(0, len(order), size)]
+        starts = self._starts(order, steps)
         for number in range(position if position < len(batches) else 0, len(batches)):
             self._dealt = (epoch, number + 1)
-            yield [SampleKey(sequence, steps) for sequence in batches[number]]
+            first = starts[number * size : (number + 1) * size][self._rank :: self._world_size]
+            yield [SampleKey(*key) for key in zip(batches[number], [steps] * len(first), first, strict=True)]
         self._dealt = (epoch, 0)
+
+    def _starts(self, order: list[int], steps: int) -> list[int]:
+        """The first frame of each sample of the current epoch."""
+        if self._frames is None:
+            return [0] * len(order)
+        draws = torch.rand(len(order), generator=torch.Generator().manual_seed(hash_seed(self._seed + 1, self.epoch)))
+        return [int(draw * (self._frames[i] - steps)) for i, draw in zip(order, draws.tolist(), strict=True)]
 
     def state_dict(self) -> dict[str, int]:
         """Epoch and number of batches already returned in it."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from gausim.data.dataset import SequenceSample
+from gausim.data.dataset import SampleFacts, SequenceSample
 from gausim.training.supervision.images import Supervision
 
 
@@ -40,20 +40,26 @@ class Baselines:
         self._known: dict[int, SequenceBaseline] = {}
 
     def of(self, sample: SequenceSample, rest: Tensor) -> SequenceBaseline:
-        """The baseline of a sample's sequence, for at least the sample's frames; ``rest`` are its rest positions."""
-        known = self._known.setdefault(sample.sequence_id, SequenceBaseline())
+        """The baseline of a sample's sequence, for at least the sample's frames; ``rest`` are its rest positions.
+
+        That of a sample from a later frame on is not kept.
+        """
+        known = SequenceBaseline()
+        if not sample.start:
+            known = self._known.setdefault(sample.sequence_id, known)
         seen = len(known.static)
         if seen < sample.steps:
             losses, motion = self._supervision.static(sample, rest, seen)
-            if seen == 0:
+            if seen == 0 and len(sample.cameras.names):  # true points have no error of a reconstruction
                 known.floor = losses[0]
             known.static += losses[1:]
             known.motion += motion
         return known
 
-    def learn(self, sequences: Sequence[int], baselines: Sequence[SequenceBaseline]) -> None:
+    def learn(self, samples: Sequence[SampleFacts], baselines: Sequence[SequenceBaseline]) -> None:
         """Stores the ranks' baselines, so that all ranks have the same."""
-        self._known.update(zip(sequences, baselines, strict=True))
+        found = zip(samples, baselines, strict=True)
+        self._known.update((sample.sequence_id, known) for sample, known in found if not sample.start)
 
     def state_dict(self) -> dict[int, dict[str, Any]]:
         """The baseline of each sequence; measuring again in other groups of frames would change the last bits."""

@@ -134,7 +134,7 @@ def _read(learner: Learner, samples: list[SequenceSample], whole: list[SampleFac
     parts = learner.ranks.gather((found, [learner.baseline(sample) for sample in samples]))
     lasting = Found.join([part[0] for part in parts]).lasting(whole, learner.objective.explosion)
     baselines = interleave([part[1] for part in parts])
-    learner.baselines.learn([s.sequence_id for s in whole], baselines)
+    learner.baselines.learn(whole, baselines)
     learner.barren = 0 if lasting.images else learner.barren + 1
     if learner.barren >= BARREN_BATCHES:
         far = f"kernels moved beyond {learner.objective.explosion} diagonals in {BARREN_BATCHES} batches in a row"

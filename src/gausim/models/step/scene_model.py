@@ -21,6 +21,9 @@ from gausim.models.template.smooth import smooth_motions
 from gausim.models.template.template import Motion, Template
 from gausim.nn.normaliser import normalisers_of
 
+# Disjoint unions that stay in memory; with many scenes almost every batch is another one.
+MOST_BATCHES = 256
+
 
 class SceneModel(nn.Module, ABC):
     """Scenes, their hierarchies, densities and attributes; a subclass adds the template, the predictor and a step.
@@ -79,6 +82,8 @@ class SceneModel(nn.Module, ABC):
         device = self.log_density[0].device
         key = (tuple(scene_ids), device)
         if key not in self._batches:
+            if len(self._batches) >= MOST_BATCHES:
+                self._batches.pop(next(iter(self._batches)))
             self._batches[key] = self._builder.build(key[0], device)
         return self._batches[key]
 

@@ -74,10 +74,10 @@ class MotionWatch(Callback):
         return Table(Path(trainer.default_root_dir) / MOTION, "epoch", self.COLUMNS)
 
     def _measure(self, trainer: Trainer, module: GausSimModule) -> dict[str, dict[str, float]]:
-        rows, first = {}, 0
+        rows, first, data = {}, 0, training_data(trainer)
         units_of_kernels = getattr(module.model, "units_of_kernels", lambda scene_id: ())
-        for scene_id, item in enumerate(training_data(trainer).objects):
-            found = list(self._predicted(module, item, scene_id, first))
+        for scene_id, item in enumerate(data.objects):
+            found = list(self._predicted(module, item, scene_id, first)) if scene_id in data.watched else []
             first += len(item.sequences)
             if found:
                 rows[item.name] = figures(found, item, units_of_kernels(scene_id))

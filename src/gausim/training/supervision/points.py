@@ -18,6 +18,10 @@ from gausim.training.supervision.images import Sources, StaticFigures
 
 # Lower bound of the ratio of predicted to true motion energy in the loss: initial states begin at rest.
 LEAST_RATIO = 0.05
+# Root mean square displacement from rest below which a relative loss is not magnified further [diagonals].
+LEAST_SWING = 1e-3
+# Sequences whose true motion stays in memory.
+MOST_KNOWN = 256
 
 
 def attach_points(scene: GaussianScene, points: Float[Tensor, "P 3"]) -> Int[Tensor, " P"]:
@@ -34,14 +38,19 @@ class PointSupervision:
     Nothing is rendered. Only the sample's frames are compared, the same as with supervision by images.
     """
 
-    def __init__(self, sources: Sources, *, energy_weight: float = 0.0) -> None:
-        """``energy_weight`` weighs the squared logarithm of predicted over true motion energy.
+    def __init__(self, sources: Sources, *, energy_weight: float = 0.0, relative: bool = False) -> None:
+        """Stores the settings; the true motion is read when a sequence is first shown.
 
-        The term is its mean over the halves of a stretch, times the rest state's loss. Without it, the least loss of a
-        motion with a wrong phase is no motion.
+        Args:
+            sources: the scenes and the reader of the true motion.
+            energy_weight: weight of the squared logarithm of predicted over true motion energy. The term is its mean
+                over the halves of a stretch, times the rest state's loss. Without it, the least loss of a motion with a
+                wrong phase is no motion.
+            relative: divide the loss of a sequence by the mean square of its displacement from rest, so that small and
+                large motions count alike. It uses all frames of the sequence, and is meant for pretraining.
         """
         self._scenes, self._read = sources.scenes, sources.truth
-        self._energy_weight = energy_weight
+        self._energy_weight, self._relative = energy_weight, relative
         self._known: dict[int, GroundTruth] = {}
         self._attached: dict[int, Int[Tensor, " P"]] = {}
 
@@ -53,23 +62,31 @@ class PointSupervision:
                 self._attached[sample.scene_id] = attach_points(self._scenes[sample.scene_id], truth.rest)
         attached = [self._attached[sample.scene_id].to(batch.rest.device) for sample in samples]
         scales = [self._scale(sample) for sample in samples]
-        known = [_on(truth, batch.rest) for truth in truths]
+        known = [_from(sample.start, truth, batch.rest) for sample, truth in zip(samples, truths, strict=True)]
         return _PointComparison(batch, known, attached, scales, self._energy_weight)
 
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
         """Losses of the rest state on frames ``first`` .. T of a sample."""
         truth = self.motion(sample)
-        positions = truth.positions[first : sample.steps + 1]
+        positions = truth.positions[sample.start + first : sample.start + sample.steps + 1]
         motion = _squared(positions.diff(dim=0))
         losses = _squared(positions - truth.rest) * (1 + self._energy_weight * math.log(1 + 1 / LEAST_RATIO) ** 2)
         return StaticFigures((self._scale(sample) * losses).tolist(), (self._scale(sample) * motion).tolist())
 
     def _scale(self, sample: SequenceSample) -> float:
+        if self._relative:
+            truth = self.motion(sample)
+            return 1 / max(float(_squared(truth.positions - truth.rest).mean()), self._least(sample))
         return (100 / self._scenes[sample.scene_id].diagonal) ** 2
 
+    def _least(self, sample: SequenceSample) -> float:
+        return (LEAST_SWING * self._scenes[sample.scene_id].diagonal) ** 2
+
     def motion(self, sample: SequenceSample) -> GroundTruth:
-        """True motion of a sample in all its frames; raises DataError where it is unknown."""
+        """True motion of a sample's sequence in all frames; raises DataError where it is unknown."""
         if sample.sequence_id not in self._known:
+            if len(self._known) >= MOST_KNOWN:
+                self._known.pop(next(iter(self._known)))
             truth = self._read(sample.sequence_id)
             if truth is None:
                 raise DataError(
@@ -99,7 +116,7 @@ class _PointComparison:
             self._kernels.append(kernel + member.kernels.start)
             self._units.append(unit[kernel] + member.units.start)
             self._offsets.append(truth.rest - batch.rest[self._kernels[-1]])
-        self._last = [truth.rest for truth in truths]
+        self._last = [truth.positions[0] for truth in truths]
 
     def __call__(self, states: States, start: int) -> tuple[Float[Tensor, "T S"], Float[Tensor, ""]]:
         """Loss of each predicted frame and member, and the squared change of the predicted points (summed)."""
@@ -132,5 +149,6 @@ def _squared(vectors: Float[Tensor, "T P 3"]) -> Float[Tensor, " T"]:
     return vectors.square().sum(-1).mean(-1)
 
 
-def _on(truth: GroundTruth, like: Tensor) -> GroundTruth:
-    return GroundTruth(truth.rest.to(like), truth.positions.to(like))
+def _from(start: int, truth: GroundTruth, like: Tensor) -> GroundTruth:
+    """The motion from frame ``start`` on, on the device of ``like``."""
+    return GroundTruth(truth.rest.to(like), truth.positions[start:].to(like))
