@@ -23,8 +23,9 @@ from gausim.training.method import SharedSimulator
 class KnownStates(SharedSimulator):
     """A simulator of all bodies whose rollouts begin at known states.
 
-    Where the material is known, densities and attributes are set from it and not trained: attribute 0 is the logarithm
-    of a kernel's stiffness over that of the template at zero attributes, attribute 1 that of its damping.
+    Where the material is known, densities and attributes start from it: attribute 0 is the logarithm of a kernel's
+    stiffness over that of the template at zero attributes, attribute 1 that of its damping. They are trained on, since
+    the modes of the template are not those of the simulator that moved the body.
     """
 
     def __init__(self, model: GausSim, data: CorpusDataModule, scene_of_sequence: Sequence[int]) -> None:
@@ -60,7 +61,7 @@ class KnownStates(SharedSimulator):
 
 @torch.no_grad()
 def give_material(model: GausSim, scene_id: int, body: CorpusBody) -> None:
-    """Sets densities and attributes of a scene from a body's true material, and excludes them from training.
+    """Sets densities and attributes of a scene from a body's true material.
 
     Attribute 0 of kernel k is ln(E_k / E_0), where the template at zero attributes has a homogeneous stiffness E_0. E_0
     is not known in the units of the corpus; it follows from the lowest period of the body, which is that of the
@@ -80,8 +81,6 @@ def give_material(model: GausSim, scene_id: int, body: CorpusBody) -> None:
     attributes[:, 0] = (stiffness / stiffness.mean()).log()
     attributes[:, 1] = (damping / (REFERENCE_FPS * math.exp(template.start[1]))).clamp_min(1e-3).log()
     attributes[:, 0] += math.log(_stiffness_for(model, template, scene_id, body.record.period / body.fps))
-    for parameter in (model.log_density[scene_id], attributes):
-        parameter.requires_grad_(False)
 
 
 def _stiffness_for(model: GausSim, template: MaterialTemplate, scene_id: int, period: float) -> float:
