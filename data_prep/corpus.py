@@ -25,7 +25,6 @@ from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, run_stage
 from data_prep.random_bodies.plan import Plan
 from gausim.core.errors import ConfigError
-from gausim.data.corpus import MANIFEST, SCHEMA, Corpus
 from gausim.io.files import write_durably, write_json
 
 # Raise when the same settings give another corpus than before.
@@ -50,6 +49,8 @@ def make_corpus(out: Path, plan: Plan, *, workers: int, force: bool = False, tic
 
 def _make(work: Path, plan: Plan, settings: dict[str, Any], workers: int, tick: Tick) -> dict[str, Any]:
     """Every body is a file of its own, its facts last, until all are there; then they are gathered in shards."""
+    from gausim.data.corpus import MANIFEST, SCHEMA
+
     jobs = [(work, plan, number) for number in range(plan.bodies)]
     each(_write_body, jobs, workers=workers, step="bodies", tick=tick)
     records = []
@@ -104,6 +105,7 @@ def _run(arguments: argparse.Namespace, tick: Tick) -> str:
     manifest = make_corpus(arguments.out, plan, workers=max(1, arguments.workers), force=arguments.force, tick=tick)
     if arguments.sheet:
         from data_prep.random_bodies.sheet import write_sheet
+        from gausim.data.corpus import Corpus
 
         write_sheet(Corpus(arguments.out), arguments.out / "sheet.png")
     told = manifest["results"]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -45,7 +47,6 @@ class Subject:
     fps: float
     period: float  # of the slowest mode [frames]
     simulator: Simulator
-    simulator_name: str
 
 
 def make_body(plan: Plan, number: int) -> tuple[dict[str, Array], BodyRecord]:
@@ -54,11 +55,15 @@ def make_body(plan: Plan, number: int) -> tuple[dict[str, Array], BodyRecord]:
     Raises:
         DivergenceError: none of many draws gave motion worth keeping, which no plan within its limits brings about.
     """
+    # These stay when a body is drawn again, or those that are dear to simulate would be rare.
+    rng = np.random.default_rng([plan.seed, number])
+    shapes: list[str | Path] = [*SHAPES, *plan.meshes]
+    shape, pins = shapes[int(rng.integers(len(shapes)))], str(rng.choice(PINS))
     redrawn = 0
     for trial in range(BODY_TRIALS):
         rng = np.random.default_rng([plan.seed, number, trial])
         try:
-            subject = _draw(plan, rng, second=_is_second(plan, number))
+            subject = _draw(plan, shape, pins, rng, second=_is_second(plan, number))
             positions, pushes, failed = _sequences(plan, subject, rng)
         except (Rejected, DivergenceError):
             redrawn += 1
@@ -72,10 +77,12 @@ def _is_second(plan: Plan, number: int) -> bool:
     return int((number + 1) * plan.second) > int(number * plan.second)
 
 
-def _draw(plan: Plan, rng: Rng, *, second: bool) -> Subject:
-    shape, body = _rest_shape(plan, rng)
-    pins = str(rng.choice(PINS))
-    held = pinned(body, pins, rng)
+def _draw(plan: Plan, kind: str | Path, pins: str, rng: Rng, *, second: bool) -> Subject:
+    """A body of a kind of shape, or of a mesh, at rest."""
+    field = SHAPES[kind](rng) if isinstance(kind, str) else from_mesh(kind)
+    shape = kind if isinstance(kind, str) else kind.name
+    body = body_of(field, int(rng.integers(*CELLS)))
+    held = body and pinned(warped(body, float(np.exp(rng.uniform(*np.log(DIAGONALS)))), rng), pins, rng)
     if held is None:
         raise Rejected
     fps = float(rng.choice(RATES))
@@ -89,11 +96,12 @@ def _draw(plan: Plan, rng: Rng, *, second: bool) -> Subject:
     if modes.highest / fps * 6 * len(held.cells) > MOST_COST:
         raise Rejected
     points = _kernels(held, int(rng.integers(plan.kernels[0], plan.kernels[1] + 1)), rng)
-    if not second:
-        mover: Simulator = FiniteElements(points, matter, modes, fps=fps)
-        return Subject(shape, pins, points, matter, modes, fps, period, mover, "mujoco")
-    mover, matter = _material_points(points, matter, modes, fps, period)
-    return Subject(shape, pins, points, matter, modes, fps, period, mover, "material_points")
+    simulator: Simulator
+    if second:
+        simulator, matter = _material_points(points, matter, modes, fps, period)
+    else:
+        simulator = FiniteElements(points, matter, modes, fps=fps)
+    return Subject(shape, pins, points, matter, modes, fps, period, simulator)
 
 
 def _material_points(
@@ -108,17 +116,6 @@ def _material_points(
         raise Rejected
     matter = replace(matter, young_modulus=matter.young_modulus * slower**2)
     return MaterialPoints(points, matter, fps=fps), matter
-
-
-def _rest_shape(plan: Plan, rng: Rng) -> tuple[str, Body]:
-    kinds = [*SHAPES, *plan.meshes]
-    kind = kinds[int(rng.integers(len(kinds)))]
-    field = SHAPES[kind](rng) if isinstance(kind, str) else from_mesh(kind)
-    body = body_of(field, int(rng.integers(*CELLS)))
-    if body is None:
-        raise Rejected
-    name = kind if isinstance(kind, str) else kind.name
-    return name, warped(body, float(np.exp(rng.uniform(*np.log(DIAGONALS)))), rng)
 
 
 def _kernels(body: Body, count: int, rng: Rng) -> Embedding:
@@ -139,7 +136,7 @@ def _kernels(body: Body, count: int, rng: Rng) -> Embedding:
 
 def _sequences(plan: Plan, subject: Subject, rng: Rng) -> tuple[Array, list[PushRecord], int]:
     """Positions (S, F, K, 3), their pushes, and how many pushes were drawn in vain."""
-    kept, records, failed = [], [], 0
+    kept, records, failed = list[Array](), list[PushRecord](), 0
     body, masses = subject.points.body, subject.matter.node_masses(subject.points.body)
     offset = max(1, round(subject.period / 4))
     while len(kept) < plan.sequences:
@@ -186,11 +183,11 @@ def _result(
         "damping": matter.drag[cell].astype(np.float32),
         "displacement": ((positions - rest) / body.diagonal).astype(np.float16),
     }
-    name = f"{subject.shape.partition('.')[0]}_{number:06d}"
+    kind = re.sub("[^A-Za-z0-9]+", "_", Path(subject.shape).stem)[:40].strip("_") or "mesh"
     record = BodyRecord(
-        name=name, shard="", shape=subject.shape, pins=subject.pins, material=matter.kind, contrast=matter.contrast,
-        simulator=subject.simulator_name, kernels=len(rest), sequences=len(positions), frames=plan.frames,
-        fps=subject.fps, diagonal=body.diagonal, poisson_ratio=matter.poisson_ratio, period=subject.period,
-        swing=max(push.swing for push in pushes), pushes=tuple(pushes), redrawn=redrawn,
+        name=f"{kind}_{number:06d}", shard="", shape=subject.shape, pins=subject.pins, material=matter.kind,
+        contrast=matter.contrast, simulator=subject.simulator.name, kernels=len(rest), sequences=len(positions),
+        frames=plan.frames, fps=subject.fps, diagonal=body.diagonal, poisson_ratio=matter.poisson_ratio,
+        period=subject.period, swing=max(push.swing for push in pushes), pushes=tuple(pushes), redrawn=redrawn,
     )  # fmt: skip
     return tensors, record

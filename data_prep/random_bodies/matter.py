@@ -29,12 +29,14 @@ class Matter:
         """(N,) a quarter of each adjoining tetrahedron."""
         tets = body.tetrahedra
         quarter = tet_volumes(body.nodes, tets) * np.tile(self.density, 6) / 4
-        return np.bincount(tets.ravel(), np.repeat(quarter, 4), len(body.nodes))
+        masses: Array = np.bincount(tets.ravel(), np.repeat(quarter, 4), len(body.nodes)).astype(float)
+        return masses
 
     def node_drag(self, body: Body) -> Array:
         """(N,) mean of the adjoining cells [1/s]."""
         corners = body.cells.ravel()
-        return np.bincount(corners, np.repeat(self.drag, 8)) / np.bincount(corners)
+        drag: Array = np.bincount(corners, np.repeat(self.drag, 8)) / np.bincount(corners)
+        return drag
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -22,23 +20,12 @@ from gausim.core import DivergenceError
 STEP_FRACTION = 0.65
 MARGIN = 0.6  # empty domain around the material points [diagonals]
 TRACER = 1e-4  # volume of a kernel that is carried along, in those of the points
-SIMULATORS = ("mujoco", "material_points")
-
-
-class Simulator(Protocol):
-    """Moves K points of a body."""
-
-    def simulate(self, velocity: Array, frames: int) -> tuple[Array, float]:
-        """Positions (F, K, 3) after an initial node velocity (N, 3), frame 0 at rest, and the least relative volume.
-
-        Raises:
-            DivergenceError: the motion left the finite numbers or the domain.
-        """
-        ...
 
 
 class FiniteElements:
     """Linear tetrahedra of St. Venant and Kirchhoff's material by MuJoCo, uneven by element."""
+
+    name = "mujoco"
 
     def __init__(self, points: Embedding, matter: Matter, modes: Modes, *, fps: float) -> None:
         body = points.body
@@ -49,7 +36,11 @@ class FiniteElements:
         self._elastic.set_uneven(np.tile(matter.young_modulus, 6), masses, matter.node_drag(body))
 
     def simulate(self, velocity: Array, frames: int) -> tuple[Array, float]:
-        """See :class:`Simulator`."""
+        """Positions (F, K, 3) after an initial node velocity (N, 3), frame 0 at rest, and the least relative volume.
+
+        Raises:
+            DivergenceError: the motion left the finite numbers.
+        """
         nodes = self._elastic.simulate(velocity, frames)
         volume = np.linalg.det(self._points.deformation_gradients(nodes)).min()
         return self._points.positions(nodes), float(volume)
@@ -57,6 +48,8 @@ class FiniteElements:
 
 class MaterialPoints:
     """MLS-MPM of a fixed corotated material: eight points per cell; the K points are carried along."""
+
+    name = "material_points"
 
     def __init__(self, points: Embedding, matter: Matter, *, fps: float) -> None:
         body, self._points = points.body, points
@@ -80,14 +73,10 @@ class MaterialPoints:
         self.young_modulus = torch.from_numpy(matter.young_modulus[cell]).float()
         self._fps = fps
 
-    @cached_property
-    def _count(self) -> int:
-        return len(self._points.cell)
-
     def simulate(self, velocity: Array, frames: int) -> tuple[Array, float]:
-        """See :class:`Simulator`."""
+        """As :meth:`FiniteElements.simulate`, or the motion left the domain."""
         x, least = self._run(velocity, frames, 1 / self._fps)
-        return x[:, -self._count :] - self._shift, least
+        return x[:, -len(self._points.cell) :] - self._shift, least
 
     def cost(self) -> float:
         """Steps of all points in a frame."""
@@ -121,3 +110,6 @@ class MaterialPoints:
             raise DivergenceError("the slowest mode of the material points does not turn within its period.")
         low, mid, high = amount[turn - 1 : turn + 2]
         return 4 * (turn + 0.5 * (low - high) / (low - 2 * mid + high)) * expected / samples
+
+
+Simulator = FiniteElements | MaterialPoints

@@ -17,24 +17,24 @@ POISSON_RATIOS = (0.2, 0.42)
 CELLS = (110, 260)  # hexahedral cells of a body, each of six tetrahedra
 CONTRASTS = (2.0, 30.0)  # of stiffness within an uneven body
 # A sequence is kept if its largest displacement lies here [diagonals] and no volume shrinks below a fraction.
-KEPT_SWING, LEAST_VOLUME = (0.01, 0.45), 0.1
+KEPT_SWING, LEAST_VOLUME = (0.015, 0.45), 0.1
 
 
 @dataclass(frozen=True)
 class Plan(Options):
     """Size of a corpus."""
 
-    bodies: int = option(300, "number of bodies", least=1)
-    sequences: int = option(4, "sequences per body", least=1)
-    frames: int = option(50, "frames per sequence", least=2)
+    bodies: int = option(300, "number of bodies (300)", least=1)
+    sequences: int = option(4, "sequences per body (4)", least=1)
+    frames: int = option(50, "frames per sequence (50)", least=2)
     kernels: tuple[int, int] = option(
-        (400, 800), "fewest and most kernels of a body", least=50, nargs=2, metavar=("FEWEST", "MOST")
+        (400, 800), "fewest and most kernels of a body (400 800)", least=50, nargs=2, metavar=("FEWEST", "MOST")
     )
     swing: tuple[float, float] = option(
-        (0.02, 0.3), "amplitude of the pushes [fractions of the body's diagonal]", least=1e-3, most=0.4, nargs=2,
-        metavar=("LOW", "HIGH"),
+        (0.02, 0.3), "amplitude of the pushes [fractions of the body's diagonal] (0.02 0.3)", least=1e-3, most=0.4,
+        nargs=2, metavar=("LOW", "HIGH"),
     )  # fmt: skip
-    second: float = option(0.2, "fraction of bodies that the material point method moves", least=0, most=1)
+    second: float = option(0.2, "fraction of bodies that the material point method moves (0.2)", least=0, most=1)
     meshes: tuple[Path, ...] = option(
         (), "surfaces (OBJ or PLY), each as likely as a procedural kind of shape", nargs="+", metavar="FILE", type=Path
     )

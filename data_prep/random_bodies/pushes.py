@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
@@ -10,9 +11,11 @@ from data_prep.random_bodies.lattice import distance_to_pins
 from data_prep.random_bodies.matter import Modes
 from data_prep.random_bodies.shapes import Rng
 from data_prep.synthetic.bodies import Array, Body
+from gausim.data.corpus import Kind, Start
 
-KINDS = ("poke", "drag", "twist")
+KINDS: tuple[Kind, ...] = get_args(Kind)
 RELEASED = 0.35  # of the sequences start at the first turn of the motion
+SMALLER = 1.5  # exponent that makes small pushes more frequent than large ones
 WIDTH = 0.28  # of a poke [diagonals]
 # Slowest modes that a push may excite: those slower than this [frames], but never fewer than LEAST_MODES.
 FASTEST_PERIOD, LEAST_MODES = 2.5, 3
@@ -22,8 +25,8 @@ FASTEST_PERIOD, LEAST_MODES = 2.5, 3
 class Push:
     """One push."""
 
-    kind: str  # one of :data:`KINDS`
-    start: str  # ``impulse`` or ``release``
+    kind: Kind
+    start: Start
     direction: tuple[float, float, float]
     amplitude: float  # largest displacement by linear modes [diagonals]
 
@@ -32,9 +35,9 @@ def random_push(rng: Rng, swing: tuple[float, float]) -> Push:
     """A push of a random amplitude within ``swing`` [diagonals]."""
     direction = rng.normal(size=3)
     direction /= np.linalg.norm(direction)
-    start = "release" if rng.random() < RELEASED else "impulse"
-    amplitude = float(np.exp(rng.uniform(*np.log(swing))))
-    return Push(str(rng.choice(KINDS)), start, tuple(direction.tolist()), amplitude)
+    start: Start = "release" if rng.random() < RELEASED else "impulse"
+    amplitude = float(swing[0] + (swing[1] - swing[0]) * rng.random() ** SMALLER)
+    return Push(KINDS[int(rng.integers(len(KINDS)))], start, tuple(direction.tolist()), amplitude)
 
 
 def push_velocity(body: Body, masses: Array, modes: Modes, push: Push, fps: float, rng: Rng) -> Array:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
+from scipy.interpolate import RegularGridInterpolator
 
 from data_prep.blender.meshes import read_mesh
 from data_prep.synthetic.bodies import Array
 
 Rng = np.random.Generator
 Field = Callable[[Array], Array]  # (P, 3) -> (P,)
-DIPOLES = 4000
+DIPOLES, SAMPLES = 3000, 32  # of a mesh's surface; along an edge of the grid that its field is interpolated on
 
 
 def blob(rng: Rng) -> Field:
@@ -132,6 +134,7 @@ def figure(rng: Rng) -> Field:
     return _union(parts)
 
 
+@cache
 def from_mesh(path: Path) -> Field:
     """The inside of a surface: its winding number, by dipoles spread over it (Barill et al. 2018), above a half.
 
@@ -149,15 +152,16 @@ def from_mesh(path: Path) -> Field:
     volume = float(np.einsum("tx,tx->", corners.mean(1), normal))
     blur = np.sqrt(area.sum() / DIPOLES)
 
-    def field(p: Array) -> Array:
-        found = np.empty(len(p))
-        for start in range(0, len(p), 512):
-            apart = place - p[start : start + 512, None]
-            distance = np.sqrt((apart**2).sum(-1) + 0.25 * blur**2)
-            found[start : start + 512] = ((apart * strength).sum(-1) / distance**3).sum(-1)
-        return np.sign(volume) * found - 0.5
-
-    return field
+    axis = np.linspace(-1.1, 1.1, SAMPLES)
+    places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    winding = np.empty(len(places))
+    for start in range(0, len(places), 512):
+        p = places[start : start + 512]
+        square = (p**2).sum(1)[:, None] + (place**2).sum(1) + 0.25 * blur**2 - 2 * p @ place.T
+        flux = (place * strength).sum(1) - p @ strength.T
+        winding[start : start + 512] = (flux / (square * np.sqrt(square))).sum(1)
+    inside = (np.sign(volume) * winding - 0.5).reshape((SAMPLES,) * 3)
+    return RegularGridInterpolator((axis, axis, axis), inside, bounds_error=False, fill_value=-0.5)
 
 
 SHAPES: dict[str, Callable[[Rng], Field]] = {

@@ -34,25 +34,23 @@ def write_sheet(corpus: Corpus, path: Path) -> None:
 
 def _draw(axis: Axes, body: CorpusBody) -> None:
     """A body at rest on the left, in the frame of its largest displacement on the right."""
+    held = body.pinned.numpy()
     rest, moved = body.rest.double().numpy(), body.positions.double().numpy()
     length = np.linalg.norm(moved - rest, axis=-1).max(-1)
     sequence, frame = np.unravel_index(length.argmax(), length.shape)
-    stiffness = np.log10(body.stiffness.numpy())
-    level = (stiffness - stiffness.min()) / max(float(np.ptp(stiffness)), 1.0)
+    level = np.log10(body.stiffness.numpy() / body.stiffness.min().item())
     radius = np.linalg.norm(np.ptp(rest, axis=0)) / 2
     for side, points in ((-1, rest), (1, moved[sequence, frame])):
         across, up, near = _seen(points - (rest.max(0) + rest.min(0)) / 2).T / radius
         order = near.argsort()
         axis.scatter(
-            (across + 1.1 * side)[order], up[order], s=7, c=level[order], cmap="viridis", vmin=0, vmax=1,
+            (across + 1.1 * side)[order], up[order], s=7, c=level[order], cmap="viridis", vmin=0, vmax=1.5,
             alpha=np.interp(near[order], (-1, 1), (0.35, 1.0)), linewidths=0,
         )  # fmt: skip
-        held = body.pinned.numpy()
         axis.scatter((across + 1.1 * side)[held], up[held], s=4, c="black", linewidths=0)
     axis.set(xlim=(-2.2, 2.2), ylim=(-1.15, 1.15), aspect="equal")
-    record = body.record
-    second = "" if record.simulator == "mujoco" else " (points)"
-    axis.set_title(f"{body.name}{second} {record.pins} {record.material} T={record.period:.0f}", fontsize=6, pad=1)
+    about = body.record
+    axis.set_title(f"{body.name} {about.pins} {about.simulator} T={about.period:.0f}", fontsize=6, pad=1)
 
 
 def _seen(points: Array) -> Array:

@@ -68,6 +68,8 @@ class ElasticBody:
         try:
             for _ in range(1, frames):
                 mujoco.mj_step(model, data, nstep=self._substeps)
+                if messages:
+                    break
                 mujoco.mj_kinematics(model, data)
                 mujoco.mj_flex(model, data)
                 positions.append(data.flexvert_xpos.copy())
