@@ -25,7 +25,7 @@ MODES = 32
 # Costs that are not paid: element steps per frame by finite elements, point steps by material points.
 MOST_COST, MOST_POINT_COST = 3e5, 1.2e5
 PUSH_TRIALS, WEAKER, STRONGER = 4, 0.6, 2.0
-BODY_TRIALS = 40
+BODY_TRIALS, KIND_TRIALS = 60, 6  # draws of a body, and those of one kind of shape and pins
 # Swing that measures the period of the material points [diagonals]; the most that it may differ from the elements',
 # so that the grid is fine enough for the body and its modulus means the same.
 TRIAL_SWING, MOST_SLOWER = 0.02, 1.4
@@ -55,13 +55,13 @@ def make_body(plan: Plan, number: int) -> tuple[dict[str, Array], BodyRecord]:
     Raises:
         DivergenceError: none of many draws gave motion worth keeping, which no plan within its limits brings about.
     """
-    # These stay when a body is drawn again, or those that are dear to simulate would be rare.
-    rng = np.random.default_rng([plan.seed, number])
     shapes: list[str | Path] = [*SHAPES, *plan.meshes]
-    shape, pins = shapes[int(rng.integers(len(shapes)))], str(rng.choice(PINS))
     redrawn = 0
     for trial in range(BODY_TRIALS):
-        rng = np.random.default_rng([plan.seed, number, trial])
+        # Shape and pins stay for some trials, or those that are dear to simulate would be rare.
+        kinds = np.random.default_rng([plan.seed, number, 1, trial // KIND_TRIALS])
+        shape, pins = shapes[int(kinds.integers(len(shapes)))], str(kinds.choice(PINS))
+        rng = np.random.default_rng([plan.seed, number, 2, trial])
         try:
             subject = _draw(plan, shape, pins, rng, second=_is_second(plan, number))
             positions, pushes, failed = _sequences(plan, subject, rng)

@@ -12,6 +12,7 @@ from data_prep.random_bodies.lattice import tet_volumes
 from data_prep.random_bodies.plan import CONTRASTS, DAMPING_RATIOS, DENSITIES, POISSON_RATIOS
 from data_prep.random_bodies.shapes import Rng
 from data_prep.synthetic.bodies import Array, Body
+from gausim.core import DivergenceError
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,18 +81,25 @@ def random_drag(omega: float, rng: Rng) -> float:
 
 
 def modes_of(body: Body, matter: Matter, count: int) -> Modes:
-    """Modes of linear elasticity on linear tetrahedra with lumped masses."""
+    """Modes of linear elasticity on linear tetrahedra with lumped masses.
+
+    Raises:
+        DivergenceError: they are not found, as where a part hangs by a hinge.
+    """
     free = np.flatnonzero(np.repeat(~body.held, 3))
     root = 1 / np.sqrt(np.repeat(matter.node_masses(body), 3)[free])
     matrix = _stiffness(body, matter)[free][:, free]
     scaled = diags_array(root) @ matrix @ diags_array(root)
     start = np.random.default_rng(0).normal(size=len(free))  # ARPACK would take another one every time
-    values, vectors = eigsh(scaled.tocsc(), k=min(count, len(free) - 2), sigma=0, v0=start)
-    highest = eigsh(scaled, k=1, v0=start, tol=1e-2, return_eigenvectors=False)[0]
+    try:
+        values, vectors = eigsh(scaled.tocsc(), k=min(count, len(free) - 2), sigma=0, v0=start)
+        highest = eigsh(scaled, k=1, v0=start, tol=1e-2, return_eigenvectors=False)[0]
+    except RuntimeError as error:  # ARPACK's errors and a singular matrix
+        raise DivergenceError(f"the modes of the body are not found ({error}).") from error
     shapes = np.zeros((len(values), body.nodes.size))
     order = np.argsort(values)
     shapes[:, free] = (root[:, None] * vectors[:, order]).T
-    return Modes(np.sqrt(np.maximum(values[order], 0)), shapes.reshape(-1, *body.nodes.shape), float(np.sqrt(highest)))
+    return Modes(np.sqrt(np.abs(values[order])), shapes.reshape(-1, *body.nodes.shape), float(np.sqrt(highest)))
 
 
 def _stiffness(body: Body, matter: Matter) -> coo_array:
