@@ -27,7 +27,7 @@ def write_sheet(corpus: Corpus, path: Path) -> None:
         axis.set_axis_off()
     for axis, number in zip(axes, chosen.tolist(), strict=False):
         _draw(axis, corpus.body(number))
-    figure.subplots_adjust(0, 0, 1, 0.98, 0, 0.15)
+    figure.subplots_adjust(0, 0, 1, 1 - 0.2 / (rows * CELL[1]), 0, 0.15)
     with replacing(path, typed=True) as temporary:
         figure.savefig(temporary)
 
