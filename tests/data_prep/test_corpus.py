@@ -12,7 +12,7 @@ if importlib.util.find_spec("mujoco") is None or importlib.util.find_spec("warp"
     pytest.skip("MuJoCo or Warp is not installed (extras 'synth' and 'baselines')", allow_module_level=True)
 
 from data_prep.corpus import main
-from data_prep.random_bodies import maker
+from data_prep.random_bodies import maker, shapes
 from data_prep.random_bodies.lattice import PINS, body_of, pinned, tet_volumes, warped
 from data_prep.random_bodies.matter import Matter, Modes, modes_of
 from data_prep.random_bodies.motion import FiniteElements, MaterialPoints
@@ -68,8 +68,9 @@ def test_bodies_are_sound(kind: str) -> None:
         assert sum(one is not None and 0 < one.held.mean() < 0.6 for one in held) >= 2
 
 
-def test_a_mesh_is_filled(tmp_path: Path) -> None:
+def test_a_mesh_is_filled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A torus of known volume, its faces turned inwards."""
+    monkeypatch.setattr(shapes, "SAMPLES", 24)
     count, turns = 48, np.linspace(0, 2 * np.pi, 48, endpoint=False)
     u, v = (t.ravel() for t in np.meshgrid(turns, turns, indexing="ij"))
     ring = 1 + 0.4 * np.cos(v)
@@ -117,7 +118,7 @@ def test_material_points_swing_nearly_as_fine_elements_do() -> None:
     mover = MaterialPoints(middles(body), block_matter(body), fps=20 / period)
     found = mover.period_of(modes.shapes[0], period, 0.1)
     velocity = modes.shapes[0] / np.abs(modes.shapes[0]).max() * 0.1 * modes.omega[0]
-    x, _ = mover.simulate(velocity, 50)
+    x, _ = mover.simulate(velocity, 32)
     assert measured_period(body, modes, x, 20 / period) == pytest.approx(found, rel=0.03)
     assert found == pytest.approx(period, rel=0.35)
 
