@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import multiprocessing
 import sys
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data_prep.common.command import add_options, cores, given, headline, run_command, stage_parser
+from data_prep.common.pool import each
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, run_stage
 from data_prep.synthetic.plan import QUICK, Plan
@@ -43,27 +42,8 @@ def synthesize(out: Path, plan: Plan, *, workers: int, force: bool = False, tick
 
 def _write_all(root: Path, plan: Plan, workers: int, tick: Tick) -> dict[str, Any]:
     jobs = [(name, part) for name in plan.objects for part in (None, *range(plan.sequences))]
-    if workers == 1:
-        for number, job in enumerate(jobs, 1):
-            _write_part(root, plan, *job)
-            tick("synthesizing", number, len(jobs))
-        return {"objects": list(plan.objects)}
-    # Not forked: a fork of a process with live threads (torch, rich) can hang.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context, initializer=_one_thread) as pool:
-        pending = [pool.submit(_write_part, root, plan, *job) for job in jobs]
-        for number, done in enumerate(as_completed(pending), 1):
-            if done.exception() is not None:
-                pool.shutdown(cancel_futures=True)
-            done.result()
-            tick("synthesizing", number, len(jobs))
+    each(_write_part, [(root, plan, *job) for job in jobs], workers=workers, step="synthesizing", tick=tick)
     return {"objects": list(plan.objects)}
-
-
-def _one_thread() -> None:
-    import torch
-
-    torch.set_num_threads(1)
 
 
 def _write_part(root: Path, plan: Plan, name: str, sequence: int | None) -> None:

@@ -33,6 +33,23 @@ class ElasticBody:
         if np.abs(self._rest - body.nodes).max() > 1e-4:
             raise DivergenceError("MuJoCo changed the order or the place of the nodes; use mujoco>=3.3,<5.")
 
+    def set_uneven(self, young_modulus: Array, masses: Array, drag: Array) -> None:
+        """Makes the material uneven.
+
+        Args:
+            young_modulus: of each tetrahedron, in the material's (T,).
+            masses: of the nodes (N,).
+            drag: of the nodes (N,), force over momentum [1/s].
+        """
+        model = self._model
+        model.flex_stiffness.reshape(len(young_modulus), -1)[:] *= young_modulus[:, None]
+        for node, part in enumerate(model.flex_vertbodyid):
+            if model.body_dofnum[part] == 3:
+                first = model.body_dofadr[part]
+                model.body_mass[part] = masses[node]
+                model.dof_damping[first : first + 3] = drag[node] * masses[node]
+        mujoco.mj_setConst(model, self._data)
+
     def simulate(self, velocity: Array, frames: int) -> Array:
         """Positions (frames, N, 3) after an initial ``velocity`` (N, 3); frame 0 is exactly the rest state.
 
@@ -51,6 +68,8 @@ class ElasticBody:
         try:
             for _ in range(1, frames):
                 mujoco.mj_step(model, data, nstep=self._substeps)
+                if messages:
+                    break
                 mujoco.mj_kinematics(model, data)
                 mujoco.mj_flex(model, data)
                 positions.append(data.flexvert_xpos.copy())

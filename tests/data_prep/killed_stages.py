@@ -24,7 +24,8 @@ import gausim.data.verify
 import gausim.io.ply
 import gausim.render.cpu  # noqa: F401
 
-STAGES = ("ingest", "poses", "segment", "reconstruct", "select", "assemble", "pack", "import_ready", "synthesize")
+STAGES = ("ingest", "poses", "segment", "reconstruct", "select", "assemble", "pack", "import_ready", "synthesize",
+          "corpus")  # fmt: skip
 PLACES = ((os, "replace"), (os, "fsync"), (Path, "unlink"), (shutil, "rmtree"))
 
 

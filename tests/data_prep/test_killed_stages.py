@@ -22,7 +22,7 @@ ROOM = runpy.run_path(str(Path(__file__).with_name("test_poses.py")))
 READY = runpy.run_path(str(ROOT / "tests" / "fuzz" / "corpus.py"))["_ready"]
 Run = Callable[..., dict[str, Any]]
 STAGES = ("ingest", "poses", "segment", "reconstruct", "select", "assemble", "pack", "import_ready", "poses-mapping",
-          "synthesize")  # fmt: skip
+          "synthesize", "corpus")  # fmt: skip
 SHARES = (0.0, 0.5, 1.0)
 
 
@@ -77,6 +77,7 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
         ],
         "synthesize": "--quick --objects pudding_soft --sequences 1 --frames 16 --resolution 24 --kernels 60 "
         "--workers 1".split(),
+        "corpus": "--bodies 2 --sequences 1 --frames 4 --kernels 60 60 --second 0 --workers 1".split(),
     }
 
     class Made(dict):

@@ -14,7 +14,7 @@ import av
 import cv2
 import numpy as np
 import torch
-from helpers import colmap_files, toy_object
+from helpers import colmap_files, toy_corpus, toy_object
 
 from data_prep.capture.cameras.sources import read_lens_transforms, read_projections
 from data_prep.capture.films.film import pictures, probe, upright
@@ -28,6 +28,7 @@ from data_prep.pack import pack
 from data_prep.ready.authors import read_pins
 from data_prep.ready.gathered import gather
 from gausim.core.errors import GausSimError
+from gausim.data.corpus import Corpus
 from gausim.data.images import read_rgba, write_rgba
 from gausim.data.objects import ObjectData
 from gausim.data.records import read_array, read_stills
@@ -113,6 +114,14 @@ def _object(folder: Path) -> Iterator[Reader]:
     yield Reader("array", root / "rest_points.npz", "npz", lambda p: read_array(p, "points"), 2)
     yield Reader("frame", sequence / "cam_0" / "0000.png", "png", whole)
     yield Reader("any json", root / "dataset.json", "json", read_json, 2)
+    bodies = toy_corpus.write_toy_corpus(folder / "bodies", bodies=1)
+
+    def body(_: Path) -> Any:
+        found = Corpus(bodies).body(0)
+        return found.rest, found.stiffness, found.positions
+
+    yield Reader("manifest of a corpus", bodies / "manifest.json", "json", body)
+    yield Reader("shard of a corpus", bodies / "shard_00000.safetensors", "binary", body)
 
 
 def _store(folder: Path) -> Iterator[Reader]:

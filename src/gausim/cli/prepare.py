@@ -24,6 +24,7 @@ STAGES = {
     "import_ready": "brings a set in the layout of READY's authors to ours",
     "dataset": "runs the stages that a YAML file lists, one after the other",
     "compare_poses": "how far poses are from others of the same photos",
+    "corpus": "random elastic bodies with known motion and material, to pretrain on",
     "synthesize": "the embedded synthetic set: puddings and flowers that MuJoCo moves",
     "blender_bunny": "the paper's synthetic set: any mesh as a soft body of Blender",
 }

@@ -19,25 +19,25 @@ MANIFEST = "manifest.json"
 SCHEMA = "gausim.corpus/1"
 REMEDY = "Make the corpus again with `gausim prepare corpus`."
 # Tensors of a body in its shard, named NAME.FIELD; K kernels, S sequences, F frames.
+_MATERIAL = dict.fromkeys(("scale", "stiffness", "density", "damping"), (torch.float32, "K"))
 FIELDS = {
     "rest": (torch.float32, "K3"),
     "pinned": (torch.bool, "K"),
-    "scale": (torch.float32, "K"),
-    "stiffness": (torch.float32, "K"),
-    "density": (torch.float32, "K"),
-    "damping": (torch.float32, "K"),
+    **_MATERIAL,
     "displacement": (torch.float16, "SFK3"),
 }
 _Count = Annotated[int, Meta(ge=1)]
-_Size = Annotated[float, Meta(gt=0)]
+_Size = Annotated[float, Meta(gt=0, le=1e9)]
 _Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z")]
+Kind = Literal["poke", "drag", "twist"]  # around a point, growing away from the pins, about an axis
+Start = Literal["impulse", "release"]  # frame 0 is at rest, or at the first turn of the motion
 
 
 class PushRecord(Struct, frozen=True, forbid_unknown_fields=True):
     """The push that set a sequence off."""
 
-    kind: Literal["poke", "drag", "twist"]  # around a point, growing away from the pins, about an axis
-    start: Literal["impulse", "release"]  # frame 0 is at rest, or at the first turn of the motion
+    kind: Kind
+    start: Start
     direction: tuple[float, float, float]  # of the push, or the axis of a twist; unit length
     swing: _Size  # largest displacement of a kernel in the sequence [diagonals]
 
@@ -45,7 +45,7 @@ class PushRecord(Struct, frozen=True, forbid_unknown_fields=True):
 class BodyRecord(Struct, frozen=True, forbid_unknown_fields=True):
     """Facts about one body."""
 
-    name: _Name  # unique in the corpus
+    name: _Name  # prefix of its tensors
     shard: _Name  # file that holds it
     shape: str  # kind of its shape, such as ``fork``, or the mesh's file name
     pins: str  # kind of its pins
@@ -91,19 +91,10 @@ class CorpusBody:
 
 
 class Corpus:
-    """Bodies that are read one by one.
-
-    Attributes:
-        path: folder of the corpus.
-        manifest: content of its manifest.
-    """
+    """The bodies in the folder ``path``, read one by one; ``manifest`` is the content of its manifest."""
 
     def __init__(self, path: Path | str) -> None:
-        """Reads the manifest.
-
-        Raises:
-            DataError: it is missing or malformed, two bodies have one name, or a shard is missing.
-        """
+        """Reads the manifest; a :class:`DataError` says that it is missing or malformed, or a shard is missing."""
         self.path = Path(path)
         file = self.path / MANIFEST
         if not file.is_file():
@@ -116,9 +107,6 @@ class Corpus:
         if found != SCHEMA:
             raise DataError(f"{file}: field 'schema' is {found!r}, expected {SCHEMA!r}. {REMEDY}")
         self.manifest: Manifest = checked(data, Manifest, str(file), REMEDY)
-        names = [body.name for body in self.manifest.bodies]
-        if len(set(names)) < len(names):
-            raise DataError(f"{file}: field 'bodies': two have the name {max(names, key=names.count)!r}. {REMEDY}")
         for shard in sorted({body.shard for body in self.manifest.bodies}):
             if not (self.path / shard).is_file():
                 raise DataError(f"{self.path / shard}: not found, though {MANIFEST} names it. {REMEDY}")
@@ -137,16 +125,14 @@ class Corpus:
         path = self.path / record.shard
         try:
             with safe_open(str(path), framework="pt") as file:
-                known = set(file.keys())
-                missing = [f for f in FIELDS if f"{record.name}.{f}" not in known]
+                missing = sorted({f"{record.name}.{field}" for field in FIELDS} - set(file.keys()))
                 if missing:
-                    raise DataError(f"{path}: tensor '{record.name}.{missing[0]}' is missing. {REMEDY}")
+                    raise DataError(f"{path}: tensor '{missing[0]}' is missing. {REMEDY}")
                 tensors = {field: file.get_tensor(f"{record.name}.{field}") for field in FIELDS}
         except (OSError, SafetensorError) as error:
             raise DataError(f"{path}: cannot be read as safetensors ({error}). {REMEDY}") from error
         _check(f"{path}: tensor '{record.name}.", tensors, record)
-        moved = tensors.pop("displacement").float() * record.diagonal
-        positions = tensors["rest"] + moved
+        positions = tensors["rest"] + tensors.pop("displacement").float() * record.diagonal
         return CorpusBody(name=record.name, fps=record.fps, positions=positions, record=record, **tensors)
 
 
@@ -155,9 +141,8 @@ def _check(where: str, tensors: dict[str, Tensor], record: BodyRecord) -> None:
     for name, (dtype, axes) in FIELDS.items():
         tensor, shape = tensors[name], tuple(sizes[axis] for axis in axes)
         if tuple(tensor.shape) != shape or tensor.dtype != dtype:
-            expected = f"{str(dtype).removeprefix('torch.')} {shape}"
-            found = f"{str(tensor.dtype).removeprefix('torch.')} {tuple(tensor.shape)}"
-            raise DataError(f"{where}{name}' is {found}, expected {expected}. {REMEDY}")
+            found = f"{tensor.dtype} {tuple(tensor.shape)}"
+            raise DataError(f"{where}{name}' is {found}, expected {dtype} {shape}. {REMEDY}")
         if not torch.isfinite(tensor).all():
             raise DataError(f"{where}{name}' has values that are no finite numbers. {REMEDY}")
         if name in ("scale", "stiffness", "density") and not (tensor > 0).all():

@@ -1,0 +1,1 @@
+"""Random elastic bodies for a corpus: shapes, materials, pins, pushes and two simulators."""

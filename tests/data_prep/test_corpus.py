@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+if importlib.util.find_spec("mujoco") is None or importlib.util.find_spec("warp") is None:
+    pytest.skip("MuJoCo or Warp is not installed (extras 'synth' and 'baselines')", allow_module_level=True)
+
+from data_prep.corpus import main
+from data_prep.random_bodies import maker, shapes
+from data_prep.random_bodies.lattice import PINS, body_of, pinned, tet_volumes, warped
+from data_prep.random_bodies.matter import Matter, Modes, modes_of
+from data_prep.random_bodies.motion import FiniteElements, MaterialPoints
+from data_prep.random_bodies.shapes import SHAPES, from_mesh
+from data_prep.synthetic.bodies import Array, Body
+from data_prep.synthetic.bodies import _body as lattice
+from data_prep.synthetic.embedding import Embedding
+from gausim.data.corpus import MANIFEST, Corpus
+
+TINY = "--sequences 1 --frames 6 --kernels 60 70 --workers".split()
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def beam(length: int, width: int) -> Body:
+    """An upright beam of unit cells whose lowest layer is held; it is free from height 1 on."""
+    cells = [(i, j, k) for i in range(width) for j in range(width) for k in range(length + 1)]
+    return lattice(cells, lambda grid: grid, held_layers=2)
+
+
+def matter_of(body: Body, young: Array | float = 1.0, poisson_ratio: float = 0.0) -> Matter:
+    cells = np.ones(len(body.cells))
+    return Matter("even", 1.0, poisson_ratio, young * cells, 2.0 * cells, 0.0 * cells)
+
+
+def measured_period(body: Body, modes: Modes, x: Array, fps: float) -> float:
+    """Seconds between crossings of zero by the motion (F, K, 3) of the cells' middles along the slowest mode."""
+    along = middles(body).positions(modes.shapes[0])
+    amount = ((x - x[0]) * along).sum((1, 2))
+    before = np.flatnonzero((amount[1:-1] * amount[2:]) < 0) + 1
+    crossings = before + amount[before] / (amount[before] - amount[before + 1])
+    return float(2 * np.diff(crossings).mean() / fps)
+
+
+def middles(body: Body) -> Embedding:
+    return Embedding(body, np.arange(len(body.cells)), np.full((len(body.cells), 3), 0.5))
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_bodies_are_sound(kind: str) -> None:
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        body = body_of(SHAPES[kind](rng), 120)
+        assert body is not None and 100 <= len(body.cells) < 600
+        solid = np.zeros(body.grid.max(0) + 1, bool)
+        solid[tuple(body.grid.T)] = True
+        assert ndimage.label(solid)[1] == 1 and solid.sum() == len(body.cells)
+        body = warped(body, 1.7, rng)
+        assert tet_volumes(body.nodes, body.tetrahedra).min() > 0 and np.isclose(body.diagonal, 1.7)
+        held = [pinned(body, pins, rng) for pins in PINS]
+        assert sum(one is not None and 0 < one.held.mean() < 0.6 for one in held) >= 2
+
+
+def test_a_mesh_is_filled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A torus of known volume, its faces turned inwards."""
+    monkeypatch.setattr(shapes, "SAMPLES", 24)
+    count, turns = 48, np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    u, v = (t.ravel() for t in np.meshgrid(turns, turns, indexing="ij"))
+    ring = 1 + 0.4 * np.cos(v)
+    points = np.stack((ring * np.cos(u), ring * np.sin(u), 0.4 * np.sin(v)), 1)
+    i, j = (t.ravel() for t in np.meshgrid(np.arange(count), np.arange(count), indexing="ij"))
+    a, b = i * count + j, (i + 1) % count * count + j
+    c, d = (i + 1) % count * count + (j + 1) % count, i * count + (j + 1) % count
+    rows = [f"v {x} {y} {z}" for x, y, z in points.tolist()]
+    rows += [f"f {p + 1} {s + 1} {r + 1} {q + 1}" for p, q, r, s in zip(a, b, c, d, strict=True)]
+    (tmp_path / "torus.obj").write_text("\n".join(rows))
+    body = body_of(from_mesh(tmp_path / "torus.obj"), 250)
+    assert body is not None
+    volume = tet_volumes(body.nodes, body.tetrahedra).sum() * (1.4 / 0.95) ** 3
+    assert volume == pytest.approx(2 * np.pi**2 * 0.4**2, rel=0.1)
+
+
+def test_slowest_mode_of_a_beam_is_that_of_beam_theory() -> None:
+    """Euler and Bernoulli's clamped beam: omega = 1.8751^2 sqrt(E I / (rho A L^4)); linear tetrahedra are stiffer."""
+    errors = []
+    for width in (2, 4):
+        body = beam(10 * width, width)
+        body = replace(body, nodes=body.nodes / width)
+        exact = 1.8751**2 * np.sqrt(1 / 12 / 2.0 / 10**4)
+        errors.append(modes_of(body, matter_of(body), 2).omega[0] / exact - 1)
+    assert 0 < errors[1] < 0.5 * errors[0] and errors[1] < 0.1, errors
+
+
+def test_mujoco_swings_at_the_frequency_of_the_uneven_body() -> None:
+    body = beam(8, 2)
+    young = np.where(body.nodes[body.cells].mean(1)[:, 2] > 5, 20.0, 1.0)
+    matter = matter_of(body, young, 0.3)
+    modes = modes_of(body, matter, 3)
+    period = 2 * np.pi / modes.omega[0]
+    mover = FiniteElements(middles(body), matter, modes, fps=20 / period)
+    velocity = modes.shapes[0] / np.abs(modes.shapes[0]).max() * 0.02 * modes.omega[0]
+    x, volume = mover.simulate(velocity, 60)
+    assert measured_period(body, modes, x, 20 / period) == pytest.approx(period, rel=0.01)
+    assert 0.95 < volume <= 1
+
+
+def test_material_points_swing_nearly_as_fine_elements_do() -> None:
+    """Three cells wide, which is the least: 27 % slower; the corpus chooses their modulus from the period measured."""
+    body, fine = beam(6, 3), beam(12, 6)
+    period, modes = period_of(replace(fine, nodes=fine.nodes / 2))[0], period_of(body)[1]
+    mover = MaterialPoints(middles(body), block_matter(body), fps=20 / period)
+    found = mover.period_of(modes.shapes[0], period, 0.1)
+    velocity = modes.shapes[0] / np.abs(modes.shapes[0]).max() * 0.1 * modes.omega[0]
+    x, _ = mover.simulate(velocity, 32)
+    assert measured_period(body, modes, x, 20 / period) == pytest.approx(found, rel=0.03)
+    assert found == pytest.approx(period, rel=0.35)
+
+
+def block_matter(body: Body) -> Matter:
+    return replace(matter_of(body, 100.0, 0.3), drag=np.full(len(body.cells), 1e-6))
+
+
+def period_of(body: Body) -> tuple[float, Modes]:
+    modes = modes_of(body, block_matter(body), 2)
+    return 2 * np.pi / modes.omega[0], modes
+
+
+def test_interrupted_corpus_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = [*TINY, "1", "--bodies", "2", "--second", "0", "--out"]
+    assert main([*command, str(tmp_path / "whole")]) == 0
+    original, made = maker.make_body, list[int]()
+
+    def interrupted(plan, number: int):
+        if number == 1 and made == [0]:
+            raise KeyboardInterrupt
+        made.append(number)
+        return original(plan, number)
+
+    monkeypatch.setattr(maker, "make_body", interrupted)
+    out = tmp_path / "cut"
+    assert main([*command, str(out)]) == 130 and not out.exists()
+    made.append(-1)
+    assert main([*command, str(out)]) == 0 and made == [0, -1, 1]
+    assert contents(out) == contents(tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_same_bytes_of_any_number_of_processes(tmp_path: Path) -> None:
+    for name, workers in (("one", "1"), ("two", "2")):
+        command = [*TINY, workers, "--bodies", "4", "--second", "0.5", "--sheet", "--out", str(tmp_path / name)]
+        assert main(command) == 0
+    one, two = contents(tmp_path / "one"), contents(tmp_path / "two")
+    assert {name for name in one if one[name] != two[name]} <= {"sheet.png"} and MANIFEST in one
+    corpus = Corpus(tmp_path / "one")
+    assert [body.simulator for body in corpus.manifest.bodies].count("material_points") == 2
+    for number in range(4):
+        body = corpus.body(number)
+        moved = (body.positions - body.rest).norm(dim=-1) / body.record.diagonal
+        assert moved.max().item() == pytest.approx(body.record.swing, rel=1e-2)
+        assert moved[:, :, body.pinned].max() < 1e-3 and body.pinned.any()
