@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -78,12 +77,6 @@ def trainings(shared: Shared) -> Iterator[Trainings]:
 def toy_run(trainings: Trainings) -> Path:
     """The directory of a finished run of three epochs on a toy of three sequences; not to be changed."""
     return trainings.whole("whole", "trainer=cpu", "trainer.max_epochs=3")
-
-
-@pytest.fixture
-def own_toy_run(toy_run: Path, tmp_path: Path) -> Path:
-    """A copy of :func:`toy_run`, for commands that write into it."""
-    return Path(shutil.copytree(toy_run, tmp_path / "toy_run" / "seed_0"))
 
 
 @pytest.fixture(scope="session")

@@ -147,16 +147,6 @@ def leaves(node: Any) -> list[Any]:
     return [node]
 
 
-def test_the_same_choice_runs_in_the_same_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    seen: list[Path] = []
-    for seed in (3, 3, 4):
-        overrides = ["name=rose", "paths.output_root=o", f"seed={seed}"]
-        assert run_hydra("train", lambda config: seen.append(_config.run_dir()), overrides) == 0
-    assert seen == [tmp_path / "o" / "rose" / f"seed_{seed}" for seed in (3, 3, 4)]
-    assert Path.cwd() == tmp_path
-
-
 @pytest.mark.parametrize(
     "swept",
     [
@@ -250,10 +240,3 @@ def test_injected_objects_are_not_copied_and_partials_await_their_arguments() ->
     factory = instantiate({"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.5})
     optimizer = factory(torch.nn.Linear(2, 3).parameters())
     assert optimizer.param_groups[0]["lr"] == 0.5
-
-
-def test_dicts_and_lists_of_nodes_become_plain_containers() -> None:
-    node = {"_target_": "torch.nn.Linear", "in_features": 2, "out_features": 3}
-    made = instantiate(OmegaConf.create({"first": node, "rest": [node]}))
-    assert type(made) is dict and type(made["rest"]) is list
-    assert isinstance(made["rest"][0], torch.nn.Linear)

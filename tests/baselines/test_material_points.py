@@ -217,23 +217,6 @@ def test_a_modulus_means_the_same_in_both_methods() -> None:
         method.take_over(dreamer(velocity_resolution=10))
 
 
-def test_place_and_scale_of_the_scene_do_not_matter() -> None:
-    first, scene = dreamer(), toy_scene()
-    second = dreamer(replace(scene, means=0.1 * scene.means - 3))
-    with torch.no_grad():
-        a, b = (rolled(m, m.begin(0), 1)[0].inner[0] for m in (first, second))
-        torch.testing.assert_close(a, b, rtol=0, atol=2e-5)
-        torch.testing.assert_close(first.body(0).places, second.body(0).places, rtol=0, atol=1e-4)
-
-
-def test_notes_say_what_differs_and_what_was_found() -> None:
-    said = " ".join(dreamer().notes())
-    for part in ("without its diffusion prior", "12 cells per unit instead of 64", "768 substeps", "36 particles"):
-        assert part in said
-    assert f"{dreamer().substeps(0)} substeps per frame" in said and "began with 1e+05" in said
-    assert "does not identify" in gaussian().notes()[0] and "3e+04" in gaussian().notes()[1]
-
-
 @pytest.mark.parametrize(
     ("make", "options", "message"),
     [

@@ -114,15 +114,6 @@ def test_stiff_springs_get_more_substeps_and_too_stiff_ones_a_message() -> None:
             method.advance(method.begin(0))
 
 
-def test_sequences_share_what_is_the_objects_only() -> None:
-    method = swaying(springs())
-    state = method.advance(method.advance(method.begin(1)))
-    (state.positions - toy_scene().means).square().sum().backward()
-    assert method.velocity[0].grad is None and method.velocity[1].grad is not None
-    assert float(method.stiffness[0].grad.abs().sum()) > 0 and float(method.attenuation[0].grad.abs()) > 0
-    assert sorted(method.parameter_groups()) == ["attenuation", "damping", "stiffness", "velocity"]
-
-
 def test_constant_velocity_goes_on_for_ever() -> None:
     method = ConstantVelocity(scenes=[toy_scene()], fps=[24.0], scene_of_sequence=[0], seen=7, anchors=20)
     with torch.no_grad():

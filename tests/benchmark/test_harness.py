@@ -53,15 +53,6 @@ def test_time_is_told_by_part_and_functions_are_themselves_again() -> None:
     assert seconds["sleep"] >= 0.02 > seconds["options"] > 0 and Options.__init__ is own
 
 
-@pytest.mark.parametrize(
-    ("value", "unit", "shown"),
-    [(0.00123, "s", ("1.23", "ms")), (2.5e9, "FLOP/s", ("2.5", "GFLOP/s")), (41.26, "x", ("41.3", "x")),
-     (0.5, "1", ("0.5", "")), (23422, "kernels", ("23422", "kernels"))],
-)  # fmt: skip
-def test_figures_are_shown_with_three_digits(value: float, unit: str, shown: tuple[str, str]) -> None:
-    assert benchmark._readable(value, unit) == shown
-
-
 def test_json_is_one_object_on_stdout(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     case = types.ModuleType("gausim.benchmark.cluster")
     case.run = lambda options: [Row("2k kernels", "time", 0.5, "s"), Row("2k kernels", "ratio", 3.0, "x", "scipy")]

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import itertools
 import os
 
 import pytest
@@ -43,12 +42,6 @@ def test_every_figure_is_reported(first_call: bool, monkeypatch: pytest.MonkeyPa
     assert len(first) == 6 and "renderer, compiles" in first and "colours and covariances, cached" in first
 
 
-def test_one_core_has_no_rows_about_threads(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0}, raising=False)
-    assert render._threads(render.QUICK_CASES, QUICK) == []
-    assert "two threads are not measured" in capsys.readouterr().err
-
-
 def test_a_gpu_that_cannot_be_used_is_reported(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     monkeypatch.setattr(gsplat, "unavailable", lambda: "gsplat is not installed")
     assert render.run(Options(torch.device("cuda"), quick=True)) == []
@@ -68,15 +61,3 @@ def test_both_sides_of_every_ratio_compute_the_same() -> None:
         pair = (call(form, state) for form in (deformed_appearance.fast, deformed_appearance.plain))
         for value, truth in zip(*pair, strict=True):
             torch.testing.assert_close(value, truth, rtol=1e-4, atol=1e-5)
-
-
-def test_pixels_are_counted_as_by_hand() -> None:
-    """Every block of two rows of eight pixels evaluates the kernels that reach it, until its last pixel closes."""
-    bands = render.bands_of(splats(60, 40, 48))
-    evaluated = 0
-    for band in bands:
-        for tile, p in itertools.product(range(len(band.start) - 1), range(8)):
-            entries = band.entries[band.start[tile] : band.start[tile + 1]]
-            reaching = [packed for packed in entries if (packed >> 4) & 15 <= p <= packed & 15]
-            evaluated += 16 * len(reaching[: band.used[tile, p]])
-    assert render.evaluated(bands) == evaluated > 0

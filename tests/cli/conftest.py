@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from helpers import joint_runs
+from helpers.evaluations import make_quick
 from helpers.shared import Shared
 from helpers.sweeps import Sweeps
 from helpers.toy_runs import Trainings
@@ -35,6 +36,11 @@ def joint(toy: Path, other: Path, shared: Shared) -> Path:
 @pytest.fixture(scope="module")
 def do(trainings: Trainings, tmp_path_factory: pytest.TempPathFactory) -> Sweeps:
     return Sweeps(trainings, tmp_path_factory.mktemp("sweeps"))
+
+
+@pytest.fixture(autouse=True)
+def quick_evaluations(monkeypatch: pytest.MonkeyPatch) -> None:
+    make_quick(monkeypatch)
 
 
 @pytest.fixture

@@ -18,6 +18,8 @@ from gausim.data.dataset import SampleKey, SequenceSample
 from gausim.training.module import GausSimModule
 
 ABLATIONS = sorted(path.stem for path in (conf_dir() / "ablation").glob("*.yaml"))
+# The others take a second each; test_configs.py composes and builds all of them.
+QUICK = {"none", "no_mass", "no_momentum", "no_hierarchy", "no_network"}
 TINY = (
     "model.simulator.network.layers=1", "model.simulator.network.hidden=8", LEVELS, "render=reference",
     "data.curriculum.t_max=3", "data.batch_size=2", "seed=1", "loss.explosion=1000",
@@ -61,8 +63,9 @@ def step_of(module: GausSimModule):
 
 @pytest.mark.parametrize(
     ("ablation", "model"),
-    [*((a, "gausim") for a in ABLATIONS), ("none", "gausim_paper"), ("no_network", "gausim_paper")],
-)
+    [*(pytest.param(a, "gausim", marks=[pytest.mark.slow] * (a not in QUICK)) for a in ABLATIONS),
+     ("none", "gausim_paper"), ("no_network", "gausim_paper")],
+)  # fmt: skip
 def test_every_ablation_can_be_trained(toy: Path, ablation: str, model: str) -> None:
     module, samples = fresh(toy, ablation, model)
     start = {n: p.detach().clone() for n, p in module.named_parameters()}

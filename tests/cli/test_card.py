@@ -97,14 +97,6 @@ def test_limitations_are_those_of_the_figures(run: Path) -> None:
         assert sentence in said, sentence
 
 
-def test_long_rollouts_are_told_where_they_were_measured(run: Path) -> None:
-    told = {"toy": {"free": {"window": 20, "energy": [1.0] * 50, "growth": 0.5, "late": 0.001}}}
-    (run / "evaluation" / "endurance.json").write_text(json.dumps(told))
-    text = written(run)
-    assert "toy, free for 1000 frames: its highest energy later is 0.50 of" in section(text, "Figures")
-    assert "--endurance" not in section(text, "Limitations")
-
-
 def test_what_is_missing_is_named_with_the_command_that_makes_it(run: Path, tmp_path: Path) -> None:
     (run / "evaluation" / "metrics.json").unlink()
     (run / "FINISHED").unlink()

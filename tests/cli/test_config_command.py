@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import inspect
 import json
-import pkgutil
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,6 @@ from omegaconf import OmegaConf
 from gausim.cli.main import main
 from gausim.compose import validate as _validate
 from gausim.compose.config import compose
-from gausim.compose.places import read_places
 from gausim.compose.root import conf_dir
 from gausim.compose.schema import training_schema
 from gausim.core import ConfigError
@@ -66,27 +63,6 @@ def test_the_schema_refuses_what_is_wrong(key: str, value: Any, told: str, schem
     node[last] = value
     (found,) = violations(schema, config)
     assert found.startswith(f"{told if told == '$' else f'$.{told}'}: ")
-
-
-def test_keys_without_a_target_are_those_of_any(schema) -> None:
-    def change(**keys: Any) -> list[str]:
-        return violations(schema, {"model": {"method": keys}})
-
-    assert change(anchors=3, particles=9) == []  # of the springs, and of PhysDreamer
-    assert len(change(ankers=3)) == 1
-
-
-def test_arguments_are_those_of_the_signatures(schema) -> None:
-    place = read_places().children["model"].children["simulator"]
-    (target,) = place.targets
-    offered = {*schema["definitions"]["model.simulator"]["else"]["properties"]}
-    arguments = {*inspect.signature(pkgutil.resolve_name(target)).parameters}
-    assert arguments - offered == {"scenes", "fps"}  # training gives it these
-    assert offered - arguments == {"_target_", "_partial_", "_recursive_", "_convert_", "_args_"}
-    levels = schema["definitions"]["model.simulator.hierarchy"]["else"]["properties"]["levels"]
-    assert "fractions of the object's diagonal" in levels["description"]
-    assert levels["else"] == {"type": "array", "items": levels["else"]["items"]}
-    assert "of every random generator" in schema["properties"]["seed"]["description"]
 
 
 def test_the_schema_is_printed(capsys, schema, monkeypatch) -> None:
@@ -172,11 +148,6 @@ def test_a_saved_configuration(once, tmp_path, capsys) -> None:
         "data.curriculum.tmax: unknown key of gausim.data.curriculum.Curriculum. Did you mean 't_max'?",
         "optimiser: unknown key. Did you mean 'optimizer'?",
     ]
-
-
-def test_contradictions_are_the_constructors_own(once, capsys) -> None:
-    assert main(["config", "validate", "data.curriculum.t_start=20"]) == 1
-    assert "t_start" in capsys.readouterr().out
 
 
 def test_all_targets_that_may_not_be_built_are_named(once, tmp_path) -> None:

@@ -10,7 +10,7 @@ import torch
 from gausim.core import ConfigError, DataError
 from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
-from gausim.data.dataset import SampleKey, SequenceIndex, collate
+from gausim.data.dataset import SampleKey, SequenceIndex
 from gausim.data.objects import ObjectData
 from gausim.data.sampler import SequenceBatchSampler
 from gausim.training.ranks.ranks import interleave
@@ -67,13 +67,6 @@ def test_what_a_loader_fetched_ahead_is_not_counted_as_trained(blob: Path) -> No
     assert [batch[0].sequence_id for batch in resumed.train_dataloader()][:2] == seen[2:]
 
 
-def test_a_loader_leaves_the_global_generator_alone(blob: Path) -> None:
-    data = ReadyDataModule(blob)
-    before = torch.get_rng_state()
-    list(data.train_dataloader())
-    assert torch.equal(torch.get_rng_state(), before)
-
-
 def test_curriculum_beyond_the_training_frames_is_refused(blob: Path) -> None:
     data = ReadyDataModule(blob, curriculum=Curriculum(t_max=16))
     with pytest.raises(ConfigError, match=r"16 steps would see frame 16, .*at most 15"):
@@ -89,12 +82,6 @@ def test_epoch_shows_every_sequence_equally_often_and_never_twice_in_a_batch() -
         assert sorted(k.sequence for b in batches for k in b) == sorted(list(range(5)) * 3)
         assert all(len({k.sequence for k in b}) == len(b) for b in batches)
         assert {k.steps for b in batches for k in b} == {Curriculum().steps(epoch)}
-
-
-def test_order_follows_from_seed_and_epoch() -> None:
-    assert sampler().order(3) == sampler().order(3)
-    orders = [tuple(sampler(seed=s).order(e)) for s in (4, 5) for e in (0, 1, 2)]
-    assert len(set(orders)) == 6
 
 
 @pytest.mark.parametrize("done", [0, 3, 8])
@@ -144,12 +131,6 @@ def test_samples_of_several_objects_are_numbered_through(two_objects: Path) -> N
         4: (1, "pear", "seq_002", 1),
     }
     assert all(s.frames.dtype == torch.uint8 and s.frames.shape == (2, 2, 6, 8, 4) for s in batch)
-
-
-def test_collate_refuses_mixed_lengths(blob: Path) -> None:
-    dataset = SequenceIndex([ObjectData(blob)])
-    with pytest.raises(ConfigError, match="one number of steps"):
-        collate([dataset[SampleKey(0, 2)], dataset[SampleKey(1, 3)]])
 
 
 def test_roots_that_are_not_there(two_objects: Path, tmp_path: Path) -> None:

@@ -115,14 +115,6 @@ def test_wrong_images(spoilt: Path, tiny: SimpleNamespace) -> None:
             record.frames(range(frame, frame + 1), ["cam_0"])
 
 
-def test_frames_and_views_out_of_range(blob: Path) -> None:
-    record = ObjectData(blob).sequences[0]
-    with pytest.raises(DataError, match=r"frames 0..19"):
-        record.frames(range(FRAMES + 1), None)
-    with pytest.raises(DataError, match=r"no view \['cam_9'\]"):
-        record.frames(range(2), ["cam_9"])
-
-
 @pytest.mark.parametrize(
     ("field", "value", "message"),
     [
@@ -178,12 +170,6 @@ def test_selections_replace_masks(blob: Path) -> None:
     assert torch.equal(scene.pinned, means[:, 2] < height) and scene.pinned.any()
     with pytest.raises(ConfigError, match="no such mask"):
         ObjectData(blob, selections={"pined": "z=0.5"}).scene()
-
-
-def test_missing_scene_names_the_remedy(spoilt: Path) -> None:
-    (spoilt / "scene.ply").unlink()
-    with pytest.raises(DataError, match="gausim reconstruct"):
-        ObjectData(spoilt).scene()
 
 
 def test_bunny(data_root: Path) -> None:

@@ -105,16 +105,6 @@ def test_an_error_comes_where_it_happened_and_threads_end() -> None:
     assert threading.active_count() == before
 
 
-def test_an_epoch_that_is_left_does_not_move_the_next(mixed: Path) -> None:
-    data = stream(mixed, prefetch=3, repeats=4)
-    expected = epoch(stream(mixed, prefetch=0, repeats=4), 1)
-    loader = data.train_dataloader()
-    left = iter(loader)
-    next(left)
-    loader.batch_sampler.set_epoch(1)  # type: ignore[union-attr]
-    assert [[s.sequence_id for s in b] for b in loader] == [[i for i, _ in b] for b in expected]
-
-
 def test_memory_is_bounded_by_the_batches_in_flight(tmp_path: Path, tiny: SimpleNamespace) -> None:
     """A packed set of ten batches: over three epochs no more than the batches in flight are in memory."""
     root = tiny.object(tmp_path / "large", sequences=1)

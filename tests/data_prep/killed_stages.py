@@ -1,7 +1,8 @@
 """Runs stages in forked children, so that one start of Python serves many, and has them die.
 
 A program, not a test: it reads one JSON object per line (stage, argv, die) and answers with the child's exit status
-(negative: the signal), its output, and how many places it passed. Places are where a stage writes, renames or removes.
+(negative: the signal), its output, and how many places it passed. Places are where a stage writes, renames or removes
+beside its result; what numba keeps in its cache on the way, once, is no such place.
 """
 
 from __future__ import annotations
@@ -29,13 +30,16 @@ STAGES = ("ingest", "poses", "segment", "reconstruct", "select", "assemble", "pa
 PLACES = ((os, "replace"), (os, "fsync"), (Path, "unlink"), (shutil, "rmtree"))
 
 
-def count_places(die: int | None, told: int) -> None:
-    """Numbers the calls of what changes the disk, and ends the process before the one called ``die``."""
+def count_places(die: int | None, told: int, folder: Path) -> None:
+    """Numbers the calls of what changes the disk below a folder, and ends the process before the one called ``die``."""
     passed = 0
 
     def wrapped(original: Callable[..., Any]) -> Callable[..., Any]:
         def called(*args: Any, **kwargs: Any) -> Any:
             nonlocal passed
+            place = os.readlink(f"/proc/self/fd/{args[0]}") if isinstance(args[0], int) else str(args[0])
+            if not Path(place).is_relative_to(folder):
+                return original(*args, **kwargs)
             if passed == die:
                 os.kill(os.getpid(), signal.SIGKILL)
             passed += 1
@@ -57,7 +61,8 @@ def answer(order: dict[str, Any]) -> dict[str, Any]:
             os.dup2(log.fileno(), 2)
             torch.set_num_threads(1)
             cv2.setNumThreads(1)
-            count_places(order.get("die"), told.fileno())
+            out = Path(order["argv"][order["argv"].index("--out") + 1])
+            count_places(order.get("die"), told.fileno(), out.parent)
             status = 1
             try:
                 status = importlib.import_module(f"data_prep.{order['stage'].partition('-')[0]}").main(order["argv"])

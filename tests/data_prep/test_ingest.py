@@ -17,7 +17,7 @@ import pytest
 from helpers.timecodes import label_of_frame
 
 from data_prep.capture.films.film import probe
-from data_prep.capture.films.sync import align, measure
+from data_prep.capture.films.sync import measure
 from data_prep.capture.films.takes import find_takes, offset_seconds
 from data_prep.common.photos import natural
 from data_prep.ingest import IngestOptions, ingest, main
@@ -312,14 +312,6 @@ def test_missing_frames_leave_a_residual_and_are_refused(
     assert found["results"]["sequences"]["seq_000"]["frames"] == 8  # before the gap all is well
 
 
-def test_cameras_whose_measurements_disagree_are_refused(pair: Path) -> None:
-    films = {name: probe(path) for name, path in find_takes(pair)[0].films.items()}
-    good = measure(films, "offsets", given={"cam_1": 0.0})
-    apart = type(good)("audio", good.seconds, {"cam_0": 0.0, "cam_1": 0.03}, good.resolution)
-    with pytest.raises(DataError, match=r"cam_1 \(side_1.mp4\).*disagree by 0.75 frames"):
-        align(films, apart)
-
-
 def test_turned_cameras_come_out_upright(tmp_path: Path) -> None:
     """The display matrix of a phone held upright is applied, not only read."""
     camera = Camera(0.1, Fraction(25), 6, audio=None, turned=90, crf="10")
@@ -346,13 +338,6 @@ def test_broken_films_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[st
     film.write_bytes(FAULTS[fault](film.read_bytes()))
     message = refused(capsys, tmp_path / "in", tmp_path / "out")
     assert f"bad{suffix}: " in message and ("empty (0 bytes)" in message) == (fault == "empty")
-
-
-def test_sound_without_pictures_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "in").mkdir()
-    with av.open(str(tmp_path / "in" / "a.mp4"), "w") as film:
-        _hush(film, film.add_stream("aac", rate=RATE, layout="mono"))
-    assert "a.mp4: holds no video stream" in refused(capsys, tmp_path / "in", tmp_path / "out")
 
 
 # ---- which films, and starting again

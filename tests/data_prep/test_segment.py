@@ -234,18 +234,6 @@ def test_files_that_are_no_networks_are_named(tmp_path: Path) -> None:
         OnnxSegmenter(tmp_path / "none.onnx")
 
 
-@pytest.mark.slow
-def test_a_real_network_on_a_real_film(data_root: Path, tmp_path: Path) -> None:
-    pytest.importorskip("onnxruntime")
-    weights, clip = data_root / "weights" / "isnet_quint8.onnx", data_root / "real_dynamic" / "hat_0_real.mp4"
-    if not weights.is_file() or not clip.is_file():
-        pytest.skip("GAUSIM_TEST_DATA has no weights/isnet_quint8.onnx or real_dynamic/hat_0_real.mp4")
-    options = ["--backend", "onnx", "--onnx", str(weights), "--every", "100"]
-    assert main([str(clip), "--out", str(tmp_path / "out"), *options]) == 0
-    found = read_manifest(tmp_path / "out")["results"]["clips"]["hat_0_real"]
-    assert found["pictures"] == 2 and 0.05 < found["coverage"]["mean"] < 0.6
-
-
 # ---- SAM 2
 
 
@@ -387,15 +375,6 @@ def test_edges_follow_the_picture() -> None:
     assert set(np.unique(cleaned(square(19, 19, 22), rgb, UNTOUCHED, soft=False))) == {0, 255}
 
 
-def test_faint_guesses_beside_the_object_go() -> None:
-    """Alpha above 0 is foreground, so a network's doubts about the rest of the picture must not be kept."""
-    mask = square(20, 20, 20)
-    mask[20:40, 40:58] = 0.3
-    alpha = cleaned(mask, np.zeros((60, 60, 3), np.uint8), Cleanup(reach=0.05), soft=True)
-    assert (alpha[20:40, 40:43] > 0).all() and alpha[:, 43:].max() == 0
-    assert cleaned(mask, np.zeros((60, 60, 3), np.uint8), Cleanup(reach=0.0), soft=True)[30, 57] > 0
-
-
 # ---- what is broken, and starting again
 
 
@@ -423,17 +402,6 @@ def test_unclear_inputs_are_refused(tmp_path: Path, capsys: Any) -> None:
         assert main([str(tmp_path / "in"), *command, option, value]) == 2 and option in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main([str(tmp_path / "in"), *command, "--key", "12345"])
-
-
-def test_pictures_of_all_kinds_are_read(tmp_path: Path) -> None:
-    grey = np.arange(12, dtype=np.uint8).reshape(3, 4) * 20
-    assert cv2.imwrite(str(tmp_path / "grey.png"), grey)
-    assert np.array_equal(read_picture(tmp_path / "grey.png")[..., 0], grey)
-    assert cv2.imwrite(str(tmp_path / "deep.png"), np.dstack([grey] * 3).astype(np.uint16) * 257)
-    assert np.array_equal(read_picture(tmp_path / "deep.png")[..., 2], grey)
-    assert cv2.imwrite(str(tmp_path / "float.tiff"), grey.astype(np.float32))
-    with pytest.raises(DataError, match=r"float.tiff: expected 8 or 16 bit"):
-        read_picture(tmp_path / "float.tiff")
 
 
 def test_clips_are_found_in_natural_order(tmp_path: Path) -> None:

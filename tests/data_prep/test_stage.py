@@ -35,11 +35,6 @@ def test_result_carries_what_it_was_made_of(stage: Stage, tmp_path: Path) -> Non
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["a.txt", MANIFEST]
 
 
-def test_the_same_again_is_left_alone(stage: Stage, tmp_path: Path) -> None:
-    run_stage(stage, tmp_path / "out", make)
-    assert run_stage(stage, tmp_path / "out", lambda work: pytest.fail("made again"))["made"] is False
-
-
 @pytest.mark.parametrize("change", ["input", "setting", "revision"])
 def test_another_result_is_replaced_only_by_force(stage: Stage, tmp_path: Path, change: str) -> None:
     run_stage(stage, tmp_path / "out", make)

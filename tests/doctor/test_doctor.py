@@ -12,7 +12,6 @@ import pytest
 from helpers import mistakes
 
 from gausim.cli.main import main
-from gausim.doctor.coverage import seen_angle
 
 MISTAKES = mistakes.MISTAKES
 
@@ -220,23 +219,6 @@ def test_no_mistake_goes_untested() -> None:
 def test_a_folder_within_an_object_is_sent_to_the_object(swaying: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", str(swaying / "sequences")]) == 2
     assert f"part of the one in {swaying}" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_the_size_of_a_move_is_measured(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    mistakes.moved_camera(spoilt, view=2, degrees=3.0)
-    _, entry = told(spoilt, capsys)
-    finding = found(entry)["calibration"]
-    assert "cam_2 is off by about 3.0 degrees" in finding["what"]
-    pixels = finding["measured"]["pixels"]
-    assert max(pixels, key=pixels.get) == "cam_2" and max(p for v, p in pixels.items() if v != "cam_2") < 0.2
-
-
-def test_opposite_views_see_depth_no_better_than_equal_ones() -> None:
-    a, b = np.array([1.0, 0, 0]), np.array([np.cos(0.1), np.sin(0.1), 0])
-    assert seen_angle(np.stack((a, b))) == pytest.approx(np.degrees(0.1), rel=1e-3)
-    assert seen_angle(np.stack((a, -b))) == pytest.approx(np.degrees(0.1), rel=1e-3)
-    assert seen_angle(np.stack((a, np.array([0.0, 1, 0])))) == pytest.approx(90)
 
 
 @pytest.mark.slow

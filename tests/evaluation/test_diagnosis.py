@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from gausim.metrics.level_error import level_error
 from gausim.report.gather.diagnosis import read_diagnosis
 from gausim.report.pictures.motion import diagnosis_figure, diagnosis_plot
 from gausim.results.curves import TRUTH
@@ -74,21 +73,6 @@ def test_errors_are_told_by_level() -> None:
     found = read_diagnosis({"diagnosis": diagnosis.summary(), "splits": {"seen": [0, 16]}})
     assert found is not None and found.rows["a"].level_errors[0] > 1e3 * found.rows["a"].level_errors[-1]
     assert found.rows["flat"].level_errors == []
-
-
-def test_level_errors_leave_out_points_of_no_unit() -> None:
-    truth, rest = torch.zeros(2, 4, 3), torch.zeros(4, 3)
-    truth[:, :, 0] = torch.tensor([1.0, 2.0, 3.0, 50.0])
-    error, still = level_error(rest.expand_as(truth), truth, rest, torch.tensor([7, 7, 2, -1]))
-    assert error.tolist() == pytest.approx([(1.5 + 3) / 2] * 2) and still.tolist() == error.tolist()
-
-
-def test_without_motion_there_is_nothing_to_say() -> None:
-    diagnosis = Diagnosis(FPS)
-    assert diagnosis.summary() is None
-    still = REST.expand(FRAMES, -1, -1)
-    diagnosis.add(still, REST, {"a": motion(2.0, 0.1)})
-    assert diagnosis.summary() is None
 
 
 def test_pictures_are_drawn_and_damaged_entries_are_not(tmp_path: Path) -> None:

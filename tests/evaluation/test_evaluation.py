@@ -6,27 +6,23 @@ import numpy as np
 import pytest
 import torch
 from helpers import toy_object
+from helpers.evaluations import make_quick
 
 from gausim.baselines.static import StaticDynamics
 from gausim.core import DataError, RunError, SimState, Trajectory
 from gausim.data.objects import ObjectData
-from gausim.evaluation import evaluation
 from gausim.evaluation.evaluation import evaluate_object, write_evaluation
 from gausim.render.reference import ReferenceRenderer
 from gausim.results.curves import load_curves
 from gausim.results.summary import load_summary, summarise
-from gausim.runs import cost
-from gausim.training.supervision.points import attach_points
 
 LINEAR = "linear AR(2) on true states, 8 modes"
 
 
 @pytest.fixture(scope="module", autouse=True)
-def without_what_takes_long():
-    """FLIP takes half of an evaluation, and collecting garbage before the memory is counted most of a prediction."""
+def quick_evaluations():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(evaluation, "flip_is_installed", lambda: False)
-        patch.setattr(cost, "_begin", lambda cuda: None)
+        make_quick(patch)
         yield
 
 
@@ -104,14 +100,6 @@ def test_floor_is_frame_0_of_the_training_views(evaluated):
     assert floor["l2"]["mean"] < 0.003 and floor["psnr"]["mean"] > 50
 
 
-def test_contrast_comes_from_the_true_foreground(evaluated, toy):
-    images = torch.cat([toy_object.rgba(toy.scene, toy.truth(n)) for n in toy.amplitudes]).float() / 255
-    alpha = images[..., 3]
-    expected = (images[..., :3] * alpha[..., None])[alpha > 0].mean(0)
-    assert evaluated.facts.mean_color == pytest.approx(tuple(expected.tolist()), abs=1e-4)
-    assert 0 < evaluated.facts.max_l2 < 0.05  # of the first method, the oracle
-
-
 def test_files_follow_the_schema(evaluated, tmp_path):
     written = write_evaluation(tmp_path / "evaluation", [evaluated], {"name": "toy run"})
     summary = load_summary(tmp_path / "evaluation" / "metrics.json")
@@ -159,8 +147,3 @@ def test_unusable_predictions_are_named(toy):
         evaluate_object(data, toy.scene, {"short": short}, ReferenceRenderer())
     with pytest.raises(RunError, match="broken, seq_000: the prediction is not finite from frame 7"):
         evaluate_object(data, toy.scene, {"broken": broken}, ReferenceRenderer())
-
-
-def test_points_follow_the_nearest_simulated_kernel(toy):
-    points = toy.scene.means[[5, 9, 30]] + 0.01
-    assert attach_points(toy.scene, points).tolist() == [5, 9, 30]

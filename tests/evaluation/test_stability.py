@@ -46,11 +46,11 @@ def test_it_is_the_growth_of_a_small_motion(monkeypatch: pytest.MonkeyPatch) -> 
     state = SimState(batch.rest, batch.rest + 1e-4 * torch.randn(batch.rest.shape))
     logs, small = [], 1e-4
     with torch.no_grad():
-        for _ in range(300):
+        for _ in range(160):
             after = model.step(batch, state).positions
             factor = small / float(torch.stack((after - batch.rest, state.positions - batch.rest)).abs().max())
             state = SimState(
                 batch.rest + factor * (after - batch.rest), batch.rest + factor * (state.positions - batch.rest)
             )
             logs.append(-torch.tensor(factor).log())
-    assert float(torch.stack(logs[100:]).mean().exp()) == pytest.approx(found, abs=5e-3)
+    assert float(torch.stack(logs[60:]).mean().exp()) == pytest.approx(found, abs=5e-3)

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from gausim.core import ConfigError, DataError
+from gausim.core import DataError
 from gausim.interaction import session as sessions
-from gausim.interaction.selections import Ball, Kernels, Unit, Whole, parse_kernels
+from gausim.interaction.selections import Ball, Kernels, Unit, Whole
 from gausim.interaction.session import (
     Entry,
     Force,
@@ -132,14 +132,3 @@ def test_files_that_cannot_be_read(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(sessions, "MOST_BYTES", 100)
     with pytest.raises(DataError, match="got [0-9]+ bytes"):
         load_session(tmp_path / "s.json")
-
-
-def test_too_many_events_are_refused() -> None:
-    with pytest.raises(ConfigError, match="field 'events': expected at most 200000, got 200001"):
-        ForceSession(MADE, 24.0, 20, (Entry(0, Reset()),) * 200_001, 9.81)
-
-
-def test_kernels_as_ranges() -> None:
-    assert parse_kernels(" 4, 0 - 2,9").numbers == (0, 1, 2, 4, 9)
-    with pytest.raises(ConfigError, match="field 'numbers': expected list of length >= 1"):
-        Kernels(())

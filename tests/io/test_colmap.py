@@ -13,7 +13,7 @@ import pytest
 from helpers import colmap_files
 
 from gausim.core import DataError
-from gausim.io.colmap import ColmapCamera, find_colmap, read_colmap
+from gausim.io.colmap import find_colmap, read_colmap
 
 WRITERS: dict[str, Callable] = {"binary": colmap_files.write_binary, "text": colmap_files.write_text}
 
@@ -61,15 +61,6 @@ def test_every_lens_model_is_read_with_its_intrinsics(tmp_path: Path) -> None:
             k = theirs[number].calibration_matrix()
             np.testing.assert_allclose((k[0, 0], k[1, 1], k[0, 2], k[1, 2]), camera.intrinsics)
             assert camera.distorted is not camera.model.endswith("PINHOLE")
-
-
-def test_a_scaled_camera_sees_the_same_directions() -> None:
-    camera = ColmapCamera("OPENCV", 640, 480, np.array([500.0, 510, 320, 240, 0.1, 0, 0, 0]))
-    half = camera.scaled(0.5, 0.5)
-    assert (half.width, half.height) == (320, 240)
-    assert half.params.tolist() == [250, 255, 160, 120, 0.1, 0, 0, 0]
-    with pytest.raises(DataError, match="cannot be scaled"):
-        ColmapCamera("SIMPLE_PINHOLE", 640, 480, np.array([500.0, 320, 240])).scaled(0.5, 0.8)
 
 
 def test_the_model_is_found_where_colmap_puts_it(tmp_path: Path) -> None:

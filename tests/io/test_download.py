@@ -8,7 +8,7 @@ from helpers.local_server import serving
 
 from gausim.core import FetchError
 from gausim.io import download
-from gausim.io.download import continue_download, read_text
+from gausim.io.download import continue_download
 
 DATA = random.Random(0).randbytes(700_000)
 
@@ -85,13 +85,3 @@ def test_nobody_there_names_the_mirror_as_a_way_out(mirror, tmp_path):
         bring(f"{server.url}/x.tar", tmp_path / "part")
     with pytest.raises(FetchError, match=r"nowhere.tar: cannot be read \(.*No such file.*Check that the file is there"):
         bring(str(mirror / "nowhere.tar"), tmp_path / "part")
-
-
-def test_texts_are_short_and_utf8(mirror):
-    (mirror / "a.toml").write_text("schema = 'ä'")
-    with serving(mirror) as server:
-        assert read_text(f"{server.url}/a.toml", most_bytes=100) == "schema = 'ä'"
-        with pytest.raises(FetchError, match="at most 100 bytes"):
-            read_text(f"{server.url}/x.tar", most_bytes=100)
-    with pytest.raises(FetchError, match="UTF-8"):
-        read_text(str(mirror / "x.tar"), most_bytes=len(DATA))

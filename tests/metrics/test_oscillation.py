@@ -3,14 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gausim.metrics.oscillation import (
-    coordinates,
-    oscillation,
-    phase_error,
-    principal_motions,
-    spectrum,
-    velocity_cosine,
-)
+from gausim.metrics.oscillation import coordinates, oscillation, phase_error, principal_motions, spectrum
 
 FPS = 24.0
 
@@ -71,13 +64,3 @@ def test_phase_error_is_the_angle_weighted_by_amplitudes() -> None:
     rng = np.random.default_rng(1)
     noise = [rng.normal(size=(frames, 20)) for _ in range(2)]
     assert np.mean(phase_error([noise[0]], [noise[1]])) == pytest.approx(180 / np.sqrt(3), rel=0.05)
-
-
-def test_velocity_cosine() -> None:
-    rng = np.random.default_rng(2)
-    motion = rng.normal(size=(3, 5, 3))
-    turned = motion.copy()
-    turned[1] = motion[0] - 2 * (motion[1] - motion[0])
-    assert velocity_cosine(motion, motion) == pytest.approx(1)
-    assert velocity_cosine(turned, motion) == pytest.approx(-1)
-    assert np.isnan(velocity_cosine(np.zeros((3, 5, 3)), motion))

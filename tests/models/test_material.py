@@ -15,7 +15,6 @@ from helpers.simulators import silence
 from gausim.core import SimState
 from gausim.evaluation.stability import _LinearStep
 from gausim.models.hierarchy.clusters import build_hierarchy
-from gausim.models.step.body_frame import body_axes
 from gausim.models.template.material import DAMPING_GAIN, MaterialTemplate
 from gausim.models.template.solid import solid_body
 from gausim.ops.quaternion import quaternion_to_matrix
@@ -88,12 +87,6 @@ def test_half_the_frame_rate_is_the_same_body(hierarchy) -> None:
     torch.testing.assert_close(slow.stiffness, 4 * fast.stiffness)
     torch.testing.assert_close(slow.damping, 2 * fast.damping)
     torch.testing.assert_close(slow.inertia, fast.inertia)
-
-
-def test_no_attributes_are_a_body_of_one_material(hierarchy) -> None:
-    template = _template(hierarchy)
-    units, links = template.decode(template.body(0), torch.zeros(hierarchy.levels[1].count, 3, dtype=torch.float64))
-    assert units.abs().max() < 1e-12 and links.std(0).max() < 0.5  # links still differ by their length
 
 
 @pytest.fixture
@@ -198,13 +191,6 @@ def test_a_turned_and_moved_scene_moves_likewise(neural, framed: bool) -> None:
         torch.testing.assert_close(there_own, own, atol=1e-6, rtol=0)
 
 
-def test_the_body_s_axes_turn_with_it() -> None:
-    axes = body_axes(make_scene(90, dtype=torch.float64))
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(axes) == pytest.approx(1.0)
-    assert axes[0, 2] > 0.9  # from the pinned foot upwards
-
-
 def test_everything_of_the_model_learns(neural) -> None:
     model = neural()
     batch, state = model.batch((0,)), make_state(model.scenes[0])
@@ -227,17 +213,6 @@ def test_millimetres_move_like_metres() -> None:
     there = other.step(other.batch((0,)), SimState(1000 * state.positions, 1000 * state.previous))
     torch.testing.assert_close(there.positions / 1000, step.positions, atol=1e-7, rtol=0)
     torch.testing.assert_close(there.momentum, step.momentum, rtol=1e-4, atol=1e-12)
-
-
-def test_scenes_share_everything_but_densities_and_attributes() -> None:
-    model = make_model([make_scene(90), make_scene(80, seed=3)], **NEURAL)
-    names = [n for n, _ in model.named_parameters()]
-    shared = tuple(f"{name}." for name in model.shared())
-    own = [n for n in names if n.startswith(model.own(0) + model.own(1))]
-    assert sorted(own) == ["attributes.0", "attributes.1", "log_density.0", "log_density.1"]
-    assert all(n.startswith(shared) for n in names if n not in own)
-    model.freeze()
-    assert sorted(n for n, p in model.named_parameters() if p.requires_grad) == sorted(own)
 
 
 def test_the_network_reads_only_what_the_modes_carry(neural) -> None:

@@ -43,18 +43,6 @@ def test_energy_grows_without_the_guard_and_not_with_it() -> None:
     assert min(kept[-FRAMES:]) > 0
 
 
-def test_what_adds_no_energy_is_not_touched() -> None:
-    scene = make_scene()
-    state = SimState(scene.means, make_state(scene).positions)
-    free, guarded = (
-        SceneDynamics(_model(scene, frames=frames, scale=0.0)).rollout(state, 40) for frames in (0, FRAMES)
-    )
-    assert torch.equal(free.positions, guarded.positions) and torch.equal(
-        free.deformation_gradients, guarded.deformation_gradients
-    )
-    assert float((free.positions - scene.means).norm(dim=-1).max()) > 1e-4
-
-
 def test_a_push_raises_the_limit_by_its_work() -> None:
     scene = make_scene()
     model = _model(scene, scale=0.0)

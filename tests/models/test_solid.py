@@ -6,12 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-import torch
-from helpers.bodies import make_scene
 
-from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.template import solid
-from gausim.models.template.elastic import ElasticTemplate
 
 
 def _shell(size: tuple[float, float, float], step: float) -> np.ndarray:
@@ -38,15 +34,6 @@ def test_splines_reproduce_linear_fields_and_their_gradients(grid: solid.Grid) -
     np.testing.assert_allclose(np.einsum("pk,pkc->pc", weights, field[nodes]), points @ slope, atol=1e-11)
     found = np.einsum("pkb,pkc->pbc", gradients, field[nodes])
     np.testing.assert_allclose(found, np.broadcast_to(slope, found.shape), atol=1e-11)
-
-
-def test_spline_gradients_are_derivatives_of_the_weights(grid: solid.Grid) -> None:
-    point = grid.origin + 0.25 * np.array([[3.3, 4.2, 5.8]])
-    _, _, gradients = grid.splines(point)
-    for axis in range(3):
-        step = 1e-6 * np.eye(3)[axis]
-        difference = (grid.splines(point + step)[1] - grid.splines(point - step)[1]) / 2e-6
-        np.testing.assert_allclose(gradients[..., axis], difference, atol=1e-6)
 
 
 def test_the_inside_of_a_closed_shell_is_body_and_a_sheet_stays_a_sheet() -> None:
@@ -128,14 +115,6 @@ def test_gradients_of_modes_are_those_of_the_field() -> None:
     for axis in range(3):
         difference = (phi[1 + 2 * axis] - phi[2 + 2 * axis]) / 2e-4
         np.testing.assert_allclose(slopes[0, :, axis], difference, atol=1e-4 * np.abs(slopes[0]).max())
-
-
-def test_the_template_carries_solid_modes() -> None:
-    hierarchy = build_hierarchy(make_scene(120), radii=(0.2, 0.5))
-    own = ElasticTemplate([hierarchy], 1, modes=9, solid=0.15).scene(0)
-    z = torch.randn(4, 9)
-    moved = torch.einsum("sm,ndm->snd", z, own.modes)
-    torch.testing.assert_close(moved.flatten(1) @ own.projection.flatten(0, 1), z, atol=1e-3, rtol=1e-3)
 
 
 def test_parts_that_nothing_holds_still_have_orthonormal_modes() -> None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 
-from gausim.io.ply import load_scene
 from gausim.ops import clustering
 from gausim.ops.clustering import agglomerative_clusters, complete_linkage_clusters
 
@@ -46,13 +43,6 @@ def test_groups_keep_the_bound_and_about_as_many_clusters(monkeypatch, points, d
     assert _count(labels) == pytest.approx(_count(complete_linkage_clusters(points, diameter)), rel=0.25)
 
 
-def test_even_the_coarsest_groups_need_not_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    points = _cube(400)
-    monkeypatch.setattr(clustering, "MAX_PAIRS", 1)
-    labels = agglomerative_clusters(points, 0.3)
-    assert 1 < _count(labels) < 200 and _widest(points, labels) <= 0.3 * (1 + 1e-12)
-
-
 def test_a_grid_full_of_ties_keeps_the_bound_and_the_equivariance() -> None:
     points = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), -1).reshape(-1, 3)
     labels = agglomerative_clusters(points, 2.0)
@@ -70,15 +60,3 @@ def test_points_on_a_line_and_clumps_that_coincide(monkeypatch: pytest.MonkeyPat
     assert (np.diff(labels) >= 0).all()  # intervals, numbered along the line
     clumps = np.repeat(_cube(5) * 10, 300, axis=0)
     assert np.array_equal(agglomerative_clusters(clumps, 0.1)[::300], np.argsort(np.argsort(clumps[::300, 0])))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fraction", [0.04, 0.13, 0.4])
-def test_counts_on_a_captured_scene(data_root: Path, fraction: float) -> None:
-    scene = load_scene(data_root / "splats" / "playbot_lod3.ply")
-    every = scene.means.double().numpy()
-    diameter = fraction * scene.diagonal
-    some = every[np.random.default_rng(0).permutation(len(every))[:8_000]]
-    labels = agglomerative_clusters(some, diameter)
-    assert _count(labels) == pytest.approx(_count(complete_linkage_clusters(some, diameter)), rel=0.25)
-    assert _widest(some, labels) <= diameter * (1 + 1e-12)

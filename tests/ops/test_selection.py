@@ -10,14 +10,7 @@ import torch
 
 from gausim.core.errors import SceneError
 from gausim.core.scene import GaussianScene
-from gausim.ops.selection import (
-    Box,
-    HalfSpace,
-    NearPoints,
-    apply_masks,
-    parse_half_space,
-    require_pinned,
-)
+from gausim.ops.selection import HalfSpace, NearPoints, apply_masks, parse_half_space, require_pinned
 
 
 @pytest.fixture
@@ -44,10 +37,6 @@ def test_half_spaces(scene: GaussianScene) -> None:
     assert selected(HalfSpace(2, below=0.5, above=0.1)(scene)) == [1, 2]
     assert selected(parse_half_space("y=1.5")(scene)) == [0, 1]
     assert selected(parse_half_space(" y = 1.5 ", above=True)(scene)) == [2, 3]
-
-
-def test_box_includes_its_border(scene: GaussianScene) -> None:
-    assert selected(Box((0, 0, 0), (1, 1, 0.2))(scene)) == [0, 1]
 
 
 def test_near_points(scene: GaussianScene) -> None:

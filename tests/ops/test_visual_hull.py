@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gausim.ops.visual_hull import VoxelHull, carve, farthest_points, project, search_cube
+from gausim.ops.visual_hull import VoxelHull, carve, project, search_cube
 
 RADIUS = 0.4
 CENTER = torch.tensor([0.1, -0.2, 0.3])
@@ -87,10 +87,3 @@ def test_projection_and_search_cube() -> None:
     pixels, depth = project(torch.zeros(2, 3), viewmats, Ks)
     assert torch.allclose(pixels, torch.full((12, 2, 2), 32.0), atol=1e-3)
     assert torch.allclose(depth, torch.full((12, 2), 3.0), atol=1e-4)
-
-
-def test_farthest_points_cover_evenly() -> None:
-    line = torch.linspace(0, 1, 101)[:, None] * torch.tensor([[1.0, 0, 0]])
-    chosen = farthest_points(line, 5)
-    assert sorted(chosen.tolist()) == [0, 25, 50, 75, 100]
-    assert len(farthest_points(line[:3], 9)) == 3

@@ -121,12 +121,6 @@ def test_masks_that_miss_a_part_are_outvoted(stills: ImageSet) -> None:
     assert (scene.means.amin(0) - whole.means.amin(0)).abs().max() < 0.1
 
 
-def test_points_outside_of_all_masks_are_refused(stills: ImageSet) -> None:
-    far = PointCloud(torch.rand(9, 3) + 20)
-    with pytest.raises(DataError, match="0 of 9 points lie in the visual hull"):
-        reconstruct([stills], CpuRenderer(threads=1), TINY, cloud=far)
-
-
 def walled(stills: ImageSet) -> ImageSet:
     """The same stills with something behind the object: all of the image counts."""
     rgb, alpha = stills.images[..., :3].float(), stills.images[..., 3:].float() / 255

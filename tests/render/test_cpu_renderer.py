@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import pickle
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -74,30 +73,6 @@ def test_threads_change_no_bit(inputs: Callable) -> None:
     assert all(torch.equal(a, b) for a, b in zip(again_gradients, gradients, strict=True))
 
 
-def test_view_that_sees_nothing(inputs: Callable) -> None:
-    """One of the two views looks away; it is background and adds nothing to the gradients."""
-    given = inputs(2, 2, 50, (20, 20))
-    given.viewmats[:, 1, 2, 3] = -50.0
-    given = given.to(torch.float32)
-    given.means.requires_grad_()
-    images = given.draw(CpuRenderer(threads=2))
-    assert torch.equal(images.rgb[:, 1].detach(), given.background.expand(2, 20, 20, 3))
-    (grad,) = torch.autograd.grad(images.rgb[:, 1].square().sum(), given.means, retain_graph=True)
-    assert float(grad.abs().max()) == 0
-    (grad,) = torch.autograd.grad(images.rgb[:, 0].square().sum(), given.means)
-    assert float(grad.abs().max()) > 0
-
-
-def test_only_the_gradients_asked_for_are_given(inputs: Callable) -> None:
-    given = inputs(2, 2, 30, (20, 20)).to(torch.float32)
-    given.covars.requires_grad_()
-    images = given.draw(CpuRenderer(threads=1))
-    images.rgb.sum().backward()
-    assert given.covars.grad is not None and given.means.grad is None
-    with torch.no_grad():
-        assert not given.draw(CpuRenderer(threads=1)).rgb.requires_grad
-
-
 def test_input_changed_in_place_before_backward_is_refused(inputs: Callable) -> None:
     given = inputs(2, 2, 30, (20, 20)).to(torch.float32)
     given.colors.requires_grad_()
@@ -121,10 +96,3 @@ def test_wrong_type_and_options_are_refused(inputs: Callable) -> None:
     for options in ({"threads": 0}, {"near": 0.0}, {"alpha_max": 1.0}):
         with pytest.raises(ConfigError, match=next(iter(options))):
             CpuRenderer(**options)
-
-
-def test_renderer_can_be_pickled_after_use(inputs: Callable) -> None:
-    given = inputs(2, 2, 30, (20, 20)).to(torch.float32)
-    renderer = CpuRenderer(threads=2)
-    first = given.draw(renderer)
-    assert torch.equal(given.draw(pickle.loads(pickle.dumps(renderer))).rgb, first.rgb)

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import pytest
 import torch
 from torch import Tensor
 
-from gausim.render import reference
 from gausim.render.reference import ReferenceRenderer
 
 
@@ -25,11 +23,3 @@ def test_gradcheck_with_respect_to_all_inputs(inputs: Callable) -> None:
         return drawn.rgb, drawn.alpha, drawn.depth
 
     assert torch.autograd.gradcheck(images, tuple(x.requires_grad_() for x in given.tensors), atol=1e-6, fast_mode=True)
-
-
-def test_tiles_do_not_change_the_image(inputs: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One tile as large as the image holds every kernel: culling per tile loses nothing."""
-    given = inputs(2, 2, 60, (70, 50), scale=0.08).to(torch.float64)
-    tiled = given.draw(ReferenceRenderer()).rgb
-    monkeypatch.setattr(reference, "TILE", 70)
-    torch.testing.assert_close(given.draw(ReferenceRenderer()).rgb, tiled, atol=1e-12, rtol=0)

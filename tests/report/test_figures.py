@@ -6,8 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gausim.report.pictures.figures import contact_frames, contact_sheet, error_figure, picture_grid, slice_figure
-from gausim.report.pictures.frames import Timeline, error_colors, moving_line, space_time_slice, video_frame
+from gausim.report.pictures.figures import contact_sheet, error_figure, picture_grid, slice_figure
+from gausim.report.pictures.frames import Timeline, moving_line, space_time_slice, video_frame
 
 CURVES = runpy.run_path(str(Path(__file__).with_name("test_summary.py")))["curves"]
 
@@ -36,15 +36,6 @@ def test_the_moving_line_is_found_and_cut():
     assert np.array_equal(space_time_slice(images.swapaxes(1, 2), ("row", 17)), cut)
 
 
-def test_error_colours_grow_with_the_error():
-    truth = np.zeros((2, 3, 3), np.uint8)
-    prediction = truth.copy()
-    prediction[0, 1], prediction[0, 2] = 20, 70
-    shown = error_colors(truth, prediction).astype(int).sum(-1)
-    assert shown[0, 0] < shown[0, 1] < shown[0, 2]
-    assert np.array_equal(error_colors(prediction, prediction)[0, 2], error_colors(truth, truth)[0, 0])
-
-
 def test_video_frames_have_one_size_and_mark_what_is_foreseen():
     images, timeline = swinging(), Timeline(12, 5)
     seen = video_frame(images[4], images[4], 4, timeline, "seq")
@@ -54,11 +45,6 @@ def test_video_frames_have_one_size_and_mark_what_is_foreseen():
     orange = (240, 150, 40)
     assert not (seen == orange).all(-1).any()
     assert (foreseen == orange).all(-1).sum() < (beyond == orange).all(-1).sum()
-
-
-def test_contact_frames_hold_the_turning_points():
-    assert {0, 15, 16, 59} <= set(contact_frames(60, 16)) and len(contact_frames(60, 16)) <= 12
-    assert contact_frames(10, 16)[-1] == 9
 
 
 def test_error_figure_is_written(tmp_path):

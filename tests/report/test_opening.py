@@ -176,13 +176,6 @@ def test_several_rows_are_compared_in_the_one_table_and_runs_can_be_chosen(tmp_p
     assert page.count(" checked>") == 1 and "and 2 more:" in page and "<script" not in page
 
 
-def test_every_object_has_its_turn_before_the_second_best(tmp_path: Path):
-    evaluate(write_run(tmp_path / "both", config()), with_psnr(2.0, "one"), with_psnr(1.0, "two"))
-    evaluate(write_run(tmp_path / "both_again", config(1)), with_psnr(1.5, "one"), with_psnr(3.0, "two"))
-    openings, _ = make_openings(make_study(find_runs([tmp_path])), pictures=False)
-    assert [o.label for o in openings] == ["one · seed 1", "two · seed 0", "one · seed 0", "two · seed 1"]
-
-
 def test_what_is_missing_is_named_with_the_command_that_makes_it(tmp_path: Path):
     trained = write_run(tmp_path / "my run", config())
     failed = write_run(tmp_path / "failed", config(conserve_mass=False), finished=False)
@@ -197,19 +190,6 @@ def test_what_is_missing_is_named_with_the_command_that_makes_it(tmp_path: Path)
     first = html.unescape(first_screen((tmp_path / "report" / "report.html").read_text()))
     assert "There is no video:" in first and f"<code>gausim evaluate {trained}</code>" in first
     assert first.count("<table") == 1
-
-
-def test_a_run_without_a_view_kept_out_says_so(tmp_path: Path):
-    curves = with_psnr(1.0)
-    facts = replace(curves.facts, train_views=curves.facts.views)
-    evaluate(
-        write_run(tmp_path / "a", config()),
-        replace(curves, facts=facts, pictures=replace(curves.pictures, heldout_views=())),
-    )
-    (opening,) = make_openings(make_study(find_runs([tmp_path])))[0]
-    assert "a in x (a training view; the evaluation has no other)" in opening.film.caption
-    assert [row[1] for row in opening.table.rows] == ["training"] * 3
-    assert opening.sentences[2].startswith("No view was kept out of training")
 
 
 def test_hostile_names_stay_text_on_the_first_screen(tmp_path: Path):

@@ -81,11 +81,6 @@ def test_runs_without_pictures_leave_the_others_theirs(tmp_path):
     assert any("gausim w/o mass:" in n and "metrics.npz" in n for n in notes)
 
 
-def test_a_name_with_a_formula_is_drawn_as_it_is(tmp_path):
-    evaluate(write_run(tmp_path / "a", config(name="x"), model="$\\frac{$"), make_curves(1.0))
-    assert len(figures(tmp_path)[0]) == 4
-
-
 def test_pictures_round_trip(tmp_path):
     original = make_pictures()
     save_pictures(tmp_path / "p.npz", [original, make_pictures("other", background=False)])
@@ -94,15 +89,6 @@ def test_pictures_round_trip(tmp_path):
     assert np.array_equal(first.predictions["gausim"], original.predictions["gausim"])
     assert (first.object, first.views, first.first_unseen) == ("toy_bunny", ("x", "y"), 8)
     assert other.object == "other" and other.background is None
-
-
-def test_composition_by_hand():
-    pictures = make_pictures()
-    frames = np.zeros((1, 2, 24, 32, 4), np.uint8)
-    frames[..., :3], frames[..., 3] = 40, 51  # a fifth opaque, premultiplied
-    shown = pictures.over_background(frames)
-    assert shown[0, 0, 0, 0].tolist() == [40 + 8, 40 + 160, 40 + 24]
-    assert make_pictures(background=False).over_background(0 * frames)[0, 0, 0, 0].tolist() == [46, 48, 52]
 
 
 def test_broken_pictures_are_refused(tmp_path):

@@ -143,12 +143,6 @@ def test_networks_of_one_object_each_are_one_row_beside_the_joint_one(tmp_path):
     assert tables["ablation_three_gausim"].columns == (("gausim", ("full", "jointly")),)
 
 
-def test_runs_on_unknown_data_get_its_directory_as_object(tmp_path):
-    write_run(tmp_path / "a", config(), finished=False)
-    study = make_study(find_runs([tmp_path]))
-    assert study.objects == ("toy",) and cell(study.groups[0], "toy", "seen", "train", "l2").status == "unfinished"
-
-
 def test_seeds_are_pooled_by_hand(sweep):
     full = make_study(find_runs([sweep])).groups[0]
     value = cell(full, "toy_bunny", "unseen", "train", "l2").value

@@ -14,7 +14,6 @@ from helpers.report_runs import config, evaluate, make_curves, write_run
 from gausim.report.gather.paper import CONTRAST, TABLES, paper_object
 from gausim.report.gather.runs import find_runs
 from gausim.report.gather.study import make_study
-from gausim.report.render import latex_escape, markdown_escape
 from gausim.report.tables.overview import make_sheets
 from gausim.report.tables.sheets import Sheet
 from gausim.report.write import write_report
@@ -116,18 +115,6 @@ def test_lpips_without_weights_says_how_to_get_them(sweep):
     assert "flip_train" not in sheets(sweep)  # nobody measured it
 
 
-def test_a_metric_that_old_evaluations_lack_is_not_called_no_weights(sweep):
-    for path in sweep.rglob("metrics.json"):
-        summary = json.loads(path.read_text())
-        for entry in summary["objects"].values():
-            for key in ("absent", "efficiency", "footnotes", "sources"):
-                del entry[key]
-        path.write_text(json.dumps(summary))
-    found = sheets(sweep)
-    assert texts(found["lpips_train"])["gausim"] == ["not measured"] * 3
-    assert texts(found["efficiency"])["gausim"][0] == "not measured"
-
-
 def test_the_efficiency_table(sweep):
     rows = texts(sheets(sweep)["efficiency"])
     assert rows["gausim"] == [
@@ -140,22 +127,11 @@ def test_the_efficiency_table(sweep):
     assert rows["GausSim w/o hierarchy (paper)"][2] == "0.36"
 
 
-def test_the_colour_contrast(sweep):
-    rows = texts(sheets(sweep)["contrast"])
-    assert rows["mean foreground colour"] == ["(0.30, 0.00, 0.40)"] and rows["its norm"] == ["0.50"]
-    assert rows["largest l2 of a pixel"] == ["0.90"] and rows["its norm (paper)"] == ["1.26"]
-
-
 def test_references_that_differ_between_runs_are_rows_of_their_own(tmp_path):
     evaluate(write_run(tmp_path / "a", config()), make_curves(1.0))
     evaluate(write_run(tmp_path / "b", config(name="b")), make_curves(1.0, static=5.0))
     rows = texts(sheets(tmp_path)["l2_train"])
     assert rows["static"][0] == "8.00 ± 4.00" and rows["static [2]"][0] == "10.00 ± 5.00"
-
-
-def test_numbers_of_an_unfinished_run_say_so(tmp_path):
-    evaluate(write_run(tmp_path / "a", config(), finished=False), make_curves(1.0), finished=False)
-    assert sheets(tmp_path)["l2_train"].lines[0].entries[0].extra == "unfinished"
 
 
 def test_the_papers_own_figures():
@@ -184,13 +160,6 @@ def test_the_page_stands_alone_and_every_number_leads_to_its_run(sweep):
     assert "11.00 ± 5.52" in page.bold and "15.00 ± 7.50" not in page.bold
     assert "c0ffeec0ffee" in page.text and "da7ada7ada7a" in page.text and "5ce7e5ce7e5c" in page.text
     assert "conserve_mass: false" in page.text and "5 runs: 3 evaluated, 1 failed, 1 unfinished" in page.text
-
-
-def test_escapes():
-    assert latex_escape("a_b & 50% {x} \\y\n$z ± 1") == (
-        r"a\_b \& 50\% \{x\} \textbackslash{}y \$z $\pm$ 1"
-    )  # fmt: skip
-    assert markdown_escape("a|b <i>*x*_[y]\n#1") == r"a\|b \<i\>\*x\*\_\[y\] \#1"
 
 
 def test_markdown_tables_have_one_cell_per_column(sweep):

@@ -101,20 +101,6 @@ def test_stretches_continue_where_the_last_one_ended() -> None:
     torch.testing.assert_close(sum(m for _, m in parts), motion, rtol=1e-12, atol=0)
 
 
-def test_only_what_needs_a_gradient_gets_one() -> None:
-    case = Case(steps=2)
-    fixed = States(case.states.positions, case.states.deformation_gradients.detach(), case.states.rotations.detach())
-    losses, _ = case.comparison()(fixed, 0)
-    (gradient,) = torch.autograd.grad(losses.sum(), [case.states.positions])
-    both, _ = case.comparison()(case.states, 0)
-    expected = torch.autograd.grad(both.sum(), case.states.tensors())[0]
-    torch.testing.assert_close(gradient, expected, rtol=1e-9, atol=1e-12)
-    with torch.no_grad():
-        silent, _ = case.comparison()(case.states, 0)
-    assert not silent.requires_grad
-    torch.testing.assert_close(silent, losses.detach(), rtol=1e-9, atol=0)
-
-
 def test_no_image_is_held_for_the_backward_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(chunked, "CPU_PIXELS", STATE)
     held = {}

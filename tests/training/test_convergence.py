@@ -13,7 +13,7 @@ from helpers.toy_runs import rows as rows_of
 
 from gausim.cli import train as command
 from gausim.compose.build import load_run
-from gausim.core import ConfigError, RunError
+from gausim.core import RunError
 from gausim.runs.checkpoint import read_checkpoint
 from gausim.training.callbacks.convergence import Convergence, forecast, verdict
 
@@ -127,8 +127,3 @@ def test_what_cannot_be_judged_has_its_epochs_and_frames(toy: Path, override: st
     rows = rows_of(run / "epochs.csv")
     assert [float(row["steps"]) for row in rows] == [2.0, 3.0] and not any(row["held_back"] for row in rows)
     assert "learning" not in json.loads((run / "FINISHED").read_text())
-
-
-def test_settings_out_of_range_are_refused() -> None:
-    with pytest.raises(ConfigError, match="held_back"):
-        Convergence(held_back=0)

@@ -13,7 +13,6 @@ import torch
 from lightning.pytorch import LightningModule, Trainer
 
 from gausim.runs.randomness import random_state, restore_random_state
-from gausim.training.callbacks.progress import EpochSummary
 from gausim.training.callbacks.resume import RunCheckpoint
 from gausim.training.callbacks.time_budget import TimeBudget
 from gausim.training.loggers.files import CsvLog, Resumable, TensorBoardLog
@@ -116,18 +115,3 @@ def test_a_resumed_run_has_the_learning_rate_of_the_time_it_used(monkeypatch: py
     resumed.on_train_start(trainer, module)
     assert module.time_fraction == 0.5  # what the next step's learning rate follows
     assert [step(resumed, trainer) for _ in range(2)] == [0.75, 1.0] and trainer.should_stop
-
-
-def test_an_epoch_cut_in_two_counts_both_parts_seconds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    now = [100.0]
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
-    first, trainer = EpochSummary(console=False), trainer_at(0, folder=tmp_path)
-    first.on_train_epoch_start(trainer, MODULE)
-    now[0] += 7.0
-    state = first.state_dict()
-    now[0] += 1000.0
-    second = EpochSummary(console=False)
-    second.load_state_dict(state)
-    second.on_train_start(trainer, MODULE)
-    now[0] += 3.0
-    assert second.state_dict() == {"elapsed": 10.0}

@@ -135,9 +135,3 @@ def test_a_model_without_smooth_motions_is_refused_or_shown_images(sources: Sour
         TrackSupervision(without)
     assert tracks_or_images(without, energy_weight=0.1) is None
     assert isinstance(tracks_or_images(sources, energy_weight=0.1), TrackSupervision)
-
-
-@pytest.mark.parametrize("wrong", [{"iterations": 0}, {"rate": 0.0}])
-def test_settings_out_of_range_are_named(sources: Sources, wrong: dict[str, float]) -> None:
-    with pytest.raises(ConfigError, match="expected iterations >= 1 and rate > 0"):
-        TrackSupervision(sources, **wrong)

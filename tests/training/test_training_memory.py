@@ -15,7 +15,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from gausim.benchmark.train import peak_saved_bytes
 from gausim.losses import Objective
-from gausim.render.reference import ReferenceRenderer
 from gausim.training import step
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings
@@ -164,16 +163,3 @@ def test_the_device_is_not_waited_for(backprop_steps: int) -> None:
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert len(statistics.fetch(norms).lasting(facts, 3.0).frames) == 3
-
-
-@pytest.mark.gpu
-def test_a_step_on_the_device_is_that_of_the_cpu() -> None:
-    found = []
-    for device in ("cpu", "cuda"):
-        module = sway_module(Objective(backprop_steps=0, static_weight=0.0)).to(device)
-        module.model.scenes = [scene.to(device) for scene in module.model.scenes]
-        module.images.renderer = ReferenceRenderer()
-        optimizer = module.configure_optimizers()
-        found.append(module.optimise([sample(0).to(device)], optimizer, torch.Generator().manual_seed(0)))
-    for name, value in found[0].items():
-        assert found[1][name] == pytest.approx(value, rel=1e-3, abs=1e-6), name

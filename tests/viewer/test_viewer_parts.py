@@ -25,15 +25,15 @@ from gausim.interaction.selections import Ball, Unit, Whole
 from gausim.interaction.session import Force, Gravity, Impulse, Pin, Release, Reset, Wind
 from gausim.ops.covariance import covariance_from_scales
 from gausim.ops.spherical_harmonics import spherical_harmonics_basis
-from gausim.viewer.coloring import BASE, MASS, SPEED, STRAIN, VIEW, Painter, highlighted, hues
+from gausim.viewer.coloring import BASE, MASS, SPEED, STRAIN, VIEW, Painter, hues
 from gausim.viewer.companion import Companion
 from gausim.viewer.live import Live
 from gausim.viewer.messages import MessageChecker, MessageError
-from gausim.viewer.pipeline import Rate, Worker
+from gausim.viewer.pipeline import Worker
 from gausim.viewer.pointer import first_hit, in_rectangle
 from gausim.viewer.recording import record
 from gausim.viewer.shown import LIVE, Shown, Take
-from gausim.viewer.splats import SIZE, Placing, half_covariances, pack, unit_centres
+from gausim.viewer.splats import Placing, half_covariances, pack
 
 
 @pytest.mark.parametrize(("size", "spread"), [(1e-3, 0.0), (1.0, 0.5), (1.0, 4.0), (1e3, 4.0)])
@@ -64,24 +64,6 @@ def test_a_packed_kernel_reads_as_viser_writes_it(make_column: Callable[..., Gau
     rgba = buffer[:, 7:].copy().view(np.uint8)
     assert np.abs(rgba[:, :3] - rgb.numpy() * 255).max() <= 0.51 and (rgba[:, 3] == 128).all()
     assert (buffer[:, 3] == 0).all()
-
-
-def test_the_object_is_shown_in_one_size_and_points_come_back(make_column: Callable[..., GaussianScene]) -> None:
-    scene = make_column()
-    big = replace(scene, means=scene.means * 1000 + 50)
-    for one in (scene, big):
-        placing = replace(Placing.of(one), offset=(1.0, 2.0, 3.0))
-        shown = placing.to_page(one.means[one.simulated])
-        assert float((shown.amax(0) - shown.amin(0)).norm()) == pytest.approx(SIZE, rel=1e-4)
-        assert torch.allclose(
-            placing.to_scene(placing.to_page(one.means)), one.means, rtol=1e-4, atol=1e-4 * one.diagonal
-        )
-
-
-def test_centres_of_units_are_centres_of_mass() -> None:
-    positions = torch.tensor([[0.0, 0, 0], [1, 0, 0], [5, 5, 5], [9, 9, 9]])
-    centres = unit_centres(positions, torch.tensor([0, 0, 1, -1]), torch.tensor([1.0, 3.0, 2.0, 7.0]), 2)
-    assert torch.allclose(centres, torch.tensor([[0.75, 0, 0], [5, 5, 5]]))
 
 
 @pytest.fixture
@@ -140,12 +122,6 @@ def test_strain_is_the_largest_logarithm_of_a_stretch(painter: tuple[Painter, In
     assert not torch.allclose(rgb[strained][0], rgb[~strained][0])
 
 
-def test_selected_and_pinned_kernels_stand_out() -> None:
-    rgb = torch.zeros(3, 3)
-    out = highlighted(rgb, torch.tensor([True, False, False]), torch.tensor([False, True, False]))
-    assert float(out[0].sum()) > 0.5 and float(out[1, 2]) > 0.5 and torch.equal(out[2], rgb[2])
-
-
 def camera() -> SimpleNamespace:
     """At (0, -5, 0), looking along +y, up +z: x right, z up."""
     half = float(np.sqrt(0.5))
@@ -191,15 +167,6 @@ def test_a_worker_takes_the_newest_item_and_outlives_an_error() -> None:
     worker.stop()
     worker.join(5)
     assert not worker.is_alive()
-
-
-def test_a_rate_counts_what_is_recent() -> None:
-    rate = Rate(window=0.2)
-    for _ in range(10):
-        rate.count()
-    assert rate.per_second == pytest.approx(50)
-    time.sleep(0.25)
-    assert rate.per_second == 0
 
 
 def test_messages_of_the_page_pass_and_others_do_not() -> None:

@@ -68,17 +68,6 @@ def test_gradients_are_difference_quotients(lattice, name: str):
     assert float((found - true).norm() / true.norm()) < 1e-2
 
 
-def test_detached_frames_and_no_grad_record_nothing(lattice):
-    solver, state, log_young = scene(lattice)
-    log_young.requires_grad_()
-    end = solver.advance(state, 0, young_modulus=log_young.exp())
-    assert end.positions.requires_grad and not end.detach().positions.requires_grad
-    with torch.no_grad():
-        again = solver.advance(state, 0, young_modulus=log_young.exp())
-    assert not again.positions.requires_grad
-    assert torch.allclose(again.positions, end.positions, atol=1e-6)
-
-
 @pytest.mark.gpu
 def test_a_gpu_gives_the_same_states_and_gradients(lattice):
     results = []
