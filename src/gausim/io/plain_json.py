@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import msgspec
@@ -27,7 +28,7 @@ def parse_json(text: str | bytes) -> Any:
     return data
 
 
-def checked(value: Any, kind: type[T], where: str, remedy: str) -> T:
+def checked(value: Any, kind: Callable[..., T], where: str, remedy: str) -> T:
     """Converts plain data to a record or another annotated ``kind``; messages start with ``where``, end in ``remedy``.
 
     Raises:

@@ -18,8 +18,8 @@ def covariance_from_scales(log_scales: Float[Tensor, "*N 3"], quats: Float[Tenso
 
 
 def transport_covariance(
-    covars: Float[Tensor, "*N 3 3"], deformation_gradient: Float[Tensor, "*N 3 3"]
-) -> Float[Tensor, "*N 3 3"]:
+    covars: Float[Tensor, "*#N 3 3"], deformation_gradient: Float[Tensor, "*#N 3 3"]
+) -> Float[Tensor, "*#N 3 3"]:
     """G S G^T: the covariance of matter deformed by G (METHOD section 2)."""
     return deformation_gradient @ covars @ deformation_gradient.mT
 

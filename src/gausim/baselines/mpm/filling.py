@@ -35,7 +35,7 @@ class Filling:
     wall: float = 3.0
     per_cell: int = 8
     ray_axis: int = 0
-    open_side: tuple[int, int] | None = None
+    open_side: tuple[int, int] | list[int] | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
