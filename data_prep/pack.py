@@ -92,7 +92,8 @@ def _sequence(data: ObjectData, name: str, folder: Path, margin: int) -> tuple[i
     from gausim.io.packed import is_packed, read_packed, write_packed
 
     root = data.root / "sequences" / name
-    copy_missing(root / "ground_truth.npz", folder / "ground_truth.npz")
+    for own in ("ground_truth.npz", "hands.npz"):
+        copy_missing(root / own, folder / own)
     source = open_frames(root, data.views, data.fps)
     if not is_packed(folder):
         # A source of its own for each view, so that images of one at most are in memory.

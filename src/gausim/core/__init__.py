@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gausim.core.protocols import (
         Dynamics,
         Forces,
+        Hands,
         Rendered,
         Renderer,
         Steppable,
@@ -32,15 +33,16 @@ if TYPE_CHECKING:
     from gausim.core.scene import GaussianScene
     from gausim.core.smooth import SmoothMotions
     from gausim.core.state import SimState, Trajectory
+    from gausim.core.surroundings import Floor, HandPath, HandPose, Surroundings
 
 __all__ = [
-    "Cameras", "BusyError", "ConfigError", "DataError", "DivergenceError", "FetchError", "Dynamics",
-    "FittedDynamics", "FittedMethod", "FittedState", "Forces", "GausSimError", "GaussianScene", "Rendered",
-    "Renderer", "RunError", "SceneError", "SimState", "SmoothMotions", "Steppable", "SteppedFrame", "Stepper",
-    "TakesOver", "Trajectory", "roll_out", "trajectory_of",
+    "BusyError", "Cameras", "ConfigError", "DataError", "DivergenceError", "Dynamics", "FetchError",
+    "FittedDynamics", "FittedMethod", "FittedState", "Floor", "Forces", "GausSimError", "GaussianScene", "HandPath",
+    "HandPose", "Hands", "Rendered", "Renderer", "RunError", "SceneError", "SimState", "SmoothMotions", "Steppable",
+    "SteppedFrame", "Stepper", "Surroundings", "TakesOver", "Trajectory", "roll_out", "trajectory_of",
 ]  # fmt: skip
 
-_LATE = ("camera", "fitted", "protocols", "scene", "smooth", "state")
+_LATE = ("camera", "fitted", "protocols", "scene", "smooth", "state", "surroundings")
 
 
 def __getattr__(name: str) -> Any:

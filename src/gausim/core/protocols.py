@@ -11,10 +11,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core.state import SimState, Trajectory
+from gausim.core.surroundings import HandPose
 
 # Forces at a step: step number (0 = the step from frame 0 to 1) -> force per kernel [mass * scene units / s^2],
 # or None where no force acts.
 Forces = Callable[[int], Tensor | None]
+# Hands at a frame: frame number (-1 is before the initial state) -> their pose, or None where nobody moves the pins.
+Hands = Callable[[int], HandPose | None]
 
 
 @runtime_checkable

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core.errors import SceneError
+from gausim.core.surroundings import Surroundings
 
 SH_COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
 
@@ -28,6 +29,8 @@ class GaussianScene:
         foreground: kernels that are compared with segmented video.
         volume_scale: c of V = prod(c s_i) (METHOD section 1), so that the mean kernel mass is of order 1.
         name: name of the scene in messages, tables and checkpoints.
+        surroundings: what acts on the body besides its own elasticity.
+        hand: the hand that holds each pinned kernel, -1 for those that nobody moves; None: there are no hands.
     """
 
     means: Float[Tensor, "K 3"]
@@ -40,6 +43,8 @@ class GaussianScene:
     foreground: Bool[Tensor, " K"]
     volume_scale: float = 1.0
     name: str = "scene"
+    surroundings: Surroundings = field(default_factory=Surroundings)
+    hand: Int[Tensor, " K"] | None = None
 
     @staticmethod
     def create(
@@ -121,12 +126,12 @@ class GaussianScene:
 
     def select(self, mask: Bool[Tensor, " K"]) -> GaussianScene:
         """The sub-scene of the kernels where ``mask`` holds, in the same order."""
-        return replace(self, **{n: getattr(self, n)[mask] for n in self._tensor_names()})
+        return replace(self, **{n: x[mask] for n in self._tensor_names() if (x := getattr(self, n)) is not None})
 
     def to(self, device: torch.device | str) -> GaussianScene:
         """The same scene on another device."""
-        return replace(self, **{n: getattr(self, n).to(device) for n in self._tensor_names()})
+        return replace(self, **{n: x.to(device) for n in self._tensor_names() if (x := getattr(self, n)) is not None})
 
     @classmethod
     def _tensor_names(cls) -> list[str]:
-        return [f.name for f in fields(cls) if f.name not in ("volume_scale", "name")]
+        return [f.name for f in fields(cls) if f.name not in ("volume_scale", "name", "surroundings")]

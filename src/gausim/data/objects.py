@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from gausim.core import ConfigError, DataError, GaussianScene
 from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_array, read_stills
+from gausim.data.surroundings import gripped, read_surroundings
 from gausim.io.plain_json import checked
 from gausim.io.ply import MASK_NAMES, load_scene
 from gausim.io.transforms import read_json
@@ -42,6 +44,7 @@ class ObjectData:
         heldout_views: cameras never trained on.
         train_frames: the frames that training may see, e.g. range(0, 16).
         facts: all other entries of ``dataset.json``.
+        surroundings: what acts on the body besides its own elasticity.
         scene_path: the rest scene's PLY file.
         masks_path: its masks; None: the file beside the PLY.
         selections: replacements of masks.
@@ -75,6 +78,7 @@ class ObjectData:
         self.name, self.fps = found.name or self.root.name, found.fps
         self.views, self.train_views, self.heldout_views = found.views, found.train_views, found.heldout_views
         self.train_frames = range(*found.train_frames)
+        self.surroundings, self._grip = read_surroundings(self.facts, str(path))
         self._check_views(path)
         self.scene_path = Path(scene) if scene is not None else self.root / "scene.ply"
         self.masks_path = Path(masks) if masks is not None else None
@@ -104,6 +108,9 @@ class ObjectData:
                     f"{record.root}: has {record.count} frames, dataset.json trains on {self.train_frames}. "
                     "Complete the sequence or leave it out."
                 )
+        counts = {r.name: 0 if r.hands is None else r.hands.centres.shape[1] for r in records}
+        if len(set(counts.values())) > 1:
+            raise DataError(f"{folder}: hands.npz must be of the same hands in every sequence, got {counts} hands.")
         return records
 
     @cached_property
@@ -142,7 +149,11 @@ class ObjectData:
                 f"{self.scene_path}: no rest scene. Make one with `gausim reconstruct {self.root}`, "
                 "or name one in the data config (scene: path/to/scene.ply)."
             )
-        scene = select_masks(load_scene(self.scene_path, masks=self.masks_path, name=self.name), self.selections)
+        scene = load_scene(self.scene_path, masks=self.masks_path, name=self.name)
+        scene = replace(select_masks(scene, self.selections), surroundings=self.surroundings)
+        first = self.sequences[0] if (self.root / "sequences").is_dir() else None
+        if first is not None and first.holds is not None:
+            scene = gripped(scene, *first.holds, self._grip, str(self.root / "dataset.json"))
         return require_pinned(scene)
 
     def _check_views(self, path: Path) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 from gausim.core import Cameras, DataError
 from gausim.data.frames import open_frames
 from gausim.data.images import read_rgba_into
+from gausim.data.surroundings import read_hands
 from gausim.io.npz import read_npz
 from gausim.io.transforms import read_transforms
 
@@ -67,6 +68,8 @@ class SequenceRecord:
         cameras: their calibration, in the same order.
         count: number of frames F.
         fps: frames per second.
+        hands: path of the hands that move the pins; None without hands.
+        holds: points of the hands at frame 0 (C, 3) and the hand of each (C,); None without hands.
     """
 
     def __init__(self, root: Path, *, views: Sequence[str], fps: float) -> None:
@@ -78,6 +81,8 @@ class SequenceRecord:
         self.root, self.name, self.views, self.fps = root, root.name, tuple(views), fps
         self._source = open_frames(root, self.views, fps)
         self.count, self.cameras = self._source.count, self._source.cameras
+        found = read_hands(root, self.count)
+        self.hands, self.holds = (None, None) if found is None else (found[0], found[1:])
 
     def camera_indices(self, views: Sequence[str] | None = None) -> list[int]:
         """Indices of these views in :attr:`views` (all when None), or :class:`DataError`."""

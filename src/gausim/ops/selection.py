@@ -158,21 +158,22 @@ def parse_half_space(text: str, *, above: bool = False) -> HalfSpace:
 
 
 def require_pinned(scene: GaussianScene) -> GaussianScene:
-    """Returns the scene if it has both pinned and free simulated kernels.
+    """Returns the scene if it has both pinned and free simulated kernels; a free body needs no pinned ones.
 
     Raises:
         SceneError: no kernel is simulated, none is pinned (with instructions to pin some), or no simulated one is free.
     """
     if not scene.simulated.any():
         raise SceneError(f"{scene.name}: mask 'simulated' marks no kernel; expected those of the object that moves.")
-    if not scene.pinned.any():
+    if not scene.pinned.any() and not scene.surroundings.free:
         z = scene.means[scene.simulated, 2]
         low, high = float(z.amin()), float(z.amax())
         height = f"z={low + 0.1 * (high - low):.3g}"
         raise SceneError(
             f"{scene.name}: no kernel is pinned; expected at least one root that holds the object. Store the mask with "
             f"`gausim inspect SCENE --pin-below {height} --save-masks` (here the lowest tenth; --pin-above where up is "
-            f"negative), or select kernels in the data config, 'data.selections={{pinned: \"{height}\"}}'."
+            f"negative), or select kernels in the data config, 'data.selections={{pinned: \"{height}\"}}'. Where "
+            'nothing holds it, set "free": true in dataset.json.'
         )
     if not (scene.simulated & ~scene.pinned).any():
         raise SceneError(f"{scene.name}: every simulated kernel is pinned; expected some that are free to move.")
