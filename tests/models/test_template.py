@@ -15,7 +15,7 @@ class _Fixed(PreparedTemplate):
     def __init__(self, state) -> None:
         self.state = state
 
-    def __call__(self, motion):
+    def __call__(self, motion, load=None):
         return self.state
 
 

@@ -100,6 +100,7 @@ def gripped(
     if empty:
         raise DataError(
             f"{where}: field 'grip' is {reach}: hand {empty[0]} holds none of the "
-            f"{int(scene.simulated.sum())} simulated kernels. Raise it to the distance from the hands' points to the object [scene units]."
+            f"{int(scene.simulated.sum())} simulated kernels. Raise it to the distance [scene units] from the "
+            "hands' points to the object."
         )
     return replace(scene, pinned=scene.pinned | near, hand=held)

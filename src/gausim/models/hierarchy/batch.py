@@ -35,7 +35,8 @@ class Member:
     scene_id: int  # index of its scene
     kernels: slice  # its rows of the state (all kernels of the scene)
     units: slice  # its rows of a :class:`Step`; the last of them is the identity unit
-    # unit of every kernel, counted from `units.start`; pinned and never-simulated kernels point to the identity unit
+    # unit of every kernel, counted from `units.start`; never-simulated kernels point to the identity unit, and pinned
+    # ones without hands
     unit_of_kernel: Int[Tensor, " K"]
 
 
@@ -136,7 +137,8 @@ class BatchBuilder:
         members = []
         for j, (scene, hierarchy) in enumerate(zip(scenes, chosen, strict=True)):
             unit_of_kernel = torch.full((scene.count,), hierarchy.levels[finest].count)
-            free = ~base[j].pinned
+            # A pinned kernel has the identity, unless a hand turns it.
+            free = ~base[j].pinned if scene.hand is None else torch.ones_like(base[j].pinned)
             unit_of_kernel[hierarchy.kernels[free]] = hierarchy.ancestor(0, finest)[free]
             spans = slice(*kernels[j : j + 2]), slice(*units[j : j + 2])
             members.append(Member(scene_ids[j], *spans, unit_of_kernel.to(device)))

@@ -26,7 +26,9 @@ class Level:
     # units of pinned kernels, which never move; no cluster has both pinned and free kernels
     pinned: Bool[Tensor, " N"]
     parent: Int[Tensor, " M"]  # the unit of the next level that contains each unit; empty at the top level
-    root: Int[Tensor, " N"]  # the nearest pinned kernel (index into the simulated kernels), the parent of a top unit
+    # the nearest pinned kernel (index into the simulated kernels), the parent of a top unit; of a free body the kernel
+    # nearest to its centre
+    root: Int[Tensor, " N"]
 
     @property
     def count(self) -> int:
@@ -64,7 +66,7 @@ def build_hierarchy(
     """Clusters the simulated kernels level by level.
 
     Args:
-        scene: the rest scene; at least one kernel must be pinned.
+        scene: the rest scene; at least one kernel must be pinned, unless it is free.
         radii: largest cluster diameter per level 1..L, as fractions of the bounding-box diagonal.
         clustering: ``agglomerative`` (complete linkage in near-linear memory), ``ball`` (a greedy cover; more clusters)
             or ``complete_linkage`` (of all pairs; the reference).
@@ -82,37 +84,43 @@ def build_hierarchy(
     rest = scene.means.cpu()[index].double()
     volume = kernel_volumes(scene.log_scales.cpu()[index].double(), scene.volume_scale)
     pinned = scene.pinned.cpu()[index]
-    pinned_kernels = pinned.nonzero()[:, 0].numpy()
+    # Kernels that move together: the free ones, and those of each hand.
+    group = torch.where(pinned, 1, 0) if scene.hand is None else torch.where(pinned, scene.hand.cpu()[index] + 2, 0)
+    roots = pinned.nonzero()[:, 0].numpy() if pinned.any() else _most_central(rest)
     diagonal = scene.diagonal if axes is None else float(np.linalg.norm(np.ptp(rest.numpy() @ axes.T, axis=0)))
-    tree = cKDTree(rest[pinned].numpy())
+    tree = cKDTree(rest[roots].numpy())
     levels = []
     for number in range(len(radii) + 1):
-        root = torch.from_numpy(pinned_kernels[tree.query(rest.numpy())[1]])
+        root = torch.from_numpy(roots[tree.query(rest.numpy())[1]])
         top = number == len(radii)
         parent = torch.zeros(0, dtype=torch.int64)
         if not top:
-            parent = _cluster_by_group(rest, pinned, radii[number] * diagonal, clustering)
+            parent = _cluster_by_group(rest, group, radii[number] * diagonal, clustering)
         levels.append(Level(rest.to(scene.means.dtype), volume.to(scene.means.dtype), pinned, parent, root))
         if not top:
-            rest, volume, pinned = _coarsen(rest, volume, pinned, parent)
+            rest, volume, group = _coarsen(rest, volume, group, parent)
+            pinned = group > 0
     return Hierarchy(tuple(levels), index, diagonal)
 
 
-def _cluster_by_group(rest: Tensor, pinned: Tensor, diameter: float, clustering: str) -> Tensor:
-    """Labels of separate clusters of free units (numbered first) and of pinned units."""
+def _most_central(rest: Tensor) -> np.ndarray:
+    """The kernel nearest to the mean, (1,)."""
+    return (rest - rest.mean(0)).norm(dim=1).argmin()[None].numpy()
+
+
+def _cluster_by_group(rest: Tensor, group: Tensor, diameter: float, clustering: str) -> Tensor:
+    """Labels of clusters within each group; those of free units, group 0, are numbered first."""
     labels = torch.zeros(len(rest), dtype=torch.int64)
     offset = 0
-    for mask in (~pinned, pinned):
+    for mask in (group == number for number in group.unique()):
         found = CLUSTERINGS[clustering](np.ascontiguousarray(rest[mask].numpy()), diameter)
         labels[mask] = torch.from_numpy(found) + offset
         offset += int(found.max()) + 1
     return labels
 
 
-def _coarsen(rest: Tensor, volume: Tensor, pinned: Tensor, parent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _coarsen(rest: Tensor, volume: Tensor, group: Tensor, parent: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     count = int(parent.max()) + 1
     total = torch.zeros(count, dtype=volume.dtype).index_add(0, parent, volume)
     centre = torch.zeros(count, 3, dtype=rest.dtype).index_add(0, parent, rest * volume[:, None]) / total[:, None]
-    held = torch.zeros(count, dtype=torch.bool)
-    held[parent[pinned]] = True
-    return centre, total, held
+    return centre, total, torch.zeros(count, dtype=group.dtype).index_copy(0, parent, group)

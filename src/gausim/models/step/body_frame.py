@@ -30,7 +30,7 @@ def body_axes(scene: GaussianScene) -> np.ndarray:
     pinned = scene.pinned[scene.simulated].cpu().numpy()
     centre = rest[~pinned].mean(0)
     offset = rest - centre
-    first = centre - rest[pinned].mean(0)
+    first = centre - rest[pinned].mean(0) if pinned.any() else np.zeros(3)
     if np.linalg.norm(first) < CLEAR * scene.diagonal:
         first = _signed(np.linalg.eigh(offset.T @ offset)[1][:, -1], offset)
     first = first / np.linalg.norm(first)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from jaxtyping import Float
 from torch import Tensor
 
+from gausim.core import SimState
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.units import FixedUnits, per_level
+from gausim.models.reference.reference import Carried, HandMotion, Reference, UnitMotion
 from gausim.models.step.body_frame import Frames
 from gausim.models.step.recursion import Solved
 from gausim.models.template.template import PreparedTemplate
@@ -34,14 +37,27 @@ class Prepared:
     # the network's outputs at rest per level, subtracted from every output; None without an anchor
     still: tuple[Tensor, ...] | None
 
+    # of bodies that move as a whole, or in hands
+    reference: Reference
+
     def aggregate(self, positions: Float[Tensor, "K 3"]) -> Float[Tensor, "N 3"]:
         """Centres of mass of the finest predicted units."""
         return weighted_sum(positions, self.mass_fraction, self.batch.finest, self.batch.levels[-1].count)
 
     def finest(self, positions: Float[Tensor, "K 3"]) -> Float[Tensor, "N 3"]:
         """:meth:`aggregate` in body axes, where these are used."""
-        found = self.aggregate(positions)
-        return found if self.frames is None else self.frames.into(len(self.levels) - 1, found)
+        return self._in_body_axes(self.aggregate(positions))
+
+    def carried(self, state: SimState, hands: Sequence[HandMotion | None] | None) -> tuple[Carried, UnitMotion]:
+        """A state relative to the reference: the way back, and the finest units in body axes, where these are used."""
+        carried = self.reference.carry(self.aggregate(state.positions), self.aggregate(state.previous), state, hands)
+        now, before, load = carried.relative.now, carried.relative.before, carried.relative.load
+        if load is not None and self.frames is not None:
+            load = (self.frames.axes[-1] @ load[..., None])[..., 0]
+        return carried, UnitMotion(self._in_body_axes(now), self._in_body_axes(before), load)
+
+    def _in_body_axes(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        return positions if self.frames is None else self.frames.into(len(self.levels) - 1, positions)
 
     def per_level(self, finest: Float[Tensor, "N 3"]) -> list[Tensor]:
         """Positions of every predicted level, coarse to fine: coarser units are the centres of mass of the finer."""

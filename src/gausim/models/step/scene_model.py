@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import torch
@@ -13,12 +15,15 @@ from torch import Tensor, nn
 from gausim.core import ConfigError, GaussianScene, SimState, SmoothMotions
 from gausim.models.hierarchy.batch import BatchBuilder, SceneBatch
 from gausim.models.hierarchy.clusters import build_hierarchy
+from gausim.models.hierarchy.units import FixedUnits
+from gausim.models.reference.reference import Reference
+from gausim.models.reference.surroundings import SceneSurroundings, reference_of
 from gausim.models.settings import HierarchySettings
 from gausim.models.step.body_frame import Frames, body_axes
 from gausim.models.step.predictor import DeformationPredictor
 from gausim.models.step.prepared import Prepared
 from gausim.models.template.smooth import smooth_motions
-from gausim.models.template.template import Motion, Template
+from gausim.models.template.template import Motion, PreparedTemplate, Template
 from gausim.nn.normaliser import normalisers_of
 
 # Disjoint unions that stay in memory; with many scenes almost every batch is another one.
@@ -70,11 +75,15 @@ class SceneModel(nn.Module, ABC):
         self.register_buffer("axes", torch.from_numpy(np.stack(self.body_axes)).to(scenes[0].means), persistent=False)
         self.register_buffer("origins", torch.stack(origins).to(scenes[0].means), persistent=False)
         counts = [h.levels[0].count for h in self.hierarchies]
+        self.surroundings = nn.ModuleList(
+            SceneSurroundings(scene, hierarchy, self.predicted_levels[-1], rate)
+            for scene, hierarchy, rate in zip(scenes, self.hierarchies, fps, strict=True)
+        )
         self.log_density = nn.ParameterList(torch.zeros(n) for n in counts)
         self.attributes = nn.ParameterList(torch.zeros(n, attributes) for n in counts)
 
     @abstractmethod
-    def prepare(self, batch: SceneBatch) -> Prepared:
+    def prepare(self, batch: SceneBatch, *, isolated: bool = False) -> Prepared:
         """Constants of the steps of this batch between two updates of the parameters."""
 
     def batch(self, scene_ids: Sequence[int]) -> SceneBatch:
@@ -86,6 +95,20 @@ class SceneModel(nn.Module, ABC):
                 self._batches.pop(next(iter(self._batches)))
             self._batches[key] = self._builder.build(key[0], device)
         return self._batches[key]
+
+    def reference(
+        self,
+        batch: SceneBatch,
+        mass: Float[Tensor, " M"],
+        units: FixedUnits,
+        rest: Float[Tensor, "N 3"],
+        template: PreparedTemplate,
+        frames: Frames | None,
+    ) -> Reference:
+        """The reference of a batch; ``rest`` are the finest units' centres in scene axes."""
+        own = [cast(SceneSurroundings, s) for s in self.surroundings]
+        axes = None if frames is None else frames.axes[-1]
+        return reference_of(own, batch, mass, replace(units, rest=rest), template, axes)
 
     def frames(self, batch: SceneBatch) -> Frames | None:
         """Body axes for every unit of a batch; None where scene axes are used."""
@@ -145,7 +168,7 @@ class SceneModel(nn.Module, ABC):
         """Parameters by role: the network, the scenes' densities and attributes, and the template."""
         return {
             "network": list(self.predictor.parameters()),
-            "scene": [*self.log_density, *self.attributes],
+            "scene": [*self.log_density, *self.attributes, *self.surroundings.parameters()],
             "template": list(self.template.parameters()),
         }
 
@@ -155,7 +178,8 @@ class SceneModel(nn.Module, ABC):
 
     def own(self, scene_id: int) -> tuple[str, ...]:
         """Prefixes of the names of a scene's parameters and buffers in the state dict."""
-        return f"log_density.{scene_id}", f"attributes.{scene_id}", *self.template.own(scene_id, "template.")
+        own = f"log_density.{scene_id}", f"attributes.{scene_id}", f"surroundings.{scene_id}."
+        return *own, *self.template.own(scene_id, "template.")
 
     def freeze(self, *, scenes: bool = False) -> None:
         """Freezes the modules of :meth:`shared`: their weights and the statistics of the normalisers.

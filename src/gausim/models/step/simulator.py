@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from gausim.core import ConfigError, GaussianScene, SimState, SteppedFrame
 from gausim.models.hierarchy.batch import LevelBatch, SceneBatch
 from gausim.models.hierarchy.units import FixedUnits, fixed_units
+from gausim.models.reference.reference import HandMotion, Placed, Reference, UnitMotion
 from gausim.models.settings import HierarchySettings, RolloutSettings
 from gausim.models.step.features import FeatureOptions
 from gausim.models.step.head import Head
@@ -90,10 +91,11 @@ class GausSim(SceneModel):
             head=head, edges=hierarchy.edges, conserve_mass=conserve_mass,
         )  # fmt: skip
 
-    def prepare(self, batch: SceneBatch) -> Prepared:
+    def prepare(self, batch: SceneBatch, *, isolated: bool = False) -> Prepared:
         """Constants of the steps of this batch between two updates of the parameters.
 
         Loss gradients flow through them: prepare anew for every stretch of steps between two backward passes.
+        ``isolated`` leaves out the surroundings: the body deforms about its rest state, which nothing moves.
         """
         mass, _ = self.masses(batch)
         attributes = torch.cat([self.attributes[i] for i in batch.scene_ids])
@@ -105,7 +107,8 @@ class GausSim(SceneModel):
             levels = tuple(replace(level, rest=frames.into(i, level.rest)) for i, level in enumerate(levels))
             roots = frames.into(0, roots)
         template = self.template.prepare(batch, levels[-1])
-        prepared = Prepared(batch, mass, fraction, levels, Solved.roots(roots), template, frames, rest, None)
+        reference = Reference() if isolated else self.reference(batch, mass, levels[-1], rest, template, frames)
+        prepared = Prepared(batch, mass, fraction, levels, Solved.roots(roots), template, frames, rest, None, reference)
         return replace(prepared, still=self._outputs_at_rest(prepared)) if self.predictor.head.anchor else prepared
 
     def step(
@@ -115,6 +118,7 @@ class GausSim(SceneModel):
         force: Float[Tensor, "K 3"] | None = None,
         prepared: Prepared | None = None,
         correction_scale: float = 1.0,
+        hands: Sequence[HandMotion | None] | None = None,
     ) -> Step:
         """Predicts the next frame.
 
@@ -125,17 +129,18 @@ class GausSim(SceneModel):
                 step (METHOD section 6).
             prepared: from :meth:`prepare`, for all steps between two updates of the parameters; computed when None.
             correction_scale: factor on the network's output; 0 gives the step of the template alone.
+            hands: poses of the hands of every member before, at and after this frame; None: all pins are at rest.
         """
         prepared = self.prepare(batch) if prepared is None else prepared
         if force is not None:
             state = self.pushed(prepared, state, force)
-        now, before = prepared.finest(state.positions), prepared.finest(state.previous)
-        finest, template, momentum, predicted = self._descend(prepared, now, before, correction_scale, [])
+        carried, units = prepared.carried(state, hands)
+        finest, template, momentum, predicted = self._descend(prepared, units, correction_scale, [])
         finest, template, predicted = prepared.in_scene_axes(finest, template, predicted)
-        return Step(*inherit(finest, template, batch.kernels), momentum, tuple(predicted))
+        return Step(*carried.place(Placed(*inherit(finest, template, batch.kernels))), momentum, tuple(predicted))
 
     def _descend(
-        self, prepared: Prepared, now: Tensor, before: Tensor, correction_scale: float, outputs: list[Tensor]
+        self, prepared: Prepared, units: UnitMotion, correction_scale: float, outputs: list[Tensor]
     ) -> tuple[Solved, Tensor | None, Tensor, list[Tensor]]:
         """Solves the predicted levels, coarse to fine: returns the finest one, the template's P, momentum and all F.
 
@@ -143,8 +148,8 @@ class GausSim(SceneModel):
         """
         # The template predicts the finest units; coarser ones are their centres of mass, at all three times.
         rest = prepared.levels[-1].rest
-        seen = prepared.template.carried(Motion(rest, now, before))
-        template = prepared.template(seen)
+        seen = prepared.template.carried(Motion(rest, units.now, units.before))
+        template = prepared.template(seen, units.load)
         states = [prepared.per_level(x) for x in (seen.now, seen.before, template.positions)]
         above, momentum, predicted = prepared.roots, rest.new_zeros(()), []
         for position, (level, fixed, x, previous, target) in enumerate(
@@ -171,7 +176,7 @@ class GausSim(SceneModel):
         rest = prepared.levels[-1].rest
         outputs: list[Tensor] = []
         with gathering_nothing(normalisers_of(self.predictor)):
-            self._descend(prepared, rest, rest, 0.0, outputs)
+            self._descend(prepared, UnitMotion(rest, rest, None), 0.0, outputs)
         return tuple(outputs)
 
 

@@ -35,6 +35,17 @@ ROUNDING = 1e-6
 SUPPORT = 3
 
 
+def rigid_motions(offset: np.ndarray) -> np.ndarray:
+    """Displacements (P, 3, 6) of points at ``offset`` (P, 3) by translations along and rotations about the axes."""
+    translations = np.broadcast_to(np.eye(3), (len(offset), 3, 3))
+    return np.concatenate((translations, np.stack([np.cross(axis, offset) for axis in np.eye(3)], -1)), -1)
+
+
+def _flat(motions: np.ndarray) -> np.ndarray:
+    """Displacements (P, 3, C) component by component, (3 P, C)."""
+    return motions.transpose(1, 0, 2).reshape(-1, motions.shape[-1])
+
+
 @dataclass(frozen=True)
 class Grid:
     """A regular grid of quadratic B-splines."""
@@ -47,6 +58,11 @@ class Grid:
     def size(self) -> int:
         """Number of nodes."""
         return int(np.prod(self.shape))
+
+    def rigid_coefficients(self) -> np.ndarray:
+        """Coefficients (3 nodes, 6) of the translations along and rotations about the axes: exact in splines."""
+        place = np.stack(np.meshgrid(*map(np.arange, self.shape), indexing="ij"), -1).reshape(-1, 3) * self.spacing
+        return _flat(rigid_motions(place - place.mean(0)))
 
     def splines(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Nodes (P, 27), weights (P, 27) and their derivatives (P, 27, 3) [1 / scene units] at points (P, 3)."""
@@ -161,7 +177,7 @@ def solid_body(
     modes: int,
     spacing: float,
 ) -> SolidBody:
-    """Lowest modes of the body around the kernels.
+    """Lowest modes of the body around the kernels; of a body that nothing holds, without its six rigid motions.
 
     Args:
         kernels: rest positions (K, 3) [scene units].
@@ -172,39 +188,100 @@ def solid_body(
         modes: number of modes; at most three per free unit are returned.
         spacing: spacing of the grid [scene units].
     """
+    grid, centres, weights, whole, _ = _assembled(kernels, held, spacing)
+    used = whole.diagonal() > 0
+    nodes, values, _ = grid.splines(rest[~pinned])
+    carry = sp.block_diag([matrix(nodes, values, grid.size)] * 3).tocsr()[:, used]
+    root = np.tile(np.sqrt(mass[~pinned]), 3)
+    rigid = None if held.any() else grid.rigid_coefficients()[used]
+    eigenvalues, vectors = lowest(whole[used][:, used], sp.diags(root) @ carry, modes, rigid)
+    full = np.zeros((3 * grid.size, vectors.shape[1]))
+    full[used] = vectors
+    return SolidBody(grid, eigenvalues, full.reshape(3, grid.size, -1), centres, weights)
+
+
+def _assembled(
+    kernels: np.ndarray, held: np.ndarray, spacing: float
+) -> tuple[Grid, np.ndarray, np.ndarray, sp.csr_matrix, sp.csr_matrix]:
+    """Grid, centres and weights of the cells, stiffness with the springs of pins, and those springs' force per motion.
+
+    Rows and columns of unused nodes are zero. The last matrix maps displacements (K, 3) of the pinned kernels,
+    flattened component by component, to forces on the nodes.
+    """
     grid, centres, weights = cells(kernels, spacing)
     blocks = stiffness(grid, centres, weights)
+    force = sp.csr_matrix((3 * grid.size, 0))
     if held.any():
         nodes, values, _ = grid.splines(kernels[held])
         hold = matrix(nodes, values, grid.size)
         strength = PIN_STIFFNESS * weights.sum() / (held.sum() * spacing**2)
         for a in range(3):
             blocks[a][a] = blocks[a][a] + strength * (hold.T @ hold)
+        force = strength * sp.block_diag([hold.T] * 3).tocsr()
     whole = sp.bmat(blocks).tocsr()
     used = whole.diagonal() > NO_SUPPORT * whole.diagonal().max()
-    whole = (whole + FOUNDATION * np.median(whole.diagonal()[used]) * sp.identity(whole.shape[0])).tocsr()
-    nodes, values, _ = grid.splines(rest[~pinned])
-    carry = sp.block_diag([matrix(nodes, values, grid.size)] * 3).tocsr()[:, used]
-    root = np.tile(np.sqrt(mass[~pinned]), 3)
-    eigenvalues, vectors = lowest(whole[used][:, used], sp.diags(root) @ carry, modes)
-    full = np.zeros((3 * grid.size, vectors.shape[1]))
-    full[used] = vectors
-    return SolidBody(grid, eigenvalues, full.reshape(3, grid.size, -1), centres, weights)
+    whole = whole + FOUNDATION * np.median(whole.diagonal()[used]) * sp.identity(whole.shape[0])
+    keep = sp.diags(used.astype(np.float64))
+    return grid, centres, weights, (keep @ whole @ keep).tocsr(), (keep @ force).tocsr()
 
 
-def lowest(k: sp.spmatrix, carry: sp.spmatrix, count: int) -> tuple[np.ndarray, np.ndarray]:
+def static_responses(
+    kernels: np.ndarray, hand: np.ndarray, points: np.ndarray, *, spacing: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Static displacements of a homogeneous body whose pins are moved rigidly, hand by hand, by small amounts.
+
+    The static modes of component mode synthesis (Craig and Bampton 1968); together with the vibration modes of the
+    pinned body they describe a body whose pins move.
+
+    Args:
+        kernels: rest positions (K, 3) [scene units].
+        hand: the hand that holds each kernel (K,), 0..G-1; -1 for free kernels.
+        points: rest positions (P, 3) at which the responses are wanted [scene units].
+        spacing: spacing of the grid [scene units].
+
+    Returns:
+        Centre of every hand's kernels (G, 3), displacements (P, 3, G, 6) of the points and their gradients
+        (P, 3, 3, G, 6) [1 / scene units] per unit translation along and rotation about each axis through that centre.
+    """
+    held = hand >= 0
+    grid, _, _, whole, force = _assembled(kernels, held, spacing)
+    used = whole.diagonal() > 0
+    solve = factorized(whole[used][:, used].tocsc())
+    own, of = kernels[held], hand[held]
+    count = int(hand.max()) + 1
+    centres = np.stack([own[of == g].mean(0) for g in range(count)])
+    field = np.zeros((3 * grid.size, count, 6))
+    for g in range(count):
+        loads = force @ _flat(rigid_motions(own - centres[g]) * (of == g)[:, None, None])
+        field[used, g] = np.stack([solve(load) for load in loads[used].T], -1)
+    nodes, values, gradients = grid.splines(points)
+    at = field.reshape(3, grid.size, count, 6)[:, nodes]
+    moved = np.einsum("pn,apngc->pagc", values, at, optimize=True)
+    return centres, moved, np.einsum("pnb,apngc->pabgc", gradients, at, optimize=True)
+
+
+def lowest(
+    k: sp.spmatrix, carry: sp.spmatrix, count: int, rigid: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Smallest eigenvalues (M,) and vectors (D, M) of k x = value carry^T carry x, with carry x orthonormal.
 
     The mass carry^T carry has a small rank R, so the R x R matrix of compliances carry k^-1 carry^T is solved instead:
-    its largest eigenvalues are the inverses.
+    its largest eigenvalues are the inverses. Vectors are orthogonal to ``rigid`` motions (D, 6), if there are any:
+    loads are freed of them beforehand, displacements afterwards (inertia relief).
     """
     solve = factorized(k.tocsc())
     rank = carry.shape[0]
     count = min(count, rank)
     turned = carry.T.tocsc()
 
+    whole = np.zeros((rank, 0)) if rigid is None else np.linalg.qr(carry @ rigid)[0]
+    count = min(count, rank - whole.shape[1])
+
+    def elastic(x: np.ndarray) -> np.ndarray:
+        return x - whole @ (whole.T @ x)
+
     def comply(x: np.ndarray) -> np.ndarray:
-        return carry @ solve(turned @ x.ravel())
+        return elastic(carry @ solve(turned @ elastic(x.ravel())))
 
     if rank <= max(400, 2 * count):
         compliance = np.stack([comply(row) for row in np.eye(rank)], 1)
@@ -216,4 +293,7 @@ def lowest(k: sp.spmatrix, carry: sp.spmatrix, count: int) -> tuple[np.ndarray, 
     inverse, found = inverse[order], found[:, order]
     kept = inverse > 1e-12 * inverse[0]
     inverse, found = inverse[kept], found[:, kept]
-    return 1 / inverse, np.stack([solve(turned @ v) for v in found.T], 1) / inverse
+    vectors = np.stack([solve(turned @ v) for v in found.T], 1) / inverse
+    if rigid is not None:
+        vectors -= rigid @ np.linalg.lstsq(carry @ rigid, carry @ vectors, rcond=None)[0]
+    return 1 / inverse, vectors

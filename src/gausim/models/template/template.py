@@ -46,9 +46,24 @@ class TemplateState:
 class PreparedTemplate:
     """The template of a batch between two updates of the parameters; in this base class the rest state."""
 
-    def __call__(self, motion: Motion) -> TemplateState:
-        """The template state at t + 1."""
+    def __init__(self, batch: SceneBatch) -> None:
+        """Stores where the members' units are."""
+        self.spans, self.device = batch.levels[-1].spans, batch.rest.device
+
+    def __call__(self, motion: Motion, load: Float[Tensor, "N 3"] | None = None) -> TemplateState:
+        """The template state at t + 1; ``load`` is an acceleration of every unit [scene units / frame^2]."""
         return TemplateState(motion.rest, None)
+
+    def yielding(self, member: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """How a member of the batch yields to impulses within a step.
+
+        Returns:
+            Modes (N, 3, M) and their gradients (N, 3, 3, M), modal displacements per modal impulse (M, M), and the mass
+            of the body in the modes' units; here the body is rigid, M = 0.
+        """
+        count = self.spans[member].stop - self.spans[member].start
+        none = torch.zeros(0, 0, device=self.device)
+        return none.new_zeros(count, 3, 0), none.new_zeros(count, 3, 3, 0), none, none.new_ones(())
 
     def carried(self, motion: Motion) -> Motion:
         """The part of the motion that is input to template and network; here all of it."""
@@ -101,7 +116,15 @@ class Template(nn.Module, ABC):
 
 
 class ModalScene(ABC):
-    """Template of one scene in modal coordinates z between two updates of the parameters, for S sequences at once."""
+    """Template of one scene in modal coordinates z between two updates of the parameters, for S sequences at once.
+
+    Attributes:
+        response: displacement z_{t+1} per modal impulse.
+        inertia: modal impulse per acceleration.
+    """
+
+    response: Float[Tensor, "M M"]
+    inertia: Float[Tensor, "M M"]
 
     def __init__(
         self, projection: Float[Tensor, "N 3 M"], modes: Float[Tensor, "N 3 M"], gradients: Float[Tensor, "N 3 3 M"]
@@ -111,9 +134,14 @@ class ModalScene(ABC):
         # Displacements and displacement gradients of a unit side by side: one product gives both.
         self.motions = torch.cat((modes, gradients.flatten(1, 2)), 1).flatten(0, 1)
 
-    def __call__(self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]) -> Float[Tensor, "S N 12"]:
+    def __call__(
+        self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"], load: Float[Tensor, "S N 3"] | None = None
+    ) -> Float[Tensor, "S N 12"]:
         """Displacement (3) and displacement gradient (9, row by row) of every unit at t + 1."""
-        return (self.after(*self.coordinates(now, before)) @ self.motions.mT).view(*now.shape[:2], 12)
+        after = self.after(*self.coordinates(now, before))
+        if load is not None:
+            after = after + (load.flatten(1) @ self.projection) @ (self.inertia @ self.response).mT
+        return (after @ self.motions.mT).view(*now.shape[:2], 12)
 
     def coordinates(
         self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]
@@ -140,6 +168,7 @@ class PreparedScenes(PreparedTemplate):
 
     def __init__(self, batch: SceneBatch, made: Callable[[int, Tensor], ModalScene], *, conserve_volume: bool) -> None:
         """Prepares every scene; ``made`` is called with its index and the rows of one member's units."""
+        super().__init__(batch)
         self._conserve_volume = conserve_volume
         self.parts = [
             (made(scene_id, rows[: len(rows) // len(members)]), rows, members)
@@ -156,13 +185,23 @@ class PreparedScenes(PreparedTemplate):
         )
         return now.view(len(members), -1, 3), before.view(len(members), -1, 3)
 
-    def __call__(self, motion: Motion) -> TemplateState:
+    def __call__(self, motion: Motion, load: Float[Tensor, "N 3"] | None = None) -> TemplateState:
         """Positions X + u and deformation gradients I + grad u, their determinants bounded."""
-        made = [part(*self._displacements(motion, rows, members)).flatten(0, 1) for part, rows, members in self.parts]
+        made = []
+        for part, rows, members in self.parts:
+            own = None if load is None else load.index_select(0, rows).view(len(members), -1, 3)
+            made.append(part(*self._displacements(motion, rows, members), own).flatten(0, 1))
         moved = made[0] if len(made) == 1 else torch.cat(made).index_select(0, self._places)
         deformation = moved[:, 3:].reshape(-1, 3, 3) + torch.eye(3, dtype=moved.dtype, device=moved.device)
         deformation = bounded_deformation(deformation, MIN_DETERMINANT, unit=self._conserve_volume)
         return TemplateState(motion.rest + moved[:, :3], deformation)
+
+    def yielding(self, member: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """How a member yields to impulses: by the modes of its scene."""
+        part = next(part for part, _, members in self.parts if member in members)
+        modes, slopes = part.motions.unflatten(0, (-1, 12)).split((3, 9), 1)
+        mass = part.inertia.diagonal().mean() * (modes.detach().square().sum((1, 2)) > 0).sum()
+        return modes, slopes.unflatten(1, (3, 3)), part.response, mass
 
     def carried(self, motion: Motion) -> Motion:
         """The part of the motion that is input to template and network, scene by scene."""
@@ -199,4 +238,4 @@ class RestTemplate(Template):
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedTemplate:
         """Rest positions, identity deformation gradients, no energy; all of the motion is input to the network."""
-        return PreparedTemplate()
+        return PreparedTemplate(batch)

@@ -1,0 +1,119 @@
+"""A free body: its reference is the rest shape in the rigid motion that keeps momentum and angular momentum.
+
+With masses m_k, centres of mass c and r = x - c, a step without a floor has exactly
+
+    c_{t+1} = 2 c_t - c_{t-1} + g            sum_k m_k r_t x r_{t+1} = sum_k m_k r_{t-1} x r_t       [frame units]
+
+which are the discrete momenta of Stoermer's and Verlet's method. The simulator gives the shape w of t + 1, and the
+rotation R of r_{t+1} = R w follows from the second equation by Newton's method.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import SimState
+from gausim.models.reference.floor import Contact, Elasticity
+from gausim.models.reference.reference import Body, BodyMotion, HandMotion, Placed, UnitMotion
+from gausim.ops.deformation import polar_rotation
+from gausim.ops.rotation import rotation_of
+
+NEWTON_STEPS = 4
+
+
+def axial(matrix: Float[Tensor, "3 3"]) -> Float[Tensor, " 3"]:
+    """sum_k r_k x s_k for the matrix sum_k s_k r_k^T."""
+    lower = matrix - matrix.mT
+    return torch.stack((lower[2, 1], lower[0, 2], lower[1, 0]))
+
+
+class FreeBody(Body):
+    """A member that nothing holds."""
+
+    def __init__(
+        self,
+        kernels: Float[Tensor, "K 3"],
+        rest: Float[Tensor, "N 3"],
+        mass: Float[Tensor, " K"],
+        gravity: Float[Tensor, " 3"],
+        contact: Contact | None,
+        elasticity: Elasticity,
+    ) -> None:
+        """Stores the constants.
+
+        Args:
+            kernels: rest positions of all kernels [scene units].
+            rest: those of the finest units.
+            mass: masses of the kernels; 0 for those never simulated.
+            gravity: [scene units / frame^2].
+            contact: the floor; None: there is none.
+            elasticity: how the body yields to a contact.
+        """
+        self.mass, self.gravity, self.contact, self.elasticity = mass / mass.sum(), gravity, contact, elasticity
+        self.centre = self.mass @ kernels
+        self.kernels, self.units = kernels, rest
+        self.simulated = mass > 0
+        offset = kernels - self.centre
+        spread = offset.mT @ (self.mass[:, None] * offset)
+        size = torch.linalg.matrix_norm(spread, 2)
+        # Of a body in a plane the third axis follows from the others.
+        self.inverse = torch.linalg.inv(spread + 1e-6 * size * torch.eye(3).to(spread))
+        self.weighted = self.mass[:, None] * offset
+
+    def pose(self, positions: Float[Tensor, "K 3"]) -> tuple[Tensor, Tensor]:
+        """Centre of mass c and rotation R of the best fit of the rest shape."""
+        centre = self.mass @ positions
+        affine = (positions - centre).mT @ self.weighted @ self.inverse
+        return centre, polar_rotation(affine)
+
+    def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> FreeMotion:
+        """The units in the axes of the body, at both times, and the centrifugal load of its rotation."""
+        return FreeMotion(self, now, before, state)
+
+
+class FreeMotion(BodyMotion):
+    """One step of a free body."""
+
+    def __init__(self, body: FreeBody, now: Tensor, before: Tensor, state: SimState) -> None:
+        self.body, self.state = body, state
+        (self.centre, self.turned), (self.last_centre, last) = body.pose(state.positions), body.pose(state.previous)
+        self.guess = self.turned @ last.mT @ self.turned  # at a constant rate of rotation
+        acceleration = self.guess - 2 * self.turned + last
+        offset = body.units - body.centre
+        load = -(offset @ acceleration.mT) @ self.turned
+        self.relative = UnitMotion(
+            body.centre + (now - self.centre) @ self.turned, body.centre + (before - self.last_centre) @ last, load
+        )
+
+    def place(self, made: Placed) -> Placed:
+        """The predicted shape, placed so that momentum and angular momentum are kept; then the floor."""
+        body = self.body
+        shape = made.positions - body.mass @ made.positions
+        rotation = self._rotation(shape)
+        centre = 2 * self.centre - self.last_centre + body.gravity
+        positions = torch.where(body.simulated[:, None], centre + shape @ rotation.mT, made.positions)
+        placed = Placed(positions, rotation @ made.deformation_gradients, rotation @ made.rotations)
+        placed = _with_identity_row(placed, made)
+        if body.contact is None:
+            return placed
+        return body.contact.resolve(placed, self.state, body.elasticity, rotation, centre)
+
+    def _rotation(self, shape: Float[Tensor, "K 3"]) -> Float[Tensor, "3 3"]:
+        """R with sum m r_t x R w = sum m r_{t-1} x r_t, in double precision."""
+        mass = self.body.mass[:, None].double()
+        now, before = self.state.positions - self.centre, self.state.previous - self.last_centre
+        target = axial((mass * now.double()).mT @ before.double())
+        carried = (mass * shape.double()).mT @ now.double()
+        rotation, identity = self.guess.double(), torch.eye(3, dtype=torch.float64, device=shape.device)
+        for _ in range(NEWTON_STEPS):
+            turned = rotation @ carried
+            change = torch.linalg.solve(turned.trace() * identity - turned, target - axial(turned))
+            rotation = rotation_of(change) @ rotation
+        return rotation.to(shape)
+
+
+def _with_identity_row(placed: Placed, made: Placed) -> Placed:
+    """Kernels that are never simulated keep the identity, the last row."""
+    return Placed(placed.positions, *(torch.cat((x[:-1], y[-1:])) for x, y in zip(placed[1:], made[1:], strict=True)))

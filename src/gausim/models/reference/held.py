@@ -1,0 +1,169 @@
+"""A body in hands, or in pins above a floor: its reference is the static shape that its pins prescribe.
+
+The pins' best rigid motion B_0 carries the whole body. Relative to it every hand is displaced by d_g and turned by
+theta_g, and a homogeneous elastic body follows by the static modes Psi of component mode synthesis (Craig and Bampton
+1968, :func:`gausim.models.template.solid.static_responses`):
+
+    a(X) = c + B_0 (X - o + sum_g Psi_g(X) (d_g, theta_g)),    A = grad a,    B = the rotation of A.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gausim.core import GaussianScene, HandPose, SimState
+from gausim.models.hierarchy.clusters import Hierarchy
+from gausim.models.reference.floor import Contact, Elasticity
+from gausim.models.reference.reference import Body, BodyMotion, HandMotion, Placed, UnitMotion
+from gausim.models.template.solid import static_responses
+from gausim.ops.deformation import polar_rotation
+from gausim.ops.rotation import rotation_vector
+
+# Poses whose static shape is kept: those of recorded sequences are asked for again and again.
+MOST_POSES = 4096
+
+
+class StaticShape:
+    """The reference of the units of one scene, as a function of where its hands are; computed once per scene."""
+
+    def __init__(self, scene: GaussianScene, hierarchy: Hierarchy, finest: int, *, spacing: float = 0.12) -> None:
+        """Computes the static modes; ``spacing`` of their grid is in diagonals."""
+        own, level = scene.means[hierarchy.kernels], hierarchy.levels[finest]
+        pinned = scene.pinned[hierarchy.kernels]
+        hand = torch.full_like(hierarchy.kernels, -1) if scene.hand is None else scene.hand[hierarchy.kernels]
+        self.hands = int(hand.max()) + 1
+        held = torch.where(pinned & (hand < 0), self.hands, hand)  # what nobody moves is a hand that stands still
+        self.rest = level.rest
+        self.of = torch.full((scene.count,), -1).index_copy(0, hierarchy.kernels, torch.where(pinned, held, -1))
+        self._pins = own[pinned].double()
+        self._holder: Int[Tensor, " P"] = held[pinned]
+        if int(self._holder.max()) == 0:  # one hand: the body follows rigidly
+            self._centres, self._modes, self._slopes = self._pins.mean(0)[None], None, None
+        else:
+            arrays = static_responses(
+                own.double().numpy(), held.where(pinned, torch.tensor(-1)).numpy(), level.rest.double().numpy(),
+                spacing=spacing * hierarchy.diagonal,
+            )  # fmt: skip
+            self._centres, self._modes, self._slopes = (torch.from_numpy(np.ascontiguousarray(x)) for x in arrays)
+        self.at = lru_cache(MOST_POSES)(self._at)
+
+    def _at(self, pose: HandPose | None) -> tuple[Tensor, Tensor, Tensor]:
+        """A (N, 3), B (N, 3, 3) and A (N, 3, 3) of the units at rest positions :attr:`rest`."""
+        count, identity = len(self.rest), torch.eye(3).expand(len(self.rest), 3, 3)
+        if pose is None:
+            return self.rest, identity, identity
+        whole = self.with_still(HandPose(*(x.double().cpu() for x in (pose.rotations, pose.origins, pose.centres))))
+        moved = whole.move(self._pins, self._holder)
+        origin, centre = self._pins.mean(0), moved.mean(0)
+        offset = self._pins - origin
+        spread = offset.mT @ offset
+        spread = spread + 1e-6 * torch.linalg.matrix_norm(spread, 2) * torch.eye(3).to(spread)
+        base = whole.rotations[0]
+        if self._modes is not None:
+            base = polar_rotation((moved - centre).mT @ offset @ torch.linalg.inv(spread))
+        displacement, slope = torch.zeros(count, 3).double(), torch.zeros(count, 3, 3).double()
+        if self._modes is not None and self._slopes is not None:
+            shifted = whole.move(self._centres, torch.arange(len(self._centres)))
+            shift = (shifted - centre) @ base - (self._centres - origin)
+            turn = torch.stack([rotation_vector(base.mT @ r) for r in whole.rotations])
+            amount = torch.cat((shift, turn), 1)
+            displacement = torch.einsum("nagc,gc->na", self._modes, amount)
+            slope = torch.einsum("nabgc,gc->nab", self._slopes, amount)
+        place = centre + (self.rest.double() - origin + displacement) @ base.mT
+        gradient = base @ (torch.eye(3).double() + slope)
+        return place.float(), polar_rotation(gradient).float(), gradient.float()
+
+    def with_still(self, pose: HandPose) -> HandPose:
+        """The pose with the pins that nobody moves as its last hand."""
+        missing = int(self._holder.max()) + 1 - len(pose.rotations)
+        if not missing:
+            return pose
+        still = torch.zeros(1, 3).to(pose.centres)
+        return HandPose(
+            torch.cat((pose.rotations, torch.eye(3)[None].to(pose.rotations))),
+            torch.cat((pose.origins, still)), torch.cat((pose.centres, still)),
+        )  # fmt: skip
+
+
+class HeldBody(Body):
+    """A member in hands."""
+
+    def __init__(
+        self,
+        shape: StaticShape,
+        kernels: Float[Tensor, "K 3"],
+        rest: Float[Tensor, "N 3"],
+        unit_of_kernel: Int[Tensor, " K"],
+        gravity: Float[Tensor, " 3"],
+        contact: Contact | None,
+        elasticity: Elasticity,
+    ) -> None:
+        """Stores the constants.
+
+        Args:
+            shape: the static shape of the scene.
+            kernels: rest positions of all kernels [scene units].
+            rest: those of the finest units, X.
+            unit_of_kernel: the unit of each kernel; N (the identity row) for those never simulated.
+            gravity: [scene units / frame^2].
+            contact: the floor; None: there is none.
+            elasticity: how the body yields to a contact.
+        """
+        self.shape, self.kernels, self.units, self.unit_of_kernel = shape, kernels, rest, unit_of_kernel
+        self.gravity, self.contact, self.elasticity = gravity, contact, elasticity
+        self.of = shape.of.to(kernels.device)
+
+    def at(self, pose: HandPose | None) -> tuple[Tensor, Tensor, Tensor]:
+        """a, B and A at the units' centres of mass, which depend on the learned densities."""
+        place, rotation, gradient = (x.to(self.units) for x in self.shape.at(pose))
+        offset = self.units - self.shape.rest.to(self.units)
+        return place + (gradient @ offset[..., None])[..., 0], rotation, gradient
+
+    def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> HeldMotion:
+        """The units relative to the static shape, and the load of its acceleration and of gravity in its axes."""
+        return HeldMotion(self, now, before, state, hands or HandMotion(None, None, None))
+
+
+class HeldMotion(BodyMotion):
+    """One step of a body in hands."""
+
+    def __init__(self, body: HeldBody, now: Tensor, before: Tensor, state: SimState, hands: HandMotion) -> None:
+        self.body, self.state, self.hands = body, state, hands
+        last, present, self.after = (body.at(pose) for pose in hands)
+        acceleration = self.after[0] - 2 * present[0] + last[0] - body.gravity
+        load = -_back(present[1], acceleration) - body.gravity  # at rest the body is in equilibrium with gravity
+        self.relative = UnitMotion(
+            body.units + _back(present[1], now - present[0]), body.units + _back(last[1], before - last[0]), load
+        )
+
+    def place(self, made: Placed) -> Placed:
+        """The prediction about the static shape at t + 1; pinned kernels go where their hands are; then the floor."""
+        body, identity = self.body, torch.eye(3).to(made.positions)
+        place, rotation, gradient = (torch.cat((x, y)) for x, y in zip(
+            self.after, (body.units.new_zeros(1, 3), identity[None], identity[None]), strict=True
+        ))  # fmt: skip
+        units = torch.cat((body.units, body.units.new_zeros(1, 3)))
+        unit = body.unit_of_kernel
+        offset = body.kernels - units[unit]
+        positions = place[unit] + _apply(gradient[unit], offset) + _apply(rotation[unit], made.positions - body.kernels)
+        if self.hands.after is not None:
+            pose = body.shape.with_still(self.hands.after.to(positions))
+            positions = torch.where((body.of < 0)[:, None], positions, pose.move(body.kernels, body.of.clamp_min(0)))
+        deformation = gradient + rotation @ (made.deformation_gradients - identity)
+        placed = Placed(positions, deformation, rotation @ made.rotations)
+        if body.contact is None:
+            return placed
+        return body.contact.resolve(placed, self.state, body.elasticity, rotation[:-1], None)
+
+
+def _apply(matrix: Float[Tensor, "N 3 3"], vector: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def _back(matrix: Float[Tensor, "N 3 3"], vector: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    return _apply(matrix.mT, vector)

@@ -1,0 +1,136 @@
+"""The reference configuration of a body that moves as a whole or in hands, and the step relative to it.
+
+Everything that the simulator learns happens relative to a reference configuration. For a body in fixed pins it is
+the rest state. For one that moves it is carried along (the floating frame of reference of multibody dynamics, Shabana
+2020): unit n has the reference position a_n, rotation B_n and deformation gradient A_n, and the simulator sees
+
+    y_n = X_n + B_n^T (x_n - a_n)
+
+at t - 1 and t, and a load: the inertial acceleration of the reference, and gravity. Its prediction y, G, Q of the
+kernels at t + 1 goes back to
+
+    x_k = a_c + A_c (X_k - X_c) + B_c (y_k - X_k),   A_c + B_c (G_c - I),   B_c Q_c.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import HandPose, SimState
+from gausim.models.hierarchy.batch import Member, SceneBatch
+
+
+class HandMotion(NamedTuple):
+    """Poses of a body's hands in the three frames of a step; None where they are at rest."""
+
+    before: HandPose | None
+    now: HandPose | None
+    after: HandPose | None
+
+
+class Placed(NamedTuple):
+    """Kernels and units of a body, in scene axes."""
+
+    positions: Float[Tensor, "K 3"]  # kernel means [scene units]
+    deformation_gradients: Float[Tensor, "R 3 3"]  # of the units and the identity row
+    rotations: Float[Tensor, "R 3 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class UnitMotion:
+    """Finest units of a batch or of a member, relative to the reference [scene units]."""
+
+    now: Float[Tensor, "N 3"]
+    before: Float[Tensor, "N 3"]
+    load: Float[Tensor, "N 3"] | None  # acceleration in the reference's axes [scene units / frame^2]
+
+
+class BodyMotion(ABC):
+    """One step of a body whose reference moves."""
+
+    relative: UnitMotion
+
+    @abstractmethod
+    def place(self, made: Placed) -> Placed:
+        """The prediction relative to the reference, in the scene."""
+
+
+class Carried:
+    """A step relative to a reference at rest: positions are those in the scene."""
+
+    def __init__(self, now: Float[Tensor, "N 3"], before: Float[Tensor, "N 3"]) -> None:
+        self.relative = UnitMotion(now, before, None)
+
+    def place(self, made: Placed) -> Placed:
+        """The prediction in the scene."""
+        return made
+
+
+class Reference:
+    """The reference of a batch in which nothing moves as a whole; see :class:`MovingReference`."""
+
+    def carry(
+        self,
+        now: Float[Tensor, "N 3"],
+        before: Float[Tensor, "N 3"],
+        state: SimState,
+        hands: Sequence[HandMotion | None] | None,
+    ) -> Carried:
+        """The finest units' positions relative to the reference, and the way back.
+
+        ``now`` and ``before`` are in scene axes; ``hands`` are those of every member.
+        """
+        return Carried(now, before)
+
+
+class Body(ABC):
+    """A member of a batch whose reference moves; constant between two updates of the parameters."""
+
+    @abstractmethod
+    def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> BodyMotion:
+        """A step of the body from its units (N, 3) and kernels (K, 3) at t and t - 1, in scene axes."""
+
+
+class MovingReference(Reference):
+    """The references of a batch, member by member."""
+
+    def __init__(self, batch: SceneBatch, bodies: Sequence[Body | None]) -> None:
+        """``bodies`` has one entry per member; None: its reference is at rest."""
+        self._members, self._spans, self._bodies = batch.members, batch.levels[-1].spans, bodies
+
+    def carry(self, now: Tensor, before: Tensor, state: SimState, hands: Sequence[HandMotion | None] | None) -> Carried:
+        """The finest units' positions relative to the references, and the way back."""
+        motions: list[BodyMotion | None] = []
+        parts: list[UnitMotion] = []
+        for i, (member, span, body) in enumerate(zip(self._members, self._spans, self._bodies, strict=True)):
+            if body is None:
+                motions.append(None)
+                parts.append(UnitMotion(now[span], before[span], torch.zeros_like(now[span])))
+                continue
+            own = SimState(state.positions[member.kernels], state.previous[member.kernels])
+            motions.append(body.carry(now[span], before[span], own, None if hands is None else hands[i]))
+            parts.append(motions[-1].relative)  # type: ignore[union-attr]
+        return _CarriedBodies(self._members, motions, parts)
+
+
+class _CarriedBodies(Carried):
+    def __init__(
+        self, members: Sequence[Member], motions: Sequence[BodyMotion | None], parts: Sequence[UnitMotion]
+    ) -> None:
+        self._members, self._motions = members, motions
+        load = torch.cat([part.load for part in parts if part.load is not None])
+        self.relative = UnitMotion(torch.cat([p.now for p in parts]), torch.cat([p.before for p in parts]), load)
+
+    def place(self, made: Placed) -> Placed:
+        placed = []
+        for member, motion in zip(self._members, self._motions, strict=True):
+            own = Placed(made.positions[member.kernels], *(x[member.units] for x in made[1:]))
+            placed.append(own if motion is None else motion.place(own))
+        return Placed(*(torch.cat(column) for column in zip(*placed, strict=True)))

@@ -1,0 +1,119 @@
+"""Surroundings of the scenes: what is trained of them, and the references of a batch's bodies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from gausim.core import GaussianScene
+from gausim.models.hierarchy.batch import SceneBatch
+from gausim.models.hierarchy.clusters import Hierarchy
+from gausim.models.hierarchy.units import FixedUnits
+from gausim.models.reference.floor import Contact, Elasticity
+from gausim.models.reference.free import FreeBody
+from gausim.models.reference.held import HeldBody, StaticShape
+from gausim.models.reference.reference import Body, MovingReference, Reference
+from gausim.models.template.template import PreparedTemplate
+
+# Initial coefficients where they are trained.
+FRICTION, RESTITUTION = 0.3, 0.1
+# Gravity per unit of its parameter [diagonals / frame^2], so that one rate trains it and the material.
+GRAVITY_GAIN = 0.1
+
+
+class SceneSurroundings(nn.Module):
+    """Gravity and floor of one scene, and the static shape of a body in hands."""
+
+    def __init__(self, scene: GaussianScene, hierarchy: Hierarchy, finest: int, fps: float) -> None:
+        """Creates parameters for what the scene leaves to training."""
+        super().__init__()
+        self.facts, self.unit = scene.surroundings, GRAVITY_GAIN * hierarchy.diagonal * fps**2
+        floor = self.facts.floor
+        given = torch.tensor(self.facts.gravity or (0.0, 0.0, 0.0))
+        self.gravity = nn.Parameter(given / self.unit) if self.facts.trains_gravity else None
+        self.friction = self.restitution = None
+        if floor is not None and floor.friction is None:
+            self.friction = nn.Parameter(torch.tensor(math.log(math.expm1(FRICTION))))
+        if floor is not None and floor.restitution is None:
+            self.restitution = nn.Parameter(torch.logit(torch.tensor(RESTITUTION)))
+        self.shape: StaticShape | None = None
+        if not self.facts.free and (scene.hand is not None or floor is not None):
+            self.shape = StaticShape(scene, hierarchy, finest)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the scene's reference moves, or a floor is near."""
+        return self.facts.free or self.shape is not None
+
+    def acceleration(self, dt: float, like: Tensor) -> Float[Tensor, " 3"]:
+        """Gravity [scene units / frame^2]."""
+        if self.gravity is not None:
+            return self.gravity.to(like) * (self.unit * dt**2)
+        return like.new_tensor(self.facts.gravity or (0.0, 0.0, 0.0)) * dt**2
+
+    def contact(self, like: Tensor) -> Contact | None:
+        """The floor with its coefficients."""
+        floor = self.facts.floor
+        if floor is None:
+            return None
+        friction = like.new_tensor(floor.friction) if floor.friction is not None else None
+        restitution = like.new_tensor(floor.restitution) if floor.restitution is not None else None
+        if self.friction is not None:
+            friction = nn.functional.softplus(self.friction)
+        if self.restitution is not None:
+            restitution = torch.sigmoid(self.restitution)
+        assert friction is not None and restitution is not None
+        return Contact(floor, friction, restitution)
+
+
+def reference_of(
+    surroundings: Sequence[SceneSurroundings],
+    batch: SceneBatch,
+    mass: Float[Tensor, " M"],
+    units: FixedUnits,
+    template: PreparedTemplate,
+    axes: Float[Tensor, "N 3 3"] | None,
+) -> Reference:
+    """The reference of a batch.
+
+    Args:
+        surroundings: of every scene.
+        batch: the sequences.
+        mass: masses of the simulated kernels.
+        units: constants of the finest predicted level, in scene axes.
+        template: of the batch, which yields to contacts.
+        axes: axes of the template's modes, as rows, per unit; None: scene axes.
+    """
+    if not any(surroundings[i].moves for i in batch.scene_ids):
+        return Reference()
+    masses = batch.rest.new_zeros(len(batch.rest)).index_copy(0, batch.simulated, mass)
+    bodies: list[Body | None] = []
+    for number, (member, span) in enumerate(zip(batch.members, batch.levels[-1].spans, strict=True)):
+        own = surroundings[member.scene_id]
+        if not own.moves:
+            bodies.append(None)
+            continue
+        rest, kernels = units.rest[span], batch.rest[member.kernels]
+        contact, gravity = own.contact(rest), own.acceleration(float(batch.levels[-1].dt[span.start]), rest)
+        yielding = _elasticity(template, number, None if axes is None else axes[span])
+        unit = member.unit_of_kernel
+        offset = kernels - torch.cat((rest, rest.new_zeros(1, 3)))[unit]
+        fraction = masses[member.kernels] / masses[member.kernels].sum()
+        elasticity = Elasticity(unit, offset, *yielding, fraction, own.facts.free)
+        if own.shape is None:
+            bodies.append(FreeBody(kernels, rest, masses[member.kernels], gravity, contact, elasticity))
+        else:
+            bodies.append(HeldBody(own.shape, kernels, rest, unit, gravity, contact, elasticity))
+    return MovingReference(batch, bodies)
+
+
+def _elasticity(template: PreparedTemplate, member: int, axes: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Modes and slopes in scene axes, response and mass."""
+    modes, slopes, response, mass = template.yielding(member)
+    if axes is None:
+        return modes, slopes, response, mass
+    return axes.mT @ modes, torch.einsum("nca,ncdm,ndb->nabm", axes, slopes, axes), response, mass
