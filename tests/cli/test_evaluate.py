@@ -25,7 +25,7 @@ def run(toy, tmp_path, monkeypatch):
     model = SimpleNamespace(scenes=[toy.scene], dynamics=lambda scene_id: SimpleNamespace(rollout=rollout))
 
     def predict(sequence, steps):
-        return rollout(SimState(toy.scene.means, initial.previous(sequence)), steps)
+        return rollout(SimState(toy.scene.means, initial.state(sequence).previous), steps)
 
     loaded = stand_in(tmp_path / "run", toy.root, model=model, initial_states=initial, predict=predict)
     monkeypatch.setattr(_run, "load_run", lambda path, data=None: loaded)

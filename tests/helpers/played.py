@@ -48,6 +48,6 @@ def played_run(folder: Path) -> SimpleNamespace:
         from gausim.core import SimState
 
         with torch.no_grad():
-            return SceneDynamics(model).rollout(SimState(toy.scene.means, states.previous(sequence)), steps)
+            return SceneDynamics(model).rollout(SimState(toy.scene.means, states.state(sequence).previous), steps)
 
     return stand_in(folder / "demo" / "seed_0", toy.root, model=model, initial_states=states, predict=predict)

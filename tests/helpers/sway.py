@@ -48,7 +48,7 @@ class Sway(nn.Module):
             start += count
         return SimpleNamespace(rest=torch.cat([self.scenes[i].means for i in scene_ids]), members=tuple(members))
 
-    def prepare(self, batch: SimpleNamespace) -> None:
+    def prepare(self, batch: SimpleNamespace, **options: bool) -> None:
         return None
 
     def step(

@@ -121,7 +121,7 @@ def test_simulator_carries_a_mode_through_its_whole_recursion() -> None:
     inner.damping.fill_(-1e4)
     initial = ModalInitialStates(model, [0]).double()
     initial.velocity[0][0] = 0.5
-    offset = scene.means - initial.previous(0)  # amplitude times the first mode, at every kernel
+    offset = scene.means - initial.state(0).previous  # amplitude times the first mode, at every kernel
     angle = 2 * math.atan(math.pi / 12.0)
     start = SimState(scene.means, scene.means - offset * math.sin(angle))
     trajectory = SceneDynamics(model).rollout(start, 40)

@@ -24,14 +24,14 @@ def test_starts_at_rest_and_moves_only_free_kernels_of_its_sequence(model, kind)
     assert len(parameters) == 3
     for number, scene_id in enumerate((0, 1, 0)):
         scene = model.scenes[scene_id]
-        assert torch.equal(initial.previous(number), scene.means)
+        assert torch.equal(initial.state(number).previous, scene.means)
         with torch.no_grad():
             parameters[number].copy_(torch.randn(parameters[number].shape))
-        moved = initial.previous(number).detach() - scene.means
+        moved = initial.state(number).previous.detach() - scene.means
         free = scene.simulated & ~scene.pinned
         assert not bool(moved[~free].any())
         assert float(moved[free].norm(dim=-1).min()) > 0
-    initial.previous(2).square().sum().backward()
+    initial.state(2).previous.square().sum().backward()
     assert [p.grad is not None for p in parameters] == [False, False, True]
 
 
@@ -41,7 +41,7 @@ def test_modal_velocity_moves_units_as_the_basis_says(model) -> None:
     with torch.no_grad():
         initial.velocity[0].copy_(velocity)
     scene, hierarchy = model.scenes[0], model.hierarchies[0]
-    moved = (scene.means - initial.previous(0).detach())[hierarchy.kernels]
+    moved = (scene.means - initial.state(0).previous.detach())[hierarchy.kernels]
     level, unit = hierarchy.levels[1], hierarchy.ancestor(0, 1)
     modes, deformation_gradients, sizes = model.template.basis(0)
     modes, deformation_gradients = modes / sizes, deformation_gradients / sizes
@@ -68,7 +68,7 @@ def test_reach_is_the_largest_motion_of_a_change_where_it_is_least(model, kind) 
     for number, scene in enumerate(model.scenes):
         with torch.no_grad():
             list(initial.parameters())[number][..., :1] = 0.3  # one direction of a free offset, the first amplitude
-        moved = (initial.previous(number) - scene.means).norm(dim=-1)
+        moved = (initial.state(number).previous - scene.means).norm(dim=-1)
         furthest.append(float(moved.detach().max()) / scene.diagonal)
     assert initial.reach(0.3) == pytest.approx(min(furthest), rel=1e-5)
 
@@ -80,7 +80,7 @@ def test_in_diagonals_every_mode_of_every_scene_moves_alike(model) -> None:
             for states in (initial, plain):
                 with torch.no_grad():
                     states.velocity[number].zero_()[mode] = 0.01
-            moved, other = (states.previous(number).detach() - scene.means for states in (initial, plain))
+            moved, other = (states.state(number).previous.detach() - scene.means for states in (initial, plain))
             assert float(moved.norm(dim=-1).max()) == pytest.approx(0.01 * scene.diagonal, rel=1e-4)
             along = (moved * other).sum() / (moved.norm() * other.norm())
             assert float(along) == pytest.approx(1.0, abs=1e-5)

@@ -29,7 +29,7 @@ class Spiral:
         self.factor, self.batch_of = factor, SimpleNamespace(rest=torch.arange(12.0).view(4, 3), members=(0, 1))
         self.scenes, self.sizes = (), []
 
-    def prepare(self, batch: object) -> None:
+    def prepare(self, batch: object, **options: bool) -> None:
         return None
 
     def step(self, batch: SimpleNamespace, state: SimState, force: object = None, prepared: object = None) -> object:

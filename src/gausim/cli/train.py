@@ -156,10 +156,13 @@ def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataM
     from lightning.pytorch import seed_everything
 
     from gausim.compose.build import build
+    from gausim.training.first_frames import begin_free_bodies
 
     seed_everything(cfg.seed, workers=True, verbose=False)
     module, datamodule = build(cfg)
     _take_over(cfg, module, resumed=resumed)
+    if module.initial_states is not None and not resumed:
+        begin_free_bodies(module, datamodule)
     return module, datamodule
 
 

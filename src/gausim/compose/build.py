@@ -76,7 +76,8 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
         method: SharedSimulator = KnownStates(model, datamodule, scene_of_sequence)
     else:
         states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
-        method = SharedSimulator(model, states, scene_of_sequence)
+        hands = [record.hands for _, record in datamodule.index.entries]
+        method = SharedSimulator(model, states, scene_of_sequence, hands)
     module = GausSimModule(
         method=method,
         renderer=renderer,

@@ -122,11 +122,11 @@ def _method(
         raise ConfigError(f"{run.run_dir}: {module.method_name} cannot be simulated by itself. Take a run of gausim.")
     states = cast(Any, module.initial_states)
     numbers = range(item.first_sequence, item.first_sequence + len(names))
-    before = [states.previous(i).detach().to(scene.means) for i in numbers]
-    ceiling = energy_ceiling(module.model, item.scene_id, before)
+    starts = [states.state(i).detach() for i in numbers]
+    ceiling = energy_ceiling(module.model, item.scene_id, [start.previous.to(scene.means) for start in starts])
     dynamics = SceneDynamics(module.model, item.scene_id, energy_ceiling=ceiling)
-    previous = scene.means if sequence == REST else before[names.index(sequence)]
-    return SimState(scene.means, previous), dynamics, dynamics.masses, ceiling
+    initial = SimState(scene.means, scene.means) if sequence == REST else starts[names.index(sequence)]
+    return initial, dynamics, dynamics.masses, ceiling
 
 
 def _name(path: Path) -> str:

@@ -157,11 +157,11 @@ def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
         )
     scene, model, states = scene_of(run, item), cast(Any, run.module.model), cast(Any, run.module.initial_states)
     dynamics = SceneDynamics(model, item.scene_id)
-    previous = states.previous(item.first_sequence).detach().to(scene.means)
+    first, hands = states.state(item.first_sequence).detach(), run.module.method.hands(item.first_sequence)
     free = scene.simulated & ~scene.pinned
     pushes = RandomPushes(scene.means, dynamics.masses, free, scene.diagonal, item.data.fps, PUSHED_FRAMES)
     still = SimState(scene.means, scene.means)
     return {
-        "free": endure(dynamics, SimState(scene.means, previous), scene.means, scene.diagonal, frames),
+        "free": endure(dynamics, first, scene.means, scene.diagonal, frames, hands=hands),
         "pushed": endure(dynamics, still, scene.means, scene.diagonal, frames, pushes=pushes),
     }

@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gausim.core import Dynamics, SimState
+from gausim.core import Hands, SimState
 from gausim.metrics.motion import motion_energy
+from gausim.models.rollout.dynamics import SceneDynamics
 
 # Frames over which a figure is averaged.
 WINDOW = 20
@@ -46,13 +47,14 @@ class RandomPushes:
 
 
 def endure(
-    dynamics: Dynamics,
+    dynamics: SceneDynamics,
     initial: SimState,
     rest: Float[Tensor, "K 3"],
     diagonal: float,
     frames: int,
     *,
     pushes: RandomPushes | None = None,
+    hands: Hands | None = None,
 ) -> dict[str, Any]:
     """Figures of a long rollout: energy, distance from rest and growth.
 
@@ -63,6 +65,7 @@ def endure(
         diagonal: diagonal of the scene [scene units].
         frames: number of predicted frames.
         pushes: forces during the rollout; none when None.
+        hands: poses of the hands that move the pins; None: the pins are at rest.
 
     Returns:
         ``energy``: mean motion energy of every 20 frames [diagonals^2, summed over kernels]; ``away``: their mean
@@ -73,7 +76,7 @@ def endure(
     Raises:
         DivergenceError: a position is not finite; the message names the frame.
     """
-    positions = dynamics.rollout(initial, frames, forces=pushes).positions
+    positions = dynamics.rollout(initial, frames, forces=pushes, hands=hands).positions
     energy = _windows(motion_energy(positions).cpu().double().numpy() / diagonal**2)
     away = _windows((positions[1:] - rest).norm(dim=-1).mean(-1).cpu().double().numpy() / diagonal)
     border = max(1, (frames // 4 if pushes is None else pushes.frames + PUSH_EVERY) // WINDOW)

@@ -59,11 +59,19 @@ class Simulator(Protocol):
     def batch(self, scene_ids: Sequence[int]) -> Any:
         """The disjoint graph of one sequence per entry."""
 
-    def prepare(self, batch: Any) -> Any:
-        """Quantities common to the steps of one stretch; part of its graph, so each stretch computes its own."""
+    def prepare(self, batch: Any, **options: Any) -> Any:
+        """Quantities common to the steps of one stretch; part of its graph, so each stretch computes its own.
 
-    def step(self, batch: Any, state: SimState, force: Tensor | None = None, prepared: Any = None) -> Any:
-        """Predicts the next frame of all members; without ``prepared`` it is computed for this step alone."""
+        ``options`` is ``isolated=True`` where a step leaves out the surroundings of a simulator that knows any.
+        """
+
+    def step(
+        self, batch: Any, state: SimState, force: Tensor | None = None, prepared: Any = None, **options: Any
+    ) -> Any:
+        """Predicts the next frame of all members; without ``prepared`` it is computed for this step alone.
+
+        ``options`` are the members' ``hands``, for a simulator of bodies in hands.
+        """
 
     def parameter_groups(self) -> dict[str, list[Parameter]]:
         """Trainable parameters: ``network`` (shared by all scenes), ``scene`` (densities, attributes), ``template``."""

@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gausim.core import ConfigError, Renderer, SimState, Trajectory
+from gausim.core import ConfigError, Hands, Renderer, SimState, Trajectory
 from gausim.data.dataset import SequenceSample
 from gausim.losses.objective import Objective
+from gausim.models.reference.reference import hand_motion
 from gausim.nn.mode import evaluating
 from gausim.render.draw import draw
 from gausim.runs.checkpoint import WeightAverage
@@ -53,6 +54,7 @@ class Learner(nn.Module):
         self.free_motion = FreeMotion(method.model, self.objective)
         self.diagonals = [scene.diagonal for scene in self.simulator.scenes]
         self.images = ImageSupervision(self.simulator.scenes, renderer, self.objective.image)
+        self.images.begins = self._begins
         self.supervision: Supervision = self.images if supervision is None else supervision
         self.baselines = Baselines(self.supervision)
         self.average = WeightAverage(self.settings.ema_decay)
@@ -110,6 +112,13 @@ class Learner(nn.Module):
         """Baseline metrics of a sample's sequence, for at least the sample's frames."""
         return self.baselines.of(sample, self.simulator.batch([sample.scene_id]).rest)
 
+    @torch.no_grad()
+    def _begins(self, sample: SequenceSample) -> Float[Tensor, "K 3"] | None:
+        if not self.simulator.scenes[sample.scene_id].surroundings.free:
+            return None
+        batch = self.simulator.batch([sample.scene_id])
+        return self.initial([sample], batch).positions
+
     def rest_loss(self, sample: SequenceSample) -> float:
         """Mean loss of the rest state on the frames of a sample: the unit of penalties."""
         losses = self.baseline(sample).static[: sample.steps]
@@ -118,6 +127,20 @@ class Learner(nn.Module):
     def initial(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> SimState:
         """Initial state of the rollouts of a batch."""
         return self.method.initial(samples, batch)
+
+    def hands(self, samples: Sequence[SequenceSample]) -> list[Hands | None] | None:
+        """Poses of the hands of each sample's sequence; None where no sample has any."""
+        found = [self.method.hands(sample.sequence_id) for sample in samples]
+        return found if any(own is not None for own in found) else None
+
+    @torch.no_grad()
+    def isolated(
+        self, batch: SceneBatch, state: SimState, hands: Sequence[Hands | None] | None, frame: int
+    ) -> SimState:
+        """A state relative to the bodies' references, as a step without surroundings takes it."""
+        motions = None if hands is None else [hand_motion(own, frame) for own in hands]
+        moved: SimState = self.simulator.prepare(batch).reference.isolated(state, motions)
+        return moved
 
     @torch.no_grad()
     def predict(self, sequence_id: int, steps: int) -> Trajectory:
@@ -135,7 +158,8 @@ class Learner(nn.Module):
         appearance, units = self.images.appearances.of(sample.scene_id, batch.rest), batch.members[0].unit_of_kernel
         frames = [self.images.rest_image(sample, batch.rest).rgb]
         with evaluating(self):
-            for _, made in windows(self.simulator, batch, self.initial([sample], batch), sample.steps, 1):
+            initial, hands = self.initial([sample], batch), self.hands([sample])
+            for _, made in windows(self.simulator, batch, initial, sample.steps, 1, hands=hands):
                 states = States.of(made).tensors()
                 frames.append(draw(self.images.renderer, appearance, *states, units, sample.cameras).rgb)
         return torch.cat(frames)

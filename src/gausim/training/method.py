@@ -11,7 +11,7 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
-from gausim.core import ConfigError, SimState, Trajectory
+from gausim.core import ConfigError, HandPath, Hands, SimState, Trajectory
 from gausim.data.dataset import SequenceSample
 from gausim.losses.objective import Objective
 from gausim.models.rollout.dynamics import SceneDynamics
@@ -106,6 +106,10 @@ class Method(ABC):
             DivergenceError: a position is not finite; names the frame.
         """
 
+    def hands(self, sequence_id: int) -> Hands | None:
+        """Poses of the hands of a sequence; None where it has none."""
+        return None
+
     def end_epoch(self, least: float) -> bool:
         """Prepares the next epoch; returns whether training is over. ``least`` is that of :class:`Moment`."""
         return False
@@ -135,13 +139,24 @@ class SharedSimulator(Method):
     name, extrapolates = "gausim", True
     initial_states: nn.Module
 
-    def __init__(self, model: nn.Module, initial_states: nn.Module, scene_of_sequence: Sequence[int]) -> None:
+    def __init__(
+        self,
+        model: nn.Module,
+        initial_states: nn.Module,
+        scene_of_sequence: Sequence[int],
+        hands: Sequence[HandPath | None] = (),
+    ) -> None:
+        """Stores the parts; ``hands`` are the paths of the hands of each sequence, empty where there are none."""
         self.model, self.initial_states = model, initial_states
         self.scene_of_sequence = tuple(scene_of_sequence)
         count = len(self.scene_of_sequence)
         if (own := len(list(initial_states.parameters()))) != count:
             raise ConfigError(f"initial states: {own} parameters for {count} sequences; expected one each.")
         self._simulator, self._states = cast(Simulator, model), cast(Any, initial_states)
+        self._hands = dict(enumerate(hands))
+        for sequence_id, path in self._hands.items():
+            if path is not None:
+                self._states.hold(sequence_id, path)
 
     def groups(self) -> dict[str, list[nn.Parameter]]:
         """The model's parameter groups, and the initial states."""
@@ -160,13 +175,18 @@ class SharedSimulator(Method):
         return RestTerm(self._simulator), MixingTerm(self.model)
 
     def initial(self, samples: Sequence[SequenceSample], batch: Any) -> SimState:
-        """x_0 (the rest state) and the trainable x_{-1} of the sequences of a batch."""
-        previous = torch.cat([self._states.previous(s.sequence_id) for s in samples])
-        return SimState(batch.rest, previous.to(batch.rest))
+        """x_0 and x_{-1} of the sequences of a batch."""
+        states = [self._states.state(s.sequence_id) for s in samples]
+        return SimState(
+            *(torch.cat(x).to(batch.rest) for x in zip(*((s.positions, s.previous) for s in states), strict=True))
+        )
+
+    def hands(self, sequence_id: int) -> Hands | None:
+        """Poses of the hands of a sequence; None where it has none."""
+        path = self._hands.get(sequence_id)
+        return None if path is None else path.pose
 
     def predict(self, sequence_id: int, steps: int) -> Trajectory:
         """Frames 0..``steps`` of a training sequence from its initial state, for all kernels of its scene."""
-        scene_id = self.scene_of_sequence[sequence_id]
-        previous = self._states.previous(sequence_id)
-        initial = SimState(self._simulator.scenes[scene_id].means.to(previous), previous)
-        return SceneDynamics(cast(Any, self.model), scene_id).rollout(initial, steps)
+        dynamics = SceneDynamics(cast(Any, self.model), self.scene_of_sequence[sequence_id])
+        return dynamics.rollout(self._states.state(sequence_id), steps, hands=self.hands(sequence_id))

@@ -36,7 +36,7 @@ class KnownStates(SharedSimulator):
             cast(Simulator, model),
             data.index,
         )
-        self._gausim = model
+        self._gausim, self._hands = model, {}
         if data.knows_material:
             for scene_id, item in enumerate(data.objects):
                 give_material(model, scene_id, item.body)

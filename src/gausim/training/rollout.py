@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, fields
-from typing import cast
+from types import MappingProxyType
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint as torch_checkpoint
 
-from gausim.core import DivergenceError, SimState
+from gausim.core import DivergenceError, Hands, SimState
 from gausim.data.dataset import SampleFacts
+from gausim.models.reference.reference import hand_motion
 from gausim.nn.normaliser import gathering_nothing, normalisers_of
 from gausim.training.contracts import SceneBatch, Simulator
 from gausim.training.contracts import Step as PredictedStep
@@ -32,17 +34,19 @@ class Frame:
     state: SimState | None = None
 
 
-def checkpointed_step(model: Simulator, batch: SceneBatch, state: SimState) -> Frame:
+def checkpointed_step(
+    model: Simulator, batch: SceneBatch, state: SimState, moved: Mapping[str, Any] = MappingProxyType({})
+) -> Frame:
     """A step whose graph keeps the input only (gradient checkpointing): it is recomputed in the backward pass.
 
     It uses nothing prepared for other steps, so that the second computation equals the first; the running statistics
-    of the inputs do not count it twice.
+    of the inputs do not count it twice. ``moved`` may hold the hands of the step.
     """
     normalisers, calls = normalisers_of(cast(nn.Module, model)), itertools.count()
 
     def run(positions: Tensor, previous: Tensor) -> tuple[Tensor, ...]:
         with gathering_nothing(normalisers) if next(calls) else nullcontext():
-            step = model.step(batch, SimState(positions, previous))
+            step = model.step(batch, SimState(positions, previous), **moved)
         return step.positions, step.deformation_gradients, step.rotations, step.momentum
 
     # A step draws no random numbers, so no generator needs to be restored.
@@ -76,12 +80,15 @@ def windows(
     restart: Callable[[SimState], SimState] | None = None,
     *,
     checkpoint: bool = False,
+    hands: Sequence[Hands | None] | None = None,
+    isolated: bool = False,
 ) -> Iterator[tuple[int, list[PredictedStep]]]:
     """Predicts ``steps`` frames of a batch in stretches of ``length`` frames.
 
     Loss gradients flow within a stretch and, from the first one, into the initial state; each stretch starts from
     detached values, so a backward pass after every stretch needs memory for one stretch only. ``restart`` is applied to
-    the first state of each stretch; ``checkpoint`` recomputes each step in the backward pass.
+    the first state of each stretch; ``checkpoint`` recomputes each step in the backward pass. ``hands`` are those of
+    every member; ``isolated`` leaves out the surroundings (:meth:`gausim.models.step.simulator.GausSim.prepare`).
 
     Yields:
         The number of frames predicted before the stretch, and its steps.
@@ -91,10 +98,13 @@ def windows(
         state = state.detach() if start else state
         state = state if restart is None else restart(state)
         made: list[PredictedStep] = []
-        prepared = None if checkpoint else model.prepare(batch)
-        for _ in range(min(length, steps - start)):
+        prepared = None if checkpoint else model.prepare(batch, **({"isolated": True} if isolated else {}))
+        for number in range(start, start + min(length, steps - start)):
+            moved = {} if hands is None else {"hands": [hand_motion(own, number) for own in hands]}
             made.append(
-                checkpointed_step(model, batch, state) if checkpoint else model.step(batch, state, prepared=prepared)
+                checkpointed_step(model, batch, state, moved)
+                if checkpoint
+                else model.step(batch, state, prepared=prepared, **moved)
             )
             state = _following(made[-1], state)
         yield start, made
@@ -114,10 +124,16 @@ def after(steps: Sequence[PredictedStep], state: SimState) -> SimState:
 
 
 def reach(batch: SceneBatch, diagonals: Sequence[float], positions: Float[Tensor, "T K 3"]) -> Float[Tensor, "T S"]:
-    """Largest distance of a kernel from its rest position, per step and member [diagonals of the member's scene]."""
+    """Largest distance of a kernel from its rest position, per step and member [diagonals of the member's scene].
+
+    Of a body that moves as a whole, the rest position moves along with its centre.
+    """
     with torch.no_grad():
-        distance = (positions - batch.rest).norm(dim=-1)
-        columns = [distance[:, m.kernels].amax(1) / diagonals[m.scene_id] for m in batch.members]
+        columns = []
+        for m in batch.members:
+            moved = positions[:, m.kernels] - batch.rest[m.kernels]
+            moved = moved - moved.mean(1, keepdim=True) if getattr(m, "free", False) else moved
+            columns.append(moved.norm(dim=-1).amax(1) / diagonals[m.scene_id])
         return torch.stack(columns, 1)
 
 

@@ -59,8 +59,9 @@ def optimise(
 def _see_first_frame(learner: Learner, samples: list[SequenceSample]) -> None:
     """Initialises the input statistics of a new model with the first frame of its first batch."""
     if samples:
-        batch = learner.simulator.batch([s.scene_id for s in samples])
-        learner.simulator.step(batch, learner.initial(samples, batch))
+        batch, hands = learner.simulator.batch([s.scene_id for s in samples]), learner.hands(samples)
+        for _ in windows(learner.simulator, batch, learner.initial(samples, batch), 1, 1, hands=hands):
+            pass
 
 
 def roll_out(
@@ -83,7 +84,10 @@ def roll_out(
     initial, kept = learner.initial(samples, batch), objective.checkpoint_steps
     per = objective.step_weight(steps) / len(whole)
     own, last = torch.zeros(len(samples), device=device), initial
-    for start, made in windows(learner.simulator, batch, initial, steps, length, explosions.restart, checkpoint=kept):
+    hands = learner.hands(samples)
+    for start, made in windows(
+        learner.simulator, batch, initial, steps, length, explosions.restart, checkpoint=kept, hands=hands
+    ):
         states = States.of(made)
         if explosions.end(states.positions, start, statistics.reach):
             break
@@ -95,7 +99,7 @@ def roll_out(
         last = after(made, last)
     else:
         if free is not None:
-            state = explosions.restart(last)
+            state = learner.isolated(batch, explosions.restart(last), hands, steps)
             statistics.growth = learner.free_motion.descend(batch, state, own, len(whole), free, learner.accumulate)
     return statistics
 

@@ -38,6 +38,7 @@ class Member:
     # unit of every kernel, counted from `units.start`; never-simulated kernels point to the identity unit, and pinned
     # ones without hands
     unit_of_kernel: Int[Tensor, " K"]
+    free: bool = False  # whether nothing holds the body
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +142,7 @@ class BatchBuilder:
             free = ~base[j].pinned if scene.hand is None else torch.ones_like(base[j].pinned)
             unit_of_kernel[hierarchy.kernels[free]] = hierarchy.ancestor(0, finest)[free]
             spans = slice(*kernels[j : j + 2]), slice(*units[j : j + 2])
-            members.append(Member(scene_ids[j], *spans, unit_of_kernel.to(device)))
+            members.append(Member(scene_ids[j], *spans, unit_of_kernel.to(device), scene.surroundings.free))
         levels = tuple(self._level(p, scene_ids, device) for p in range(len(self.settings.predicted)))
         rest, index = (
             torch.cat([scene.means for scene in scenes]).to(device),

@@ -38,7 +38,9 @@ class StaticShape:
         hand = torch.full_like(hierarchy.kernels, -1) if scene.hand is None else scene.hand[hierarchy.kernels]
         self.hands = int(hand.max()) + 1
         held = torch.where(pinned & (hand < 0), self.hands, hand)  # what nobody moves is a hand that stands still
-        self.rest = level.rest
+        self.rest, self._scene_rest = level.rest, scene.means
+        unit = hierarchy.ancestor(0, finest)
+        self.of_kernel = torch.full((scene.count,), -1).index_copy(0, hierarchy.kernels, unit)
         self.of = torch.full((scene.count,), -1).index_copy(0, hierarchy.kernels, torch.where(pinned, held, -1))
         self._pins = own[pinned].double()
         self._holder: Int[Tensor, " P"] = held[pinned]
@@ -77,6 +79,14 @@ class StaticShape:
         place = centre + (self.rest.double() - origin + displacement) @ base.mT
         gradient = base @ (torch.eye(3).double() + slope)
         return place.float(), polar_rotation(gradient).float(), gradient.float()
+
+    def kernels(self, pose: HandPose | None) -> Float[Tensor, "K 3"]:
+        """Displacement of all kernels of the scene by the static shape [scene units]."""
+        place, _, gradient = self.at(pose)
+        own = self.of_kernel >= 0
+        unit, rest = self.of_kernel[own], self._scene_rest[own]
+        moved = place[unit] - rest + _apply(gradient[unit], rest - self.rest[unit])
+        return torch.zeros_like(self._scene_rest).masked_scatter(own[:, None], moved.to(self._scene_rest))
 
     def with_still(self, pose: HandPose) -> HandPose:
         """The pose with the pins that nobody moves as its last hand."""
@@ -123,6 +133,23 @@ class HeldBody(Body):
         place, rotation, gradient = (x.to(self.units) for x in self.shape.at(pose))
         offset = self.units - self.shape.rest.to(self.units)
         return place + (gradient @ offset[..., None])[..., 0], rotation, gradient
+
+    def isolated(self, state: SimState, hands: HandMotion | None) -> SimState:
+        """The kernels relative to the static shape."""
+        hands = hands or HandMotion(None, None, None)
+        return SimState(self._relative(state.positions, hands.now), self._relative(state.previous, hands.before))
+
+    def _relative(self, positions: Tensor, pose: HandPose | None) -> Tensor:
+        place, rotation, gradient = self.at(pose)
+        unit = self.unit_of_kernel.clamp_max(len(self.units) - 1)
+        static = place[unit] + _apply(gradient[unit], self.kernels - self.units[unit])
+        moved = self.kernels + _back(rotation[unit], positions - static)
+        still = (self.of >= 0) | (self.unit_of_kernel == len(self.units))
+        return torch.where(still[:, None], self.kernels, moved)
+
+    def turned(self, state: SimState) -> Float[Tensor, "3 3"]:
+        """The identity: a body in hands begins at rest."""
+        return torch.eye(3).to(self.units)
 
     def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> HeldMotion:
         """The units relative to the static shape, and the load of its acceleration and of gravity in its axes."""

@@ -23,7 +23,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.core import HandPose, SimState
+from gausim.core import HandPose, Hands, SimState
 from gausim.models.hierarchy.batch import Member, SceneBatch
 
 
@@ -33,6 +33,11 @@ class HandMotion(NamedTuple):
     before: HandPose | None
     now: HandPose | None
     after: HandPose | None
+
+
+def hand_motion(hands: Hands | None, frame: int) -> HandMotion | None:
+    """Poses of the step from ``frame`` to the next; None without hands."""
+    return None if hands is None else HandMotion(hands(frame - 1), hands(frame), hands(frame + 1))
 
 
 class Placed(NamedTuple):
@@ -73,9 +78,10 @@ class Carried:
         return made
 
 
-class Reference:
-    """The reference of a batch in which nothing moves as a whole; see :class:`MovingReference`."""
+class Reference(ABC):
+    """The reference of a batch."""
 
+    @abstractmethod
     def carry(
         self,
         now: Float[Tensor, "N 3"],
@@ -87,7 +93,35 @@ class Reference:
 
         ``now`` and ``before`` are in scene axes; ``hands`` are those of every member.
         """
+
+    @abstractmethod
+    def undeformed(self, state: SimState) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
+        """Deformation gradients and rotations of all rows of a step where the bodies have their rest shape."""
+
+    @abstractmethod
+    def isolated(self, state: SimState, hands: Sequence[HandMotion | None] | None) -> SimState:
+        """A state of the kernels relative to the reference."""
+
+
+class StillReference(Reference):
+    """The reference of a batch in which nothing moves as a whole."""
+
+    def __init__(self, batch: SceneBatch) -> None:
+        """Stores the number of rows."""
+        self._rows, self._like = batch.members[-1].units.stop, batch.rest
+
+    def carry(self, now: Tensor, before: Tensor, state: SimState, hands: Sequence[HandMotion | None] | None) -> Carried:
+        """The units' positions as they are."""
         return Carried(now, before)
+
+    def undeformed(self, state: SimState) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
+        """Identities."""
+        identity = torch.eye(3).to(self._like).expand(self._rows, 3, 3)
+        return identity, identity
+
+    def isolated(self, state: SimState, hands: Sequence[HandMotion | None] | None) -> SimState:
+        """The state as it is."""
+        return state
 
 
 class Body(ABC):
@@ -97,6 +131,14 @@ class Body(ABC):
     def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> BodyMotion:
         """A step of the body from its units (N, 3) and kernels (K, 3) at t and t - 1, in scene axes."""
 
+    @abstractmethod
+    def isolated(self, state: SimState, hands: HandMotion | None) -> SimState:
+        """A state of the body's kernels relative to the reference."""
+
+    @abstractmethod
+    def turned(self, state: SimState) -> Float[Tensor, "3 3"]:
+        """Rotation of the undeformed body in a state of its kernels."""
+
 
 class MovingReference(Reference):
     """The references of a batch, member by member."""
@@ -104,6 +146,25 @@ class MovingReference(Reference):
     def __init__(self, batch: SceneBatch, bodies: Sequence[Body | None]) -> None:
         """``bodies`` has one entry per member; None: its reference is at rest."""
         self._members, self._spans, self._bodies = batch.members, batch.levels[-1].spans, bodies
+
+    def undeformed(self, state: SimState) -> tuple[Float[Tensor, "R 3 3"], Float[Tensor, "R 3 3"]]:
+        """Rotations of the bodies; identities for kernels that never move."""
+        parts = []
+        for member, body in zip(self._members, self._bodies, strict=True):
+            rotation = torch.eye(3).to(state.positions).repeat(member.units.stop - member.units.start, 1, 1)
+            if body is not None:
+                rotation[:-1] = body.turned(SimState(state.positions[member.kernels], state.previous[member.kernels]))
+            parts.append(rotation)
+        whole = torch.cat(parts)
+        return whole, whole
+
+    def isolated(self, state: SimState, hands: Sequence[HandMotion | None] | None) -> SimState:
+        """A state of the kernels relative to the references."""
+        parts = []
+        for i, (member, body) in enumerate(zip(self._members, self._bodies, strict=True)):
+            own = SimState(state.positions[member.kernels], state.previous[member.kernels])
+            parts.append(own if body is None else body.isolated(own, None if hands is None else hands[i]))
+        return SimState(torch.cat([p.positions for p in parts]), torch.cat([p.previous for p in parts]))
 
     def carry(self, now: Tensor, before: Tensor, state: SimState, hands: Sequence[HandMotion | None] | None) -> Carried:
         """The finest units' positions relative to the references, and the way back."""

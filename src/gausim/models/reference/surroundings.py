@@ -16,7 +16,7 @@ from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.reference.floor import Contact, Elasticity
 from gausim.models.reference.free import FreeBody
 from gausim.models.reference.held import HeldBody, StaticShape
-from gausim.models.reference.reference import Body, MovingReference, Reference
+from gausim.models.reference.reference import Body, MovingReference, Reference, StillReference
 from gausim.models.template.template import PreparedTemplate
 
 # Initial coefficients where they are trained.
@@ -89,7 +89,7 @@ def reference_of(
         axes: axes of the template's modes, as rows, per unit; None: scene axes.
     """
     if not any(surroundings[i].moves for i in batch.scene_ids):
-        return Reference()
+        return StillReference(batch)
     masses = batch.rest.new_zeros(len(batch.rest)).index_copy(0, batch.simulated, mass)
     bodies: list[Body | None] = []
     for number, (member, span) in enumerate(zip(batch.members, batch.levels[-1].spans, strict=True)):

@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gausim.core import DivergenceError, Forces, SimState, SteppedFrame, Trajectory, roll_out
+from gausim.core import DivergenceError, Forces, Hands, SimState, SteppedFrame, Trajectory, roll_out
+from gausim.models.reference.reference import StillReference, hand_motion
 from gausim.models.rollout.cuda_graph import GraphedStep
 from gausim.models.rollout.energy_guard import EnergyGuard
 from gausim.models.step.simulator import GausSim
@@ -30,18 +31,20 @@ class SceneDynamics:
         own, _ = self.model.masses(self.model.batch((self.scene_id,)))
         return own.new_zeros(scene.count).index_copy(0, hierarchy.kernels.to(own.device), own)
 
-    def rollout(self, initial: SimState, steps: int, *, forces: Forces | None = None) -> Trajectory:
-        """Predicts ``steps`` frames; frame 0 is the initial state with G = I (METHOD: the rest state).
+    def rollout(
+        self, initial: SimState, steps: int, *, forces: Forces | None = None, hands: Hands | None = None
+    ) -> Trajectory:
+        """Predicts ``steps`` frames; frame 0 is the initial state, undeformed (METHOD: the rest state).
 
         Raises:
             DivergenceError: a position or force is not finite; the message names the frame.
         """
         with evaluating(self.model):
-            return roll_out(self.stepper(initial), steps, forces)
+            return roll_out(self.stepper(initial, hands), steps, forces)
 
-    def stepper(self, initial: SimState) -> SceneStepper:
+    def stepper(self, initial: SimState, hands: Hands | None = None) -> SceneStepper:
         """Stepper from an initial state; its steps are those of :meth:`rollout`."""
-        return SceneStepper(self.model, self.scene_id, initial, energy_ceiling=self.energy_ceiling)
+        return SceneStepper(self.model, self.scene_id, initial, energy_ceiling=self.energy_ceiling, hands=hands)
 
 
 class SceneStepper:
@@ -51,31 +54,45 @@ class SceneStepper:
 
     @torch.no_grad()
     def __init__(
-        self, model: GausSim, scene_id: int, initial: SimState, *, energy_ceiling: float | None = None
+        self,
+        model: GausSim,
+        scene_id: int,
+        initial: SimState,
+        *,
+        energy_ceiling: float | None = None,
+        hands: Hands | None = None,
     ) -> None:
         """Begins at ``initial``, a state of the model's scene ``scene_id``.
 
-        ``energy_ceiling`` is the highest energy that forces may reach, for models with an energy; None: no limit.
+        Args:
+            model: the simulator.
+            scene_id: index of the scene.
+            initial: positions at frames 0 and -1.
+            energy_ceiling: the highest energy that forces may reach, for models with an energy; None: no limit.
+            hands: poses of the hands that move the pins, by frame.
         """
         batch = model.batch((scene_id,))
         member, prepared = batch.members[0], model.prepare(batch)
-        identity = torch.eye(3).to(initial.positions).expand(member.units.stop - member.units.start, 3, 3)
         self._model, self._name = model, model.scenes[scene_id].name
         self.fps: float = model.fps[scene_id]
-        self.state, self.frame = initial, SteppedFrame(initial.positions, identity, identity)
+        self._hands, self._number = hands, 0
+        self.state, self.frame = initial, SteppedFrame(initial.positions, *prepared.reference.undeformed(initial))
         self.unit_of_kernel: Int[Tensor, " K"] = member.unit_of_kernel
 
-        def step(state: SimState, force: Tensor | None) -> SteppedFrame:
-            return model.step(batch, state, force, prepared)
+        still = isinstance(prepared.reference, StillReference)
 
-        graphed = model.rollout.cuda_graph and batch.rest.device.type == "cuda"
+        def step(state: SimState, force: Tensor | None) -> SteppedFrame:
+            return model.step(batch, state, force, prepared, hands=[hand_motion(self._hands, self._number)])
+
+        graphed = model.rollout.cuda_graph and batch.rest.device.type == "cuda" and still
         self._step = GraphedStep(step, batch.rest) if graphed else step
         self._guard: EnergyGuard | None = None
-        if model.rollout.energy_guard_frames and model.knows_energy:
+        # Gravity, impacts and hands change the energy of a body that is not in fixed pins.
+        if model.rollout.energy_guard_frames and model.knows_energy and still:
             self._guard = EnergyGuard(model, prepared, self._step, ceiling=energy_ceiling)
         # Whether positions and forces were finite since the last check; kept on the device, read every `_interval`.
         self._finite = torch.ones(2, dtype=torch.bool, device=initial.positions.device)
-        self._number, self._asked = 0, 0
+        self._asked = 0
         self._interval = 1 if initial.positions.device.type == "cpu" else INTERVAL
         self._note(0, torch.cat((initial.positions, initial.previous)))
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from gausim.core import ConfigError, GaussianScene, SimState, SteppedFrame
 from gausim.models.hierarchy.batch import LevelBatch, SceneBatch
 from gausim.models.hierarchy.units import FixedUnits, fixed_units
-from gausim.models.reference.reference import HandMotion, Placed, Reference, UnitMotion
+from gausim.models.reference.reference import HandMotion, Placed, StillReference, UnitMotion
 from gausim.models.settings import HierarchySettings, RolloutSettings
 from gausim.models.step.features import FeatureOptions
 from gausim.models.step.head import Head
@@ -107,7 +107,9 @@ class GausSim(SceneModel):
             levels = tuple(replace(level, rest=frames.into(i, level.rest)) for i, level in enumerate(levels))
             roots = frames.into(0, roots)
         template = self.template.prepare(batch, levels[-1])
-        reference = Reference() if isolated else self.reference(batch, mass, levels[-1], rest, template, frames)
+        reference = (
+            StillReference(batch) if isolated else self.reference(batch, mass, levels[-1], rest, template, frames)
+        )
         prepared = Prepared(batch, mass, fraction, levels, Solved.roots(roots), template, frames, rest, None, reference)
         return replace(prepared, still=self._outputs_at_rest(prepared)) if self.predictor.head.anchor else prepared
 

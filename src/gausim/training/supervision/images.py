@@ -84,6 +84,8 @@ class ImageSupervision:
         self.appearances = Appearances(scenes)
         self._keys: dict[tuple[int, tuple[str, ...]], Hashable] = {}
         self._rest: dict[Hashable, Rendered] = {}
+        # Positions at frame 0 of a sequence whose body does not begin at rest; set by the learner.
+        self.begins: Callable[[SequenceSample], Float[Tensor, "K 3"] | None] = lambda sample: None
 
     def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Comparison:
         """Rendering and image loss of the predictions of a batch."""
@@ -116,8 +118,13 @@ class ImageSupervision:
         return self._keys[known]
 
     def rest_image(self, sample: SequenceSample, rest: Float[Tensor, "K 3"]) -> Rendered:
-        """Image of the rest state in a sample's cameras; rendered once per scene and set of cameras."""
-        key = self._key(sample)
+        """Image of the rest state in a sample's cameras; rendered once per scene and set of cameras.
+
+        Of a body that begins elsewhere it is an image of where it begins, rendered once per sequence.
+        """
+        key, first = self._key(sample), self.begins(sample)
+        if first is not None:
+            key, rest = (key, sample.sequence_id), first
         if key not in self._rest:
             appearance = self.appearances.of(sample.scene_id, rest)
             identity = torch.eye(3, dtype=rest.dtype, device=rest.device)[None, None]

@@ -30,8 +30,8 @@ def energy_growth(
 
     The energy of a vibration in the template's terms is not constant from frame to frame, so means over stretches of
     about a period are compared. The motion continues from ``state``, scaled by a random factor, for ``frames`` frames;
-    loss gradients stop at the beginning of every ``stretch``. After an explosion nothing more is yielded: its loss
-    gradients are not finite.
+    loss gradients stop at the beginning of every ``stretch``. Surroundings are left out. After an explosion nothing
+    more is yielded: its loss gradients are not finite.
 
     Yields:
         max(0, ln E_k / E_{k-1}) of every member, stretch by stretch from the second on; differentiable.
@@ -42,10 +42,10 @@ def energy_growth(
         *(batch.rest + size * (x - batch.rest) for x in (state.positions.detach(), state.previous.detach()))
     )
     with torch.no_grad():
-        ((_, made),) = windows(model, batch, state, stretch, stretch)
+        ((_, made),) = windows(model, batch, state, stretch, stretch, isolated=True)
         before = _mean_energy(model, batch, state, made)
     state = after(made, state)
-    for _, made in windows(model, batch, state, frames - stretch, stretch):
+    for _, made in windows(model, batch, state, frames - stretch, stretch, isolated=True):
         now = _mean_energy(model, batch, state, made)
         if not bool(torch.isfinite(now).all()):
             return  # exploded; loss gradients are not finite (the step's only read that blocks on a GPU)
@@ -54,7 +54,8 @@ def energy_growth(
 
 
 def _mean_energy(model: Any, batch: SceneBatch, state: SimState, made: list[Step]) -> Float[Tensor, " S"]:
-    positions, prepared = [state.positions, *(step.positions for step in made)], model.prepare(batch)
+    positions = [state.positions, *(step.positions for step in made)]
+    prepared = model.prepare(batch, isolated=True)
     energies = [model.energy(batch, SimState(b, a), prepared) for a, b in zip(positions, positions[1:], strict=False)]
     return torch.stack(energies).mean(0)
 

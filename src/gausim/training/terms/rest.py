@@ -6,7 +6,7 @@ import torch
 
 from gausim.core import SimState
 from gausim.losses.static import static_loss
-from gausim.training.contracts import Simulator
+from gausim.training.contracts import SceneBatch, Simulator, Step
 from gausim.training.rollout import States
 from gausim.training.terms.term import StepInputs
 
@@ -29,15 +29,21 @@ class RestTerm:
         if not own:
             return
         batch = self._simulator.batch(own)
-        made = self._simulator.step(batch, SimState(batch.rest, batch.rest))
+        made = self._step(batch)
         diagonal = torch.cat([batch.rest.new_full((len(batch.rest[m.kernels]), 1), step.diagonals[m.scene_id])
                               for m in batch.members])  # fmt: skip
         loss = static_loss(made.positions, batch.rest, diagonal) / len(scene_ids)
         step.backward(step.objective.static_weight * loss)
         step.statistics.static = loss.detach()
 
+    def _step(self, batch: SceneBatch) -> Step:
+        """One step from rest, without surroundings: what falls does not stay."""
+        still = SimState(batch.rest, batch.rest)
+        made: Step = self._simulator.step(batch, still, prepared=self._simulator.prepare(batch, isolated=True))
+        return made
+
     def _descend_image(self, step: StepInputs) -> None:
         batch = self._simulator.batch([s.scene_id for s in step.samples])
-        made = self._simulator.step(batch, SimState(batch.rest, batch.rest))
+        made = self._step(batch)
         losses, _ = step.images.at_rest(step.samples, batch)(States.of([made]), 0)
         step.backward(step.objective.rest_image_weight / len(step.whole) * losses.sum())

@@ -1,0 +1,70 @@
+"""Where free bodies are and how fast they move in their first frames, from silhouettes: the start of their training."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gausim.core import Cameras
+from gausim.data.datamodule import ReadyDataModule
+from gausim.data.dataset import SampleKey, SequenceSample
+from gausim.render.draw import SceneAppearance, draw
+from gausim.training.module import GausSimModule
+
+# Frames before which a body is taken to fall freely.
+FREE_FALL = 4
+
+
+def begin_free_bodies(module: GausSimModule, datamodule: ReadyDataModule) -> None:
+    """Sets the initial states of all sequences of free bodies from the silhouettes of frames 0 to 4."""
+    scenes, states = module.simulator.scenes, cast(Any, module.initial_states)
+    for sequence_id, (scene_id, record) in enumerate(datamodule.index.entries):
+        surroundings = scenes[scene_id].surroundings
+        if not surroundings.free:
+            continue
+        last = min(FREE_FALL, len(datamodule.objects[scene_id].train_frames) - 1)
+        sample = datamodule.index[SampleKey(sequence_id, last)]
+        gravity = torch.tensor(surroundings.gravity or (0.0, 0.0, 0.0), dtype=torch.float64) / record.fps**2
+        observed = centroids(sample.frames[..., 3].double() / 255, sample.cameras)
+        place, velocity = ballistic(observed, gravity)
+        rest = scenes[scene_id].means.double()
+        moved = place - rest[scenes[scene_id].simulated].mean(0)
+        # The middle of what is seen is not the centre of the kernels: compare with the body drawn at that place.
+        drawn = centroids(_alpha(module, sample, rest + moved)[None], sample.cameras)[0]
+        states.begin(sequence_id, moved + place - drawn, velocity)
+
+
+def centroids(alpha: Float[Tensor, "F V H W"], cameras: Cameras) -> Float[Tensor, "F 3"]:
+    """The point nearest to the rays through the silhouettes' centroids, for every frame [scene units]."""
+    weight = alpha.sum((2, 3)).clamp_min(1e-12)
+    y, x = (torch.arange(n, dtype=alpha.dtype) + 0.5 for n in alpha.shape[2:])
+    pixel = torch.stack(((alpha.sum(2) @ x) / weight, (alpha.sum(3) @ y) / weight, torch.ones_like(weight)), -1)
+    rays = torch.einsum("vba,vbc,fvc->fva", cameras.viewmats[:, :3, :3].double(),
+                        torch.linalg.inv(cameras.Ks.double()), pixel)  # fmt: skip
+    rays = rays / rays.norm(dim=-1, keepdim=True)
+    across = torch.eye(3, dtype=alpha.dtype) - rays[..., :, None] * rays[..., None, :]
+    across = across * (weight > 1e-6).to(alpha)[..., None, None]
+    target = (across @ cameras.centers.double()[None, :, :, None]).sum(1)
+    return torch.linalg.lstsq(across.sum(1), target).solution[..., 0]
+
+
+def ballistic(places: Float[Tensor, "F 3"], gravity: Float[Tensor, " 3"]) -> tuple[Tensor, Tensor]:
+    """x_0 and x_0 - x_{-1} of the fall x_f = x_0 + f (x_0 - x_{-1}) + f (f + 1) / 2 g nearest to the places."""
+    frame = torch.arange(len(places), dtype=places.dtype)
+    straight = places - (frame * (frame + 1) / 2)[:, None] * gravity
+    columns = torch.stack((torch.ones_like(frame), frame), 1)
+    found = torch.linalg.lstsq(columns, straight).solution
+    return found[0], found[1]
+
+
+@torch.no_grad()
+def _alpha(module: GausSimModule, sample: SequenceSample, positions: Float[Tensor, "K 3"]) -> Float[Tensor, "V H W"]:
+    scene = module.simulator.scenes[sample.scene_id]
+    identity = torch.eye(3)[None, None]
+    units = torch.zeros(scene.count, dtype=torch.long)
+    appearance = SceneAppearance.of(scene, scene.foreground)
+    places = positions.to(scene.means)[None]
+    return draw(module.renderer, appearance, places, identity, identity, units, sample.cameras).alpha[0].double()
