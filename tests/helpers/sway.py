@@ -72,8 +72,10 @@ class Previous(nn.Module):
         super().__init__()
         self.values = nn.ParameterList(model.scenes[i].means.clone() for i in scene_of_sequence)
 
-    def previous(self, sequence_id: int) -> Tensor:
-        return self.values[sequence_id]
+        self.rest = [model.scenes[i].means for i in scene_of_sequence]
+
+    def state(self, sequence_id: int) -> SimState:
+        return SimState(self.rest[sequence_id], self.values[sequence_id])
 
 
 SCENE_OF_SEQUENCE = (0, 0, 1)

@@ -47,10 +47,12 @@ def checkpointed_step(
     def run(positions: Tensor, previous: Tensor) -> tuple[Tensor, ...]:
         with gathering_nothing(normalisers) if next(calls) else nullcontext():
             step = model.step(batch, SimState(positions, previous), **moved)
-        return step.positions, step.deformation_gradients, step.rotations, step.momentum
+        last = positions if step.state is None else step.state.previous
+        return step.positions, step.deformation_gradients, step.rotations, step.momentum, last
 
     # A step draws no random numbers, so no generator needs to be restored.
-    return Frame(*torch_checkpoint(run, state.positions, state.previous, use_reentrant=False, preserve_rng_state=False))
+    made = torch_checkpoint(run, state.positions, state.previous, use_reentrant=False, preserve_rng_state=False)
+    return Frame(*made[:4], SimState(made[0], made[4]))
 
 
 @dataclass(frozen=True, eq=False)

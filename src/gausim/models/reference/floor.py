@@ -1,54 +1,111 @@
 """Contact with a floor: impulses at the lowest kernels, shared by the modes and the rigid motion of the body.
 
-A step without the floor gives the gaps g of the contact points from the plane, and their displacements s along it.
-With impulses p (along the normal and two tangents) they become g + W p and s + W p, where W is the Delassus operator:
-how far a contact point moves by an impulse at another, through the body's modes and its rigid motion. The impulses are
-those of Signorini's and Coulomb's laws,
+An impact is shorter than a frame, so it is followed in substeps h. Within a frame the body deviates by coordinates q,
+amplitudes of its modes and a rigid motion, from the path it would take without the floor:
 
-    p_n >= 0, g >= g_min, p_n (g - g_min) = 0        |p_t| <= mu p_n, against the sliding
+    (M + h^2 K / 4 + h D / 2) (q_{i+1} - 2 q_i + q_{i-1}) = -h^2 K q_i - h D (q_i - q_{i-1}) + J^T p   [frame units]
 
-found by projected gradients on the friction cones (Mazhar, Heyn, Negrut and Tasora 2015). Loss gradients are those of
-the linear equations that hold as long as the same points press, stick and slide.
+J are the displacements of the contact points per coordinate, along the normal and two tangents. The impulses p obey
+Signorini's and Coulomb's laws for the gap g, which is at least g_min, and the sliding s in a substep,
+
+    p_n >= 0, g >= g_min, p_n (g - g_min) = 0        |p_t| <= mu p_n, against s
+
+and are found by projected gradients on the friction cones (Mazhar, Heyn, Negrut and Tasora 2015). Loss gradients are
+those of the linear equations that hold as long as the same points press, stick and slide.
+
+After the frame the body has the deviation q and its velocity v. The trapezoidal step of a frame keeps the amplitude of
+every mode if it starts from q at t + 1 and, at t, from q - (M + K / 4)^-1 (K q / 2 + M v).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import Floor, SimState
+from gausim.models.reference.placed import Placed
 from gausim.ops.rotation import cross_matrix, rotation_of
 
-if TYPE_CHECKING:
-    from gausim.models.reference.reference import Placed
-
-# Added to the diagonal of W, as a fraction of its mean: contact points close together are hardly independent.
+# Added to the diagonal of J (M + ...)^-1 J^T, as a fraction of its mean: near contact points are hardly independent.
 COMPLIANCE = 1e-3
-ITERATIONS = 60
-# Rounds of contact points: the impulses of one may press another kernel into the floor.
-ROUNDS = 3
-# Depth below which a kernel is in contact [fractions of the body's size].
-SHALLOW = 1e-6
+SUBSTEPS, ITERATIONS = 8, 30
+# A unit takes part in a frame's contact if its lowest kernel comes nearer to the floor [fractions of the body's size].
+NEAR = 0.05
 # Part of the friction cone's radius above which a point slides.
 SLIDING = 0.999
 
 
 @dataclass(frozen=True, eq=False)
 class Elasticity:
-    """How a body yields to impulses at its kernels within one step."""
+    """Matrices of a body's modes, and how kernels follow them."""
 
     unit_of_kernel: Int[Tensor, " K"]  # N (the identity row) for kernels that never move
     offset: Float[Tensor, "K 3"]  # X_k - X_c [scene units]
     modes: Float[Tensor, "N 3 M"]  # displacements of units per mode, in the reference's axes; M may be 0
     slopes: Float[Tensor, "N 3 3 M"]  # and their gradients [1 / scene units]
-    response: Float[Tensor, "M M"]  # modal displacement per modal impulse [frame units]
+    matrices: tuple[Tensor, Tensor, Tensor]  # inertia, stiffness and damping, each (M, M) [frame units]
     mass: Float[Tensor, ""]  # of the whole body, in the modes' units
     fraction: Float[Tensor, " K"]  # of every kernel, of the whole
     free: bool  # whether the body moves as a whole
+
+
+@dataclass(frozen=True, eq=False)
+class Coordinates:
+    """Coordinates of a body's deviation in one frame: its modes, and six of its rigid motion where it is free."""
+
+    body: Elasticity
+    rotation: Float[Tensor, "N 3 3"]  # from the modes' axes to scene axes
+    centre: Float[Tensor, " 3"] | None  # of a free body
+    inertia: Float[Tensor, "C C"]
+    stiffness: Float[Tensor, "C C"]
+    damping: Float[Tensor, "C C"]
+
+    @classmethod
+    def of(
+        cls, body: Elasticity, positions: Float[Tensor, "K 3"], rotation: Tensor, centre: Tensor | None
+    ) -> Coordinates:
+        """The coordinates about the ``positions`` of a frame."""
+        inertia, stiffness, damping = body.matrices
+        if body.free and centre is not None:
+            arm = positions - centre
+            square = (body.fraction * arm.square().sum(-1)).sum()
+            turning = square * torch.eye(3).to(arm) - arm.mT @ (body.fraction[:, None] * arm)
+            none = arm.new_zeros(6, 6)
+            rigid = torch.block_diag(torch.eye(3).to(arm), turning) * body.mass
+            inertia = torch.block_diag(inertia, rigid)
+            stiffness, damping = torch.block_diag(stiffness, none), torch.block_diag(damping, none)
+        return cls(body, rotation.expand(len(body.modes), 3, 3), centre, inertia, stiffness, damping)
+
+    def jacobian(
+        self, points: Int[Tensor, " P"], positions: Float[Tensor, "K 3"], axes: Float[Tensor, "3 3"]
+    ) -> Float[Tensor, "P3 C"]:
+        """Displacements of kernels along the axes per coordinate."""
+        body, unit = self.body, self.body.unit_of_kernel[points]
+        local = body.modes[unit] + torch.einsum("cabm,cb->cam", body.slopes[unit], body.offset[points])
+        rows = torch.einsum("da,cab,cbm->cdm", axes, self.rotation[unit], local)
+        if self.centre is not None:
+            arms = -axes @ cross_matrix(positions[points] - self.centre)
+            rows = torch.cat((rows, axes.expand(len(points), 3, 3), arms), -1)
+        return rows.flatten(0, 1)
+
+    def applied(
+        self, positions: Float[Tensor, "K 3"], amount: Float[Tensor, " C"]
+    ) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "R 3 3"], Float[Tensor, "3 3"]]:
+        """Displaced kernels, the change of the units' deformation gradients, and the rotation of the whole."""
+        body, unit = self.body, self.body.unit_of_kernel
+        modal, none = amount[: body.modes.shape[-1]], positions.new_zeros(1, 3, 3)
+        shift = torch.einsum("nab,nbm,m->na", self.rotation, body.modes, modal)
+        slope = torch.cat((torch.einsum("nab,nbcm,m->nac", self.rotation, body.slopes, modal), none))
+        moved = positions + torch.cat((shift, none[0, :1]))[unit] + (slope[unit] @ body.offset[..., None])[..., 0]
+        turn = torch.eye(3).to(positions)
+        if self.centre is not None:
+            rigid, turn = amount[-6:], rotation_of(amount[-3:])
+            moved = moved - (body.fraction[:, None] * (moved - positions)).sum(0)  # modes keep the centre of mass
+            moved = self.centre + rigid[:3] + (moved - self.centre) @ turn.mT
+        return torch.where((unit == len(body.modes))[:, None], positions, moved), slope, turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +117,7 @@ class Contact:
     restitution: Float[Tensor, ""]
 
     def resolve(
-        self,
-        placed: Placed,
-        state: SimState,
-        body: Elasticity,
-        rotation: Float[Tensor, "*N 3 3"],
-        centre: Float[Tensor, " 3"] | None,
+        self, placed: Placed, state: SimState, body: Elasticity, rotation: Tensor, centre: Tensor | None
     ) -> Placed:
         """A predicted frame, with the impulses of the floor; no kernel is left below it.
 
@@ -73,72 +125,94 @@ class Contact:
             placed: the prediction without the floor, in scene axes.
             state: positions at t and t - 1.
             body: how the body yields.
-            rotation: of the whole body, or of every unit, from the modes' axes to scene axes.
-            centre: centre of mass of a free body at t + 1; None for a held one.
+            rotation: (3, 3) of the whole body, or (N, 3, 3) of every unit, from the modes' axes to scene axes.
+            centre: centre of mass (3,) of a free body at t + 1; None for a held one.
         """
+        points = self._points(placed.positions, state, body)
+        if len(points):
+            coordinates = Coordinates.of(body, placed.positions, rotation, centre)
+            now, before = self._deviation(placed, state, coordinates, points)
+            moved, slope, turn = coordinates.applied(placed.positions, now)
+            earlier, _, _ = coordinates.applied(state.positions, before)
+            deformation = torch.cat(
+                (turn @ (placed.deformation_gradients + slope)[:-1], placed.deformation_gradients[-1:])
+            )
+            rotations = torch.cat((turn @ placed.rotations[:-1], placed.rotations[-1:]))
+            placed = Placed(moved, deformation, rotations, earlier)
         moving = body.unit_of_kernel < len(body.modes)
-        turned = rotation.expand(len(body.modes), 3, 3)
-        for _ in range(ROUNDS):
-            gap = torch.where(moving, self.floor.height(placed.positions), torch.inf)
-            points = _lowest(gap.detach(), body, SHALLOW * float(body.offset.detach().abs().max()))
-            if not len(points):
-                return placed
-            placed = self._pushed(placed, state, body, turned, centre, points)
-        below = torch.where(moving, -self.floor.height(placed.positions), 0.0).clamp_min(0)
-        lifted = placed.positions + below[:, None] * placed.positions.new_tensor(self.floor.normal)
-        return placed._replace(positions=lifted)
+        below = torch.where(moving, -self.floor.height(placed.positions), 0.0).clamp_min(0)[:, None]
+        lift = below * placed.positions.new_tensor(self.floor.normal)
+        previous = None if placed.previous is None else placed.previous + lift
+        return placed._replace(positions=placed.positions + lift, previous=previous)
 
-    def _pushed(
-        self, placed: Placed, state: SimState, body: Elasticity, turned: Tensor, centre: Tensor | None, points: Tensor
-    ) -> Placed:
-        x = placed.positions
-        axes = _axes(x.new_tensor(self.floor.normal))
-        unit = body.unit_of_kernel[points]
-        local = body.modes[unit] + torch.einsum("cabm,cb->cam", body.slopes[unit], body.offset[points])
-        modal = torch.einsum("da,cab,cbm->cdm", axes, turned[unit], local).flatten(0, 1)
-        rigid = _rigid_rows(axes, x[points], centre) if body.free and centre is not None else None
-        inverse = _rigid_inverse(body, x, centre) if rigid is not None and centre is not None else None
-        delassus = modal @ body.response @ modal.mT
-        if rigid is not None and inverse is not None:
-            delassus = delassus + rigid @ inverse @ rigid.mT
-        delassus = delassus + COMPLIANCE * delassus.diagonal().mean() * torch.eye(len(delassus)).to(delassus)
-        impulse = self._impulses(delassus, self._wanted(x[points], state, points, axes))
-        amount = body.response @ (modal.mT @ impulse)
-        shift = torch.cat((torch.einsum("nab,nbm,m->na", turned, body.modes, amount), x.new_zeros(1, 3)))
-        slope = torch.cat((torch.einsum("nab,nbcm,m->nac", turned, body.slopes, amount), x.new_zeros(1, 3, 3)))
-        unit = body.unit_of_kernel
-        moved = x + shift[unit] + (slope[unit] @ body.offset[..., None])[..., 0]
-        deformation, rotations = placed.deformation_gradients + slope, placed.rotations
-        if rigid is not None and inverse is not None and centre is not None:
-            change = inverse @ (rigid.mT @ impulse)
-            turn, still = rotation_of(change[3:]), unit == len(body.modes)
-            moved = torch.where(still[:, None], x, centre + change[:3] + (moved - centre) @ turn.mT)
-            deformation = torch.cat((turn @ deformation[:-1], deformation[-1:]))
-            rotations = torch.cat((turn @ rotations[:-1], rotations[-1:]))
-        return placed._replace(positions=moved, deformation_gradients=deformation, rotations=rotations)
+    def _points(self, x: Float[Tensor, "K 3"], state: SimState, body: Elasticity) -> Int[Tensor, " P"]:
+        """The lowest kernel of every unit that comes near the floor; none if nothing would touch it."""
+        moving = body.unit_of_kernel < len(body.modes)
+        gap = torch.where(moving, torch.minimum(self.floor.height(x), self.floor.height(state.positions)), torch.inf)
+        gap, size = gap.detach(), float(body.offset.detach().norm(dim=1).max()) + 1e-12
+        if not bool((gap < -1e-6 * size).any()):
+            return torch.zeros(0, dtype=torch.long, device=x.device)
+        return _lowest(gap, body, NEAR * size)
 
-    def _wanted(self, x: Tensor, state: SimState, points: Tensor, axes: Tensor) -> Float[Tensor, " C3"]:
-        """What the impulses have to undo: depth below the wanted gap, and sliding, of every contact point."""
-        now, before = self.floor.height(state.positions[points]), self.floor.height(state.previous[points])
-        bounce = self.restitution * (now.clamp_min(0) + (before - now).clamp_min(0))
-        wanted = (x - state.positions[points]) @ axes.mT
-        return torch.cat((self.floor.height(x)[:, None] - bounce[:, None], wanted[:, 1:]), 1).flatten()
+    def _deviation(
+        self, placed: Placed, state: SimState, coordinates: Coordinates, points: Int[Tensor, " P"]
+    ) -> tuple[Float[Tensor, " C"], Float[Tensor, " C"]]:
+        """The deviation at t + 1, and at t as the next frame has to see it."""
+        axes, h = _axes(placed.positions.new_tensor(self.floor.normal)), 1.0 / SUBSTEPS
+        jacobian = coordinates.jacobian(points, placed.positions, axes)
+        inertia, stiffness, damping = coordinates.inertia, coordinates.stiffness, coordinates.damping
+        response = torch.linalg.inv(inertia + h**2 / 4 * stiffness + h / 2 * damping)
+        spread = jacobian @ response @ jacobian.mT
+        spread = spread + COMPLIANCE * spread.diagonal().mean() * torch.eye(len(spread)).to(spread)
+        start, end = (
+            (x[points] - x.new_tensor(self.floor.point)) @ axes.mT for x in (state.positions, placed.positions)
+        )
+        bent = end - 2 * start + (state.previous[points] - start.new_tensor(self.floor.point)) @ axes.mT
+        paths = [start + i * h * (end - start) + 0.5 * i * h * (i * h - 1) * bent for i in range(-1, SUBSTEPS + 1)]
+        q = last = jacobian.new_zeros(jacobian.shape[1])
+        place, before = paths[1].flatten(), paths[0].flatten()
+        impulse = torch.zeros(len(spread), dtype=torch.float64, device=spread.device)
+        for path in paths[2:]:
+            force = -(h**2) * (stiffness @ q) - h * (damping @ (q - last))
+            ahead = 2 * q - last + response @ force
+            reached = path.flatten() + jacobian @ ahead
+            p, impulse = self._impulses(spread, self._wanted(reached, place, before), impulse)
+            q, last = ahead + response @ (jacobian.mT @ p), q
+            before, place = place, path.flatten() + jacobian @ q
+        speed = (q - last) / h - 0.5 * h * torch.linalg.solve(inertia, stiffness @ q + damping @ (q - last) / h)
+        seen = torch.linalg.solve(inertia + stiffness / 4, 0.5 * (stiffness @ q) + inertia @ speed)
+        return q, q - seen
 
-    def _impulses(self, delassus: Float[Tensor, "D D"], wanted: Float[Tensor, " D"]) -> Float[Tensor, " D"]:
-        """Impulses of all contact points, each along the normal and two tangents."""
+    def _wanted(self, reached: Tensor, place: Tensor, before: Tensor) -> Float[Tensor, " P3"]:
+        """What impulses have to undo: depth below the wanted gap, and sliding, of every contact point."""
+        gap, last = place.view(-1, 3)[:, 0], before.view(-1, 3)[:, 0]
+        bounce = self.restitution * (gap.clamp_min(0) + (last - gap).clamp_min(0))
+        slid = (reached - place).view(-1, 3)[:, 1:]
+        return torch.cat(((reached.view(-1, 3)[:, 0] - bounce)[:, None], slid), 1).flatten()
+
+    def _impulses(
+        self, spread: Float[Tensor, "D D"], wanted: Float[Tensor, " D"], guess: Float[Tensor, " D"]
+    ) -> tuple[Float[Tensor, " D"], Float[Tensor, " D"]]:
+        """Impulses of all contact points, each along the normal and two tangents; and in double precision."""
         with torch.no_grad():
-            found = _projected_gradients(delassus.double(), wanted.double(), float(self.friction)).view(-1, 3)
+            if not bool((wanted.view(-1, 3)[:, 0] < 0).any()):
+                return torch.zeros_like(wanted), torch.zeros_like(guess)
+            friction = float(self.friction)
+            solved = _projected_gradients(spread.double(), wanted.double(), friction, guess)
+            found = solved.view(-1, 3)
             size = found[:, 1:].norm(dim=1)
             pressing = found[:, 0] > 1e-9 * found[:, 0].max().clamp_min(1e-30)
-            sliding = pressing & (size >= SLIDING * float(self.friction) * found[:, 0])
+            sliding = pressing & (size >= SLIDING * friction * found[:, 0])
             direction = (found[:, 1:] / size.clamp_min(1e-30)[:, None]).to(wanted)
-        equal = _solved(delassus, wanted, pressing, sliding, direction * self.friction)
-        return found.flatten().to(wanted) + (equal - equal.detach())
+        if not torch.is_grad_enabled():
+            return solved.to(wanted), solved
+        equal = _solved(spread, wanted, pressing, sliding, direction * self.friction)
+        return solved.to(wanted) + (equal - equal.detach()), solved
 
 
-def _lowest(gap: Float[Tensor, " K"], body: Elasticity, depth: float) -> Int[Tensor, " C"]:
-    """The lowest kernel of each unit that has one below the floor."""
-    inside = (gap < -depth).nonzero()[:, 0]
+def _lowest(gap: Float[Tensor, " K"], body: Elasticity, near: float) -> Int[Tensor, " P"]:
+    """The lowest kernel of each unit that has one nearer to the floor than ``near``."""
+    inside = (gap < near).nonzero()[:, 0]
     order = inside[gap[inside].argsort(stable=True)]
     unit = body.unit_of_kernel[order]
     sort = unit.argsort(stable=True)
@@ -155,24 +229,12 @@ def _axes(normal: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
     return torch.stack((normal, first, torch.linalg.cross(normal, first)))
 
 
-def _rigid_rows(axes: Tensor, points: Float[Tensor, "C 3"], centre: Float[Tensor, " 3"]) -> Float[Tensor, "D 6"]:
-    """Displacement of the contact points along the axes per translation and rotation of the body."""
-    arms = -axes @ cross_matrix(points - centre)
-    return torch.cat((axes.expand(len(points), 3, 3), arms), -1).flatten(0, 1)
-
-
-def _rigid_inverse(body: Elasticity, x: Float[Tensor, "K 3"], centre: Float[Tensor, " 3"]) -> Float[Tensor, "6 6"]:
-    """Inverse of the mass and of the inertia tensor."""
-    arm = x - centre
-    square = (body.fraction * arm.square().sum(-1)).sum()
-    inertia = square * torch.eye(3).to(x) - arm.mT @ (body.fraction[:, None] * arm)
-    return torch.block_diag(torch.eye(3).to(x) / body.mass, torch.linalg.inv(inertia) / body.mass)
-
-
-def _projected_gradients(w: Float[Tensor, "D D"], b: Float[Tensor, " D"], friction: float) -> Float[Tensor, " D"]:
-    """Minimum of p^T W p / 2 + p^T b over the friction cones, by accelerated projected gradients."""
+def _projected_gradients(
+    w: Float[Tensor, "D D"], b: Float[Tensor, " D"], friction: float, guess: Float[Tensor, " D"]
+) -> Float[Tensor, " D"]:
+    """Minimum of p^T W p / 2 + p^T b over the friction cones, by accelerated projected gradients from a guess."""
     rate = 1 / float(torch.linalg.matrix_norm(w, torch.inf))
-    p = y = torch.zeros_like(b)
+    p = y = guess
     momentum = 1.0
     for _ in range(ITERATIONS):
         after = _onto_cones((y - rate * (w @ y + b)).view(-1, 3), friction).flatten()

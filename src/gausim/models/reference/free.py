@@ -16,7 +16,8 @@ from torch import Tensor
 
 from gausim.core import SimState
 from gausim.models.reference.floor import Contact, Elasticity
-from gausim.models.reference.reference import Body, BodyMotion, HandMotion, Placed, UnitMotion
+from gausim.models.reference.placed import Placed
+from gausim.models.reference.reference import Body, BodyMotion, HandMotion, UnitMotion
 from gausim.ops.deformation import polar_rotation
 from gausim.ops.rotation import rotation_of
 
@@ -128,4 +129,4 @@ class FreeMotion(BodyMotion):
 
 def _with_identity_row(placed: Placed, made: Placed) -> Placed:
     """Kernels that are never simulated keep the identity, the last row."""
-    return Placed(placed.positions, *(torch.cat((x[:-1], y[-1:])) for x, y in zip(placed[1:], made[1:], strict=True)))
+    return Placed(placed.positions, *(torch.cat((x[:-1], y[-1:])) for x, y in zip(placed[1:3], made[1:3], strict=True)))

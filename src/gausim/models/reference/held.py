@@ -19,7 +19,8 @@ from torch import Tensor
 from gausim.core import GaussianScene, HandPose, SimState
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.reference.floor import Contact, Elasticity
-from gausim.models.reference.reference import Body, BodyMotion, HandMotion, Placed, UnitMotion
+from gausim.models.reference.placed import Placed
+from gausim.models.reference.reference import Body, BodyMotion, HandMotion, UnitMotion
 from gausim.models.template.solid import static_responses
 from gausim.ops.deformation import polar_rotation
 from gausim.ops.rotation import rotation_vector

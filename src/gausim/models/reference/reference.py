@@ -25,6 +25,7 @@ from torch import Tensor
 
 from gausim.core import HandPose, Hands, SimState
 from gausim.models.hierarchy.batch import Member, SceneBatch
+from gausim.models.reference.placed import Placed
 
 
 class HandMotion(NamedTuple):
@@ -38,14 +39,6 @@ class HandMotion(NamedTuple):
 def hand_motion(hands: Hands | None, frame: int) -> HandMotion | None:
     """Poses of the step from ``frame`` to the next; None without hands."""
     return None if hands is None else HandMotion(hands(frame - 1), hands(frame), hands(frame + 1))
-
-
-class Placed(NamedTuple):
-    """Kernels and units of a body, in scene axes."""
-
-    positions: Float[Tensor, "K 3"]  # kernel means [scene units]
-    deformation_gradients: Float[Tensor, "R 3 3"]  # of the units and the identity row
-    rotations: Float[Tensor, "R 3 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,20 +171,31 @@ class MovingReference(Reference):
             own = SimState(state.positions[member.kernels], state.previous[member.kernels])
             motions.append(body.carry(now[span], before[span], own, None if hands is None else hands[i]))
             parts.append(motions[-1].relative)  # type: ignore[union-attr]
-        return _CarriedBodies(self._members, motions, parts)
+        return _CarriedBodies(self._members, motions, parts, state)
 
 
 class _CarriedBodies(Carried):
     def __init__(
-        self, members: Sequence[Member], motions: Sequence[BodyMotion | None], parts: Sequence[UnitMotion]
+        self,
+        members: Sequence[Member],
+        motions: Sequence[BodyMotion | None],
+        parts: Sequence[UnitMotion],
+        state: SimState,
     ) -> None:
-        self._members, self._motions = members, motions
+        self._members, self._motions, self._state = members, motions, state
         load = torch.cat([part.load for part in parts if part.load is not None])
         self.relative = UnitMotion(torch.cat([p.now for p in parts]), torch.cat([p.before for p in parts]), load)
 
     def place(self, made: Placed) -> Placed:
         placed = []
         for member, motion in zip(self._members, self._motions, strict=True):
-            own = Placed(made.positions[member.kernels], *(x[member.units] for x in made[1:]))
+            rows = made.deformation_gradients[member.units], made.rotations[member.units]
+            own = Placed(made.positions[member.kernels], *rows)
             placed.append(own if motion is None else motion.place(own))
-        return Placed(*(torch.cat(column) for column in zip(*placed, strict=True)))
+        positions, deformation, rotations = (torch.cat([own[i] for own in placed]) for i in range(3))
+        previous = None
+        if any(own.previous is not None for own in placed):
+            now = [self._state.positions[member.kernels] for member in self._members]
+            before = [own.previous for own in placed]
+            previous = torch.cat([a if b is None else b for a, b in zip(now, before, strict=True)])
+        return Placed(positions, deformation, rotations, previous)

@@ -111,9 +111,11 @@ def reference_of(
     return MovingReference(batch, bodies)
 
 
-def _elasticity(template: PreparedTemplate, member: int, axes: Tensor | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Modes and slopes in scene axes, response and mass."""
-    modes, slopes, response, mass = template.yielding(member)
+def _elasticity(
+    template: PreparedTemplate, member: int, axes: Tensor | None
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
+    """Modes and slopes in scene axes, matrices and mass."""
+    modes, slopes, matrices, mass = template.yielding(member)
     if axes is None:
-        return modes, slopes, response, mass
-    return axes.mT @ modes, torch.einsum("nca,ncdm,ndb->nabm", axes, slopes, axes), response, mass
+        return modes, slopes, matrices, mass
+    return axes.mT @ modes, torch.einsum("nca,ncdm,ndb->nabm", axes, slopes, axes), matrices, mass

@@ -121,7 +121,8 @@ class SceneStepper:
             positions = torch.where(held[:, None], self.state.positions, positions)
         self._number += 1
         self._note(0, positions)
-        self.state = SimState(positions, self.state.positions)
+        after = getattr(made, "state", None)
+        self.state = SimState(positions, self.state.positions if after is None else after.previous)
         self.frame = SteppedFrame(positions, made.deformation_gradients, made.rotations)
         return self.frame
 

@@ -12,7 +12,8 @@ from torch import Tensor, nn
 from gausim.core import ConfigError, GaussianScene, SimState, SteppedFrame
 from gausim.models.hierarchy.batch import LevelBatch, SceneBatch
 from gausim.models.hierarchy.units import FixedUnits, fixed_units
-from gausim.models.reference.reference import HandMotion, Placed, StillReference, UnitMotion
+from gausim.models.reference.placed import Placed
+from gausim.models.reference.reference import HandMotion, StillReference, UnitMotion
 from gausim.models.settings import HierarchySettings, RolloutSettings
 from gausim.models.step.features import FeatureOptions
 from gausim.models.step.head import Head
@@ -37,6 +38,7 @@ class Step(SteppedFrame):
     # conserve_momentum
     momentum: Float[Tensor, ""]
     predicted: tuple[Float[Tensor, "_ 3 3"], ...]  # F per predicted level, coarse to fine
+    state: SimState | None = None  # where the next step starts, if an impact changed a velocity within the frame
 
 
 class GausSim(SceneModel):
@@ -139,7 +141,9 @@ class GausSim(SceneModel):
         carried, units = prepared.carried(state, hands)
         finest, template, momentum, predicted = self._descend(prepared, units, correction_scale, [])
         finest, template, predicted = prepared.in_scene_axes(finest, template, predicted)
-        return Step(*carried.place(Placed(*inherit(finest, template, batch.kernels))), momentum, tuple(predicted))
+        x, deformation, rotations, before = carried.place(Placed(*inherit(finest, template, batch.kernels)))
+        after = None if before is None else SimState(x, before)
+        return Step(x, deformation, rotations, momentum, tuple(predicted), after)
 
     def _descend(
         self, prepared: Prepared, units: UnitMotion, correction_scale: float, outputs: list[Tensor]

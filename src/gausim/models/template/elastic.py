@@ -121,9 +121,11 @@ class PreparedElastic(ModalScene):
         a, b, e = scene.matrices()
         self.transition = torch.cat((a.mT, -b.mT))
         self.size = scene.gain * (scene.initial_log_stiffness + SPECTRUM_GAIN * scene.stiffness).exp()
-        self.response, self.turned = e, self.size * e.mT
-        root = scene.inertia_root()
-        self.inertia = root.mT @ root
+        self.turned = self.size * e.mT
+        root, (stretch, mixing) = scene.inertia_root(), scene.roots()
+        pull = (stretch[:, None] * mixing).mT @ root
+        self.inertia, self.stiffness = root.mT @ root, pull.mT @ pull
+        self.damping = root.mT @ scene.dissipation() @ root
         # I - A + B = E H^T K H: the restoring force of the trained stiffness, as it acts in a step.
         self.pull = torch.eye(len(a), dtype=a.dtype, device=a.device) - a.mT + b.mT
 

@@ -30,7 +30,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -273,12 +272,7 @@ class PreparedMaterial(ModalScene):
         super().__init__(body.projection, body.modes, body.gradients)
         self.matrices, self.springs, self.positions = matrices, body.springs, body.modes.flatten(0, 1)
         self.operator = matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2
-        self.inertia = matrices.inertia
-
-    @cached_property
-    def response(self) -> Float[Tensor, "M M"]:  # type: ignore[override]
-        """The inverse of the implicit step's operator at rest, computed where something touches the body."""
-        return torch.linalg.inv(self.operator)
+        self.inertia, self.stiffness, self.damping = matrices.inertia, matrices.stiffness, matrices.damping
 
     def change(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
         """z_{t+1} - 2 z_t + z_{t-1} (see the module's docstring)."""

@@ -54,16 +54,16 @@ class PreparedTemplate:
         """The template state at t + 1; ``load`` is an acceleration of every unit [scene units / frame^2]."""
         return TemplateState(motion.rest, None)
 
-    def yielding(self, member: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """How a member of the batch yields to impulses within a step.
+    def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
+        """How a member of the batch yields to impulses.
 
         Returns:
-            Modes (N, 3, M) and their gradients (N, 3, 3, M), modal displacements per modal impulse (M, M), and the mass
-            of the body in the modes' units; here the body is rigid, M = 0.
+            Modes (N, 3, M) and their gradients (N, 3, 3, M); inertia, stiffness and damping (M, M) [frame units];
+            and the mass of the body in the modes' units; here the body is rigid, M = 0.
         """
         count = self.spans[member].stop - self.spans[member].start
         none = torch.zeros(0, 0, device=self.device)
-        return none.new_zeros(count, 3, 0), none.new_zeros(count, 3, 3, 0), none, none.new_ones(())
+        return none.new_zeros(count, 3, 0), none.new_zeros(count, 3, 3, 0), (none, none, none), none.new_ones(())
 
     def carried(self, motion: Motion) -> Motion:
         """The part of the motion that is input to template and network; here all of it."""
@@ -119,12 +119,14 @@ class ModalScene(ABC):
     """Template of one scene in modal coordinates z between two updates of the parameters, for S sequences at once.
 
     Attributes:
-        response: displacement z_{t+1} per modal impulse.
-        inertia: modal impulse per acceleration.
+        inertia: modal inertia [frame units].
+        stiffness: modal stiffness at rest.
+        damping: modal damping.
     """
 
-    response: Float[Tensor, "M M"]
     inertia: Float[Tensor, "M M"]
+    stiffness: Float[Tensor, "M M"]
+    damping: Float[Tensor, "M M"]
 
     def __init__(
         self, projection: Float[Tensor, "N 3 M"], modes: Float[Tensor, "N 3 M"], gradients: Float[Tensor, "N 3 3 M"]
@@ -140,7 +142,9 @@ class ModalScene(ABC):
         """Displacement (3) and displacement gradient (9, row by row) of every unit at t + 1."""
         after = self.after(*self.coordinates(now, before))
         if load is not None:
-            after = after + (load.flatten(1) @ self.projection) @ (self.inertia @ self.response).mT
+            operator = self.inertia + self.stiffness / 4 + self.damping / 2
+            pushed = (load.flatten(1) @ self.projection) @ self.inertia.mT
+            after = after + torch.linalg.solve(operator, pushed.mT).mT
         return (after @ self.motions.mT).view(*now.shape[:2], 12)
 
     def coordinates(
@@ -196,12 +200,12 @@ class PreparedScenes(PreparedTemplate):
         deformation = bounded_deformation(deformation, MIN_DETERMINANT, unit=self._conserve_volume)
         return TemplateState(motion.rest + moved[:, :3], deformation)
 
-    def yielding(self, member: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
         """How a member yields to impulses: by the modes of its scene."""
         part = next(part for part, _, members in self.parts if member in members)
         modes, slopes = part.motions.unflatten(0, (-1, 12)).split((3, 9), 1)
         mass = part.inertia.diagonal().mean() * (modes.detach().square().sum((1, 2)) > 0).sum()
-        return modes, slopes.unflatten(1, (3, 3)), part.response, mass
+        return modes, slopes.unflatten(1, (3, 3)), (part.inertia, part.stiffness, part.damping), mass
 
     def carried(self, motion: Motion) -> Motion:
         """The part of the motion that is input to template and network, scene by scene."""

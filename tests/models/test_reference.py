@@ -1,0 +1,237 @@
+"""Bodies that move as a whole, in hands, and onto a floor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from helpers.bodies import NEURAL, make_model
+
+from gausim.core import Floor, GaussianScene, HandPath, SimState, Surroundings
+from gausim.models.initial_state import FreeInitialStates, ModalInitialStates
+from gausim.models.reference.floor import _projected_gradients, _solved
+from gausim.models.reference.reference import hand_motion
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.ops.rotation import rotation_of, rotation_vector
+
+TURN = torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64)
+FLOOR = Floor((0.0, 0.0, -0.3), (0.0, 0.0, 1.0), friction=0.4, restitution=0.0)
+FALL = -9.0
+
+
+def _block(count: int = 220, **surroundings) -> GaussianScene:
+    generator = torch.Generator().manual_seed(0)
+    size = torch.tensor([1.2, 0.8, 0.6], dtype=torch.float64)
+    means = torch.rand(count, 3, generator=generator, dtype=torch.float64) * size
+    scene = GaussianScene.create(
+        means=means, log_scales=torch.full_like(means, -3), quats=torch.eye(4).double()[:1].repeat(count, 1),
+        opacity_logits=torch.zeros(count).double(), sh=torch.zeros(count, 1, 3).double(),
+    )  # fmt: skip
+    return replace(scene, surroundings=Surroundings(**surroundings))
+
+
+def _frozen(scene: GaussianScene):
+    return make_model(scene, **NEURAL).double().eval().requires_grad_(False)
+
+
+def _thrown(scene: GaussianScene, speed: float = 1.0) -> SimState:
+    """It translates, spins and deforms."""
+    x, velocity = scene.means, torch.tensor([0.02, -0.01, 0.015]).double()
+    spin = torch.linalg.cross(torch.tensor([0.05, 0.1, -0.02]).double().expand_as(x), x - x.mean(0))
+    stretch = 0.01 * (x - x.mean(0)) * torch.tensor([1.0, -1.0, 0.0]).double()
+    return SimState(x, x - speed * (velocity + spin - stretch))
+
+
+def _steps(model, state: SimState, count: int) -> list[SimState]:
+    batch = model.batch((0,))
+    prepared, states = model.prepare(batch), [state]
+    for _ in range(count):
+        made = model.step(batch, states[-1], prepared=prepared)
+        states.append(made.state or SimState(made.positions, states[-1].positions))
+    return states
+
+
+def _momenta(state: SimState, mass: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    now, before = mass @ state.positions, mass @ state.previous
+    arms = torch.linalg.cross(state.previous - before, state.positions - now)
+    return now - before, mass @ arms
+
+
+def test_a_free_body_keeps_momentum_and_angular_momentum() -> None:
+    scene = _block(free=True)
+    model = _frozen(scene)
+    mass, _ = model.masses(model.batch((0,)))
+    states = _steps(model, _thrown(scene), 60)
+    for found, expected in zip(
+        _momenta(states[-1], mass / mass.sum()), _momenta(states[0], mass / mass.sum()), strict=True
+    ):
+        torch.testing.assert_close(found, expected, atol=1e-11, rtol=0)
+    away = (states[-1].positions - mass / mass.sum() @ states[-1].positions).norm(dim=1).max()
+    assert away < 1.2 * (scene.means - scene.means.mean(0)).norm(dim=1).max()
+
+
+def test_a_rigid_spin_about_a_principal_axis_goes_on() -> None:
+    """A body that is not deformed, about an axis of symmetry: the centrifugal load deforms it a little, no more."""
+    scene = _block(free=True)
+    model, x = _frozen(scene), scene.means
+    mass, _ = model.masses(model.batch((0,)))
+    centre = mass / mass.sum() @ x
+    spread = (x - centre).mT @ (mass[:, None] * (x - centre))
+    axis = torch.linalg.eigh(spread)[1][:, 0]  # of the largest moment of inertia
+    spin = rotation_of(0.02 * axis)
+    last = _steps(model, SimState(x, (x - centre) @ spin + centre), 50)[-1]
+    turned = (x - centre) @ torch.linalg.matrix_power(spin, 50).mT + centre
+    assert (last.positions - turned).norm(dim=1).max() < 0.02 * scene.diagonal
+
+
+def test_a_turned_and_moved_scene_gives_turned_and_moved_motion() -> None:
+    scene, turn, shift = _block(free=True, gravity=(0.0, 0.0, FALL), floor=FLOOR), rotation_of(TURN), TURN.flip(0)
+    normal, point = (turn @ torch.tensor(x).double() for x in (FLOOR.normal, FLOOR.point))
+    floor = replace(FLOOR, normal=tuple(normal.tolist()), point=tuple((point + shift).tolist()))
+    gravity = tuple((turn @ torch.tensor([0.0, 0.0, FALL]).double()).tolist())
+    other = replace(
+        scene, means=scene.means @ turn.mT + shift, surroundings=Surroundings(free=True, gravity=gravity, floor=floor)
+    )
+    model, moved = _frozen(scene), _frozen(other)
+    moved.load_state_dict(model.state_dict())
+    state = _thrown(scene)
+    alike = SimState(*(x @ turn.mT + shift for x in (state.positions, state.previous)))
+    found, expected = _steps(moved, alike, 15), _steps(model, state, 15)
+    for frame, most in ((6, 1e-5), (15, 1e-4)):  # in the air, and after the impact
+        far = (found[frame].positions - expected[frame].positions @ turn.mT - shift).abs().max()
+        assert far < most * scene.diagonal
+
+
+def test_a_fall_is_a_parabola_until_the_floor_which_nothing_enters() -> None:
+    scene = _block(free=True, gravity=(0.0, 0.0, FALL), floor=FLOOR)
+    model = _frozen(scene)
+    mass, _ = model.masses(model.batch((0,)))
+    states = _steps(model, SimState(scene.means, scene.means), 60)
+    heights = torch.stack([(mass / mass.sum()) @ s.positions[:, 2] for s in states])
+    frame = torch.arange(5).double()
+    torch.testing.assert_close(heights[:5], heights[0] + FALL / 24**2 * frame * (frame + 1) / 2)
+    lowest = min(float(FLOOR.height(s.positions).min()) for s in states)
+    assert -1e-3 * scene.diagonal < lowest < 0.01 * scene.diagonal
+    assert heights[45:].std() < 0.02 * scene.diagonal  # it has come to rest
+
+
+def test_friction_stops_what_slides_and_without_it_nothing_does() -> None:
+    speeds = []
+    for friction in (0.0, 0.6):
+        floor = replace(FLOOR, point=(0.0, 0.0, 0.0), friction=friction)
+        scene = _block(free=True, gravity=(0.0, 0.0, FALL), floor=floor)
+        model, push = _frozen(scene), torch.tensor([0.01, 0.0, 0.0]).double()
+        last = _steps(model, SimState(scene.means, scene.means - push), 40)[-1]
+        mass, _ = model.masses(model.batch((0,)))
+        speeds.append(float(mass / mass.sum() @ (last.positions - last.previous)[:, 0]))
+    assert speeds[0] == pytest.approx(0.01, rel=0.05)
+    assert abs(speeds[1]) < 1e-3
+
+
+def test_impulses_obey_the_laws_of_contact_and_their_equations_agree() -> None:
+    generator = torch.Generator().manual_seed(0)
+    root = torch.randn(12, 14, generator=generator, dtype=torch.float64)
+    w, b = root @ root.mT / 14 + 0.1 * torch.eye(12), torch.randn(12, generator=generator, dtype=torch.float64)
+    p = smooth = torch.zeros(12).double()
+    for _ in range(100):
+        p, smooth = _projected_gradients(w, b, 0.5, p), _projected_gradients(w, b, 0.0, smooth)
+    found, gap = p.view(-1, 3), (w @ p + b).view(-1, 3)
+    size = found[:, 1:].norm(dim=1)
+    assert (found[:, 0] >= 0).all() and (size <= 0.5 * found[:, 0] + 1e-9).all()
+    pressing = found[:, 0] > 1e-9
+    sliding = pressing & (size > 0.4999 * found[:, 0])
+    assert pressing.any() and sliding.any()
+    sticking = gap[pressing & ~sliding]
+    torch.testing.assert_close(sticking, torch.zeros_like(sticking), atol=1e-7, rtol=0)
+    # Without friction the equations of the pressing points give the same impulses.
+    pressing = smooth.view(-1, 3)[:, 0] > 1e-9
+    equal = _solved(w, b, pressing, pressing, torch.zeros(4, 2).double())
+    torch.testing.assert_close(equal, smooth, atol=1e-7, rtol=0)
+
+
+def test_loss_gradients_flow_through_an_impact() -> None:
+    scene = _block(free=True, gravity=(0.0, 0.0, FALL), floor=replace(FLOOR, friction=None, restitution=None))
+    model = make_model(scene, **NEURAL).double().eval()
+    surroundings = model.surroundings[0]
+    states = _steps(model, SimState(scene.means, scene.means), 12)
+    states[-1].positions.square().sum().backward()
+    for parameter in (surroundings.friction, surroundings.restitution, model.attributes[0]):
+        assert parameter.grad is not None and torch.isfinite(parameter.grad).all() and parameter.grad.abs().max() > 0
+
+
+def _bar(hands: bool = True) -> GaussianScene:
+    generator = torch.Generator().manual_seed(1)
+    means = torch.rand(300, 3, generator=generator, dtype=torch.float64) * torch.tensor([2.0, 0.4, 0.3])
+    scene = replace(_block(300), means=means)
+    hand = torch.where(means[:, 0] < 0.25, 0, torch.where(means[:, 0] > 1.75, 1, -1))
+    return replace(scene, pinned=hand >= 0, hand=hand)
+
+
+def _path(move) -> HandPath:
+    """Hands at x = 0.1 and 1.9, moved from frame 1 on by a function of frame and points."""
+    corners = torch.tensor([[0.0, 0.1, 0.0], [0.0, -0.1, 0.1], [0.0, 0.0, -0.1]]).double()
+    points = torch.cat([corners + torch.tensor([x, 0.2, 0.15]) for x in (0.1, 1.9)])
+    return HandPath.of(torch.stack([move(f, points) for f in range(41)]), torch.tensor([0, 0, 0, 1, 1, 1]))
+
+
+def test_hands_that_move_together_carry_the_body_rigidly() -> None:
+    scene = _bar()
+    model, turn, shift = _frozen(scene), 0.5 * TURN, torch.tensor([0.3, 0.1, -0.2]).double()
+
+    def move(frame: int, points: torch.Tensor) -> torch.Tensor:
+        part = min(frame / 200, 1.0)  # slowly
+        return points @ rotation_of(part * turn).mT + part * shift
+
+    path = _path(move)
+    made = SceneDynamics(model).rollout(SimState(scene.means, scene.means), 40, hands=path.pose)
+    expected = move(40, scene.means)
+    assert (made.positions[-1] - expected).norm(dim=1).max() < 0.01 * scene.diagonal
+    torch.testing.assert_close(made.positions[-1][scene.pinned], expected[scene.pinned], atol=1e-5, rtol=0)
+    rotation = made.rotations[-1][made.unit_of_kernel[scene.pinned]]
+    torch.testing.assert_close(rotation, rotation_of(0.2 * turn).expand_as(rotation), atol=1e-3, rtol=0)
+
+
+def test_a_bar_pulled_apart_comes_to_rest_stretched_evenly_and_thinner() -> None:
+    scene = _bar()
+    model = _frozen(scene)
+    apart = torch.tensor([0.2, 0.0, 0.0]).double()
+    path = _path(lambda f, x: x + min(f / 20, 1.0) * apart * (x[:, :1] > 1))
+    made = SceneDynamics(model).rollout(SimState(scene.means, scene.means), 120, hands=path.pose).positions[-1]
+    free = ~scene.pinned
+    x = scene.means[free]
+    stretched = torch.stack((torch.ones(len(x)).double(), x[:, 0]), 1)
+    slope = torch.linalg.lstsq(stretched, (made[free] - x)[:, :1]).solution[1]
+    assert float(slope) == pytest.approx(0.2 / 1.5, rel=0.1)
+    assert (made[free] - x)[:, 0].std() > 0.04 and (made - scene.means)[free].norm(dim=1).max() < 0.25
+
+
+def test_a_state_relative_to_its_reference_is_deformed_only() -> None:
+    for scene, path in ((_block(free=True), None), (_bar(), _path(lambda f, x: x @ rotation_of(0.01 * f * TURN).mT))):
+        model = _frozen(scene)
+        reference = model.prepare(model.batch((0,))).reference
+        turned = rotation_of(0.05 * TURN)
+        now = scene.means @ turned.mT
+        before = scene.means @ rotation_of(0.04 * TURN).mT
+        hands = None if path is None else [hand_motion(path.pose, 5)]
+        state = reference.isolated(SimState(now, before), hands)
+        for x in (state.positions, state.previous):
+            torch.testing.assert_close(x, scene.means, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("kind", [FreeInitialStates, ModalInitialStates])
+def test_a_free_body_begins_where_its_parameter_says(kind) -> None:
+    scene = _block(free=True)
+    states = kind(_frozen(scene), (0,)).double()
+    place, velocity = torch.tensor([0.5, 0.0, 1.0]).double(), torch.tensor([0.0, 0.1, -0.2]).double()
+    states.begin(0, place, velocity)
+    found = states.state(0)
+    torch.testing.assert_close(found.positions, scene.means + place)
+    torch.testing.assert_close(found.positions - found.previous, velocity.expand_as(scene.means), atol=1e-6, rtol=0)
+    found.positions.square().sum().backward()
+    assert states.parameter(0).grad.flatten()[-12:-6].abs().min() > 0
+
+
+def test_the_vector_of_a_rotation() -> None:
+    torch.testing.assert_close(rotation_vector(rotation_of(TURN)), TURN)
+    torch.testing.assert_close(rotation_vector(torch.eye(3).double()), torch.zeros(3).double())
