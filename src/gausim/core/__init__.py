@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gausim.core.protocols import (
         Dynamics,
         Forces,
+        Handled,
         Hands,
         Rendered,
         Renderer,
@@ -38,8 +39,8 @@ if TYPE_CHECKING:
 __all__ = [
     "BusyError", "Cameras", "ConfigError", "DataError", "DivergenceError", "Dynamics", "FetchError",
     "FittedDynamics", "FittedMethod", "FittedState", "Floor", "Forces", "GausSimError", "GaussianScene", "HandPath",
-    "HandPose", "Hands", "Rendered", "Renderer", "RunError", "SceneError", "SimState", "SmoothMotions", "Steppable",
-    "SteppedFrame", "Stepper", "Surroundings", "TakesOver", "Trajectory", "roll_out", "trajectory_of",
+    "HandPose", "Handled", "Hands", "Rendered", "Renderer", "RunError", "SceneError", "SimState", "SmoothMotions",
+    "Steppable", "SteppedFrame", "Stepper", "Surroundings", "TakesOver", "Trajectory", "roll_out", "trajectory_of",
 ]  # fmt: skip
 
 _LATE = ("camera", "fitted", "protocols", "scene", "smooth", "state", "surroundings")

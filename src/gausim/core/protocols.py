@@ -97,6 +97,16 @@ class Steppable(Dynamics, Protocol):
         """Stepper at a state; its first frame has identity deformation gradients."""
 
 
+@runtime_checkable
+class Handled(Steppable, Protocol):
+    """Dynamics whose pins can be moved."""
+
+    takes_hands: bool
+
+    def stepper(self, initial: SimState, hands: Hands | None = None) -> Stepper:
+        """Stepper at a state; ``hands`` are the poses of the hands by frame, counted from that state."""
+
+
 def roll_out(stepper: Stepper, steps: int, forces: Forces | None = None) -> Trajectory:
     """Takes ``steps`` steps; the result has steps + 1 frames, the stepper's current one first."""
     frames = [stepper.frame]

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from gausim.core import Cameras, DataError
+from gausim.core import Cameras, DataError, HandPath
 from gausim.data.frames import open_frames
 from gausim.data.images import read_rgba_into
 from gausim.data.surroundings import read_hands
@@ -82,7 +82,8 @@ class SequenceRecord:
         self._source = open_frames(root, self.views, fps)
         self.count, self.cameras = self._source.count, self._source.cameras
         found = read_hands(root, self.count)
-        self.hands, self.holds = (None, None) if found is None else (found[0], found[1:])
+        self.hands: HandPath | None = None if found is None else found[0]
+        self.holds: tuple[Tensor, Tensor] | None = None if found is None else found[1:]
 
     def camera_indices(self, views: Sequence[str] | None = None) -> list[int]:
         """Indices of these views in :attr:`views` (all when None), or :class:`DataError`."""

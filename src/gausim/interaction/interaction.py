@@ -6,6 +6,7 @@ import math
 import random
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,12 +17,14 @@ from gausim.core import (
     DataError,
     DivergenceError,
     GaussianScene,
+    Handled,
     SimState,
     Steppable,
     SteppedFrame,
     Trajectory,
     trajectory_of,
 )
+from gausim.interaction.hands import MovedHands
 from gausim.interaction.pushes import Push, exposure, scaled
 from gausim.interaction.selections import Selected, selection_to_json
 from gausim.interaction.session import (
@@ -32,6 +35,7 @@ from gausim.interaction.session import (
     Force,
     ForceSession,
     Gravity,
+    Hand,
     Impulse,
     MadeWith,
     Pin,
@@ -130,6 +134,7 @@ class Interaction:
     def _rest_all(self) -> None:
         self._stepper = self._dynamics.stepper(self._initial)
         self._limited_at: int | None = None
+        self._limited_before, self._hands = 0, cast("MovedHands | None", None)
         self.frame: SteppedFrame = self._stepper.frame
         self.frame_number = 0
         self.broken: str | None = None
@@ -189,7 +194,7 @@ class Interaction:
     @property
     def limited(self) -> int:
         """Frames since the last reset in which forces were reduced (:attr:`gausim.core.Stepper.limited`)."""
-        return self._stepper.limited
+        return self._limited_before + self._stepper.limited
 
     @property
     def resisting(self) -> bool:
@@ -257,8 +262,24 @@ class Interaction:
                 self.held = self.held | self._movable(event.on)
             case Unpin():
                 self.held = self.held & ~event.on.mask(self.scene, self.units).to(self.held.device)
+            case Hand():
+                self._move_hand(event)
             case Reset():
                 self._rest_all()
+
+    def _move_hand(self, event: Hand) -> None:
+        """Moves a hand; the first one to move makes a stepper whose pins can, from the current state on."""
+        if not isinstance(self._dynamics, Handled) or not bool(self.scene.pinned.any()):
+            raise ConfigError(
+                f"{self.made_with.run or 'this method'}: nothing of '{self.scene.name}' is held by a hand that this "
+                "method can move. Play a run of gausim with pinned kernels."
+            )
+        if self._hands is None:
+            self._hands, begin = MovedHands(self.scene), self.frame_number
+            hands = self._hands
+            self._limited_before += self._stepper.limited
+            self._stepper = self._dynamics.stepper(self.state, lambda frame: hands.pose(frame + begin))
+        self._hands.move(event, self.frame_number)
 
     def _allowed(self, name: str, amount: float, *, per: float = 1.0) -> float:
         """``amount * per``, a force in weights, or an error if it exceeds the largest force."""

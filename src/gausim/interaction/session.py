@@ -102,12 +102,30 @@ class Unpin(_EventBase, frozen=True):
     on: Selected = Whole()
 
 
+class Hand(_EventBase, frozen=True):
+    """Moves the pins of a hand smoothly to a place relative to rest, and holds them there.
+
+    Attributes:
+        to: displacement from rest [scene units].
+        frames: duration of the motion.
+        turn: rotation about the middle of the hand's pins, axis times angle [radian].
+        hand: number of the hand; an object without recorded hands has one, which holds all pins.
+    """
+
+    to: Vector
+    frames: Annotated[int, Meta(ge=1, le=MOST_STEPS)] = 1
+    turn: Vector = (0.0, 0.0, 0.0)
+    hand: Annotated[int, Meta(ge=0, lt=1000)] = 0
+
+
 class Reset(_EventBase, frozen=True):
     """Returns to the initial state without forces, wind, gravity or pins."""
 
 
-Event = Force | Release | Impulse | Gravity | Wind | Pin | Unpin | Reset
-KINDS: dict[str, type] = {t.__name__.lower(): t for t in (Force, Release, Impulse, Gravity, Wind, Pin, Unpin, Reset)}
+Event = Force | Release | Impulse | Gravity | Wind | Pin | Unpin | Hand | Reset
+KINDS: dict[str, type] = {
+    t.__name__.lower(): t for t in (Force, Release, Impulse, Gravity, Wind, Pin, Unpin, Hand, Reset)
+}
 
 
 class Entry(Checked, frozen=True):

@@ -23,6 +23,7 @@ _WORDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "gravity": (("weights", "direction"), ("at",)),
     "pin": (("on",), ("at",)),
     "unpin": ((), ("on", "at")),
+    "hand": (("to",), ("frames", "turn", "hand", "at")),
 }
 _HELP = {
     "force": "on=PART weights=W direction=D [at=FRAME] [frames=N]: W times the part's weight, from FRAME, for N frames",
@@ -31,6 +32,8 @@ _HELP = {
     "gravity": "weights=W direction=D [at=FRAME]: besides that of the recording, until the next",
     "pin": "on=PART [at=FRAME]: hold it where it is",
     "unpin": "[on=PART] [at=FRAME]: let it go",
+    "hand": "to=X,Y,Z [frames=N] [turn=X,Y,Z] [hand=H] [at=FRAME]: move the pins to a place relative to rest [scene "
+    "units], turned by an axis times an angle [radian], within N frames",
 }
 EPILOG = """\
 parts of an object (on=PART):
@@ -85,6 +88,7 @@ def entry_of(kind: str, words: Sequence[str], scene: GaussianScene, *, name: str
     needed, allowed = _WORDS[kind]
     read: dict[str, Callable[[str], Any]] = {
         "on": lambda text: parse_part(text, scene), "direction": parse_direction, "frames": _whole, "at": _whole,
+        "to": parse_direction, "turn": parse_direction, "hand": _whole,
     }  # fmt: skip
     try:
         values: dict[str, Any] = {"at": 0} | ({"name": name} if kind == "force" else {})

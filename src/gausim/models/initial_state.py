@@ -37,7 +37,7 @@ class InitialStates(nn.Module, ABC):
         self._diagonal = [h.diagonal for h in model.hierarchies]
         self._moving = [s.simulated[:, None] for s in model.scenes]
         self._is_free = [s.surroundings.free for s in model.scenes]
-        self._shapes = [cast(SceneSurroundings, s).shape for s in model.surroundings]
+        self._surroundings = [cast(SceneSurroundings, s) for s in model.surroundings]
         self._carried: dict[int, Float[Tensor, "K 3"]] = {}
 
     @abstractmethod
@@ -82,7 +82,7 @@ class InitialStates(nn.Module, ABC):
     def hold(self, sequence_id: int, path: HandPath) -> None:
         """Lets the body be in hands, which already move at frame 0, and carry it along at frame -1."""
         scene = self.scene_of_sequence[sequence_id]
-        shape, rest = self._shapes[scene], self._rest[scene]
+        shape, rest = self._surroundings[scene].shape, self._rest[scene]
         if shape is None:
             raise ConfigError(f"hands.npz: the scene of sequence {sequence_id} has no kernel in a hand.")
         self._carried[sequence_id] = rest + shape.kernels(path.pose(-1)).to(rest) - shape.kernels(path.pose(0)).to(rest)

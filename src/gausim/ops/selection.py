@@ -94,7 +94,7 @@ class Box(Selection):
 
 @dataclass(frozen=True, eq=False)
 class NearPoints(Selection):
-    """Kernels within a distance of any point of a cloud [scene units] (METHOD section 7: 0.01 for READY)."""
+    """Kernels within a distance of any point of a cloud [scene units] (METHOD section 8: 0.01 for READY)."""
 
     points: Float[Tensor, "P 3"]
     distance: float

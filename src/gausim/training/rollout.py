@@ -52,7 +52,8 @@ def checkpointed_step(
 
     # A step draws no random numbers, so no generator needs to be restored.
     made = torch_checkpoint(run, state.positions, state.previous, use_reentrant=False, preserve_rng_state=False)
-    return Frame(*made[:4], SimState(made[0], made[4]))
+    positions, deformation_gradients, rotations, momentum, last = made
+    return Frame(positions, deformation_gradients, rotations, momentum, SimState(positions, last))
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +103,9 @@ def windows(
         made: list[PredictedStep] = []
         prepared = None if checkpoint else model.prepare(batch, **({"isolated": True} if isolated else {}))
         for number in range(start, start + min(length, steps - start)):
-            moved = {} if hands is None else {"hands": [hand_motion(own, number) for own in hands]}
+            moved: dict[str, Any] = {}
+            if hands is not None:
+                moved["hands"] = [hand_motion(own, number) for own in hands]
             made.append(
                 checkpointed_step(model, batch, state, moved)
                 if checkpoint

@@ -192,7 +192,9 @@ class _CarriedBodies(Carried):
             rows = made.deformation_gradients[member.units], made.rotations[member.units]
             own = Placed(made.positions[member.kernels], *rows)
             placed.append(own if motion is None else motion.place(own))
-        positions, deformation, rotations = (torch.cat([own[i] for own in placed]) for i in range(3))
+        positions = torch.cat([own.positions for own in placed])
+        deformation = torch.cat([own.deformation_gradients for own in placed])
+        rotations = torch.cat([own.rotations for own in placed])
         previous = None
         if any(own.previous is not None for own in placed):
             now = [self._state.positions[member.kernels] for member in self._members]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -40,14 +41,13 @@ class SceneSurroundings(nn.Module):
             self.friction = nn.Parameter(torch.tensor(math.log(math.expm1(FRICTION))))
         if floor is not None and floor.restitution is None:
             self.restitution = nn.Parameter(torch.logit(torch.tensor(RESTITUTION)))
-        self.shape: StaticShape | None = None
-        if not self.facts.free and (scene.hand is not None or floor is not None):
-            self.shape = StaticShape(scene, hierarchy, finest)
+        self.moves = not self.facts.still or scene.hand is not None
+        self._built_from = scene, hierarchy, finest
 
-    @property
-    def moves(self) -> bool:
-        """Whether the scene's reference moves, or a floor is near."""
-        return self.facts.free or self.shape is not None
+    @cached_property
+    def shape(self) -> StaticShape | None:
+        """The static shape of a body in hands or pins; None for a free body."""
+        return None if self.facts.free else StaticShape(*self._built_from)
 
     def acceleration(self, dt: float, like: Tensor) -> Float[Tensor, " 3"]:
         """Gravity [scene units / frame^2]."""
@@ -77,6 +77,8 @@ def reference_of(
     units: FixedUnits,
     template: PreparedTemplate,
     axes: Float[Tensor, "N 3 3"] | None,
+    *,
+    driven: bool = False,
 ) -> Reference:
     """The reference of a batch.
 
@@ -87,14 +89,15 @@ def reference_of(
         units: constants of the finest predicted level, in scene axes.
         template: of the batch, which yields to contacts.
         axes: axes of the template's modes, as rows, per unit; None: scene axes.
+        driven: let the pins of every scene move; those without recorded hands are one hand.
     """
-    if not any(surroundings[i].moves for i in batch.scene_ids):
+    if not driven and not any(surroundings[i].moves for i in batch.scene_ids):
         return StillReference(batch)
     masses = batch.rest.new_zeros(len(batch.rest)).index_copy(0, batch.simulated, mass)
     bodies: list[Body | None] = []
     for number, (member, span) in enumerate(zip(batch.members, batch.levels[-1].spans, strict=True)):
         own = surroundings[member.scene_id]
-        if not own.moves:
+        if not (driven or own.moves):
             bodies.append(None)
             continue
         rest, kernels = units.rest[span], batch.rest[member.kernels]

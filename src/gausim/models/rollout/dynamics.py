@@ -19,6 +19,8 @@ INTERVAL = 64  # frames between two checks for finite values on a CUDA device; e
 class SceneDynamics:
     """Rollouts of one scene of a :class:`GausSim`, without loss gradients and in evaluation mode."""
 
+    takes_hands: bool = True
+
     def __init__(self, model: GausSim, scene_id: int = 0, *, energy_ceiling: float | None = None) -> None:
         """Binds ``model`` to its scene ``scene_id``; ``energy_ceiling`` as for :class:`SceneStepper`."""
         self.model, self.scene_id, self.energy_ceiling = model, scene_id, energy_ceiling
@@ -72,7 +74,7 @@ class SceneStepper:
             hands: poses of the hands that move the pins, by frame.
         """
         batch = model.batch((scene_id,))
-        member, prepared = batch.members[0], model.prepare(batch)
+        member, prepared = batch.members[0], model.prepare(batch, driven=hands is not None)
         self._model, self._name = model, model.scenes[scene_id].name
         self.fps: float = model.fps[scene_id]
         self._hands, self._number = hands, 0

@@ -83,7 +83,7 @@ class SceneModel(nn.Module, ABC):
         self.attributes = nn.ParameterList(torch.zeros(n, attributes) for n in counts)
 
     @abstractmethod
-    def prepare(self, batch: SceneBatch, *, isolated: bool = False) -> Prepared:
+    def prepare(self, batch: SceneBatch, *, isolated: bool = False, driven: bool = False) -> Prepared:
         """Constants of the steps of this batch between two updates of the parameters."""
 
     def batch(self, scene_ids: Sequence[int]) -> SceneBatch:
@@ -104,11 +104,13 @@ class SceneModel(nn.Module, ABC):
         rest: Float[Tensor, "N 3"],
         template: PreparedTemplate,
         frames: Frames | None,
+        *,
+        driven: bool,
     ) -> Reference:
         """The reference of a batch; ``rest`` are the finest units' centres in scene axes."""
         own = [cast(SceneSurroundings, s) for s in self.surroundings]
         axes = None if frames is None else frames.axes[-1]
-        return reference_of(own, batch, mass, replace(units, rest=rest), template, axes)
+        return reference_of(own, batch, mass, replace(units, rest=rest), template, axes, driven=driven)
 
     def frames(self, batch: SceneBatch) -> Frames | None:
         """Body axes for every unit of a batch; None where scene axes are used."""

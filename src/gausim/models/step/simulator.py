@@ -93,11 +93,12 @@ class GausSim(SceneModel):
             head=head, edges=hierarchy.edges, conserve_mass=conserve_mass,
         )  # fmt: skip
 
-    def prepare(self, batch: SceneBatch, *, isolated: bool = False) -> Prepared:
+    def prepare(self, batch: SceneBatch, *, isolated: bool = False, driven: bool = False) -> Prepared:
         """Constants of the steps of this batch between two updates of the parameters.
 
         Loss gradients flow through them: prepare anew for every stretch of steps between two backward passes.
-        ``isolated`` leaves out the surroundings: the body deforms about its rest state, which nothing moves.
+        ``isolated`` leaves out the surroundings: the body deforms about its rest state, which nothing moves. ``driven``
+        lets the pins of scenes without recorded hands move, as one hand.
         """
         mass, _ = self.masses(batch)
         attributes = torch.cat([self.attributes[i] for i in batch.scene_ids])
@@ -110,7 +111,9 @@ class GausSim(SceneModel):
             roots = frames.into(0, roots)
         template = self.template.prepare(batch, levels[-1])
         reference = (
-            StillReference(batch) if isolated else self.reference(batch, mass, levels[-1], rest, template, frames)
+            StillReference(batch)
+            if isolated
+            else self.reference(batch, mass, levels[-1], rest, template, frames, driven=driven)
         )
         prepared = Prepared(batch, mass, fraction, levels, Solved.roots(roots), template, frames, rest, None, reference)
         return replace(prepared, still=self._outputs_at_rest(prepared)) if self.predictor.head.anchor else prepared
