@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -323,7 +322,7 @@ def still(scene: GaussianScene, frames: int) -> Trajectory:
 
 def test_a_recording_holds_every_frame(make_column: Callable[..., GaussianScene], tmp_path: Path) -> None:
     scene = make_column()
-    path = record(scene, still(scene, 5), tmp_path / "a.viser", kind="viser")
+    path = record(scene, still(scene, 5), tmp_path / "a.viser")
     data = path.read_bytes()
     inner = zstandard.ZstdDecompressor().decompress(data[8:], max_output_size=int.from_bytes(data[:8], "little"))
     length = int.from_bytes(inner[:8], "little")
@@ -344,18 +343,8 @@ def test_a_recording_holds_every_frame(make_column: Callable[..., GaussianScene]
     assert found, "the last frame's positions are not in the file"
 
 
-def test_a_page_names_the_object_and_refuses_the_network(
-    make_column: Callable[..., GaussianScene], tmp_path: Path
-) -> None:
-    scene = replace(make_column(), name="<b>evil & co</b>")
-    text = record(scene, still(scene, 2), tmp_path / "a.html").read_text()
-    assert "<title>&lt;b&gt;evil &amp; co&lt;/b&gt; - gausim</title>" in text
-    assert text.index("Content-Security-Policy") < text.index("<script")
-    assert not list(tmp_path.glob(".*"))
-
-
 def test_what_cannot_be_recorded_is_said(make_column: Callable[..., GaussianScene], tmp_path: Path) -> None:
-    scene, path = make_column(), tmp_path / "a.html"
+    scene, path = make_column(), tmp_path / "a.viser"
     with pytest.raises(DataError, match="kernels"):
         record(make_column(80), still(scene, 2), path)
     with pytest.raises(DataError, match="every"):

@@ -285,10 +285,10 @@ FORMATS = {
     "motion": Format(
         ".motion.glb",
         _write_motion,
-        "the rest scene and its masks; per unit and frame centre and deformation gradient as 12 half floats: a hundredth "
-        "of the size of PLY files",
-        "digits (error below a thousandth of the diagonal; spherical harmonics with 8 bits), rotations other than those of "
-        "the deformation gradients",
+        "the rest scene and its masks; of every unit and frame centre and deformation gradient as 12 half floats, a "
+        "hundredth of the size of PLY files",
+        "digits (errors below a thousandth of the diagonal; spherical harmonics have 8 bits); rotations become those "
+        "of the deformation gradients",
         "gausim; the rest scene by every reader of glTF's KHR_gaussian_splatting",
     ),
     "html": Format(

@@ -80,7 +80,9 @@ class Glb:
         text += b" " * (-len(text) % 4)
         size = 28 + len(text) + len(self.binary)
         if size >= _LARGEST:
-            raise DataError(f"glTF: {size} bytes, expected less than {_LARGEST >> 30} GiB. Take fewer frames (--every).")
+            raise DataError(
+                f"glTF: {size} bytes, expected less than {_LARGEST >> 30} GiB. Take fewer frames (--every)."
+            )
         head = _MAGIC + struct.pack("<III", 2, size, len(text)) + _JSON
         return head + text + struct.pack("<I", len(self.binary)) + _BINARY + bytes(self.binary)
 

@@ -1,8 +1,8 @@
 """A motion as one GLB file: the rest scene as glTF, and twelve half floats per unit and frame.
 
-Every kernel follows exactly one unit, x_k = x_c + G_c (X_k - X_c) with covariance G_c S_k G_c^T, so that the units' centres
-and deformation gradients are the whole motion. A reader of glTF shows the rest scene with its base colours; the motion is
-in ``extras.gausim_motion``, see docs/reference/files.md for the layout.
+Every kernel follows exactly one unit, x_k = x_c + G_c (X_k - X_c) with covariance G_c S_k G_c^T, so that the units'
+centres and deformation gradients are the whole motion. A reader of glTF shows the rest scene with its base colours; the
+motion is in ``extras.gausim_motion``, see docs/reference/files.md for the layout.
 """
 
 from __future__ import annotations
@@ -68,13 +68,13 @@ class UnitMotion:
 
     Attributes:
         rest_centres: X_c, mean of the kernels of each unit at rest [scene units].
-        centres: x_c of every frame [scene units].
+        displacements: x_c - X_c of every frame [scene units].
         deformation_gradients: G_c of every frame.
         unit_of_kernel: the unit of each kernel.
     """
 
     rest_centres: Float[Tensor, "N 3"]
-    centres: Float[Tensor, "F N 3"]
+    displacements: Float[Tensor, "F N 3"]
     deformation_gradients: Float[Tensor, "F N 3 3"]
     unit_of_kernel: Int[Tensor, " K"]
 
@@ -101,10 +101,10 @@ class UnitMotion:
         return _averaged(scene.means, positions, gradients, unit)
 
     def positions(self, rest: Float[Tensor, "K 3"]) -> Iterator[Float[Tensor, "K 3"]]:
-        """x_c + G_c (X_k - X_c) of all kernels, frame by frame [scene units]."""
+        """x_c + G_c (X_k - X_c) of all kernels, frame by frame [scene units]; exactly X_k where nothing moves."""
         unit, offset = self.unit_of_kernel, (rest - self.rest_centres[self.unit_of_kernel])[..., None]
-        for centres, gradients in zip(self.centres, self.deformation_gradients, strict=True):
-            yield centres[unit] + (gradients[unit] @ offset)[..., 0]
+        for moved, gradients in zip(self.displacements, self.deformation_gradients - torch.eye(3), strict=True):
+            yield rest + moved[unit] + (gradients[unit] @ offset)[..., 0]
 
     def trajectory(self, rest: Float[Tensor, "K 3"], fps: float) -> Trajectory:
         """The motion of all kernels; Q is the rotation of the polar decomposition of G."""
@@ -118,13 +118,13 @@ def motion_glb(scene: GaussianScene, trajectory: Trajectory, *, up: str = "z") -
     """The document of a motion, see :func:`save_motion`."""
     motion = UnitMotion.of(scene, trajectory)
     count, glb = len(motion.rest_centres), splat_glb(scene, up=up, degree=0)
-    moved = motion.centres - motion.rest_centres
+    moved = motion.displacements
     # Half floats are relative: what all units have in common is stored apart where a body travels far.
     origins = (moved.amax(1) + moved.amin(1)) / 2
     if float(moved.abs().max()) < scene.diagonal:
         origins = torch.zeros_like(origins)
     parts = (moved - origins[:, None]) / scene.diagonal, (motion.deformation_gradients - torch.eye(3)).flatten(2)
-    units = torch.cat(parts, 2).numpy().astype("<f2")
+    units = torch.cat(parts, 2).half().numpy().astype("<f2")
     if not np.isfinite(units).all():
         raise DataError(f"{scene.name}: the motion is beyond half floats (65504). Export it as ply or safetensors.")
     masks = sum(getattr(scene, name).cpu().int() << bit for bit, name in enumerate(_MASKS))
@@ -139,7 +139,9 @@ def motion_glb(scene: GaussianScene, trajectory: Trajectory, *, up: str = "z") -
         masks=glb.add_view(np.asarray(masks, np.uint8)),
         sh=glb.add_view(levels.numpy().astype(np.int8)),
     )
-    facts = _Facts(1, trajectory.fps, trajectory.frames, count, scene.diagonal, scene.volume_scale, scales.tolist(), views)
+    facts = _Facts(
+        1, trajectory.fps, trajectory.frames, count, scene.diagonal, scene.volume_scale, scales.tolist(), views
+    )
     glb.document["extras"] = {KEY: msgspec.to_builtins(facts)}
     return glb
 
@@ -181,7 +183,7 @@ def load_motion(path: Path | str) -> tuple[GaussianScene, Trajectory]:
             f"{path}: {frames} frames of {scene.count} kernels take {needs / 2**30:.1f} GiB, expected at most "
             f"{_MOST_MEMORY >> 30}. Export fewer frames (--every)."
         )
-    rest = _array(glb, views.rest_centres, "rest_centres", "<f4", (units, 3))
+    rest = _array(glb, views.rest_centres, "rest_centres", "<f4", (units, 3)).copy()
     origins = _array(glb, views.origins, "origins", "<f4", (frames, 3))
     moved = _array(glb, views.units, "units", "<f2", (frames, units, 12)).astype(np.float32)
     kind = "<u2" if units <= 1 << 16 else "<u4"
@@ -190,8 +192,8 @@ def load_motion(path: Path | str) -> tuple[GaussianScene, Trajectory]:
         raise DataError(f"{path}: field 'unit_of_kernel': expected indices of {units} units. {_REMEDY}")
     gradients = np.eye(3, dtype=np.float32) + moved[..., 3:].reshape(frames, units, 3, 3)
     with np.errstate(over="ignore", invalid="ignore"):
-        centres = rest + origins[:, None] + np.float32(facts.diagonal) * moved[..., :3]
-    motion = UnitMotion(*(torch.from_numpy(np.ascontiguousarray(x)) for x in (rest, centres, gradients, index)))
+        shifts = origins[:, None] + np.float32(facts.diagonal) * moved[..., :3]
+    motion = UnitMotion(*(torch.from_numpy(np.ascontiguousarray(x)) for x in (rest, shifts, gradients, index)))
     trajectory = motion.trajectory(scene.means, facts.fps)
     if not torch.isfinite(trajectory.positions).all():
         raise DataError(f"{path}: fields 'units' and 'diagonal' give positions beyond float32. {_REMEDY}")
@@ -244,13 +246,14 @@ def _array(glb: Glb, index: int, name: str, kind: str, shape: tuple[int, ...]) -
 
 
 def _averaged(rest: Tensor, positions: Tensor, gradients: Tensor, unit: Tensor) -> UnitMotion:
-    """X_c and x_c as means over the kernels of each unit; zero displacement for units without kernels."""
+    """Units' centres and displacements as means over their kernels; zero for units without kernels."""
     count = gradients.shape[1]
     members = torch.zeros(count).index_add(0, unit, torch.ones(len(unit))).clamp_min(1)[:, None]
     centres = torch.zeros(count, 3, dtype=torch.float64).index_add(0, unit, rest.double()) / members
+    # x_c - X_c = mean of x_k - X_k, since the offsets of a unit's kernels from their mean sum to zero.
     moved = torch.zeros(len(positions), count, 3, dtype=torch.float64)
     moved.index_add_(1, unit, positions.double() - rest.double())
-    return UnitMotion(centres.float(), (centres + moved / members).float(), gradients, unit)
+    return UnitMotion(centres.float(), (moved / members).float(), gradients, unit)
 
 
 def _check_trajectory(scene: GaussianScene, trajectory: Trajectory) -> None:

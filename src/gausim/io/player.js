@@ -3,7 +3,7 @@
 "use strict";
 
 const WIDTH = 2048; // of all textures that are lists [texels]
-const NEAR = 0.01, DILATION = 0.3, MARGIN = 1.3, MOST_OPAQUE = 0.999; // as in gausim's renderer
+const content = (id) => document.getElementById(id).textContent;
 
 // ---- The file -------------------------------------------------------------------------------------------------------
 
@@ -121,98 +121,6 @@ class Order {
 
 // ---- The pictures ---------------------------------------------------------------------------------------------------
 
-const FETCH = `#version 300 es
-precision highp float; precision highp int; precision highp sampler2D;
-vec4 item(sampler2D list, int i) { return texelFetch(list, ivec2(i % ${WIDTH}, i / ${WIDTH}), 0); }
-`;
-
-const WHOLE = `#version 300 es
-void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }`;
-
-const PROJECT = FETCH + `
-uniform sampler2D offsets, covariances, corners, bases, units, harmonics;
-uniform float scales[15];
-uniform int count, coefficients;
-uniform mat4 view;
-uniform vec3 eye;
-uniform vec3 camera; // focal length, width, height [pixels]
-layout(location = 0) out vec4 place; // mean [pixels], depth, opacity
-layout(location = 1) out vec4 axes;  // of the ellipse at whose edge alpha is 1/255 [pixels]
-layout(location = 2) out vec4 color;
-
-vec3 shaded(int k, vec3 d) {
-  vec3 sum = 0.5 + 0.28209479177387814 * item(bases, k).rgb;
-  float x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
-  float basis[15] = float[15](-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
-    1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2.0 * zz - xx - yy),
-    -1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy), -0.5900435899266435 * y * (3.0 * xx - yy),
-    2.890611442640554 * x * y * z, -0.4570457994644658 * y * (4.0 * zz - xx - yy),
-    0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy), -0.4570457994644658 * x * (4.0 * zz - xx - yy),
-    1.445305721320277 * z * (xx - yy), -0.5900435899266435 * x * (xx - 3.0 * yy));
-  for (int i = 0; i < coefficients; i++) sum += basis[i] * scales[i] * item(harmonics, k * coefficients + i).rgb;
-  return max(sum, 0.0);
-}
-
-void main() {
-  int k = int(gl_FragCoord.y) * ${WIDTH} + int(gl_FragCoord.x);
-  place = vec4(0.0);
-  if (k >= count) return;
-  vec4 o = item(offsets, k), c = item(covariances, k), e = item(corners, k);
-  int unit = int(o.w) * 6;
-  vec4 r0 = item(units, unit), r1 = item(units, unit + 1), r2 = item(units, unit + 2);
-  mat3 G = transpose(mat3(r0.xyz, r1.xyz, r2.xyz));
-  vec3 x = vec3(r0.w, r1.w, r2.w) + G * o.xyz;
-  vec3 p = (view * vec4(x, 1.0)).xyz;
-  if (p.z <= ${NEAR} || c.w < 1.0 / 255.0) return;
-  float f = camera.x;
-  vec2 q = p.xy / p.z, limit = ${MARGIN} * 0.5 * camera.yz / f, held = clamp(q, -limit, limit);
-  mat3 S = G * mat3(c.x, c.y, c.z, c.y, e.x, e.y, c.z, e.y, e.z) * transpose(G);
-  mat3 W = mat3(view);
-  vec3 row0 = (f / p.z) * (vec3(1.0, 0.0, -held.x) * W), row1 = (f / p.z) * (vec3(0.0, 1.0, -held.y) * W);
-  float a = dot(row0, S * row0) + ${DILATION}, b = dot(row0, S * row1), d = dot(row1, S * row1) + ${DILATION};
-  float middle = 0.5 * (a + d), spread = length(vec2(0.5 * (a - d), b));
-  float angle = 0.5 * atan(2.0 * b, a - d), t = 2.0 * log(255.0 * c.w);
-  vec2 along = vec2(cos(angle), sin(angle));
-  axes = vec4(along * sqrt(t * (middle + spread)), vec2(-along.y, along.x) * sqrt(t * max(middle - spread, 1e-6)));
-  place = vec4(f * q + 0.5 * camera.yz, p.z, c.w);
-  mat3 Q = transpose(mat3(item(units, unit + 3).xyz, item(units, unit + 4).xyz, item(units, unit + 5).xyz));
-  color = vec4(shaded(k, normalize(x - eye) * Q), 1.0);
-}`;
-
-const QUADS = FETCH + `
-uniform sampler2D places, ellipses, colors;
-uniform highp usampler2D order;
-uniform vec3 camera;
-out vec2 at;
-flat out vec4 tint;
-flat out float reach;
-void main() {
-  int quad = gl_VertexID / 4, corner = gl_VertexID % 4;
-  int index = int(texelFetch(order, ivec2(quad % ${WIDTH}, quad / ${WIDTH}), 0).r);
-  vec4 place = item(places, index);
-  gl_Position = vec4(2.0, 2.0, 2.0, 1.0); // outside
-  if (place.w <= 0.0) return;
-  vec4 axes = item(ellipses, index);
-  at = vec2(corner & 1, corner >> 1) * 2.0 - 1.0;
-  vec2 pixel = place.xy + at.x * axes.xy + at.y * axes.zw;
-  tint = vec4(item(colors, index).rgb, place.w);
-  reach = log(255.0 * place.w);
-  gl_Position = vec4(vec2(2.0, -2.0) * pixel / camera.yz + vec2(-1.0, 1.0), 0.0, 1.0);
-}`;
-
-const BLEND = `#version 300 es
-precision highp float;
-in vec2 at;
-flat in vec4 tint;
-flat in float reach;
-out vec4 color;
-void main() {
-  float square = dot(at, at);
-  if (square > 1.0) discard;
-  float alpha = min(tint.a * exp(-reach * square), ${MOST_OPAQUE});
-  color = vec4(tint.rgb * alpha, alpha);
-}`;
-
 class Painter {
   constructor(canvas, motion, lists, background) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, depth: false });
@@ -224,8 +132,8 @@ class Painter {
       throw new Error(`${count} Gaussians do not fit into this machine's textures.`);
     }
     Object.assign(this, { gl, canvas, count, rows: rows(count), background });
-    this.project = program(gl, WHOLE, PROJECT);
-    this.quads = program(gl, QUADS, BLEND);
+    this.project = program(gl, "whole", "project");
+    this.quads = program(gl, "quads", "blend");
     this.lists = lists.map((list) => texture(gl, list, this.rows));
     this.harmonics = texture(gl, padded(motion.sh, above * count), Math.max(rows(above * count), 1), gl.RGBA8_SNORM, gl.BYTE);
     this.units = texture(gl, null, rows(6 * motion.units));
@@ -308,7 +216,7 @@ function program(gl, vertex, fragment) {
   const made = gl.createProgram();
   for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(kind);
-    gl.shaderSource(shader, text);
+    gl.shaderSource(shader, `#version 300 es\n#define WIDTH ${WIDTH}\n` + content("common") + content(text));
     gl.compileShader(shader);
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
     gl.attachShader(made, shader);
@@ -451,7 +359,6 @@ class Player {
 }
 
 try {
-  const content = (id) => document.getElementById(id).textContent;
   window.player = new Player(readMotion(content("motion")), JSON.parse(content("settings")));
 } catch (error) {
   const trouble = document.getElementById("trouble");

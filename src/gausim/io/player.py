@@ -27,7 +27,7 @@ def save_player(
     up: str = "z",
     background: Float[Tensor, " 3"] | None = None,
 ) -> None:
-    """Writes a page with time bar, speed, loop and orbit; the motion in it is that of :func:`gausim.io.motion.save_motion`.
+    """Writes a page with time bar, speed, loop and orbit; in it is the file of :func:`gausim.io.motion.save_motion`.
 
     Args:
         path: the page; replaced atomically.
