@@ -22,6 +22,7 @@ from gausim.core import ConfigError, DataError, DivergenceError, GaussianScene, 
 from gausim.interaction.interaction import Interaction, replay
 from gausim.interaction.selections import Ball, Unit, Whole
 from gausim.interaction.session import Force, Gravity, Impulse, Pin, Release, Reset, Wind
+from gausim.models.template.template import Property
 from gausim.ops.covariance import covariance_from_scales
 from gausim.ops.spherical_harmonics import spherical_harmonics_basis
 from gausim.viewer.coloring import BASE, MASS, SPEED, STRAIN, VIEW, Painter, hues
@@ -96,6 +97,15 @@ def test_every_mode_colours_every_kernel(painter: tuple[Painter, Interaction]) -
     other = painted(paint, interaction, VIEW, -eye)[1]
     assert not torch.allclose(other, seen[VIEW], atol=1e-3)
     assert torch.equal(painted(paint, interaction, BASE, -eye)[1], seen[BASE])
+
+
+def test_the_learned_material_is_a_mode(make_interaction: Callable[..., Interaction]) -> None:
+    interaction = make_interaction()
+    values = torch.linspace(0.5, 2, interaction.scene.count)
+    values[3] = torch.nan
+    paint = Painter(interaction.scene, (), interaction.masses, {"stiffness": Property(values, "stiffness")})
+    rgb = painted(paint, interaction, "Stiffness", torch.ones(3))[1]
+    assert "Stiffness" in paint.modes and torch.equal(rgb[3], torch.full((3,), 0.5)) and len(rgb.unique(dim=0)) > 20
 
 
 def test_hierarchy_has_one_colour_per_unit(painter: tuple[Painter, Interaction]) -> None:
