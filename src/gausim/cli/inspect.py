@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     learned.add_argument("--object", metavar="NAME", help="of the run; default its first")
     learned.add_argument("--azimuths", type=float, nargs="+", default=[30.0, 210.0], metavar="DEGREE",
                          help="cameras about the vertical (default: 30 210)")  # fmt: skip
-    add_data_option(learned)
+    add_data_option(parser)
     return parser
 
 

@@ -118,7 +118,7 @@ class Glb:
                 f"{self.source}: attribute '{name}': expected {rows} rows of {width} float32, got "
                 f"{json.dumps(accessor)[:200]} of {len(data)} bytes. {_REMEDY}"
             )
-        values = np.frombuffer(data, "<f4").reshape(rows, width)
+        values = np.frombuffer(data, "<f4").reshape(-1, width)
         if not np.isfinite(values).all():
             raise DataError(f"{self.source}: attribute '{name}' is NaN or infinite. {_REMEDY}")
         return values

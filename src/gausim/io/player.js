@@ -2,7 +2,7 @@
 // Every frame, a first pass projects each Gaussian once into textures; a second draws them as quads from back to front.
 "use strict";
 
-const WIDTH = 2048; // of all textures that are lists [texels]
+const SHIFT = 11, WIDTH = 1 << SHIFT; // of all textures that are lists [texels]
 const content = (id) => document.getElementById(id).textContent;
 
 // ---- The file -------------------------------------------------------------------------------------------------------
@@ -164,8 +164,9 @@ class Painter {
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.target);
     gl.viewport(0, 0, WIDTH, this.rows);
     gl.disable(gl.BLEND);
-    const names = ["offsets", "covariances", "corners", "bases", "harmonics", "units"];
-    this.use(this.project, names, [...this.lists, this.harmonics, this.units], size);
+    const names = ["offsets", "covariances", "corners", "bases", "harmonics", "units", "order"];
+    this.use(this.project, names, [...this.lists, this.harmonics, this.units, this.order], size);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, indices); // the last used
     gl.uniformMatrix4fv(gl.getUniformLocation(this.project, "view"), true, camera.view);
     gl.uniform3fv(gl.getUniformLocation(this.project, "eye"), camera.eye);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -175,8 +176,7 @@ class Painter {
     gl.clear(gl.COLOR_BUFFER_BIT);
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-    this.use(this.quads, ["places", "ellipses", "colors", "order"], [...this.made, this.order], size);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, indices);
+    this.use(this.quads, ["places", "ellipses", "colors"], this.made, size);
     gl.drawElements(gl.TRIANGLES, 6 * this.count, gl.UNSIGNED_INT, 0);
   }
 
@@ -216,7 +216,7 @@ function program(gl, vertex, fragment) {
   const made = gl.createProgram();
   for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(kind);
-    gl.shaderSource(shader, `#version 300 es\n#define WIDTH ${WIDTH}\n` + content("common") + content(text));
+    gl.shaderSource(shader, `#version 300 es\n#define WIDTH ${WIDTH}\n#define SHIFT ${SHIFT}\n` + content("common") + content(text));
     gl.compileShader(shader);
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
     gl.attachShader(made, shader);
