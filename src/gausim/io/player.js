@@ -1,4 +1,4 @@
-// Plays a motion of Gaussians: x_k = x_c + G_c (X_k - X_c), covariance G S G^T, colours looked up in the direction Q^T d.
+// Plays a motion of Gaussians: x_k = x_c + G_c (X_k - X_c), covariance G S G^T, colours looked up at Q^T d.
 // Every frame, a first pass projects each Gaussian once into textures; a second draws them as quads from back to front.
 "use strict";
 
@@ -35,7 +35,7 @@ const HALF = Float32Array.from({ length: 65536 }, (_, bits) => {
 
 // ---- The motion -----------------------------------------------------------------------------------------------------
 
-// Centre, G and Q of every unit at a time between two frames, 24 floats each: rows of G with the centre beside, rows of Q.
+// Centre, G and Q of every unit at a time between two frames, 24 floats: rows of G with the centre beside, rows of Q.
 function unitsAt(motion, time, out) {
   const { units, frames, diagonal, halves, origins, restCentres } = motion;
   const first = Math.min(Math.floor(time), frames - 1), second = Math.min(first + 1, frames - 1), part = time - first;
@@ -135,7 +135,8 @@ class Painter {
     this.project = program(gl, "whole", "project");
     this.quads = program(gl, "quads", "blend");
     this.lists = lists.map((list) => texture(gl, list, this.rows));
-    this.harmonics = texture(gl, padded(motion.sh, above * count), Math.max(rows(above * count), 1), gl.RGBA8_SNORM, gl.BYTE);
+    const higher = padded(motion.sh, above * count);
+    this.harmonics = texture(gl, higher, Math.max(rows(above * count), 1), gl.RGBA8_SNORM, gl.BYTE);
     this.units = texture(gl, null, rows(6 * motion.units));
     this.unitRows = rows(6 * motion.units);
     this.made = [0, 1, 2].map(() => texture(gl, null, this.rows));
@@ -147,10 +148,12 @@ class Painter {
     this.order = texture(gl, null, this.rows, gl.R32UI);
     // One draw call of all quads: instances of four corners are slow where GL is computed by software.
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
-    const corners = Uint32Array.from({ length: 6 * count }, (_, i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6]);
+    const corner = (i) => 4 * Math.floor(i / 6) + [0, 1, 2, 2, 1, 3][i % 6];
+    const corners = Uint32Array.from({ length: 6 * count }, (_, i) => corner(i));
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.useProgram(this.project);
-    gl.uniform1fv(gl.getUniformLocation(this.project, "scales"), Float32Array.from({ length: 15 }, (_, i) => 127 * (motion.sh_scales[i] || 0)));
+    const scales = Float32Array.from({ length: 15 }, (_, i) => 127 * (motion.sh_scales[i] || 0)); // of values in -1..1
+    gl.uniform1fv(gl.getUniformLocation(this.project, "scales"), scales);
     gl.uniform1i(gl.getUniformLocation(this.project, "count"), count);
     gl.uniform1i(gl.getUniformLocation(this.project, "coefficients"), above);
   }
@@ -166,7 +169,8 @@ class Painter {
     gl.disable(gl.BLEND);
     const names = ["offsets", "covariances", "corners", "bases", "harmonics", "units", "order"];
     this.use(this.project, names, [...this.lists, this.harmonics, this.units, this.order], size);
-    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, indices); // the last used
+    // Into `order`, which is the texture that was bound last.
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, WIDTH, this.rows, gl.RED_INTEGER, gl.UNSIGNED_INT, indices);
     gl.uniformMatrix4fv(gl.getUniformLocation(this.project, "view"), true, camera.view);
     gl.uniform3fv(gl.getUniformLocation(this.project, "eye"), camera.eye);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
@@ -216,7 +220,8 @@ function program(gl, vertex, fragment) {
   const made = gl.createProgram();
   for (const [kind, text] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
     const shader = gl.createShader(kind);
-    gl.shaderSource(shader, `#version 300 es\n#define WIDTH ${WIDTH}\n#define SHIFT ${SHIFT}\n` + content("common") + content(text));
+    const sizes = `#version 300 es\n#define WIDTH ${WIDTH}\n#define SHIFT ${SHIFT}\n`;
+    gl.shaderSource(shader, sizes + content("common") + content(text));
     gl.compileShader(shader);
     if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
     gl.attachShader(made, shader);
@@ -243,7 +248,8 @@ class Orbit {
     this.distance = Math.hypot(...back);
     this.pitch = Math.asin(Math.max(-1, Math.min(1, dot(back, this.up) / this.distance)));
     const flat = plus(back, this.up, -dot(back, this.up));
-    this.front = Math.hypot(...flat) > 1e-9 * this.distance ? unit(flat) : unit(cross(this.up, [this.up[1], this.up[2], -this.up[0]]));
+    const [x, y, z] = this.up;
+    this.front = unit(Math.hypot(...flat) > 1e-9 * this.distance ? flat : cross(this.up, [y, z, -x]));
     this.side = cross(this.up, this.front);
     this.yaw = 0;
   }
@@ -275,7 +281,8 @@ class Player {
     Object.assign(this, { motion, orbit: new Orbit(settings.camera), order: new Order(motion, lists[0]), drawn: 0 });
     this.painter = new Painter(this.canvas, motion, lists, settings.background);
     this.units = new Float32Array(24 * motion.units);
-    Object.assign(this, { time: 0, playing: true, stale: true, bar: find("time"), clock: find("clock"), button: find("play") });
+    Object.assign(this, { time: 0, playing: true, stale: true });
+    Object.assign(this, { bar: find("time"), clock: find("clock"), button: find("play") });
     this.bar.max = motion.frames - 1;
     this.speed = find("speed"); this.loop = find("loop");
     this.listen(find("home"));
@@ -316,7 +323,8 @@ class Player {
     unitsAt(this.motion, this.time, this.units);
     this.painter.draw(this.units, this.order.sort(this.units, camera.view), camera);
     this.bar.value = this.time;
-    this.clock.textContent = `${(this.time / fps).toFixed(2)} s · frame ${Math.floor(this.time + 1e-6)} / ${frames - 1}`;
+    const number = Math.floor(this.time + 1e-6);
+    this.clock.textContent = `${(this.time / fps).toFixed(2)} s · frame ${number} / ${frames - 1}`;
     this.stale = false;
     this.drawn++;
   }
@@ -328,7 +336,10 @@ class Player {
     this.bar.oninput = () => { this.play(false); this.seek(Number(this.bar.value)); };
     home.onclick = () => changed(() => this.orbit.reset());
     canvas.oncontextmenu = (event) => event.preventDefault();
-    canvas.onpointerdown = (event) => { canvas.setPointerCapture(event.pointerId); fingers.set(event.pointerId, event); };
+    canvas.onpointerdown = (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      fingers.set(event.pointerId, event);
+    };
     canvas.onpointerup = canvas.onpointercancel = (event) => fingers.delete(event.pointerId);
     canvas.onpointermove = (event) => {
       const before = fingers.get(event.pointerId);
