@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from types import SimpleNamespace
 from unittest import mock
 
 import numpy as np
@@ -16,6 +15,7 @@ from helpers.simulators import silence
 from gausim.core import SimState
 from gausim.evaluation.stability import _LinearStep
 from gausim.models.hierarchy.clusters import build_hierarchy
+from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.material import DAMPING_GAIN, MaterialTemplate
 from gausim.models.template.solid import solid_body
 from gausim.ops.quaternion import quaternion_to_matrix
@@ -259,7 +259,8 @@ def test_the_material_of_the_units_is_told_as_it_enters_the_matrices(hierarchy) 
     template, count = _template(hierarchy), hierarchy.levels[1].count
     units, links = torch.zeros(count, 3, dtype=torch.float64), template.body(0).distance.new_zeros(1, 3)
     links = links.expand(template.body(0).links.shape[1], 3)
-    fixed = SimpleNamespace(attributes=torch.zeros(count, 3), log_density=torch.full((count,), 9.0).double())
+    zeros = torch.zeros(count, 3, dtype=torch.float64)
+    fixed = FixedUnits(zeros, zeros[:, 0], zeros[:, 0], zeros[:, 0] + 9, zeros, zeros[:, :1])
 
     def told(units, links):
         with mock.patch.object(template, "decode", return_value=(units, links)):
