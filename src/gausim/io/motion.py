@@ -252,7 +252,8 @@ def _averaged(rest: Tensor, positions: Tensor, gradients: Tensor, unit: Tensor) 
     centres = torch.zeros(count, 3, dtype=torch.float64).index_add(0, unit, rest.double()) / members
     # x_c - X_c = mean of x_k - X_k, since the offsets of a unit's kernels from their mean sum to zero.
     moved = torch.zeros(len(positions), count, 3, dtype=torch.float64)
-    moved.index_add_(1, unit, positions.double() - rest.double())
+    for frame, now in zip(moved, positions, strict=True):
+        frame.index_add_(0, unit, now.double() - rest.double())
     return UnitMotion(centres.float(), (moved / members).float(), gradients, unit)
 
 
