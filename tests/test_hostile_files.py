@@ -18,6 +18,7 @@ from gausim.cli.main import main
 from gausim.core import GausSimError
 from gausim.data.objects import ObjectData
 from gausim.data.records import read_array
+from gausim.io.motion import load_motion
 from gausim.io.ply import load_masks, load_scene
 from gausim.io.trajectory import load_trajectory
 from gausim.io.transforms import read_json, read_transforms
@@ -43,6 +44,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "scene": ("scene.ply", load_scene),
     "masks": ("scene.masks.npz", lambda path: load_masks(toy_scene(), path)),
     "trajectory": ("trajectory.safetensors", load_trajectory),
+    "motion": ("m.motion.glb", load_motion),
     "lpips": ("lpips.safetensors", LPIPS),
     "lpips, jax": ("alexnet.ckpt", convert),
     "lpips, wheel": ("lpips.whl", convert),

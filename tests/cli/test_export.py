@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,6 +12,7 @@ from PIL import Image
 
 from gausim.cli import export
 from gausim.core import ConfigError, DataError
+from gausim.io.gltf import read_glb, splat_scene
 from gausim.io.ply import save_scene
 from gausim.io.ply_sequence import load_ply_sequence
 from gausim.io.trajectory import load_trajectory
@@ -64,7 +66,7 @@ def test_usd_and_back(run) -> None:
     assert count == 4 and fps == 24.0
     for scene, positions in zip(scenes, whole.positions, strict=True):
         assert torch.equal(scene.means, positions)
-    for form in ("safetensors", "html"):
+    for form in ("safetensors", "motion", "html"):
         with pytest.raises(ConfigError, match=f"--format {form}: m.usdc holds frames without units"):
             export.main(["m.usdc", "--format", form])
 
@@ -84,11 +86,33 @@ def test_pictures(run) -> None:
         assert image.n_frames == 2 and image.size == (40, 40) and min(image.convert("RGB").getpixel((0, 0))) > 245
 
 
-@pytest.mark.parametrize("form", ["viser", "html"])
-def test_recordings(run, form: str) -> None:
+def test_a_recording(run) -> None:
     pytest.importorskip("viser", reason="needs viser (extra view)")
-    assert export.main([str(run.run_dir), "--format", form, "--frames", "3"]) == 0
-    assert Path(f"toy_seq_000.{form}").stat().st_size > 1000
+    assert export.main([str(run.run_dir), "--format", "viser", "--frames", "3"]) == 0
+    assert Path("toy_seq_000.viser").stat().st_size > 1000
+
+
+def test_a_compact_motion_and_back_and_its_page(run, capsys) -> None:
+    source, whole = str(run.run_dir), run.module.predict(0, 5)
+    assert export.main([source, "--format", "motion", "--frames", "6"]) == 0
+    assert "wrote toy_seq_000.motion.glb: 6 frames of 36 kernels at 24 frames" in capsys.readouterr().out
+    assert export.main(["toy_seq_000.motion.glb", "--format", "safetensors", "--every", "2"]) == 0
+    back = load_trajectory("toy_seq_000.safetensors")
+    error = (back.positions - whole.positions[::2]).norm(dim=-1).max() / run.module.model.scenes[0].diagonal
+    assert float(error) < 1e-3 and back.fps == 12.0
+    with pytest.raises(DataError, match="--view cam_1: expected one of"):
+        export.main(["toy_seq_000.motion.glb", "--format", "html", "--view", "cam_1"])
+    assert export.main([source, "--format", "html", "--frames", "6", "--view", "cam_1"]) == 0
+    record, page = run.objects[0].sequences[0], Path("toy_seq_000.html").read_text()
+    eye = json.loads(page.split('id="settings">')[1].split("<")[0])["camera"]["eye"]
+    assert eye == pytest.approx(record.cameras_of(["cam_1"]).centers[0].tolist(), abs=1e-6)
+
+
+def test_frames_as_gltf(run) -> None:
+    assert export.main([str(run.run_dir), "--format", "gltf", "--frames", "4", "--every", "2", "--out", "g"]) == 0
+    assert sorted(path.name for path in Path("g").iterdir()) == [f"toy_seq_000_000{i}.glb" for i in (1, 2)]
+    scene = splat_scene(read_glb("g/toy_seq_000_0002.glb"), "toy")
+    assert torch.equal(scene.means, run.module.predict(0, 3).positions[2])
 
 
 @pytest.mark.parametrize(

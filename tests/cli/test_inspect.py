@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
+import numpy as np
 import pytest
 import torch
+from plyfile import PlyData
 
 from gausim.cli import inspect as command
 from gausim.cli.main import main
@@ -14,7 +17,7 @@ from gausim.compose.config import compose
 from gausim.compose.places import more_settings
 from gausim.core.scene import GaussianScene
 from gausim.io.ply import load_scene, save_scene
-from gausim.report.pictures import clusters
+from gausim.report.pictures import clusters, material
 
 
 @pytest.fixture
@@ -90,3 +93,38 @@ def test_the_default_hierarchy_is_that_of_the_models(option: str) -> None:
     levels = compose("train", [f"model={option}"]).model.simulator.hierarchy.levels
     assert tuple(level.diameter for level in reversed(levels)) == command.DEFAULT_RADII
     assert more_settings()["model.simulator.hierarchy.clustering"] == command.DEFAULT_CLUSTERING
+
+
+@pytest.mark.parametrize("name", ["stiffness", "damping"])
+def test_material_as_picture_and_ply(played: SimpleNamespace, tmp_path: Path, capsys, name: str) -> None:
+    out = tmp_path / f"{name}.png"
+    assert main(["inspect", str(played.run_dir), "--property", name, "--azimuths", "30", "--out", str(out)]) == 0
+    told, ply = capsys.readouterr().out, out.with_suffix(".ply")
+    assert name in told and f"PLY        {ply}" in told
+    image = cv2.imread(str(out))
+    assert image is not None and image.shape[1] > 400
+    colored, scene = load_scene(ply), played.module.model.scenes[0]
+    free, values = scene.simulated & ~scene.pinned, torch.from_numpy(np.array(PlyData.read(ply)["vertex"][name]))
+    assert f"{int(free.sum())} of 36 move" in told and (values[free] > 0).all() and (values[~free] == 0).all()
+    assert torch.equal(colored.means, scene.means) and torch.equal(colored.pinned, scene.pinned)
+    assert colored.sh_degree == 0 and len(colored.sh[~free].unique(dim=0)) == 1
+
+
+def test_a_trained_run_tells_what_it_has_learned_and_no_more(toy_run: Path, tmp_path: Path, capsys) -> None:
+    asked = ["inspect", str(toy_run), "--out", str(tmp_path / "m.png"), "--property"]
+    assert main([*asked, "density"]) == 0
+    assert "density over that at the beginning of training" in capsys.readouterr().out
+    values = PlyData.read(tmp_path / "m.ply")["vertex"]["density"]
+    assert len(np.unique(values[values > 0])) > 1
+    assert main([*asked, "stiffness"]) == 2
+    assert "has learned density. Take one of these, or a run of model=gausim" in capsys.readouterr().err
+
+
+def test_scales_leave_out_extremes_and_unknown_kernels_are_grey() -> None:
+    values = torch.cat((torch.linspace(1, 2, 1000), torch.tensor([1e6, torch.nan])))
+    scale = material.property_scale(values)
+    assert 1 <= scale.vmin < 1.05 and 1.95 < scale.vmax <= 2
+    colors = material.property_colors(values, scale)
+    assert torch.equal(colors[-2], colors[999]) and float(colors[-1].std()) < 1e-6 and float(colors[0].std()) > 0.05
+    same = material.property_scale(torch.ones(5))
+    assert same.vmin < 1 < same.vmax

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -36,6 +37,7 @@ from gausim.data.verify import verify
 from gausim.interaction.selections import Ball, Kernels
 from gausim.interaction.session import Entry, Force, ForceSession, MadeWith, Pin, Reset, load_session, save_session
 from gausim.io.colmap import read_colmap
+from gausim.io.motion import load_motion, motion_glb
 from gausim.io.ply import load_masks, load_points, load_scene, save_scene
 from gausim.io.ply_sequence import load_ply_sequence, save_ply_sequence
 from gausim.io.trajectory import load_trajectory, save_trajectory
@@ -89,6 +91,7 @@ def _scenes(folder: Path) -> Iterator[Reader]:
     yield Reader("masks", path.with_name("scene.masks.npz"), "npz", lambda p: load_masks(SCENE, p))
     save_trajectory(folder / "scene" / "t.safetensors", toy.truth("seq_000", 3), facts={"object": "toy"})
     yield Reader("trajectory", folder / "scene" / "t.safetensors", "binary", load_trajectory, 8)
+    yield from _motions(folder / "scene", toy)
     save_session(SESSION, folder / "scene" / "pull.json")
     yield Reader("session of forces", folder / "scene" / "pull.json", "json", load_session, 6)
     frames = save_ply_sequence(folder / "frames", "toy", [SCENE, SCENE], 24.0)
@@ -96,6 +99,24 @@ def _scenes(folder: Path) -> Iterator[Reader]:
     yield Reader(
         "rate of a PLY sequence", folder / "frames" / "toy.json", "json", lambda p: load_ply_sequence(p.parent)
     )
+
+
+def _motions(folder: Path, toy: toy_object.ToyObject) -> Iterator[Reader]:
+    motion = motion_glb(SCENE, toy.truth("seq_000", 3))
+    path, facts = folder / "t.motion.glb", folder / "t.json"
+    path.write_bytes(motion.to_bytes())
+    facts.write_text(json.dumps(motion.document))
+
+    def packed(p: Path) -> Any:
+        """The damaged JSON part between a header that fits it and the good binary part."""
+        text, whole = p.read_bytes(), p.with_name("u.motion.glb")
+        lengths = struct.pack("<III", 2, 28 + len(text) + len(motion.binary), len(text))
+        head = b"glTF" + lengths + b"JSON" + text + struct.pack("<I", len(motion.binary))
+        whole.write_bytes(head + b"BIN\0" + motion.binary)
+        return load_motion(whole)
+
+    yield Reader("motion", path, "binary", load_motion, 6)
+    yield Reader("facts of a motion", facts, "json", packed, 6)
 
 
 def _object(folder: Path) -> Iterator[Reader]:

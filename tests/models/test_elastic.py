@@ -227,3 +227,21 @@ def test_trained_inertia_is_the_equation_of_motion_with_another_mass() -> None:
     step, middle = (z - before)[0], (z + before)[0] / 2
     energy = (step @ mass @ step + middle @ stiffness @ middle) / 2 + size * scene.springs.potential(middle[None])[0]
     assert float(_energy(scene, *place)) == pytest.approx(float(energy), rel=1e-4)
+
+
+def test_matrices_tell_which_unit_resists_and_how_fast_an_impulse_is_damped(elastic: ElasticScene) -> None:
+    moving = torch.isfinite(elastic.resistance())
+    torch.testing.assert_close(elastic.resistance()[moving], torch.ones(int(moving.sum())).double())
+    elastic.damping.fill_(0.7)
+    rate = torch.exp(torch.tensor(-4.0 + 2.0 * 0.7).double())
+    torch.testing.assert_close(elastic.damping_rate()[moving], rate.expand(int(moving.sum())), rtol=1e-4, atol=0)
+    # A spring that ties one unit to its place is found where it is, with any inertia.
+    unit = int(moving.nonzero()[3])
+    root, _ = elastic.roots()
+    tied = torch.diag(root**2) + 3 * root[0] ** 2 * elastic.modes[unit].mT @ elastic.modes[unit]
+    factor = torch.linalg.cholesky(tied) / root[:, None]
+    elastic.mixing.copy_((factor - torch.eye(9)) / 0.3)
+    found = elastic.resistance()
+    assert int(found.nan_to_num().argmax()) == unit
+    elastic.inertia_mixing.copy_(0.05 * torch.randn(9, 9, generator=torch.Generator().manual_seed(0)))
+    assert torch.isfinite(elastic.resistance()[moving]).all() and (elastic.damping_rate()[moving] > 0).all()

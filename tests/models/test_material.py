@@ -15,6 +15,7 @@ from helpers.simulators import silence
 from gausim.core import SimState
 from gausim.evaluation.stability import _LinearStep
 from gausim.models.hierarchy.clusters import build_hierarchy
+from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.material import DAMPING_GAIN, MaterialTemplate
 from gausim.models.template.solid import solid_body
 from gausim.ops.quaternion import quaternion_to_matrix
@@ -252,3 +253,40 @@ def test_stiff_bodies_do_not_tremble_ever_more_after_a_large_displacement(neural
             state = SimState(step.positions, state.positions)
         sizes[name] = float((state.positions - scene.means).norm() / moved.norm())
     assert sizes["implicit"] < 0.5 and not sizes["explicit"] < 100, sizes
+
+
+def test_the_material_of_the_units_is_told_as_it_enters_the_matrices(hierarchy) -> None:
+    template, count = _template(hierarchy), hierarchy.levels[1].count
+    units, links = torch.zeros(count, 3, dtype=torch.float64), template.body(0).distance.new_zeros(1, 3)
+    links = links.expand(template.body(0).links.shape[1], 3)
+    zeros = torch.zeros(count, 3, dtype=torch.float64)
+    fixed = FixedUnits(zeros, zeros[:, 0], zeros[:, 0], zeros[:, 0] + 9, zeros, zeros[:, :1])
+
+    def told(units, links):
+        with mock.patch.object(template, "decode", return_value=(units, links)):
+            return {name: found.values for name, found in template.material(0, fixed, 30.0).items()}
+
+    even = told(units, links)
+    torch.testing.assert_close(even["stiffness"], torch.ones(count).double())
+    torch.testing.assert_close(even["damping"], torch.full((count,), 24 * 0.02).double())  # c_0 is of 24 frames per s
+    torch.testing.assert_close(even["density"], torch.full((count,), np.exp(2.5 * np.tanh(9 / 2.5))).double())
+    units[4], log3 = torch.tensor([1.0, 1.0, -1.0]), np.log(3)
+    one = told(units, links)
+    others = torch.arange(count) != 4
+    assert 1.5 < float(one["stiffness"][4]) < np.e and (one["stiffness"][others] - 1).abs().max() < 1e-12
+    assert float(one["damping"][4]) == pytest.approx(24 * 0.02 / np.e)
+    thrice = told(torch.full_like(units, log3), torch.full_like(links, log3))["stiffness"]
+    torch.testing.assert_close(thrice, torch.full((count,), 3.0).double())
+
+
+@torch.no_grad()
+def test_kernels_have_the_material_of_their_units(neural) -> None:
+    model = neural()
+    known, scene = model.material(0), model.scenes[0]
+    free = scene.simulated & ~scene.pinned
+    unit = model.units_of_kernels(0)[model.predicted_levels[-1] - 1]
+    for name in ("stiffness", "density", "damping"):
+        values = known[name].values
+        assert torch.equal(torch.isfinite(values), free) and (values[free] > 0).all()
+        for u in unit[free].unique():
+            assert len(values[free & (unit == u)].unique()) == 1

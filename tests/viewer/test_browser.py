@@ -18,14 +18,12 @@ pytest.importorskip("viser", reason="the extra 'view' is not installed")
 from viser.transforms import SO3
 
 from gausim.cli.view_subject import playable_run, subject_of
-from gausim.core import Trajectory
 from gausim.interaction.interaction import Interaction, replay
 from gausim.interaction.selections import Kernels
 from gausim.interaction.session import Force, Impulse, load_session, save_session
 from gausim.ops.orbit import orbit_cameras
 from gausim.viewer.access import Access
 from gausim.viewer.app import Subject, Viewer
-from gausim.viewer.recording import record
 
 pytestmark = needs_chromium
 SIZE = (1280, 800)
@@ -191,24 +189,3 @@ def test_page_looks_from_a_camera_of_the_data_set(make_interaction: Callable[...
         page.press_input("Look from")
         page.press_text(cameras.names[1], "[role=option]")
         page.wait(lambda: np.linalg.norm(client.camera.position - expected) < 1e-3, 10, "the camera's place")
-
-
-@pytest.mark.slow
-def test_exported_page_plays_without_a_network(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
-    scene, frames = make_interaction().scene, 12
-    positions = scene.means.expand(frames, -1, -1).clone()
-    positions[:, :, 0] += torch.linspace(0, 0.6, frames)[:, None] * scene.diagonal
-    identity = torch.eye(3).expand(frames, 1, 3, 3)
-    unit = torch.zeros(scene.count, dtype=torch.long)
-    path = record(scene, Trajectory(positions, identity, identity, unit, 6.0), tmp_path / "column.html")
-    with chromium(tmp_path, size=SIZE) as page:
-        page.open(path.as_uri())
-        page.wait(lambda: page.run("!!document.querySelector('canvas')"), 30, "a picture")
-        page.wait(lambda: page.run("document.title").startswith("column"), 10, "its title")
-        pictures = set()
-        for _ in range(6):
-            time.sleep(0.4)
-            pictures.add(page.picture())
-        assert len(pictures) > 2, "nothing moves"
-        outside = [address for address in page.requests if not address.startswith(("file:", "data:", "blob:"))]
-        assert not outside, outside

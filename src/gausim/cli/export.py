@@ -49,10 +49,10 @@ def main(argv: list[str]) -> int:
     motion = _thinned(_opened(arguments), arguments.every)
     form = FORMATS[arguments.format]
     path = arguments.out or Path(f"{motion.name}{form.suffix}")
-    if form.write in (_write_safetensors, _write_recording) and motion.trajectory is None:
+    if form.write in (_write_safetensors, _write_motion, _write_page, _write_recording) and motion.trajectory is None:
         raise ConfigError(
             f"--format {arguments.format}: {arguments.source} holds frames without units, which make no trajectory. "
-            "Export from a run or a trajectory, or as ply, usd, mp4 or gif."
+            "Export from a run, a trajectory or a motion, or as ply, gltf, usd, mp4 or gif."
         )
     count = form.write(motion, path, arguments)
     print(f"wrote {path}: {count} frames of {motion.first.count} kernels at {motion.fps:g} frames per second")
@@ -67,10 +67,10 @@ def _parser() -> argparse.ArgumentParser:
         rows += [f"  {'':<{width}}  read by {form.reader}"] if form.reader else []
     parser = command_parser("export", epilog="formats:\n" + "\n".join(rows))
     add = parser.add_argument
-    add("source", metavar="SOURCE", type=Path, help="a RUN; a trajectory.safetensors (with --scene); a folder of "
-        "name_0001.ply, ...; or a .usd, .usda, .usdc file")  # fmt: skip
+    add("source", metavar="SOURCE", type=Path, help="a RUN; a trajectory.safetensors (with --scene); a .motion.glb; a "
+        "folder of name_0001.ply, ...; or a .usd, .usda, .usdc file")  # fmt: skip
     add("--format", required=True, choices=list(FORMATS), help="what to write, see below")
-    add("--out", metavar="PATH", type=Path, help="file to write (a folder for ply); default NAME.SUFFIX here")
+    add("--out", metavar="PATH", type=Path, help="file to write (a folder for ply and gltf); default NAME.SUFFIX here")
     add("--scene", type=Path, metavar="SCENE.ply", help="the rest scene of a trajectory")
     add("--object", metavar="NAME", help="of a run; default its first")
     add("--sequence", metavar="NAME", help="of a run; default its first")
@@ -79,16 +79,18 @@ def _parser() -> argparse.ArgumentParser:
     add("--every", type=positive, default=1, metavar="N", help="take every so many frames")
     add("--fps", type=float, help="of a folder of PLY files that does not say it")
     add("--up", default="z", choices=("y", "z"), help="vertical axis (default: z)")
-    pictures = parser.add_argument_group("mp4 and gif")
+    pictures = parser.add_argument_group("mp4, gif and html")
     pictures.add_argument("--view", metavar="NAME", help="camera of the run's data set")
     pictures.add_argument("--azimuth", type=float, default=30.0, metavar="DEGREE", help="of a camera about the "
                           "vertical, where no --view is named (default: 30)")  # fmt: skip
-    pictures.add_argument("--size", type=positive, default=480, metavar="PIXELS", help="height and width (480)")
+    pictures.add_argument("--size", type=positive, default=480, metavar="PIXELS", help="height and width of mp4 and "
+                          "gif (480)")  # fmt: skip
     pictures.add_argument("--background", default="black", metavar="COLOR", help="black, white or R,G,B in 0..1")
     return parser
 
 
 def _opened(arguments: argparse.Namespace) -> Motion:
+    from gausim.io.motion import load_motion
     from gausim.io.ply_sequence import load_ply_sequence
     from gausim.io.usd import SUFFIXES, load_usd
 
@@ -101,6 +103,9 @@ def _opened(arguments: argparse.Namespace) -> Motion:
         return Motion(source.name, fps, count, lambda: load_ply_sequence(source, fps=fps)[0], next(scenes))
     if source.suffix == ".safetensors":
         return _from_trajectory(source, arguments.scene)
+    if source.suffix == ".glb":
+        scene, trajectory = load_motion(source)
+        return _of_trajectory(scene.name, scene, trajectory)
     return _from_run(arguments)
 
 
@@ -173,6 +178,29 @@ def _write_ply(motion: Motion, path: Path, arguments: argparse.Namespace) -> int
     return len(save_ply_sequence(path, motion.name, motion.scenes(), motion.fps))
 
 
+def _write_gltf(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
+    from gausim.io.gltf import save_gltf_frames
+
+    return save_gltf_frames(path, motion.name, motion.scenes(), up=arguments.up)
+
+
+def _write_motion(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
+    from gausim.io.motion import save_motion
+
+    assert motion.trajectory is not None
+    save_motion(path, motion.first, motion.trajectory, up=arguments.up)
+    return motion.frames
+
+
+def _write_page(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
+    from gausim.io.player import save_player
+
+    assert motion.trajectory is not None
+    background, camera = parse_background(arguments.background), _camera(motion, arguments)
+    save_player(path, motion.first, motion.trajectory, camera, up=arguments.up, background=background)
+    return motion.frames
+
+
 def _write_usd(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
     from gausim.io.usd import save_usd
 
@@ -183,7 +211,7 @@ def _write_recording(motion: Motion, path: Path, arguments: argparse.Namespace) 
     from gausim.viewer.recording import record
 
     assert motion.trajectory is not None
-    record(motion.first, motion.trajectory, path, kind=arguments.format, up=arguments.up)
+    record(motion.first, motion.trajectory, path, up=arguments.up)
     return motion.frames
 
 
@@ -254,6 +282,30 @@ FORMATS = {
         "units of the kernels, deformation gradients",
         "gausim, SuperSplat, every 3DGS viewer",
     ),
+    "motion": Format(
+        ".motion.glb",
+        _write_motion,
+        "the rest scene and its masks; of every unit and frame centre and deformation gradient as 12 half floats, a "
+        "hundredth of the size of PLY files",
+        "digits (errors below a thousandth of the diagonal; spherical harmonics have 8 bits); rotations become those "
+        "of the deformation gradients",
+        "gausim; the rest scene by every reader of glTF's KHR_gaussian_splatting",
+    ),
+    "html": Format(
+        ".html",
+        _write_page,
+        "as motion, in one page that plays in a browser without a network: turned spherical harmonics, time bar, orbit",
+        "as motion",
+        "every browser with WebGL 2",
+    ),
+    "gltf": Format(
+        "",
+        _write_gltf,
+        "one glTF (GLB with KHR_gaussian_splatting) per frame, name_0001.glb: covariances as axes and lengths, turned "
+        "spherical harmonics, float32",
+        "masks, units, deformation gradients, frame rate",
+        "PlayCanvas, Babylon.js, three.js, Cesium",
+    ),
     "usd": Format(
         ".usdc",
         _write_usd,
@@ -266,12 +318,6 @@ FORMATS = {
         ".viser",
         _write_recording,
         "positions, covariances (float16), one colour per kernel and frame",
-        "spherical harmonics, masks, units",
-    ),
-    "html": Format(
-        ".html",
-        _write_recording,
-        "as viser, in one page that plays in a browser without a network",
         "spherical harmonics, masks, units",
     ),
     "mp4": Format(".mp4", _write_pictures, "pictures of one camera", "everything else"),

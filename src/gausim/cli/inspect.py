@@ -1,4 +1,4 @@
-"""`gausim inspect`: statistics of a scene and of its hierarchy."""
+"""`gausim inspect`: statistics of a scene and of its hierarchy, or the material that a run has learned."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.cli.arguments import add_pin_options, command_parser, pinned_by
+from gausim.cli.arguments import add_data_option, add_pin_options, command_parser, pinned_by
 
 if TYPE_CHECKING:
     from gausim.core.scene import GaussianScene
@@ -16,11 +16,16 @@ if TYPE_CHECKING:
 # The hierarchy of the model configurations in conf/model; composing them here would be slow.
 DEFAULT_RADII = (0.13, 0.4)
 DEFAULT_CLUSTERING = "agglomerative"
+PROPERTIES = ("stiffness", "density", "damping")
 
 
 def main(argv: list[str]) -> int:
     """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
+    if arguments.property is not None:
+        from gausim.cli.inspect_material import show_material
+
+        return show_material(arguments)
     from gausim.core.errors import SceneError
     from gausim.io.ply import load_scene, masks_path, save_masks
     from gausim.models.hierarchy.clusters import build_hierarchy
@@ -46,7 +51,7 @@ def _parser() -> argparse.ArgumentParser:
 
     parser = command_parser("inspect")
     add = parser.add_argument
-    add("scene", metavar="SCENE", type=Path, help="3DGS scene (PLY)")
+    add("scene", metavar="SCENE", type=Path, help="3DGS scene (PLY), or a RUN with --property")
     add("--masks", metavar="FILE", type=Path, help="masks (npz); default <stem>.masks.npz next to the scene, if there")
     add_pin_options(parser)
     add("--simulate-below", metavar="AXIS=VALUE", help="simulate only kernels below (others are drawn, never moved)")
@@ -59,7 +64,15 @@ def _parser() -> argparse.ArgumentParser:
         help="clustering method; default %(default)s, as in the model configurations")  # fmt: skip
     add("--up", choices=("x", "y", "z", "-x", "-y", "-z"),
         help="axis drawn upwards (write --up=-y); default away from the pins, else z")  # fmt: skip
-    add("--out", metavar="PICTURE.png", type=Path, help="picture of the clusters; default <stem>.clusters.png")
+    add("--out", metavar="PICTURE.png", type=Path,
+        help="default <stem>.clusters.png, of a property OBJECT.PROPERTY.png")  # fmt: skip
+    learned = parser.add_argument_group("the material that a run has learned")
+    learned.add_argument("--property", choices=PROPERTIES, help="colour the Gaussians by it: a picture, and a PLY "
+                         "with these colours and the property")  # fmt: skip
+    learned.add_argument("--object", metavar="NAME", help="of the run; default its first")
+    learned.add_argument("--azimuths", type=float, nargs="+", default=[30.0, 210.0], metavar="DEGREE",
+                         help="cameras about the vertical (default: 30 210)")  # fmt: skip
+    add_data_option(parser)
     return parser
 
 

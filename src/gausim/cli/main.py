@@ -27,7 +27,7 @@ COMMANDS = {
     "benchmark": "Measure the speed of rendering, stepping, training and clustering as ratios within one run.",
     "simulate": "Roll a run forward and write videos, figures and trajectories.",
     "view": "Simulate a run or a scene interactively in the browser.",
-    "export": "Write a motion as PLY, OpenUSD, safetensors, viser, HTML, MP4 or GIF, and read it back.",
+    "export": "Write a motion as HTML that plays it, glTF, PLY, OpenUSD, safetensors, viser, MP4 or GIF, and read it.",
     "config": "Check a training configuration, print its JSON schema, complete it in the shell.",
     "card": "Write the card of a run: data, figures, cost, limitations, licence.",
     "fetch": "Fetch a published run or data set, or pack one for others.",

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from gausim.compose.build import LoadedRun
     from gausim.compose.predict import RunObject
     from gausim.interaction.interaction import Interaction
+    from gausim.models.template.template import Property
     from gausim.viewer.shown import Take
     from gausim.viewer.subject import Subject
 
@@ -104,19 +105,23 @@ def takes_of(made: Playable, beside: Playable | None) -> list[Take]:
 
 def subject_of(made: Playable, *, title: str, beside: Playable | None, up: str, sessions: Path) -> Subject:
     """The complete content of the viewer."""
+    from gausim.models.step.scene_model import SceneModel
     from gausim.viewer.companion import Companion
     from gausim.viewer.films import Films
     from gausim.viewer.subject import Subject
 
     films = cameras = companion = None
+    material: dict[str, Property] = {}
     if made.run is not None and made.item is not None:
         records = {record.name: record for record in made.item.data.sequences}
         films = Films(records, made.interaction.scene, made.run.renderer)
         cameras = next(iter(records.values())).cameras
+        if isinstance(made.run.module.model, SceneModel):
+            material = made.run.module.model.material(made.item.scene_id)
     if beside is not None and beside.run is not None:
         name = f"{beside.run.module.method_name} ({Path(beside.run.run_dir).name})"
         companion = Companion(name, beside.interaction)
     return Subject(
         title=title, interaction=made.interaction, takes=takes_of(made, beside), companion=companion, films=films,
-        cameras=cameras, up=up, sessions=sessions,
+        cameras=cameras, material=material, up=up, sessions=sessions,
     )  # fmt: skip

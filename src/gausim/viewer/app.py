@@ -54,7 +54,7 @@ class Viewer:
         scene = subject.interaction.scene
         self.server = GuardedServer(access, label="gausim")
         self.placing = Placing.of(scene)
-        self._painter = Painter(scene, subject.interaction.units, subject.interaction.masses)
+        self._painter = Painter(scene, subject.interaction.units, subject.interaction.masses, subject.material)
         self.workers = (Worker("paint", self._paint), Worker("send", self._send))
         self.live = Live(
             subject.interaction, self.workers[0].put, takes=subject.takes, companion=subject.companion,

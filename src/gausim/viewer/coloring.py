@@ -1,8 +1,8 @@
-"""Colour modes of the kernels: appearance, hierarchy, strain, speed or mass."""
+"""Colour modes of the kernels: appearance, hierarchy, strain, speed, mass or the learned material."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import GaussianScene, SteppedFrame
+from gausim.models.template.template import Property
 from gausim.ops.covariance import transport_covariance
 from gausim.ops.spherical_harmonics import C0
 from gausim.render.draw import SceneAppearance, deformed_appearance
@@ -35,18 +36,26 @@ class Legend:
 class Painter:
     """Colours and covariances of the frames of one scene."""
 
-    def __init__(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]], masses: Float[Tensor, " K"]) -> None:
+    def __init__(
+        self,
+        scene: GaussianScene,
+        units: Sequence[Int[Tensor, " K"]],
+        masses: Float[Tensor, " K"],
+        material: Mapping[str, Property] | None = None,
+    ) -> None:
+        """Takes the scene, its units of levels 1..L, masses, and learned properties of the kernels by name."""
         self._look = SceneAppearance.of(scene.to("cpu"))
         self._masses, self._diagonal = masses.float().cpu(), scene.diagonal
         self._moving = (scene.simulated & ~scene.pinned).cpu()
         self._levels = {f"Hierarchy, level {i} ({int(u.max()) + 1} units)": u for i, u in enumerate(units, 1)}
+        self._material = {name.capitalize(): found for name, found in (material or {}).items()}
         self._highest: dict[str, float] = {}
         self.opacities = self._look.opacities
 
     @property
     def modes(self) -> tuple[str, ...]:
         """Names of the colour modes."""
-        return (VIEW, BASE, *self._levels, STRAIN, SPEED, MASS)
+        return (VIEW, BASE, *self._levels, STRAIN, SPEED, MASS, *self._material)
 
     def forget(self) -> None:
         """Restarts the scales, which otherwise extend to the largest value so far."""
@@ -87,12 +96,19 @@ class Painter:
         if mode == SPEED:
             return self._scaled(mode, speed / self._diagonal, "speed", "diagonals / s")
         if mode == MASS:
-            weight = self._masses.clamp_min(1e-12).log10()
-            low, high = float(weight[self._moving].min()), float(weight[self._moving].max())
-            return _ramp((weight - low) / max(high - low, 1e-6)), Legend("mass, logarithm to base 10", low, high)
+            return self._logarithmic(self._masses, self._moving, "mass")
+        if mode in self._material:
+            found, known = self._material[mode], torch.isfinite(self._material[mode].values)
+            rgb, legend = self._logarithmic(found.values, known, found.text)
+            return torch.where(known[:, None], rgb, 0.5), legend
         if mode in self._levels:
             return hues(self._levels[mode].cpu()), Legend("one colour per unit of this level; grey: never simulated")
         return (0.5 + C0 * self._look.sh[:, 0]).clamp(0, 1), Legend("base colours, the same from every side")
+
+    def _logarithmic(self, value: Tensor, known: Tensor, text: str) -> tuple[Tensor, Legend]:
+        logarithm = value.nan_to_num().clamp_min(1e-12).log10()
+        low, high = float(logarithm[known].min()), float(logarithm[known].max())
+        return _ramp((logarithm - low) / max(high - low, 1e-6)), Legend(f"{text}, logarithm to base 10", low, high)
 
     def _scaled(self, mode: str, value: Tensor, text: str, unit: str) -> tuple[Tensor, Legend]:
         value = torch.where(self._moving, value, torch.zeros_like(value))

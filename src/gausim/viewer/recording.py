@@ -1,8 +1,7 @@
-"""Export of a trajectory as a `.viser` recording or as one HTML page that plays it offline."""
+"""Export of a trajectory as a `.viser` recording."""
 
 from __future__ import annotations
 
-import html
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,14 +15,9 @@ from gausim.viewer.coloring import BASE, VIEW, Painter
 from gausim.viewer.server import GuardedServer
 from gausim.viewer.splats import SIZE, Placing, add_splats, pack
 
-# Largest size of the buffers of all frames, which are in memory at once and in a page as base64 [bytes].
+# Largest size of the buffers of all frames, which are in memory at once [bytes].
 _LARGEST = 1 << 30
 _EYE = {"x": (0.3, 1.0, 0.4), "y": (0.4, 0.3, 1.0), "z": (0.4, -1.0, 0.3)}
-# Forbids all requests: the page is complete in one file.
-_POLICY = (
-    "default-src 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' data: blob:; connect-src data: blob:; "
-    "worker-src data: blob:; form-action 'none'; base-uri 'none'"
-)
 
 
 def record(
@@ -31,13 +25,11 @@ def record(
     trajectory: Trajectory,
     path: Path | str,
     *,
-    kind: Literal["viser", "html"] = "html",
     every: int = 1,
     up: str = "z",
     colors: Literal["base", "view"] = "base",
-    dark: bool = False,
 ) -> Path:
-    """Writes a trajectory that plays in a browser at its frame rate, in a loop.
+    """Writes a trajectory for viser's player, which plays it at its frame rate, in a loop.
 
     Kept: positions (float32), covariances (float16, with the object scaled to :data:`SIZE` units), colours and
     opacities (8 bit). Lost: view-dependent colours (one colour per kernel and frame), masks, masses, the hierarchy.
@@ -46,11 +38,9 @@ def record(
         scene: the rest scene.
         trajectory: the trajectory to play.
         path: the file; an existing one is replaced.
-        kind: ``viser`` (for viser's player) or ``html`` (a local file that needs no network).
         every: interval of the exported frames [frames].
         up: vertical axis: x, y, z, -x, -y or -z.
         colors: ``base`` (independent of the view) or ``view`` (as seen from the initial camera).
-        dark: use a dark theme.
 
     Returns:
         The path.
@@ -64,8 +54,7 @@ def record(
     server = GuardedServer(Access(port=0), label=scene.name)
     try:
         serializer = _recorded(server, scene, trajectory, numbers, up, VIEW if colors == "view" else BASE)
-        page = _sealed(serializer.as_html(dark_mode=dark), scene.name).encode() if kind == "html" else None
-        write_durably(Path(path), page or serializer.serialize())
+        write_durably(Path(path), serializer.serialize())
     finally:
         server.stop()
     return Path(path)
@@ -124,12 +113,3 @@ def _recorded(
         node.buffer = buffer(number)
     serializer.insert_sleep(seconds)
     return serializer
-
-
-def _sealed(page: str, name: str) -> str:
-    """The page with its title and a policy that forbids all requests."""
-    policy = f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}" />'
-    head, _, rest = page.partition("<head>")
-    before, _, titled = rest.partition("<title>")
-    title = html.escape(f"{name} - gausim")
-    return f"{head}<head>{policy}{before}<title>{title}</title>{titled.partition('</title>')[2]}"

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from gausim.core import ConfigError, GaussianScene, SimState, SmoothMotions
 from gausim.models.hierarchy.batch import BatchBuilder, SceneBatch
 from gausim.models.hierarchy.clusters import build_hierarchy
-from gausim.models.hierarchy.units import FixedUnits
+from gausim.models.hierarchy.units import FixedUnits, fixed_units
 from gausim.models.reference.reference import Reference
 from gausim.models.reference.surroundings import SceneSurroundings, reference_of
 from gausim.models.settings import HierarchySettings
@@ -23,7 +23,7 @@ from gausim.models.step.body_frame import Frames, body_axes
 from gausim.models.step.predictor import DeformationPredictor
 from gausim.models.step.prepared import Prepared
 from gausim.models.template.smooth import smooth_motions
-from gausim.models.template.template import Motion, PreparedTemplate, Template
+from gausim.models.template.template import Motion, PreparedTemplate, Property, Template
 from gausim.nn.normaliser import normalisers_of
 
 # Disjoint unions that stay in memory; with many scenes almost every batch is another one.
@@ -165,6 +165,23 @@ class SceneModel(nn.Module, ABC):
         slopes = torch.einsum("ca,ncdm,db->nabm", axes, slopes, axes)
         own = modes, slopes, sizes
         return smooth_motions(self.scenes[scene_id], self.hierarchies[scene_id], self.predicted_levels[-1], own)
+
+    @torch.no_grad()
+    def material(self, scene_id: int) -> dict[str, Property]:
+        """Learned properties of the scene's kernels: ``density``, and ``stiffness`` and ``damping`` if it knows them.
+
+        Each kernel has the value of its finest predicted unit; NaN for kernels that never move.
+        """
+        batch, scene = self.batch((scene_id,)), self.scenes[scene_id]
+        _, units = fixed_units(batch, self.masses(batch)[0], self.attributes[scene_id])
+        known = self.template.material(scene_id, units[-1], self.fps[scene_id])
+
+        def of_kernels(values: Tensor) -> Tensor:
+            every = torch.full((scene.count,), torch.nan)
+            every[batch.simulated.cpu()] = values[batch.levels[-1].unit_of_kernel].float().cpu()
+            return torch.where(scene.simulated.cpu() & ~scene.pinned.cpu(), every, torch.nan)
+
+        return {name: Property(of_kernels(found.values), found.text) for name, found in known.items()}
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by role: the network, the scenes' densities and attributes, and the template."""

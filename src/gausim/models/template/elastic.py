@@ -26,7 +26,7 @@ from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.solid import solid_body
 from gausim.models.template.springs import limited, unit_springs
-from gausim.models.template.template import ModalScene, PreparedScenes, Template
+from gausim.models.template.template import ModalScene, PreparedScenes, Property, Template
 
 # Gains on the parameters: with one learning rate, logarithms of stiffness and damping change faster than the mixing of
 # modes.
@@ -97,6 +97,28 @@ class ElasticScene(nn.Module):
         log_damping = INITIAL_LOG_DAMPING + SPECTRUM_GAIN * self.damping
         factor = (0.5 * log_damping).exp()[:, None] * (self._identity() + MIXING_GAIN * self.damping_mixing)
         return factor @ factor.mT
+
+    def resistance(self) -> Float[Tensor, " N"]:
+        """Compliance of each unit under a force on it in the homogeneous body over that in the trained one.
+
+        The compliance is tr(Phi_i K^-1 Phi_i^T). It depends on where a unit sits, the quotient does not. The mean of
+        its logarithm over the free units is 0; pinned units have none (NaN).
+        """
+        root, mixing = self.roots()
+        factor = (root[:, None] * mixing).mT @ self.inertia_root()  # the trained stiffness is its square
+        trained = torch.linalg.solve(factor.mT, self.modes.flatten(0, 1).mT).square().sum(0)
+        even = (self.modes.square() / self.values).sum((1, 2))
+        quotient = even / trained.view(-1, 3).sum(1)
+        return quotient / quotient.log().nanmean().exp()
+
+    def damping_rate(self) -> Float[Tensor, " N"]:
+        """Rate at which the motion after an impulse on each unit loses momentum to D [1 / frame]; NaN for pinned units.
+
+        v = (H^T H)^-1 Phi_i^T; the rate is v^T H^T D H v over v^T H^T H v, summed over the directions.
+        """
+        pushed = torch.linalg.solve(self.inertia_root().mT, self.modes.flatten(0, 1).mT)  # H v (M, 3 N)
+        lost = (pushed * (self.dissipation() @ pushed)).sum(0)
+        return lost.view(-1, 3).sum(1) / pushed.square().sum(0).view(-1, 3).sum(1)
 
     def matrices(self) -> tuple[Tensor, Tensor, Tensor]:
         """A, B and E of z_{t+1} = A z_t - B z_{t-1} + E f."""
@@ -193,6 +215,15 @@ class ElasticTemplate(Template):
         scene = self.scenes[scene_id]
         assert isinstance(scene, ElasticScene)
         return scene
+
+    def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
+        """What a scene's matrices tell about its units."""
+        scene = self.scene(scene_id)
+        return {
+            **super().material(scene_id, units, fps),
+            "stiffness": Property(scene.resistance(), "resistance to a force over that of a homogeneous body"),
+            "damping": Property(fps * scene.damping_rate(), "damping of an impulse [1/s]"),
+        }
 
     def mixing(self, scene_id: int) -> Float[Tensor, ""]:
         """Squared Frobenius norm of the mode mixing of a scene's matrices."""

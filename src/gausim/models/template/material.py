@@ -42,7 +42,7 @@ from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
 from gausim.models.template.solid import POISSON, SolidBody, solid_body
 from gausim.models.template.springs import Springs, neighbour_pairs
-from gausim.models.template.template import ModalScene, PreparedScenes, Template
+from gausim.models.template.template import DENSITY, ModalScene, PreparedScenes, Property, Template
 from gausim.nn.mlp import mlp
 
 # Bound of the decoded logarithms: factors between 1/12 and 12.
@@ -242,6 +242,28 @@ class MaterialTemplate(Template):
         dragged = root.mT @ (units[:, 2, None, None].exp() * density * body.inertia).flatten(0, 1)
         damping = drag * frame * dragged + viscosity / frame * k * stiffness
         return Matrices(k * stiffness, inertia, damping, k * springs)
+
+    def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
+        """Stiffness, damping and density of the units as they enter K, D and M.
+
+        Stiffness is the unit's part of the trace of K (half of each of its links) over the same part of the homogeneous
+        body that k stands for; damping is the drag c_0 e^{d_i}.
+        """
+        body = self.body(scene_id)
+        decoded, links = self.decode(body, units.attributes)
+        parts = body.stiffness.diagonal(dim1=-2, dim2=-1).sum(-1)  # of shear and volume (2, N)
+        factors = LINK_FRACTION * links[:, 0].exp() + SPRING_FRACTION * links[:, 2].exp()
+        size = 0.5 * body.stretch.square().sum(-1)
+        own, homogeneous = (parts.mT * decoded[:, :2].exp()).sum(-1), parts.sum(0)
+        for end in body.links:
+            own = own.index_add(0, end, factors * size)
+            homogeneous = homogeneous.index_add(0, end, (LINK_FRACTION + SPRING_FRACTION) * size)
+        drag = REFERENCE_FPS * (self.start[1] + DAMPING_GAIN * self.damping[0]).exp()
+        return {
+            "stiffness": Property(own / homogeneous, "stiffness over that of a homogeneous body"),
+            "damping": Property(drag * decoded[:, 2].exp(), "drag over momentum [1/s]"),
+            "density": Property(_saturated(units.log_density).exp(), DENSITY),
+        }
 
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
         """Template of a batch with constant matrices."""

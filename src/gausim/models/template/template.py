@@ -24,6 +24,7 @@ from gausim.ops.deformation import bounded_deformation
 
 # Deformation gradients with a smaller determinant (nearly or fully inverted matter) are replaced by the identity.
 MIN_DETERMINANT = 0.2
+DENSITY = "density over that at the beginning of training"
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,14 @@ class TemplateState:
 
     positions: Float[Tensor, "N 3"]  # unit positions [scene units]
     deformation_gradients: Float[Tensor, "N 3 3"] | None  # P of each unit, or None for the identity
+
+
+@dataclass(frozen=True, eq=False)
+class Property:
+    """A learned material property."""
+
+    values: Float[Tensor, " N"]  # positive; of units, or of kernels, NaN where it is not known
+    text: str  # what it is, with its unit
 
 
 class PreparedTemplate:
@@ -98,6 +107,10 @@ class Template(nn.Module, ABC):
             batch: the disjoint graph.
             units: constants of the finest predicted level, densities and attributes among them.
         """
+
+    def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
+        """Learned properties of the scene's units by name: ``density``, and ``stiffness`` and ``damping`` if known."""
+        return {"density": Property(units.log_density.exp(), DENSITY)}
 
     def mixing(self, scene_id: int) -> Float[Tensor, ""] | None:
         """Differentiable measure of the mode mixing relative to the initial body; None for templates without it."""
