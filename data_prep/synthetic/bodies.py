@@ -1,4 +1,4 @@
-"""Shapes of the synthetic set: lattices of hexahedral cells bent into a pudding and a flower.
+"""Shapes of the synthetic set: lattices of hexahedral cells bent into a pudding, a flower, a jelly and a bar.
 
 A lattice is a list of unit cubes on an integer grid; a smooth map takes its nodes to the rest shape. The same cells
 carry the finite elements (split into tetrahedra) and the Gaussians (by trilinear coordinates within a cell).
@@ -28,7 +28,7 @@ class Body:
     nodes: Array  # (N, 3) rest positions [scene units], z up
     cells: Ints  # (C, 8) node numbers of each cell's corners
     grid: Ints  # (C, 3) integer position of each cell in the lattice
-    held: NDArray[np.bool_]  # (N,) nodes that never move
+    held: NDArray[np.bool_]  # (N,) nodes that nothing but a hand moves
 
     @property
     def tetrahedra(self) -> Ints:
@@ -59,7 +59,7 @@ def pudding() -> Body:
         dome = 0.06 * w**2 * (1 - 0.5 * (u * u + v * v))
         return np.stack((radius * x, 0.92 * radius * y, 0.74 * w + dome), 1)
 
-    return _body(cells, shape, held_layers=2)
+    return _body(cells, shape, _lowest_layers)
 
 
 def flower() -> Body:
@@ -90,10 +90,41 @@ def flower() -> Body:
         rest[:, 0] += 0.1 * np.sin(2.2 * z)  # the curve of the stem, which the blossom rides on
         return rest
 
-    return _body(cells, shape, held_layers=2)
+    return _body(cells, shape, _lowest_layers)
 
 
-BODIES: dict[str, Callable[[], Body]] = {"pudding": pudding, "flower": flower}
+def jelly() -> Body:
+    """A lopsided block with rounded sides, 1 wide and 0.8 high, its lowest point 0.45 above z = 0; nothing is held."""
+    count = 5
+    cells = [(i, j, k) for i in range(count) for j in range(count) for k in range(count)]
+
+    def shape(grid: Array) -> Array:
+        u, v, w = (2 * grid / count - 1).T
+        x, y = _round_square(u, v, 0.5)
+        narrow = 1 - 0.16 * w - 0.08 * u * w  # tapered, more so on one side
+        bump = 0.06 * np.exp(-((u - 0.5) ** 2 + (v - 0.4) ** 2) / 0.3) * (w + 1)
+        return np.stack((0.5 * narrow * x, 0.44 * narrow * (y + 0.12 * x), 0.81 + 0.36 * w + bump), 1)
+
+    return _body(cells, shape, lambda grid: np.zeros(len(grid), dtype=bool))
+
+
+def bar() -> Body:
+    """A bar along x with a thick head beside its middle, 1.6 long; two layers of cells at either end are held."""
+    length, across = 16, 3
+    cells = [(i, j, k) for i in range(length) for j in range(across) for k in range(across)]
+
+    def shape(grid: Array) -> Array:
+        along = 2 * grid[:, 0] / length - 1
+        v, w = (2 * grid[:, 1:] / across - 1).T
+        y, z = _round_square(v, w, 0.6)
+        head = np.exp(-(((along - 0.12) / 0.26) ** 4))
+        half = 0.1 + 0.13 * head
+        return np.stack((0.8 * along, half * y, 0.8 + half * (z + 0.25 * head)), 1)
+
+    return _body(cells, shape, lambda grid: (grid[:, 0] <= 2) | (grid[:, 0] >= length - 2))
+
+
+BODIES: dict[str, Callable[[], Body]] = {"pudding": pudding, "flower": flower, "jelly": jelly, "bar": bar}
 
 
 def _round_square(u: Array, v: Array, roundness: float) -> tuple[Array, Array]:
@@ -101,13 +132,14 @@ def _round_square(u: Array, v: Array, roundness: float) -> tuple[Array, Array]:
     return u * np.sqrt(1 - 0.5 * roundness * v * v), v * np.sqrt(1 - 0.5 * roundness * u * u)
 
 
-def _body(cells: list[tuple[int, int, int]], shape: Callable[[Array], Array], *, held_layers: int) -> Body:
+def _lowest_layers(grid: Ints) -> NDArray[np.bool_]:
+    # Two layers of held nodes make the lowest cells rigid: Gaussians in them are pinned, exactly.
+    return grid[:, 2] < 2
+
+
+def _body(
+    cells: list[tuple[int, int, int]], shape: Callable[[Array], Array], held: Callable[[Ints], NDArray[np.bool_]]
+) -> Body:
     grid = np.array(sorted(cells))
     nodes, inverse = np.unique((grid[:, None] + CORNERS).reshape(-1, 3), axis=0, return_inverse=True)
-    return Body(
-        nodes=shape(nodes.astype(float)),
-        cells=inverse.reshape(-1, 8),
-        grid=grid,
-        # Two layers of held nodes make the lowest cells rigid: Gaussians in them are pinned, exactly.
-        held=nodes[:, 2] < held_layers,
-    )
+    return Body(nodes=shape(nodes.astype(float)), cells=inverse.reshape(-1, 8), grid=grid, held=held(nodes))
