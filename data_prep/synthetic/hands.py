@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from data_prep.common.spread import farthest
 from data_prep.synthetic.bodies import Array, Body, Ints
 
 # Amplitudes of the six motions of the two hands, of which a kind weights some [scene units, radian].
@@ -25,7 +25,6 @@ KINDS = {
 }
 SLOW, FAST = 0.35, 1.1  # lowest and highest frequency of a motion [Hz]
 BEGIN = 0.5  # hands reach their full amplitude after this time [s]
-POINTS = 8  # of each hand that are recorded
 
 
 @dataclass(frozen=True)
@@ -83,23 +82,6 @@ def _motion(path: HandPath, hand: int, times: Array) -> tuple[Array, Array]:
     return np.stack((out, y, z), 1), np.stack((side * TWIST * twist, *bend), 1)
 
 
-def recorded_points(body: Body, rest: Array, pinned: NDArray[np.bool_]) -> tuple[Ints, Ints, float]:
-    """Kernels whose motion is recorded as the hands'.
-
-    Args:
-        body: the held body.
-        rest: rest positions of K kernels [scene units].
-        pinned: (K,) kernels that the hands hold.
-
-    Returns:
-        Numbers (C,) of the kernels, their hands (C,), and the largest distance within which no kernel is free.
-    """
-    chosen = []
-    for hand in (0, 1):
-        own = np.flatnonzero(pinned & ((rest[:, 0] > 0) == bool(hand)))
-        out = np.abs(rest[own, 0])
-        own = own[out >= np.median(out)]  # the outer half, far from what is free
-        chosen.append(own[farthest(rest[own], min(POINTS, len(own)))])
-    kernels = np.concatenate(chosen)
-    away = np.linalg.norm(rest[~pinned][:, None] - rest[kernels], axis=-1).min()
-    return kernels, np.repeat([0, 1], [len(own) for own in chosen]), float(away)
+def grip(rest: Array, pinned: NDArray[np.bool_]) -> float:
+    """A distance from the pinned ones of K kernels (K, 3) within which no kernel is free [scene units]."""
+    return 0.9 * float(cKDTree(rest[pinned]).query(rest[~pinned])[0].min())

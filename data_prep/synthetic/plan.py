@@ -43,7 +43,7 @@ class Recipe:
     viscosity: float | None = None  # damping forces over stiffness, in the place of drag [s]
     floor: Floor | None = None  # what it falls on; then it is free, and not pushed
     hands: tuple[str, ...] | None = None  # kinds of paths of the hands that move it; then it is not pushed
-    like: str | None = None  # the object whose looks and kernels it shares
+    like: str | None = None  # the object that it is, in other motions: its name, looks and kernels
     train: float | None = None  # fraction of the frames that are seen; frames 0..15 unless given
     room: tuple[tuple[float, float, float], float] | None = None  # ball that the video cameras see: centre and radius
 

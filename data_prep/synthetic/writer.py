@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from data_prep.synthetic.bodies import BODIES, Array, Body, Ints
+from data_prep.synthetic.bodies import BODIES, Array, Body
 from data_prep.synthetic.elastic import ElasticBody
 from data_prep.synthetic.embedding import Embedding, cover_surface, embedded_scene
 from data_prep.synthetic.falls import fall_field, random_fall
-from data_prep.synthetic.hands import held_path, random_path, recorded_points
+from data_prep.synthetic.hands import grip, held_path, random_path
 from data_prep.synthetic.paint import PAINTERS
 from data_prep.synthetic.plan import RECIPES, TRAIN_FRAMES, Plan
 from data_prep.synthetic.pushes import pushed_motion, random_push
@@ -30,7 +30,8 @@ class SyntheticObject:
 
     def __init__(self, name: str, plan: Plan) -> None:
         """Covers the body of a recipe with painted Gaussians."""
-        self.name, self.plan, self.recipe = name, plan, RECIPES[name]
+        self.plan, self.recipe = plan, RECIPES[name]
+        self.folder, self.name = name, self.recipe.like or name
         self.body: Body = BODIES[self.recipe.body]()
         rng = self._rng("look")
         points, frames, spacing = cover_surface(self.body, plan.kernels, rng)
@@ -95,8 +96,9 @@ class SyntheticObject:
         true = self.points.positions(displacement).astype(np.float32)
         np.savez(folder / "ground_truth.npz", displacement=true)
         if self.recipe.hands is not None:
-            kernels, hands, _ = self._hands
-            np.savez(folder / "hands.npz", points=self.scene.means.numpy()[kernels] + true[:, kernels], hand=hands)
+            rest, pinned = self.scene.means.numpy(), self.scene.pinned.numpy()
+            hand = (rest[pinned, 0] > 0).astype(np.int64)
+            np.savez(folder / "hands.npz", points=rest[pinned] + true[:, pinned], hand=hand)
         write_json(folder / "meta.json", {**cause, **self._figures(true)})
 
     def _motion(self, number: int) -> tuple[Array, dict[str, object]]:
@@ -113,11 +115,6 @@ class SyntheticObject:
             return self.elastic.simulate(np.zeros_like(body.nodes), frames, path=held), asdict(path)
         push = random_push(body, ("poke", "drag")[number % 2], self._rng("push", number), self._swing)
         return pushed_motion(body, self.elastic, push, frames), asdict(push)
-
-    @cached_property
-    def _hands(self) -> tuple[Ints, Ints, float]:
-        """Kernels that record the hands, the hand of each, and the reach of the grip."""
-        return recorded_points(self.body, self.scene.means.numpy(), self.scene.pinned.numpy())
 
     def _photograph(self, displacement: Array, cameras: Cameras) -> np.ndarray:
         """(F, V, H, W, 4) images of the scene under node displacements (F, N, 3)."""
@@ -153,7 +150,9 @@ class SyntheticObject:
         if recipe.floor is not None:
             floor = {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "friction": recipe.floor.friction}
             return {"free": True, "gravity": [0.0, 0.0, -recipe.floor.gravity], "floor": floor}
-        return {} if recipe.hands is None else {"grip": 0.99 * self._hands[2]}
+        if recipe.hands is None:
+            return {}
+        return {"grip": grip(self.scene.means.numpy(), self.scene.pinned.numpy())}
 
     def _figures(self, displacement: np.ndarray) -> dict[str, object]:
         length = np.linalg.norm(displacement, axis=-1)
@@ -166,5 +165,5 @@ class SyntheticObject:
 
     def _rng(self, *stream: object) -> np.random.Generator:
         """A generator of its own for every purpose, so that no part depends on the order of the others."""
-        name = self.recipe.like or self.name if stream == ("look",) else self.name
+        name = self.name if stream == ("look",) else self.folder
         return np.random.default_rng([self.plan.seed, zlib.crc32(repr((name, *stream)).encode())])
