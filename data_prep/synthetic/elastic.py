@@ -64,9 +64,7 @@ class ElasticBody:
                 model.dof_damping[first : first + 3] = drag[node] * masses[node]
         mujoco.mj_setConst(model, self._data)
 
-    def simulate(
-        self, velocity: Array, frames: int, *, shift: Array | None = None, path: Array | None = None
-    ) -> Array:
+    def simulate(self, velocity: Array, frames: int, *, shift: Array | None = None, path: Array | None = None) -> Array:
         """Positions (frames, N, 3) after an initial ``velocity`` (N, 3); frame 0 is exactly the rest shape.
 
         Args:
