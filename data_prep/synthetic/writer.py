@@ -38,7 +38,7 @@ class SyntheticObject:
         self.points: Embedding = points
         rest = points.positions(self.body.nodes)
         colors = PAINTERS[self.recipe.body](rest, frames[..., 2], self.body.grid[points.cell], rng)
-        self.scene: GaussianScene = embedded_scene(points, frames, spacing, colors, name=name)
+        self.scene: GaussianScene = embedded_scene(points, frames, spacing, colors, name=self.name)
         low, high = self.body.nodes.min(0), self.body.nodes.max(0)
         self.center, self.radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
         self.room = self.recipe.room or (self.center, self.radius)

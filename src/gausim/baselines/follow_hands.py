@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gausim.core import Forces, GaussianScene, HandPath, SimState, Trajectory
@@ -55,9 +57,9 @@ def hand_weights(scene: GaussianScene) -> Float[Tensor, "K G"]:
     """
     hand = torch.full_like(scene.pinned, -1, dtype=torch.long) if scene.hand is None else scene.hand
     holders = sorted(set(hand[scene.pinned].tolist()))
-    distance = torch.stack(
-        [torch.cdist(scene.means, scene.means[scene.pinned & (hand == g)]).amin(1) for g in holders], 1
-    )
+    means = scene.means.cpu().numpy()
+    trees = [cKDTree(means[(scene.pinned & (hand == g)).cpu().numpy()]) for g in holders]
+    distance = torch.from_numpy(np.stack([tree.query(means)[0] for tree in trees], 1)).to(scene.means)
     nearness = 1 / distance.clamp_min(1e-6 * scene.diagonal)
     weights = nearness / nearness.sum(1, keepdim=True)
     for column, holder in enumerate(holders):

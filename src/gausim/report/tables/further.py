@@ -14,8 +14,8 @@ from gausim.results.table import BOUNCE_HEAD
 _BOUNCE = (("height", 1.0, "{:.3f}"), ("height_error", 100.0, "{:.1f} %"), ("rise", 1.0, "{:.3f}"),
            ("rise_error", 100.0, "{:.1f} %"), ("depth", 1.0, "{:.2f}"))  # fmt: skip
 _BOUNCE_CAPTION = (
-    "Centre of the true points: its highest point above the floor after the first contact, and its rise from the lowest "
-    "point before [scene units], with the mean of the relative errors over sequences."
+    "Centre of the true points: its highest point above the floor after the first contact, and its rise from the "
+    "lowest point before [scene units], with the mean of the relative errors over sequences."
 )
 _AHEAD_CAPTION = "3D error [% of diagonal] of the frame that is so many frames after the last one trained on."
 

@@ -123,13 +123,8 @@ def metric_sheet(study: Study, metric: str, views: str) -> Sheet | None:
     title = f"{info['label']}{_unit(info)}, {VIEWS[views]}"
     blind = [f"{group.label}: {NO_FORESIGHT}" for group in study.groups if NO_FORESIGHT in says(group)]
     caption = " ".join([_caption(metric, views, info, lines), *blind])
-    section = (
-        MOTION
-        if metric in (ERROR_3D, TRACK_ERROR, CHAMFER, MOTION_ENERGY)
-        else NEW_VIEWS
-        if views == "heldout"
-        else TRAINING_VIEWS
-    )
+    in_3d = metric in (ERROR_3D, TRACK_ERROR, CHAMFER, MOTION_ENERGY)
+    section = MOTION if in_3d else NEW_VIEWS if views == "heldout" else TRAINING_VIEWS
     return Sheet(f"{metric}_{views}", section, title, caption, heads, tuple(lines), "method")
 
 
