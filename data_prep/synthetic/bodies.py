@@ -7,7 +7,7 @@ carry the finite elements (split into tetrahedra) and the Gaussians (by trilinea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +59,7 @@ def pudding() -> Body:
         dome = 0.06 * w**2 * (1 - 0.5 * (u * u + v * v))
         return np.stack((radius * x, 0.92 * radius * y, 0.74 * w + dome), 1)
 
-    return _body(cells, shape, _lowest_layers)
+    return _body(cells, shape, held_layers=2)
 
 
 def flower() -> Body:
@@ -90,7 +90,7 @@ def flower() -> Body:
         rest[:, 0] += 0.1 * np.sin(2.2 * z)  # the curve of the stem, which the blossom rides on
         return rest
 
-    return _body(cells, shape, _lowest_layers)
+    return _body(cells, shape, held_layers=2)
 
 
 def jelly() -> Body:
@@ -105,7 +105,7 @@ def jelly() -> Body:
         bump = 0.06 * np.exp(-((u - 0.5) ** 2 + (v - 0.4) ** 2) / 0.3) * (w + 1)
         return np.stack((0.5 * narrow * x, 0.44 * narrow * (y + 0.12 * x), 0.81 + 0.36 * w + bump), 1)
 
-    return _body(cells, shape, lambda grid: np.zeros(len(grid), dtype=bool))
+    return _body(cells, shape, held_layers=0)
 
 
 def bar() -> Body:
@@ -121,7 +121,8 @@ def bar() -> Body:
         half = 0.1 + 0.13 * head
         return np.stack((0.8 * along, half * y, 0.8 + half * (z + 0.25 * head)), 1)
 
-    return _body(cells, shape, lambda grid: (grid[:, 0] <= 2) | (grid[:, 0] >= length - 2))
+    whole = _body(cells, shape, held_layers=0)
+    return replace(whole, held=np.abs(whole.nodes[:, 0]) > 0.8 * (1 - 4 / length) - 1e-6)
 
 
 BODIES: dict[str, Callable[[], Body]] = {"pudding": pudding, "flower": flower, "jelly": jelly, "bar": bar}
@@ -132,14 +133,13 @@ def _round_square(u: Array, v: Array, roundness: float) -> tuple[Array, Array]:
     return u * np.sqrt(1 - 0.5 * roundness * v * v), v * np.sqrt(1 - 0.5 * roundness * u * u)
 
 
-def _lowest_layers(grid: Ints) -> NDArray[np.bool_]:
-    # Two layers of held nodes make the lowest cells rigid: Gaussians in them are pinned, exactly.
-    return grid[:, 2] < 2
-
-
-def _body(
-    cells: list[tuple[int, int, int]], shape: Callable[[Array], Array], held: Callable[[Ints], NDArray[np.bool_]]
-) -> Body:
+def _body(cells: list[tuple[int, int, int]], shape: Callable[[Array], Array], *, held_layers: int) -> Body:
     grid = np.array(sorted(cells))
     nodes, inverse = np.unique((grid[:, None] + CORNERS).reshape(-1, 3), axis=0, return_inverse=True)
-    return Body(nodes=shape(nodes.astype(float)), cells=inverse.reshape(-1, 8), grid=grid, held=held(nodes))
+    return Body(
+        nodes=shape(nodes.astype(float)),
+        cells=inverse.reshape(-1, 8),
+        grid=grid,
+        # Two layers of held nodes make the lowest cells rigid: Gaussians in them are pinned, exactly.
+        held=nodes[:, 2] < held_layers,
+    )
