@@ -119,7 +119,7 @@ def evaluate_object(
     """
     measure = _ObjectMeasure(data, scene, renderer, views)
     records = _chosen(data, sequences)
-    references = _linear_references(data)
+    references = _linear_references(data) if measure.reference.name == STATIC else {}
     results: list[Rows] = []
     pictures = PictureRecorder(data, records[0].name, measure.views)
     for record in records:
@@ -167,7 +167,7 @@ def _chosen(data: ObjectData, names: Sequence[str] | None) -> list[SequenceRecor
 
 
 def _linear_references(data: ObjectData) -> dict[str, LinearAR2]:
-    """Linear AR(2) fitted to the seen frames of every sequence whose truth is known."""
+    """Linear AR(2) about the rest state, fitted to the seen frames of every sequence whose truth is known."""
     truths = [t for t in (data.ground_truth(s) for s in data.sequences) if t is not None]
     seen = [(t.positions - t.rest)[: data.train_frames.stop] for t in truths]
     if not seen or min(len(d) for d in seen) < 3:
