@@ -96,8 +96,8 @@ def grid_update(
 ) -> None:
     """Velocity of nodes: momentum over mass, damped by the factor ``kept``, plus ``pull``; 0 where nodes are pinned.
 
-    Nodes on or behind the plane n . x = ``level`` [cells] lose their velocity into it, and along it as much as Coulomb's
-    friction takes; without a plane n is 0.
+    Nodes on or behind the plane n . x = ``level`` [cells] lose their velocity into it, and along it as much as
+    Coulomb's friction takes; without a plane n is 0.
     """
     i, j, k = wp.tid()
     node = grid[i, j, k]
