@@ -120,7 +120,8 @@ def frame_splits(frames: int, first_unseen: int) -> dict[str, tuple[int, int]]:
     """Named ranges [first, end) of frames; ``unseen_all`` only if it is longer than ``unseen``."""
     splits = {"seen": (0, min(first_unseen, frames))}
     if frames > first_unseen:
-        stop = min(frames, max(HEADLINE_STOP, first_unseen + 1))
+        # Of recordings that are seen nearly as far as the paper's test range, the headline is all that is unseen.
+        stop = min(frames, HEADLINE_STOP) if first_unseen + NEAR_FRAMES <= HEADLINE_STOP else frames
         splits["unseen"] = (first_unseen, stop)
         splits["unseen_near"] = (first_unseen, min(first_unseen + NEAR_FRAMES, frames))
         if frames > stop:

@@ -14,7 +14,7 @@ from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import footnotes_of, reference_row
 
 # What the references predict, in words.
-NAMES = {STATIC: "no motion", BALLISTIC: "rigid flight", FOLLOW_HANDS: "no more than the hands' motion"}
+NAMES = {STATIC: "no motion", BALLISTIC: "rigid flight", FOLLOW_HANDS: "the hands' motion alone"}
 # Error relative to the reference's from which a prediction counts as useless.
 NO_BETTER = 0.9
 # Upper limits and words, for the error over the reference's and for predicted over true energy.
