@@ -44,8 +44,12 @@ def random_path(kind: str, rng: np.random.Generator) -> HandPath:
     slow = rng.uniform(SLOW, FAST, (5, 1))
     frequencies = np.concatenate((slow, np.minimum(slow * rng.uniform(1.3, 1.9, (5, 1)), FAST)), axis=1)
     phases = rng.uniform(0, 2 * np.pi, (5, 2))
-    rounded = [tuple(map(tuple, x.round(6).tolist())) for x in (frequencies, phases)]
-    return HandPath(kind, KINDS[kind], *rounded, round(float(rng.uniform(0, 2 * np.pi)), 6), int(rng.integers(2)))
+    direction, hand = round(float(rng.uniform(0, 2 * np.pi)), 6), int(rng.integers(2))
+    return HandPath(kind, KINDS[kind], _pairs(frequencies), _pairs(phases), direction, hand)
+
+
+def _pairs(values: Array) -> tuple[tuple[float, float], ...]:
+    return tuple((a, b) for a, b in values.round(6).tolist())
 
 
 def hand_of_node(body: Body) -> Ints:

@@ -272,9 +272,9 @@ class _ObjectMeasure:
             else:
                 beside = self._draw(reference, frames, cameras)
             every = {**images_of, self.reference.name: beside}
-            for name, images in every.items():
-                parts.setdefault(name, {}).setdefault(IOU, []).append(mask_iou(images.alpha, alpha))
-            drawn = {name: images.rgb for name, images in every.items()}
+            for name, shown in every.items():
+                parts.setdefault(name, {}).setdefault(IOU, []).append(mask_iou(shown.alpha, alpha))
+            drawn = {name: shown.rgb for name, shown in every.items()}
             for i, (name, images) in enumerate(drawn.items()):
                 if i == 0:
                     self.max_l2 = max(self.max_l2, float((images - target).norm(dim=-1).max()))

@@ -60,10 +60,13 @@ class Reference:
             return flight.rollout(SimState(state, before), stop - 1 - now)
 
         parts = (states(0, 0, 1), states(0, 1, seen), states(seen - 2, seen - 1, count))
-        fields = ("positions", "deformation_gradients", "rotations")
-        # The last part begins with the last seen frame, which the one before has already.
-        joined = [torch.cat([getattr(part, field)[int(part is parts[2]) :] for part in parts]) for field in fields]
-        return Trajectory(*joined, parts[0].unit_of_kernel, self._fps)
+
+        def joined(field: str) -> Tensor:
+            """The last part begins with the last seen frame, which the one before has already."""
+            return torch.cat([getattr(part, field)[int(part is parts[2]) :] for part in parts])
+
+        turned = joined("rotations")
+        return Trajectory(joined("positions"), turned, turned, parts[0].unit_of_kernel, self._fps)
 
     def _placed(self, truth: GroundTruth, frame: int) -> Float[Tensor, "K 3"]:
         """The rest kernels where the true points are in a frame, as a rigid body."""
@@ -85,8 +88,11 @@ class Bounces:
     def add(self, points: Mapping[str, Float[Tensor, "F P 3"]], diagonal: float) -> None:
         """Adds the points of every row, and of the truth, in one sequence."""
         self._diagonal = diagonal
-        for name, positions in points.items() if self._floor is not None else ():
-            heights = self._floor.height(positions.double()).cpu().numpy()
+        floor = self._floor
+        if floor is None:
+            return
+        for name, positions in points.items():
+            heights = floor.height(positions.double()).cpu().numpy()
             self._found.setdefault(name, []).append(bounce(heights, diagonal))
 
     def summary(self) -> dict[str, dict[str, float | None]] | None:

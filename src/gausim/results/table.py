@@ -49,7 +49,8 @@ def horizon_table(name: str, entry: dict[str, Any]) -> Table | None:
     if not found.get("frames"):
         return None
     shown = [("points", ERROR_3D), ("train", "psnr"), ("heldout", "psnr")]
-    rows, breaks = [], []
+    rows: list[list[str]] = []
+    breaks = []
     for group, metric in shown:
         own = {row: means for row, groups in found["rows"].items() if (means := groups.get(group, {}).get(metric))}
         if own:

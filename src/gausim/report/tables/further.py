@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import zip_longest
 from typing import Any
 
 from gausim.report.gather.runs import RunRecord, dig
@@ -27,36 +28,34 @@ def bounce_sheets(study: Study) -> list[Sheet]:
 
     def columns(found: Sequence[Evaluated], row: str) -> tuple[Entry, ...]:
         return tuple(
-            _entry(found, form, lambda e, key=key: dig(e, "bounce", row, key), scale) for key, scale, form in _BOUNCE
+            _entry(found, form, [_scaled(dig(e, "bounce", row, key), scale) for _, e in found])
+            for key, scale, form in _BOUNCE
         )
 
     sheets = []
     for name in study.objects:
         lines = _lines(study, name, lambda entry: entry.get("bounce"), columns)
         if lines:
-            title = f"How {name} bounces"
+            head = (("", BOUNCE_HEAD),)
             sheets.append(
-                Sheet(f"bounce_{name}", MOTION, title, _BOUNCE_CAPTION, (("", BOUNCE_HEAD),), lines, "method")
+                Sheet(f"bounce_{name}", MOTION, f"How {name} bounces", _BOUNCE_CAPTION, head, lines, "method")
             )
     return sheets
 
 
 def horizon_sheets(study: Study) -> list[Sheet]:
     """One table for each object whose true motion is known beyond the seen frames."""
+
+    def columns(found: Sequence[Evaluated], row: str) -> tuple[Entry, ...]:
+        series = [dig(e, "horizon", "rows", row, "points", ERROR_3D) or [] for _, e in found]
+        return tuple(_entry(found, "{:.2f}", list(values)) for values in zip_longest(*series))
+
     sheets = []
     for name in study.objects:
-        ahead: list[int] = []
-
-        def columns(found: Sequence[Evaluated], row: str, ahead: list[int] = ahead) -> tuple[Entry, ...]:
-            ahead[:] = found[0][1]["horizon"]["frames"]
-            return tuple(
-                _entry(found, "{:.2f}", lambda e, i=i: _nth(dig(e, "horizon", "rows", row, "points", ERROR_3D), i), 1.0)
-                for i in range(len(ahead))
-            )
-
         lines = _lines(study, name, _known_ahead, columns)
         if lines:
-            heads = tuple(f"+{frames}" for frames in ahead)
+            entries = (e for group in study.groups for _, e in group.entries(name) if _known_ahead(e))
+            heads = tuple(f"+{frames}" for frames in next(entries)["horizon"]["frames"])
             title = f"3D error of {name} by frames ahead"
             sheets.append(Sheet(f"horizon_{name}", MOTION, title, _AHEAD_CAPTION, (("", heads),), lines, "method"))
     return sheets
@@ -87,10 +86,10 @@ def _lines(
     return tuple(lines)
 
 
-def _entry(found: Sequence[Evaluated], form: str, read: Callable[[dict[str, Any]], Any], scale: float) -> Entry:
-    values = [value * scale for _, entry in found if (value := number(read(entry))) is not None]
+def _entry(found: Sequence[Evaluated], form: str, values: Sequence[float | None]) -> Entry:
     return seeds_entry(values, form, runs=tuple(run for run, _ in found))
 
 
-def _nth(values: Any, index: int) -> Any:
-    return values[index] if isinstance(values, list) and index < len(values) else None
+def _scaled(value: Any, scale: float) -> float | None:
+    known = number(value)
+    return None if known is None else known * scale
