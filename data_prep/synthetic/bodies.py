@@ -1,4 +1,4 @@
-"""Shapes of the synthetic set: lattices of hexahedral cells bent into a pudding and a flower.
+"""Shapes of the synthetic set: lattices of hexahedral cells bent into a pudding, a flower, a jelly and a bar.
 
 A lattice is a list of unit cubes on an integer grid; a smooth map takes its nodes to the rest shape. The same cells
 carry the finite elements (split into tetrahedra) and the Gaussians (by trilinear coordinates within a cell).
@@ -7,7 +7,7 @@ carry the finite elements (split into tetrahedra) and the Gaussians (by trilinea
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ class Body:
     nodes: Array  # (N, 3) rest positions [scene units], z up
     cells: Ints  # (C, 8) node numbers of each cell's corners
     grid: Ints  # (C, 3) integer position of each cell in the lattice
-    held: NDArray[np.bool_]  # (N,) nodes that never move
+    held: NDArray[np.bool_]  # (N,) nodes that nothing but a hand moves
 
     @property
     def tetrahedra(self) -> Ints:
@@ -93,7 +93,39 @@ def flower() -> Body:
     return _body(cells, shape, held_layers=2)
 
 
-BODIES: dict[str, Callable[[], Body]] = {"pudding": pudding, "flower": flower}
+def jelly() -> Body:
+    """A lopsided block with rounded sides, 1 wide and 0.8 high, its lowest point 0.45 above z = 0; nothing is held."""
+    count = 5
+    cells = [(i, j, k) for i in range(count) for j in range(count) for k in range(count)]
+
+    def shape(grid: Array) -> Array:
+        u, v, w = (2 * grid / count - 1).T
+        x, y = _round_square(u, v, 0.5)
+        narrow = 1 - 0.16 * w - 0.08 * u * w  # tapered, more so on one side
+        bump = 0.06 * np.exp(-((u - 0.5) ** 2 + (v - 0.4) ** 2) / 0.3) * (w + 1)
+        return np.stack((0.5 * narrow * x, 0.44 * narrow * (y + 0.12 * x), 0.81 + 0.36 * w + bump), 1)
+
+    return _body(cells, shape, held_layers=0)
+
+
+def bar() -> Body:
+    """A bar along x with a thick head beside its middle, 1.6 long; two layers of cells at either end are held."""
+    length, across = 16, 3
+    cells = [(i, j, k) for i in range(length) for j in range(across) for k in range(across)]
+
+    def shape(grid: Array) -> Array:
+        along = 2 * grid[:, 0] / length - 1
+        v, w = (2 * grid[:, 1:] / across - 1).T
+        y, z = _round_square(v, w, 0.6)
+        head = np.exp(-(((along - 0.12) / 0.26) ** 4))
+        half = 0.1 + 0.13 * head
+        return np.stack((0.8 * along, half * y, 0.8 + half * (z + 0.25 * head)), 1)
+
+    whole = _body(cells, shape, held_layers=0)
+    return replace(whole, held=np.abs(whole.nodes[:, 0]) > 0.8 * (1 - 4 / length) - 1e-6)
+
+
+BODIES: dict[str, Callable[[], Body]] = {"pudding": pudding, "flower": flower, "jelly": jelly, "bar": bar}
 
 
 def _round_square(u: Array, v: Array, roundness: float) -> tuple[Array, Array]:

@@ -32,9 +32,26 @@ def paint_flower(x: Array, normal: Array, grid: Ints, rng: np.random.Generator) 
     return _shade(_spots(color, x, 22, 0.06, rng), normal)
 
 
+def paint_jelly(x: Array, normal: Array, grid: Ints, rng: np.random.Generator) -> Array:
+    """Raspberry on one side, mint on the other, with fruits: RGB (K, 3) at points ``x``."""
+    side = (x - x.min(0)) / np.ptp(x, axis=0) @ np.array([0.5, 0.2, 0.3])
+    mint = 1 / (1 + np.exp(-12 * (side - 0.5 - 0.06 * np.sin(9 * x[:, 1]))))[:, None]
+    return _shade(_spots((1 - mint) * [0.85, 0.2, 0.35] + mint * [0.35, 0.8, 0.6], x, 60, 0.1, rng), normal)
+
+
+def paint_bar(x: Array, normal: Array, grid: Ints, rng: np.random.Generator) -> Array:
+    """Bands along the bar from blue to orange, with spots: RGB (K, 3) at points ``x``."""
+    along = ((x[:, 0] - x[:, 0].min()) / np.ptp(x[:, 0]))[:, None]
+    band = 0.75 + 0.25 * np.sin(40 * along)
+    color = band * ((1 - along) * [0.2, 0.35, 0.85] + along * [0.95, 0.55, 0.15])
+    return _shade(_spots(color, x, 40, 0.055, rng), normal)
+
+
 PAINTERS: dict[str, Callable[[Array, Array, Ints, np.random.Generator], Array]] = {
     "pudding": paint_pudding,
     "flower": paint_flower,
+    "jelly": paint_jelly,
+    "bar": paint_bar,
 }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 from data_prep.common.command import Options, names, option
 from gausim.core.errors import ConfigError
@@ -25,6 +25,14 @@ class Material:
 
 
 @dataclass(frozen=True)
+class Floor:
+    """The plane z = 0, on which a body falls along -z."""
+
+    gravity: float  # [scene units / s^2]
+    friction: float  # Coulomb's coefficient
+
+
+@dataclass(frozen=True)
 class Recipe:
     """Definition of an object."""
 
@@ -32,11 +40,26 @@ class Recipe:
     material: Material  # of the body
     time_step: float  # that its stiffness allows [s]
     swing: tuple[float, float] = SMALL_SWING  # least and largest amplitude of its pushes [diagonals]
+    viscosity: float | None = None  # damping forces over stiffness, in the place of drag [s]
+    floor: Floor | None = None  # what it falls on; then it is free, and not pushed
+    hands: tuple[str, ...] | None = None  # kinds of paths of the hands that move it; then it is not pushed
+    like: str | None = None  # the object that it is, in other motions: its name, looks and kernels
+    train: float | None = None  # fraction of the frames that are seen; frames 0..15 unless given
+    room: tuple[tuple[float, float, float], float] | None = None  # ball that the video cameras see: centre and radius
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """The fields that are given, for ``dataset.json``."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 # Periods of the slowest mode are about 14 frames (soft) and 9 frames (firm) at 24 frames per second.
 SOFT_PUDDING = Recipe("pudding", Material(young_modulus=170.0, poisson_ratio=0.35, drag=0.5), 2e-3)
 SOFT_FLOWER = Recipe("flower", Material(young_modulus=8e4, poisson_ratio=0.35, drag=0.5), 2e-4)
+TWO_HANDS = Recipe(
+    "bar", Material(young_modulus=1500.0, poisson_ratio=0.35, drag=0.0), 2e-4, viscosity=0.004,
+    hands=("stretch", "bend", "swing"), train=0.7, room=((0.0, 0.0, 0.8), 1.25),
+)  # fmt: skip
 RECIPES = {
     "pudding_soft": SOFT_PUDDING,
     "pudding_firm": Recipe("pudding", Material(young_modulus=400.0, poisson_ratio=0.35, drag=0.5), 2e-3),
@@ -44,7 +67,14 @@ RECIPES = {
     "flower_firm": Recipe("flower", Material(young_modulus=1.7e5, poisson_ratio=0.35, drag=0.5), 1.5e-4),
     "pudding_swing": replace(SOFT_PUDDING, swing=LARGE_SWING),
     "flower_swing": replace(SOFT_FLOWER, swing=LARGE_SWING),
-}
+    # Lands at about frame 10 and touches the floor for 4 to 5 frames.
+    "jelly_fall": Recipe(
+        "jelly", Material(young_modulus=400.0, poisson_ratio=0.35, drag=0.0), 2e-4, viscosity=0.0015,
+        floor=Floor(gravity=5.0, friction=0.5), room=((0.0, 0.0, 0.6), 1.15),
+    ),
+    "bar_hands": TWO_HANDS,
+    "bar_hands_new": replace(TWO_HANDS, hands=("crank", "twist"), like="bar_hands"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ import numpy as np
 from data_prep.synthetic.bodies import BODIES, Array, Body
 from data_prep.synthetic.elastic import ElasticBody
 from data_prep.synthetic.embedding import Embedding, cover_surface, embedded_scene
+from data_prep.synthetic.falls import fall_field, random_fall
+from data_prep.synthetic.hands import grip, held_path, random_path
 from data_prep.synthetic.paint import PAINTERS
 from data_prep.synthetic.plan import RECIPES, TRAIN_FRAMES, Plan
 from data_prep.synthetic.pushes import pushed_motion, random_push
@@ -28,16 +30,18 @@ class SyntheticObject:
 
     def __init__(self, name: str, plan: Plan) -> None:
         """Covers the body of a recipe with painted Gaussians."""
-        self.name, self.plan, self.recipe = name, plan, RECIPES[name]
+        self.plan, self.recipe = plan, RECIPES[name]
+        self.folder, self.name = name, self.recipe.like or name
         self.body: Body = BODIES[self.recipe.body]()
         rng = self._rng("look")
         points, frames, spacing = cover_surface(self.body, plan.kernels, rng)
         self.points: Embedding = points
         rest = points.positions(self.body.nodes)
         colors = PAINTERS[self.recipe.body](rest, frames[..., 2], self.body.grid[points.cell], rng)
-        self.scene: GaussianScene = embedded_scene(points, frames, spacing, colors, name=name)
+        self.scene: GaussianScene = embedded_scene(points, frames, spacing, colors, name=self.name)
         low, high = self.body.nodes.min(0), self.body.nodes.max(0)
         self.center, self.radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
+        self.room = self.recipe.room or (self.center, self.radius)
 
     @property
     def _swing(self) -> tuple[float, float]:
@@ -47,7 +51,10 @@ class SyntheticObject:
     def elastic(self) -> ElasticBody:
         """The body's finite elements."""
         recipe = self.recipe
-        return ElasticBody(self.body, recipe.material, fps=self.plan.fps, time_step=recipe.time_step)
+        return ElasticBody(
+            self.body, recipe.material, fps=self.plan.fps, time_step=recipe.time_step, viscosity=recipe.viscosity,
+            floor=recipe.floor, driven=recipe.hands is not None,
+        )  # fmt: skip
 
     def write_rest(self, root: Path) -> None:
         """Writes ``scene.ply`` with masks, ``rest_points.npz``, the stills and, last, ``dataset.json``."""
@@ -73,10 +80,9 @@ class SyntheticObject:
         plan, folder = self.plan, root / "sequences" / f"seq_{number:03d}"
         if (folder / "meta.json").is_file():
             return
-        push = random_push(self.body, ("poke", "drag")[number % 2], self._rng("push", number), self._swing)
-        motion = pushed_motion(self.body, self.elastic, push, plan.frames)
-        displacement = motion - motion[0]
-        cameras = video_cameras(self.center, self.radius, plan.resolution, plan.views)
+        motion, cause = self._motion(number)
+        displacement = motion - self.elastic.rest
+        cameras = video_cameras(np.asarray(self.room[0]), self.room[1], plan.resolution, plan.views)
         pictures = self._photograph(displacement, cameras)
         entries, poses = [], []
         for view, name in enumerate(plan.views):
@@ -89,7 +95,26 @@ class SyntheticObject:
         write_transforms(folder / "transforms.json", cameras.select(poses), entries, fps=plan.fps)
         true = self.points.positions(displacement).astype(np.float32)
         np.savez(folder / "ground_truth.npz", displacement=true)
-        write_json(folder / "meta.json", {**asdict(push), **self._figures(true)})
+        if self.recipe.hands is not None:
+            rest, pinned = self.scene.means.numpy(), self.scene.pinned.numpy()
+            hand = (rest[pinned, 0] > 0).astype(np.int64)
+            np.savez(folder / "hands.npz", points=rest[pinned] + true[:, pinned], hand=hand)
+        write_json(folder / "meta.json", {**cause, **self._figures(true)})
+
+    def _motion(self, number: int) -> tuple[Array, dict[str, object]]:
+        """Positions (F, N, 3) of the nodes in a sequence, and what causes them."""
+        recipe, body, frames = self.recipe, self.body, self.plan.frames
+        if recipe.floor is not None:
+            fall = random_fall(self._rng("fall", number))
+            return self.elastic.simulate(fall_field(body, fall), frames, shift=np.array(fall.shift)), asdict(fall)
+        if recipe.hands is not None:
+            path = random_path(recipe.hands[number % len(recipe.hands)], self._rng("hands", number))
+            steps = (frames - 1) * self.elastic.substeps
+            times = np.arange(steps + 1) / (self.plan.fps * self.elastic.substeps)
+            held = held_path(body, path, times)
+            return self.elastic.simulate(np.zeros_like(body.nodes), frames, path=held), asdict(path)
+        push = random_push(body, ("poke", "drag")[number % 2], self._rng("push", number), self._swing)
+        return pushed_motion(body, self.elastic, push, frames), asdict(push)
 
     def _photograph(self, displacement: Array, cameras: Cameras) -> np.ndarray:
         """(F, V, H, W, 4) images of the scene under node displacements (F, N, 3)."""
@@ -98,7 +123,8 @@ class SyntheticObject:
         return photograph(self.scene, positions, gradients, cameras).numpy()
 
     def _facts(self) -> dict[str, object]:
-        plan = self.plan
+        plan, recipe = self.plan, self.recipe
+        gravity = 0.0 if recipe.floor is None else recipe.floor.gravity
         return {
             "name": self.name,
             "fps": plan.fps,
@@ -107,15 +133,26 @@ class SyntheticObject:
             "views": list(plan.views),
             "train_views": list(plan.views[:-1]),
             "heldout_views": [plan.views[-1]],
-            "train_frames": [0, TRAIN_FRAMES],
+            "train_frames": [0, TRAIN_FRAMES if recipe.train is None else round(recipe.train * plan.frames)],
             "resolution": plan.resolution,
             "static_views": plan.stills,
             "static_resolution": plan.still_resolution,
             "object_diagonal": self.scene.diagonal,
             "alpha": "straight; foreground mask = alpha; composite as rgb * alpha",
             "seed": plan.seed,
-            "simulation": {"method": "MuJoCo flex, linear tetrahedra", "gravity": 0.0, **asdict(self.recipe)},
+            "simulation": {"method": "MuJoCo flex, linear tetrahedra", "gravity": gravity, **recipe.facts},
+            **self._surroundings(),
         }
+
+    def _surroundings(self) -> dict[str, object]:
+        """The entries of ``dataset.json`` on gravity, floor and hands, where there are any."""
+        recipe = self.recipe
+        if recipe.floor is not None:
+            floor = {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "friction": recipe.floor.friction}
+            return {"free": True, "gravity": [0.0, 0.0, -recipe.floor.gravity], "floor": floor}
+        if recipe.hands is None:
+            return {}
+        return {"grip": grip(self.scene.means.numpy(), self.scene.pinned.numpy())}
 
     def _figures(self, displacement: np.ndarray) -> dict[str, object]:
         length = np.linalg.norm(displacement, axis=-1)
@@ -128,4 +165,5 @@ class SyntheticObject:
 
     def _rng(self, *stream: object) -> np.random.Generator:
         """A generator of its own for every purpose, so that no part depends on the order of the others."""
-        return np.random.default_rng([self.plan.seed, zlib.crc32(repr((self.name, *stream)).encode())])
+        name = self.name if stream == ("look",) else self.folder
+        return np.random.default_rng([self.plan.seed, zlib.crc32(repr((name, *stream)).encode())])

@@ -19,7 +19,18 @@ from gausim.baselines.material_point.method import Discretisation, MaterialPoint
 from gausim.baselines.material_point.physdreamer import ModulusField, PhysDreamer
 from gausim.baselines.material_point.physgaussian import PhysGaussian
 from gausim.baselines.mpm import Filling, Grid, Material, MPMSolver, Particles, ParticleState, TimeStep
-from gausim.core import ConfigError, FittedMethod, FittedState, GaussianScene, SceneError, TakesOver
+from gausim.core import (
+    ConfigError,
+    FittedDynamics,
+    FittedMethod,
+    FittedState,
+    Floor,
+    GaussianScene,
+    SceneError,
+    SimState,
+    Surroundings,
+    TakesOver,
+)
 from gausim.ops.quaternion import quaternion_to_matrix
 
 TRUE = 1e5
@@ -236,3 +247,44 @@ def test_a_modulus_means_the_same_in_both_methods() -> None:
 def test_wrong_settings_name_their_field(make: Callable[..., Any], options: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make(**options)
+
+
+def falling_scene() -> GaussianScene:
+    scene = toy_scene()
+    floor = Floor((0.0, 0.0, -0.4), (0.0, 0.0, 1.0))
+    around = Surroundings(free=True, gravity=(0.0, 0.0, -4.0), floor=floor)
+    return replace(scene, pinned=torch.zeros_like(scene.pinned), surroundings=around)
+
+
+def test_a_free_body_begins_where_it_was_fitted_falls_and_stays_above_the_floor() -> None:
+    method = gaussian(falling_scene())
+    with torch.no_grad():
+        method.shift[0] = torch.tensor([0.1, 0.0, 0.05])
+    rest = method.scenes[0].means
+    longest = float((rest.amax(0) - rest.amin(0)).max())
+    moved = FittedDynamics(method, 0).rollout(SimState(rest, rest), 20).positions
+    shift = longest * torch.tensor([0.1, 0.0, 0.05])
+    torch.testing.assert_close(moved[0], rest + shift)
+    t = torch.arange(8) / 24
+    fallen = moved[:8].mean(1) - moved[0].mean(0)
+    torch.testing.assert_close(fallen[:, 2], -2 * t**2, atol=2e-3, rtol=0.02)
+    cell = longest * 2 / 14
+    assert moved[..., 2].min() > -0.4 - 0.3 * cell
+    assert moved[20, :, 2].mean() > -0.2, "it fell through the floor"
+
+
+def test_loss_gradients_reach_the_place_where_a_free_body_begins() -> None:
+    method = gaussian(falling_scene())
+    method.advance(method.begin(1)).positions[:, 0].mean().backward()
+    rest = method.scenes[0].means
+    longest = float((rest.amax(0) - rest.amin(0)).max())
+    assert method.shift.grad[1, 0] == pytest.approx(longest, rel=1e-3)
+    assert method.shift.grad[0].abs().max() == 0
+    assert any(p is method.shift for p in method.parameter_groups()["velocity"])
+
+
+def test_bodies_in_hands_are_refused() -> None:
+    scene = toy_scene()
+    held = replace(scene, hand=torch.where(scene.pinned, 0, -1))
+    with pytest.raises(ConfigError, match=r"hands move .* keep their pins in place"):
+        gaussian(held)

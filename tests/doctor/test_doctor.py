@@ -222,6 +222,16 @@ def test_a_folder_within_an_object_is_sent_to_the_object(swaying: Path, capsys: 
 
 
 @pytest.mark.slow
+def test_a_free_body_needs_no_pin_and_may_begin_elsewhere(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    MISTAKES["no pin"](spoilt)
+    MISTAKES["not at rest"](spoilt)
+    mistakes.edit(spoilt / "dataset.json", lambda data: data.update(free=True))
+    _, entry = told(spoilt, capsys)
+    assert "pins" not in found(entry)
+    assert not any("not at rest" in f["what"] for f in entry["findings"])
+
+
+@pytest.mark.slow
 def test_pins_may_be_given(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     MISTAKES["no pin"](spoilt)
     assert told(spoilt, capsys, "--pin-below", "z=0.1")[0] == 0

@@ -69,6 +69,12 @@ def test_the_true_motion_is_right_up_to_eight_bits(evaluated):
             assert rows[split][group]["motion_energy"]["pooled"] == pytest.approx(1.0, abs=0.02)
 
 
+def test_masks_of_the_true_motion_overlap_and_those_at_rest_less(evaluated):
+    assert evaluated.facts.reference == "static"
+    assert evaluated.values["oracle"]["iou"].min() > 0.97
+    assert evaluated.values["static"]["iou"][:, 4].max() < 0.97
+
+
 def test_half_the_motion_has_half_the_3d_error_and_a_quarter_of_the_energy(evaluated):
     rows = summarise(evaluated)["rows"]["half"]
     for split in ("seen", "unseen"):

@@ -119,7 +119,7 @@ class FittedDynamics:
         return roll_out(self.stepper(initial), steps)
 
     def stepper(self, initial: SimState) -> FittedStepper:
-        """Stepper at frame 0; of ``initial`` only the positions are used."""
+        """Stepper at frame 0; of ``initial`` only the positions are used, and nothing of a free body."""
         return FittedStepper(self.method, self.sequence_id, initial)
 
 
@@ -133,7 +133,9 @@ class FittedStepper:
         """Starts sequence ``sequence_id`` of ``method`` at the positions of ``initial``."""
         self._method, self._scene_id = method, method.scene_of_sequence[sequence_id]
         self._inner = method.begin(sequence_id)
-        positions = initial.positions.to(self._inner.positions)
+        # A free body begins where it was fitted to be.
+        free = method.scenes[self._scene_id].surroundings.free
+        positions = self._inner.positions if free else initial.positions.to(self._inner.positions)
         self.state = SimState(positions, positions)
         self.frame = SteppedFrame(positions, self._inner.deformation_gradients, self._inner.rotations)
         self.unit_of_kernel: Int[Tensor, " K"] = method.unit_of_kernel(self._scene_id)

@@ -114,9 +114,9 @@ def find_tiny(evidence: Evidence) -> Iterator[Finding]:
 
 
 def find_pins(evidence: Evidence) -> Iterator[Finding]:
-    """Finds scenes without pinned kernels, or with nearly all pinned."""
+    """Finds scenes without pinned kernels, or with nearly all pinned; nothing holds a free body."""
     scene = evidence.scene
-    if scene is None:
+    if scene is None or evidence.data.surroundings.free:
         return
     try:
         require_pinned(scene)

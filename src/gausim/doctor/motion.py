@@ -91,7 +91,9 @@ def _displacements(item: Watched, scale: float) -> np.ndarray:
 
 
 def find_unrest(evidence: Evidence) -> Iterator[Finding]:
-    """Finds sequences whose frame 0 is not the rest state."""
+    """Finds sequences whose frame 0 is not the rest state; a free body may begin elsewhere."""
+    if evidence.data.surroundings.free:
+        return
     overlaps = _first_overlaps(evidence)
     off = {name: value for name, value in overlaps.items() if value < _AT_REST}
     if not off:

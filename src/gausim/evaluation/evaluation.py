@@ -1,7 +1,8 @@
 """Evaluation of predictions of an object against its videos and, where known, its true 3D motion.
 
 It needs no run: any callable that returns a :class:`Trajectory` of a sequence can be evaluated beside the references
-(the static prediction, linear AR(2) on the true states). Frames are processed in chunks; per-frame figures are kept.
+(a prediction without dynamics, linear AR(2) on the true states). Frames are processed in chunks; per-frame figures are
+kept.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gausim.baselines.linear_ar import LinearAR2, fit_linear_ar2
-from gausim.baselines.static import StaticDynamics
-from gausim.core import Cameras, DataError, GaussianScene, Rendered, Renderer, RunError, SimState, Trajectory
+from gausim.core import Cameras, DataError, GaussianScene, Rendered, Renderer, RunError, Trajectory
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.data.records import GroundTruth, SequenceRecord
 from gausim.evaluation.recorder import PictureRecorder
+from gausim.evaluation.references import Bounces, Reference
 from gausim.metrics import (
     FLIP,
     L2,
@@ -32,17 +33,23 @@ from gausim.metrics import (
     ForegroundL2,
     ForegroundPSNR,
     ImageMetric,
+    chamfer,
+    mask_iou,
     motion_energy,
     point_error,
+    track_error,
 )
 from gausim.metrics.flip import NO_PACKAGE, flip_is_installed
 from gausim.metrics.lpips import NO_WEIGHTS, SMALLEST, TOO_SMALL, weights_path
 from gausim.render.draw import SceneAppearance, draw
 from gausim.results.curves import (
+    CHAMFER,
     ERROR_3D,
     IMAGE_ENERGY,
+    IOU,
     POINT_ENERGY,
     STATIC,
+    TRACK_ERROR,
     TRUTH,
     ImageMetricInfo,
     ObjectCurves,
@@ -65,6 +72,7 @@ Rows = dict[str, dict[str, np.ndarray]]
 
 # Modes of the linear references: few for robustness, more for finer motion.
 AR_MODES = (8, 24)
+MASK_IOU = ImageMetricInfo(IOU, "mask IoU", 1.0, "", higher_is_better=True)
 # Pixels that are rendered and compared at once: about 100 MB of float images and their filters.
 PIXELS_AT_ONCE = 1 << 20
 
@@ -100,7 +108,7 @@ def evaluate_object(
         data: the object.
         scene: its rest scene, with all kernels of the trajectories.
         methods: row name -> prediction.
-        renderer: renderer of predictions and of the static reference.
+        renderer: renderer of predictions and of the reference.
         sequences: names of the sequences to measure; all when None.
         views: names of the cameras to measure in; all when None.
         advance: called with a sequence's name when it is done.
@@ -111,7 +119,7 @@ def evaluate_object(
     """
     measure = _ObjectMeasure(data, scene, renderer, views)
     records = _chosen(data, sequences)
-    references = _linear_references(data)
+    references = _linear_references(data) if measure.reference.name == STATIC else {}
     results: list[Rows] = []
     pictures = PictureRecorder(data, records[0].name, measure.views)
     for record in records:
@@ -129,11 +137,13 @@ def evaluate_object(
         train_views=tuple(v for v in measure.views if v in data.train_views),
         first_unseen=data.train_frames.stop,
         methods=tuple(methods),
-        metrics=tuple(
-            ImageMetricInfo(m.key, m.label, m.scale, m.unit, bool(m.higher_is_better)) for m in measure.metrics
+        metrics=(
+            *(ImageMetricInfo(m.key, m.label, m.scale, m.unit, bool(m.higher_is_better)) for m in measure.metrics),
+            MASK_IOU,
         ),
         mean_color=measure.mean_color,
         max_l2=measure.max_l2,
+        reference=measure.reference.name,
     )
     return ObjectCurves(facts, _stack(results), measure.record(methods), pictures.finish())
 
@@ -157,7 +167,7 @@ def _chosen(data: ObjectData, names: Sequence[str] | None) -> list[SequenceRecor
 
 
 def _linear_references(data: ObjectData) -> dict[str, LinearAR2]:
-    """Linear AR(2) fitted to the seen frames of every sequence whose truth is known."""
+    """Linear AR(2) about the rest state, fitted to the seen frames of every sequence whose truth is known."""
     truths = [t for t in (data.ground_truth(s) for s in data.sequences) if t is not None]
     seen = [(t.positions - t.rest)[: data.train_frames.stop] for t in truths]
     if not seen or min(len(d) for d in seen) < 3:
@@ -173,7 +183,7 @@ class _ObjectMeasure:
         self.views = list(data.views if views is None else views)
         side = min(side for r in data.sequences for side in (r.cameras.width, r.cameras.height))
         self.metrics, self._absent = default_metrics(side), absent_metrics(side)
-        self.static = StaticDynamics(scene, fps=data.fps)
+        self.reference, self._bounces = Reference(data, scene), Bounces(data)
         self.look = SceneAppearance.of(scene, scene.foreground)
         points = data.rest_points
         self.attached = None if points is None else attach_points(scene, points)
@@ -191,8 +201,8 @@ class _ObjectMeasure:
         footnotes = {name: found for name, p in methods.items() if (found := getattr(p, "footnotes", None)) is not None}
         sources = data_provenance(self.data)
         facts = {"efficiency": costs, "sources": sources, "absent": self._absent, "footnotes": footnotes}
-        diagnosis = self._diagnosis.summary()
-        return facts if diagnosis is None else {**facts, "diagnosis": diagnosis}
+        further = {"diagnosis": self._diagnosis.summary(), "bounce": self._bounces.summary()}
+        return {**facts, **{key: found for key, found in further.items() if found is not None}}
 
     @property
     def mean_color(self) -> tuple[float, float, float]:
@@ -214,11 +224,12 @@ class _ObjectMeasure:
             meter = self._costs.setdefault(name, CostMeter())
             made = meter.predict(partial(predict, record), record.count - 1)
             trajectories[name] = self._checked(name, record, made)
-        rows = self._images(record, trajectories, pictures)
         truth = self.data.ground_truth(record)
+        reference = self.reference.trajectory(record, truth)
+        rows = self._images(record, trajectories, reference, pictures)
         if truth is not None:
             units = {name: found for name, predict in methods.items() if (found := getattr(predict, "units", None))}
-            self._points(rows, trajectories, references, truth, units)
+            self._points(rows, {**trajectories, self.reference.name: reference}, references, truth, units)
         return rows
 
     def _checked(self, name: str, record: SequenceRecord, trajectory: Trajectory) -> Trajectory:
@@ -234,17 +245,21 @@ class _ObjectMeasure:
         return trajectory
 
     def _images(
-        self, record: SequenceRecord, trajectories: Mapping[str, Trajectory], pictures: PictureRecorder | None
+        self,
+        record: SequenceRecord,
+        trajectories: Mapping[str, Trajectory],
+        reference: Trajectory,
+        pictures: PictureRecorder | None,
     ) -> Rows:
         cameras = record.cameras_of(self.views).to(self.scene.means.device)
-        still = SimState(self.scene.means, self.scene.means)
-        rest = self._draw(self.static.rollout(still, 0), range(1), cameras).rgb
+        first = self._draw(reference, range(1), cameras)
         parts: dict[str, dict[str, list[Tensor]]] = {}
         before: dict[str, Tensor] = {}
         for frames in _chunks(record, len(self.views)):
             recorded = record.frames(frames, self.views)
             target, alpha = composite(recorded)
-            target, mask = target.to(rest), (alpha > 0).to(rest.device)
+            target, alpha = target.to(first.rgb), alpha.to(first.alpha)
+            mask = alpha > 0
             self._count_color(target, mask)
             images_of = {
                 name: self._costs[name].draw(partial(self._draw, t, frames, cameras), mask.shape[:2].numel())
@@ -252,7 +267,14 @@ class _ObjectMeasure:
             }
             if pictures is not None:
                 pictures.add(recorded, images_of)
-            drawn = {name: images.rgb for name, images in images_of.items()} | {STATIC: rest.expand_as(target)}
+            if self.reference.name == STATIC:  # one frame, drawn once
+                beside = Rendered(first.rgb.expand_as(target), first.alpha.expand_as(alpha))
+            else:
+                beside = self._draw(reference, frames, cameras)
+            every = {**images_of, self.reference.name: beside}
+            for name, shown in every.items():
+                parts.setdefault(name, {}).setdefault(IOU, []).append(mask_iou(shown.alpha, alpha))
+            drawn = {name: shown.rgb for name, shown in every.items()}
             for i, (name, images) in enumerate(drawn.items()):
                 if i == 0:
                     self.max_l2 = max(self.max_l2, float((images - target).norm(dim=-1).max()))
@@ -291,19 +313,21 @@ class _ObjectMeasure:
             name: t.carry(truth.rest.to(t.positions), self.attached, self.scene.means).to(truth.positions)
             for name, t in trajectories.items()
         }
-        predicted[STATIC] = truth.rest.expand_as(truth.positions)
         displacement = truth.positions - truth.rest
         for name, linear in references.items():
             predicted[name] = truth.rest + linear.rollout(displacement[:2], frames - 1)
-        moving = {name: points for name, points in predicted.items() if name != STATIC}
+        moving = {name: points for name, points in predicted.items() if name != self.reference.name}
         parts = {name: [unit[self.attached] for unit in levels] for name, levels in units.items()}
         self._diagnosis.add(truth.positions, truth.rest, moving, parts)
         spread = truth.rest.amax(0) - truth.rest.amin(0)
         diagonal = self.data.diagonal or float(spread.norm())
+        self._bounces.add({**predicted, TRUTH: truth.positions}, diagonal)
         for name, points in {**predicted, TRUTH: truth.positions}.items():
             row = rows.setdefault(name, {})
             if name != TRUTH:
                 row[ERROR_3D] = point_error(points, truth.positions, diagonal).cpu().numpy()
+                row[TRACK_ERROR] = track_error(points, truth.positions).cpu().numpy()
+                row[CHAMFER] = chamfer(points, truth.positions).numpy()
             row[POINT_ENERGY] = np.concatenate(([np.nan], motion_energy(points).cpu().numpy()))
 
 

@@ -71,3 +71,10 @@ def masked_mean(values: Float[Tensor, "B H W"], mask: Mask) -> PerImage:
     """Mean over the masked pixels of each image; NaN for an image without any."""
     weight = mask.to(values)
     return (values * weight).sum((1, 2)) / weight.sum((1, 2))
+
+
+def mask_iou(prediction: Float[Tensor, "*B H W"], target: Float[Tensor, "*B H W"]) -> Float[Tensor, " *B"]:
+    """Intersection over union of the pixels with alpha above 1/2, per image; NaN where neither image has any."""
+    ours, true = prediction > 0.5, target > 0.5
+    both, either = (ours & true).sum((-2, -1)), (ours | true).sum((-2, -1))
+    return both / torch.where(either > 0, either, torch.nan)

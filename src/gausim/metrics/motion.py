@@ -10,7 +10,12 @@ def point_error(
     prediction: Float[Tensor, "F P 3"], target: Float[Tensor, "F P 3"], diagonal: float
 ) -> Float[Tensor, " F"]:
     """Mean over points of the distance to the truth, as a percentage of the object's bounding-box diagonal."""
-    return 100 * (prediction - target).norm(dim=-1).mean(-1) / diagonal
+    return 100 * track_error(prediction, target) / diagonal
+
+
+def track_error(prediction: Float[Tensor, "F P 3"], target: Float[Tensor, "F P 3"]) -> Float[Tensor, " F"]:
+    """Mean over points of the distance to the truth [scene units]."""
+    return (prediction - target).norm(dim=-1).mean(-1)
 
 
 def motion_energy(frames: Float[Tensor, "F *N D"]) -> Float[Tensor, " F-1"]:

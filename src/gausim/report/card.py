@@ -11,7 +11,15 @@ from jinja2 import Environment, PackageLoader
 
 from gausim.report.gather.runs import RunRecord, dig
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import GROUP_TITLES, LEGEND, NO_FORESIGHT, footnotes_of, markdown_table, object_tables
+from gausim.results.table import (
+    GROUP_TITLES,
+    LEGEND,
+    NO_FORESIGHT,
+    footnotes_of,
+    markdown_table,
+    object_tables,
+    reference_row,
+)
 
 # Hugging Face and code hosts display a file of this name.
 CARD = "README.md"
@@ -112,13 +120,14 @@ def _headline_metrics(entry: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _headline(entry: dict[str, Any]) -> dict[str, Any] | None:
-    """Figures of the unseen frames for the limitations: ratios to the static prediction, and energy."""
+    """Figures of the unseen frames for the limitations: ratios to the reference, and energy."""
     row = entry["rows"].get(_method(entry), {})
     for group, metric in _HEADLINES.items():
         if dig(row, "unseen", group, metric, "mean") is not None:
             return {
                 "label": entry["metrics"][metric]["label"],
                 "where": GROUP_TITLES[group],
+                "reference": reference_row(entry),
                 "ratios": [dig(row, split, group, metric, "ratio") for split in ("seen", "unseen")],
                 "energy": dig(row, "unseen", group, MOTION_ENERGY, "pooled"),
             }

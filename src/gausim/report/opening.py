@@ -15,22 +15,21 @@ from gausim.report.gather.runs import BROKEN, FAILURE, NOT_EVALUATED, UNFINISHED
 from gausim.report.gather.study import Group, Study, cell, pooled
 from gausim.report.pictures.film import Film, make_film
 from gausim.report.tables.sheets import NOTHING
-from gausim.report.tables.verdict import outcome, sentences
+from gausim.report.tables.verdict import NAMES, outcome, sentences
 from gausim.results.curves import ERROR_3D, STATIC
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import Table, plus_minus
+from gausim.results.table import Table, plus_minus, reference_row
 
 # Largest number of first screens, because videos make up most of a page's size.
 MOST_OPENINGS = 6
-# Largest number of rows of its table; the last is the static prediction.
+# Largest number of rows of its table; the last is the reference.
 MOST_ROWS = 6
-_STILL = "no motion"
 # Columns: metric, views (None: those of the row), heading, digits.
 _COLUMNS = (
     ("psnr", None, "PSNR [dB] ↑", 1),
     ("ssim", None, "SSIM ↑", 3),
     ("lpips", None, "LPIPS ↓", 3),
-    (ERROR_3D, "points", "3D error ÷ static ↓", 2),
+    (ERROR_3D, "points", "3D error ÷ {reference} ↓", 2),
     (MOTION_ENERGY, "points", "motion energy → 1", 2),
 )
 
@@ -132,12 +131,14 @@ def _own_table(study: Study, group: Group, name: str) -> Table:
     for split in ("seen", "unseen"):
         rows += _rows(group, name, split, f"{split} {_span(splits[split])}") if split in splits else []
     last = "unseen" if "unseen" in splits else "seen"
-    rows += _rows(group, name, last, _STILL, row=STATIC)
+    reference = _reference(group, name)
+    rows += _rows(group, name, last, NAMES[reference], row=reference)
     seeds = "± standard deviation over seeds. " if len(group.entries(name)) > 1 else ""
     caption = (
-        f"No motion: the static prediction of the {last} frames. New views: never trained on. {seeds}{_legend(rows)}"
+        f"{NAMES[reference].capitalize()}: the {reference} prediction of the {last} frames. New views: never trained "
+        f"on. {seeds}{_legend(rows, reference)}"
     )
-    return _tidy(["frames", "views"], rows, caption)
+    return _tidy(["frames", "views"], rows, caption, reference)
 
 
 def _comparison(study: Study, rivals: list[Group], name: str) -> Table:
@@ -150,11 +151,18 @@ def _comparison(study: Study, rivals: list[Group], name: str) -> Table:
     shown = ordered[: MOST_ROWS - 1]
     views = "heldout" if any(_rows(g, name, split, "")[1:] for g in shown) else "train"
     rows = [_row(g, name, split, views, g.label) for g in shown]
-    rows.append(_row(shown[0], name, split, views, _STILL, row=STATIC))
+    reference = _reference(shown[0], name)
+    rows.append(_row(shown[0], name, split, views, NAMES[reference], row=reference))
     where = "views never trained on" if views == "heldout" else "training views"
     left = f" The best {len(shown)} of {len(ordered)} rows; all are below." if len(ordered) > len(shown) else ""
-    caption = f"Frames {_span(splits[split])} ({split}), {where}. {_legend(rows)}{left}"
-    return _tidy(["method"], rows, caption)
+    caption = f"Frames {_span(splits[split])} ({split}), {where}. {_legend(rows, reference)}{left}"
+    return _tidy(["method"], rows, caption, reference)
+
+
+def _reference(group: Group, name: str) -> str:
+    """The row of the reference; an unknown one counts as static."""
+    found = next((reference_row(entry) for _, entry in group.entries(name)), STATIC)
+    return found if found in NAMES else STATIC
 
 
 def _span(split: Sequence[int]) -> str:
@@ -190,16 +198,18 @@ def _is_figure(text: str) -> bool:
     return text[:1].isdigit() or text[:1] == "-"
 
 
-def _legend(rows: list[list[str]]) -> str:
-    text = "3D error: over that of no motion, below 1 is better. Motion energy: predicted over true, 1 is right."
+def _legend(rows: list[list[str]], reference: str) -> str:
+    text = (
+        f"3D error: over that of {NAMES[reference]}, below 1 is better. Motion energy: predicted over true, 1 is right."
+    )
     if any(NO_WEIGHTS in row for row in rows):
         text += f" LPIPS: its weights were not there; `{HOW_TO_GET_WEIGHTS}` gets them, then evaluate again."
     return text
 
 
-def _tidy(stubs: list[str], rows: list[list[str]], caption: str) -> Table:
+def _tidy(stubs: list[str], rows: list[list[str]], caption: str, reference: str) -> Table:
     """The table without empty columns."""
-    head = [*stubs, *(heading for _, _, heading, _ in _COLUMNS)]
+    head = [*stubs, *(heading.format(reference=reference) for _, _, heading, _ in _COLUMNS)]
     kept = [i for i in range(len(head)) if i < len(stubs) or any(_is_figure(row[i]) for row in rows)]
-    breaks = [i for i, row in enumerate(rows) if i and (row[0] == _STILL or (len(stubs) > 1 and row[0]))]
+    breaks = [i for i, row in enumerate(rows) if i and (row[0] == NAMES[reference] or (len(stubs) > 1 and row[0]))]
     return Table(caption, [head[i] for i in kept], [[row[i] for i in kept] for row in rows], breaks)

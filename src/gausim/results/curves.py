@@ -1,8 +1,8 @@
 """Per-frame figures of an evaluated object, from which tables and plots are computed.
 
 Arrays of ``metrics.npz`` are named ``OBJECT/ROW/METRIC``: image metrics and ``image_energy`` are (S, F, V) over
-sequences, frames and views, ``error_3d`` and ``point_energy`` (S, F). NaN pads shorter sequences. Energies of frame t
-are those of the step from t-1 to t, and exist for the row ``truth``, too.
+sequences, frames and views, ``error_3d``, ``track_error``, ``chamfer`` and ``point_energy`` (S, F). NaN pads shorter
+sequences. Energies of frame t are those of the step from t-1 to t, and exist for the row ``truth``, too.
 """
 
 from __future__ import annotations
@@ -18,13 +18,17 @@ from gausim.core import RunError
 from gausim.io.npz import read_npz
 from gausim.results.pictures import Pictures
 
-STATIC = "static"
+# Rows of the references with which every table compares: of a body at rest in its pins, in flight, and in hands.
+STATIC, BALLISTIC, FOLLOW_HANDS = "static", "ballistic", "follow hands"
 TRUTH = "truth"
 IMAGE_ENERGY = "image_energy"
 ERROR_3D = "error_3d"
+TRACK_ERROR = "track_error"
+CHAMFER = "chamfer"
+IOU = "iou"
 POINT_ENERGY = "point_energy"
 # Arrays without a view axis.
-POINT_ARRAYS = (ERROR_3D, POINT_ENERGY)
+POINT_ARRAYS = (ERROR_3D, TRACK_ERROR, CHAMFER, POINT_ENERGY)
 _FACTS = "facts"
 
 
@@ -54,6 +58,7 @@ class ObjectFacts:
     metrics: tuple[ImageMetricInfo, ...]
     mean_color: tuple[float, float, float]  # of the true foreground, in [0, 1]
     max_l2: float  # largest per-pixel colour distance of any prediction of the first method
+    reference: str = STATIC  # row of the reference that ratios divide by
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,7 @@
      "provenance": {"gausim", "torch", "python", "commit", "modified"},   of the program that evaluated
      "objects": {NAME: {
         "fps", "sequences", "frames", "views", "train_views", "heldout_views", "methods",
+        "reference": ROW,                             the row that ratios divide by: static, ballistic, follow hands
         "splits": {"seen": [0, 16], "unseen": [16, 50], "unseen_near": [16, 26], "unseen_all": [16, 60]},
         "metrics": {KEY: {"label", "scale", "unit", "higher_is_better"}},
         "contrast": {"mean_color": [r, g, b], "norm": x, "max_l2": x},
@@ -17,6 +18,8 @@
             "predicted", "predictions", "kernels"}}}, memory and levels null where unknown
         "sources": {"root", "scene": {"file", "sha256"}, "masks": {...}, "manifest": {...}},
         "absent": {KEY: why},                         metrics that could not be computed
+        "horizon": {"frames": [1, 2, 5, ...], "rows": {ROW: {GROUP: {KEY: [mean, ...]}}}},   by frames ahead
+        "bounce": {ROW: {"height", "rise", "height_error", "rise_error", "depth"}},   of free bodies above a floor
         "footnotes": {METHOD: {"extrapolates": bool, "notes": [text, ...], "fit": {"seconds", "cpu_seconds",
             "peak_bytes"}, "largest_eigenvalue": x}}          fit null where it was not counted; the eigenvalue is of
                                                       the step linearised at rest, only of simulators with a network
@@ -26,15 +29,19 @@
      }}}
 
 A CELL is ``{"mean", "std", "ratio"}``: mean and standard deviation over sequences (of the mean over frames and views
-of a sequence) and the mean divided by the static row's (null for the floor and for what is better when higher). Ends
+of a sequence) and the mean divided by the reference row's (null for the floor and for what is better when higher). Ends
 of splits are exclusive. The cell of ``motion_energy`` has besides ``"pooled"``: predicted over true energy summed over
 all sequences, which no single sequence at rest can spoil; its mean and std are over the sequences' own ratios and its
 ratio is null. Undefined numbers are null. ``footnotes`` are notes on a method and the cost of its training; a method
 that does not extrapolate repeats its fitted motion beyond the training frames. ``diagnosis`` describes motion in the
 principal motions of the truth: the fraction (``share``) of the squared displacement, ``frequencies`` and ``dampings``
 (of critical) of each; power per ``frequency`` over all of them; ``phase_error`` per frame; ``level_errors`` of the
-units' centres over static's, at each level of a hierarchy, the finest first; the truth is a row. ``provenance``,
-``efficiency``, ``sources``, ``absent``, ``footnotes`` and ``diagnosis`` are not in files of earlier versions.
+units' centres over static's, at each level of a hierarchy, the finest first; the truth is a row. ``horizon``
+has the mean of the frame that is so many frames after the last seen one, over sequences and views. ``bounce`` is of the
+points' centre: its highest point above the floor after the first contact and above its lowest point before, the mean
+relative errors of both, and the deepest point of all below the floor [% of diagonal]; the truth is a row.
+``provenance``, ``efficiency``, ``sources``, ``absent``, ``footnotes``, ``diagnosis``, ``reference``, ``horizon`` and
+``bounce`` are not in files of earlier versions.
 """
 
 from __future__ import annotations
@@ -50,7 +57,18 @@ import numpy as np
 
 from gausim.core import RunError
 from gausim.io.plain_json import parse_json
-from gausim.results.curves import ERROR_3D, IMAGE_ENERGY, POINT_ARRAYS, POINT_ENERGY, STATIC, TRUTH, ObjectCurves
+from gausim.results.curves import (
+    CHAMFER,
+    ERROR_3D,
+    IMAGE_ENERGY,
+    POINT_ARRAYS,
+    POINT_ENERGY,
+    STATIC,
+    TRACK_ERROR,
+    TRUTH,
+    ObjectCurves,
+)
+from gausim.results.horizon import horizon
 
 SCHEMA = "gausim.evaluation/1"
 MOTION_ENERGY = "motion_energy"
@@ -61,6 +79,8 @@ NEAR_FRAMES = 10
 
 _POINT_METRICS = {
     ERROR_3D: {"label": "3D error", "scale": 1.0, "unit": "% of diagonal", "higher_is_better": False},
+    TRACK_ERROR: {"label": "track error", "scale": 1e3, "unit": "1e-3 scene units", "higher_is_better": False},
+    CHAMFER: {"label": "Chamfer distance", "scale": 1e3, "unit": "1e-3 scene units", "higher_is_better": False},
     MOTION_ENERGY: {"label": "motion energy", "scale": 1.0, "unit": "", "higher_is_better": None},
 }
 
@@ -88,6 +108,7 @@ class _Object(msgspec.Struct):
     methods: list[str]
     contrast: _Contrast | None = None
     absent: dict[str, str] = {}
+    reference: str = STATIC
 
 
 class _Summary(msgspec.Struct):
@@ -99,7 +120,8 @@ def frame_splits(frames: int, first_unseen: int) -> dict[str, tuple[int, int]]:
     """Named ranges [first, end) of frames; ``unseen_all`` only if it is longer than ``unseen``."""
     splits = {"seen": (0, min(first_unseen, frames))}
     if frames > first_unseen:
-        stop = min(frames, max(HEADLINE_STOP, first_unseen + 1))
+        # Of recordings that are seen nearly as far as the paper's test range, the headline is all that is unseen.
+        stop = min(frames, HEADLINE_STOP) if first_unseen + NEAR_FRAMES <= HEADLINE_STOP else frames
         splits["unseen"] = (first_unseen, stop)
         splits["unseen_near"] = (first_unseen, min(first_unseen + NEAR_FRAMES, frames))
         if frames > stop:
@@ -125,19 +147,22 @@ def summarise(curves: ObjectCurves) -> dict[str, Any]:
         "train_views": [facts.views[i] for i in groups["train"]],
         "heldout_views": [facts.views[i] for i in groups["heldout"]],
         "methods": list(facts.methods),
+        "reference": facts.reference,
         "splits": {name: list(split) for name, split in splits.items()},
         "metrics": metrics | _POINT_METRICS,
         "contrast": {"mean_color": color, "norm": math.hypot(*color), "max_l2": facts.max_l2},
         "floor": _floor(curves, groups["train"]),
         "rows": {row: _row(curves, row, splits, groups) for row in curves.rows},
+        "horizon": horizon(curves),
         **curves.record,
     }
 
 
 def _floor(curves: ObjectCurves, views: list[int]) -> dict[str, Any]:
-    if not views or STATIC not in curves.values:
+    reference = curves.values.get(curves.facts.reference)
+    if not views or reference is None:
         return {}
-    frame0 = {m.key: curves.values[STATIC][m.key][:, 0][:, views].mean(1) for m in curves.facts.metrics}
+    frame0 = {m.key: reference[m.key][:, 0][:, views].mean(1) for m in curves.facts.metrics}
     return {key: _cell(values) for key, values in frame0.items()}
 
 
@@ -156,8 +181,8 @@ def _row(
                     true = _window(curves.values[TRUTH][metric], start, stop, views)
                     cells.setdefault(group, {})[MOTION_ENERGY] = _energy_cell(window, true)
                 else:
-                    static = curves.values.get(STATIC, {}).get(metric)
-                    reference = None if static is None else _means(_window(static, start, stop, views))
+                    base = curves.values.get(curves.facts.reference, {}).get(metric)
+                    reference = None if base is None else _means(_window(base, start, stop, views))
                     cells.setdefault(group, {})[metric] = _cell(_means(window), _ratio_base(curves, metric, reference))
         result[split] = cells
     return result

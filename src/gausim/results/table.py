@@ -7,12 +7,14 @@ from typing import Any
 
 from gausim.metrics.flip import NO_FLIP, NO_PACKAGE
 from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
+from gausim.results.curves import ERROR_3D, STATIC, TRACK_ERROR
 from gausim.results.summary import MOTION_ENERGY
 
 SPLIT_TITLES = {"seen": "seen", "unseen": "unseen", "unseen_near": "unseen, first", "unseen_all": "unseen, all"}
 GROUP_TITLES = {"points": "3D, true points", "train": "training views", "heldout": "views never trained on"}
 LEGEND = (
-    "Mean ± standard deviation over sequences; `/ static` is the ratio to the static prediction (below 1 is better); "
+    "Mean ± standard deviation over sequences; `/ static` is the ratio to the static prediction (below 1 is better), "
+    "`/ ballistic` and `/ follow hands` to rigid flight and to following the hands at once, of bodies that move so; "
     "motion energy is the predicted over the true one, all sequences together (1 is right, 0 stands still); floor is "
     "the reconstruction itself against frame 0. Images are foreground on black."
 )
@@ -36,6 +38,55 @@ def object_tables(name: str, entry: dict[str, Any]) -> list[Table]:
     return [_group_table(name, entry, group) for group in GROUP_TITLES if group in present]
 
 
+def reference_row(entry: dict[str, Any]) -> str:
+    """The row of an object's entry that ratios divide by."""
+    return str(entry.get("reference", STATIC))
+
+
+def horizon_table(name: str, entry: dict[str, Any]) -> Table | None:
+    """Errors by frames ahead: in 3D where the truth is known, else of the images; None without unseen frames."""
+    found = entry.get("horizon") or {}
+    if not found.get("frames"):
+        return None
+    shown = [("points", ERROR_3D), ("train", "psnr"), ("heldout", "psnr")]
+    rows: list[list[str]] = []
+    breaks = []
+    for group, metric in shown:
+        own = {row: means for row, groups in found["rows"].items() if (means := groups.get(group, {}).get(metric))}
+        if own:
+            breaks.append(len(rows))
+        info = entry["metrics"].get(metric, {})
+        where = f"{info.get('label', metric)} [{info.get('unit', '')}], {GROUP_TITLES[group]}"
+        rows += [[where, row, *(_number(mean, 2) for mean in means)] for row, means in own.items()]
+    head = ["figure", "row", *(f"+{frames}" for frames in found["frames"])]
+    return Table(f"{name}: by frames ahead of the last seen one", head, rows, breaks)
+
+
+BOUNCE_HEAD = ("highest point", "its error", "rise", "its error", "deepest below the floor [% of diagonal]")
+
+
+def bounce_table(name: str, entry: dict[str, Any]) -> Table | None:
+    """First bounce of every row; None for bodies that do not fall on a floor."""
+    found = entry.get("bounce")
+    if not found:
+        return None
+    rows = [[row, *bounce_texts(figures)] for row, figures in found.items()]
+    return Table(
+        f"{name}: centre after the first contact with the floor [scene units]", ["row", *BOUNCE_HEAD], rows, []
+    )
+
+
+def bounce_texts(figures: dict[str, Any]) -> list[str]:
+    """The columns of :data:`BOUNCE_HEAD`."""
+
+    def percent(value: float | None) -> str:
+        return "" if value is None else f"{100 * value:.1f} %"
+
+    height, rise = _number(figures["height"], 3), _number(figures["rise"], 3)
+    errors = percent(figures["height_error"]), percent(figures["rise_error"])
+    return [height, errors[0], rise, errors[1], _number(figures["depth"], 2)]
+
+
 def _group_table(name: str, entry: dict[str, Any], group: str) -> Table:
     metrics = _metrics_of(entry, group)
     infos = {m: entry["metrics"].get(m) or entry["metrics"][MOTION_ENERGY] for m in metrics}
@@ -43,7 +94,7 @@ def _group_table(name: str, entry: dict[str, Any], group: str) -> Table:
     for metric, info in infos.items():
         head.append(f"{info['label']} [{info['unit']}]" if info["unit"] else info["label"])
         if _has_ratio(metric, info):
-            head.append("/ static")
+            head.append(f"/ {reference_row(entry)}")
     rows, breaks = [], []
     if group == "train" and entry["floor"]:
         rows.append(_line("0", FLOOR_ROW, entry["floor"], infos))
@@ -66,7 +117,8 @@ def _metrics_of(entry: dict[str, Any], group: str) -> list[str]:
 
 
 def _has_ratio(metric: str, info: dict[str, Any]) -> bool:
-    return metric != MOTION_ENERGY and not info["higher_is_better"]
+    # The track error is the 3D error in other units.
+    return metric not in (MOTION_ENERGY, TRACK_ERROR) and not info["higher_is_better"]
 
 
 def _line(frames: str, row: str, cells: dict[str, Any], infos: dict[str, Any]) -> list[str]:
@@ -123,7 +175,8 @@ def gaps(summary: dict[str, Any]) -> list[str]:
 def markdown_table(table: Table) -> str:
     """One table as GitHub Markdown, its title as a heading."""
     lines = [f"### {table.title}", "", _markdown_row(table.head)]
-    lines.append(_markdown_row(["---", "---"] + ["---:"] * (len(table.head) - 2)))
+    texts = 1 if table.head[0] == "row" else 2
+    lines.append(_markdown_row(["---"] * texts + ["---:"] * (len(table.head) - texts)))
     return "\n".join(lines + [_markdown_row(row) for row in table.rows]) + "\n"
 
 
@@ -138,7 +191,8 @@ def markdown(summary: dict[str, Any]) -> str:
     for name, entry in summary["objects"].items():
         count, frames = len(entry["sequences"]), max(entry["frames"])
         parts += [f"## {name}", "", f"{count} sequences of {frames} frames at {entry['fps']:g} fps.", ""]
-        parts += [markdown_table(table) for table in object_tables(name, entry)]
+        tables = [*object_tables(name, entry), bounce_table(name, entry), horizon_table(name, entry)]
+        parts += [markdown_table(table) for table in tables if table is not None]
         parts += [f"* {row}: {note}\n" for row in entry["methods"] for note in footnotes(entry, row)]
     return "\n".join([*parts, _contrast(summary)])
 

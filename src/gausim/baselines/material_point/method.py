@@ -27,6 +27,7 @@ from gausim.baselines.mpm import (
     MPMSolver,
     Particles,
     ParticleState,
+    Slope,
     TimeStep,
     fill_interior,
 )
@@ -37,6 +38,8 @@ from gausim.nn.planes import SUM, Planes
 from gausim.ops.covariance import covariance_from_scales
 
 # Range of Young's modulus in PhysDreamer [simulation units].
+# Coulomb's coefficient of a floor that states none.
+FRICTION = 0.5
 LEAST_MODULUS, GREATEST_MODULUS = 1e3, 5e8
 
 
@@ -122,6 +125,18 @@ class Domain:
         """The background grid."""
         return Grid(cells=self.cells, size=self.size, damping=self.settings.damping)
 
+    def grid_of(self, scene: GaussianScene) -> Grid:
+        """The background grid with a scene's gravity and floor."""
+        mapping, around = self.mapping(scene), scene.surroundings
+        x, y, z = around.gravity or (0.0, 0.0, 0.0)
+        slope, floor = None, around.floor
+        if floor is not None:
+            point = mapping.to_simulation(torch.tensor(floor.point, dtype=torch.float64))
+            level = float(point @ torch.tensor(floor.normal, dtype=torch.float64))
+            slope = Slope(floor.normal, level, FRICTION if floor.friction is None else floor.friction)
+        pull = (mapping.scale * x, mapping.scale * y, mapping.scale * z)
+        return replace(self.grid, gravity=pull, slope=slope)
+
     def mapping(self, scene: GaussianScene) -> SceneMapping:
         """The mapping from a scene to the simulation."""
         low, high = extent(scene)
@@ -165,6 +180,8 @@ class Body:
 class MaterialPoints(Fitted):
     """Base of the methods with a velocity field per sequence, which the material point method carries on.
 
+    Gravity acts on the grid, and its nodes slide on the floor. A free body begins at a fitted place.
+
     A velocity is ``velocity_scale`` times the field's output [longest sides / s], and 0 for pinned particles. Before
     fitting all velocities are 0.
     """
@@ -187,10 +204,16 @@ class MaterialPoints(Fitted):
             velocity_scale: factor on the velocity fields' outputs [longest sides / s].
 
         Raises:
-            ConfigError: Warp is not installed, or a number is out of range.
+            ConfigError: Warp is not installed, a number is out of range, or hands move a scene's pins.
             SceneError: too few kernels.
         """
         super().__init__(**recorded)
+        handled = [scene.name for scene in self.scenes if scene.hand is not None]
+        if handled:
+            raise ConfigError(
+                f"{self.name}: hands move {', '.join(handled)}, but particles keep their pins in place here. Take "
+                "another model, or objects without hands (data.names)."
+            )
         if velocity_resolution < 2 or not velocity_scale > 0:
             raise ConfigError(
                 "model.method: expected velocity_resolution >= 2 and velocity_scale > 0, got "
@@ -200,6 +223,9 @@ class MaterialPoints(Fitted):
         self.material, self.domain, self.velocity_scale = material, domain, velocity_scale
         self._bodies = [self._body(i, self.drive(scene)) for i, scene in enumerate(self.scenes)]
         self.velocity = nn.ModuleList(TriPlaneField(velocity_resolution, outputs=3) for _ in self.scene_of_sequence)
+        # Where free bodies begin, from rest [longest sides].
+        free = any(scene.surroundings.free for scene in self.scenes)
+        self.shift = nn.Parameter(torch.zeros(len(self.scene_of_sequence), 3)) if free else None
 
     def drive(self, scene: GaussianScene) -> Driven:
         """The particles of a scene and the kernels that follow them."""
@@ -211,12 +237,12 @@ class MaterialPoints(Fitted):
 
     def _body(self, scene_id: int, driven: Driven) -> Body:
         scene, domain = self.scenes[scene_id], self.domain
-        settings = domain.settings
+        settings, grid = domain.settings, domain.grid_of(scene)
         mapping, step = domain.mapping(scene), TimeStep(1 / self.fps[scene_id], settings.substeps, settings.courant)
         particles = Particles.create(
-            mapping.to_simulation(driven.rest), grid=domain.grid, density=self.material.density, pinned=driven.pinned
+            mapping.to_simulation(driven.rest), grid=grid, density=self.material.density, pinned=driven.pinned
         )
-        solver = MPMSolver(particles, self.material, domain.grid, step)
+        solver = MPMSolver(particles, self.material, grid, step)
         return Body(driven, mapping, self.places(scene, driven.rest), solver)
 
     @staticmethod
@@ -237,8 +263,18 @@ class MaterialPoints(Fitted):
         body = self.body(self.scene_of_sequence[sequence_id])
         speed = self.domain.side * self.velocity_scale
         velocity = speed * self.velocity[sequence_id](body.places) * ~body.driven.pinned[:, None]
-        particles = ParticleState.at_rest(body.mapping.to_simulation(body.driven.rest), velocity)
-        return replace(super().begin(sequence_id), inner=particles.tensors())
+        shift = self._shift(sequence_id)
+        particles = ParticleState.at_rest(body.mapping.to_simulation(body.driven.rest + shift), velocity)
+        first = super().begin(sequence_id)
+        return replace(first, positions=first.positions + shift, inner=particles.tensors())
+
+    def _shift(self, sequence_id: int) -> Float[Tensor, " 3"]:
+        """Where a body is in frame 0, from rest [scene units]."""
+        scene = self.scenes[self.scene_of_sequence[sequence_id]]
+        if self.shift is None or not scene.surroundings.free:
+            return torch.zeros(3, device=self._device)
+        low, high = extent(scene)
+        return float((high - low).amax()) * self.shift[sequence_id]
 
     def advance(self, state: FittedState) -> FittedState:
         """One frame of substeps; differentiable.
@@ -280,8 +316,9 @@ class MaterialPoints(Fitted):
         )
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
-        """``velocity``, one field per sequence."""
-        return {"velocity": list(self.velocity.parameters())}
+        """``velocity``: one field per sequence, and the places where free bodies begin."""
+        places = [] if self.shift is None else [self.shift]
+        return {"velocity": [*self.velocity.parameters(), *places]}
 
     def penalties(self, sequence_id: int) -> Mapping[str, Tensor]:
         """``velocity_variation``: of the planes of the velocity field."""

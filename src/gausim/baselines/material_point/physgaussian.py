@@ -88,6 +88,8 @@ class PhysGaussian(MaterialPoints):
             )
         self._require_same_data(other)
         self.velocity.load_state_dict(other.velocity.state_dict())
+        if self.shift is not None and other.shift is not None:
+            self.shift.copy_(other.shift)
         for scene_id in range(len(self.scenes)):
             found = other.modulus_at(scene_id, self.body(scene_id).places)
             stretched = self.domain.side / other.domain.side

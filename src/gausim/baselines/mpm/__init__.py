@@ -6,7 +6,7 @@ Warp is imported when the first solver is made, not before. Elastic particles th
     state = solver.advance(ParticleState.at_rest(x, velocities), frame=0)  # state.detach() stops loss gradients
 """
 
-from gausim.baselines.mpm.config import Grid, Material, TimeStep
+from gausim.baselines.mpm.config import Grid, Material, Slope, TimeStep
 from gausim.baselines.mpm.filling import Filling, fill_interior
 from gausim.baselines.mpm.particles import Particles, ParticleState
 from gausim.baselines.mpm.solver import MPMSolver
@@ -18,6 +18,7 @@ __all__ = [
     "Material",
     "ParticleState",
     "Particles",
+    "Slope",
     "TimeStep",
     "fill_interior",
 ]

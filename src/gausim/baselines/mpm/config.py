@@ -34,6 +34,21 @@ class Material:
 
 
 @dataclass(frozen=True)
+class Slope:
+    """A plane that matter slides on under Coulomb's friction; nodes on it or behind it have no velocity into it.
+
+    Attributes:
+        normal: unit vector out of the plane.
+        level: n . x of its points [simulation units].
+        friction: Coulomb's coefficient.
+    """
+
+    normal: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    level: float = 0.0
+    friction: float = 0.0
+
+
+@dataclass(frozen=True)
 class Grid:
     """The background grid over the domain [0, size]^3.
 
@@ -41,11 +56,15 @@ class Grid:
         cells: cells per axis; nodes are one more.
         size: edge L of the domain [simulation units].
         damping: rate at which nodes lose velocity [1 / s]; 0 is none.
+        gravity: acceleration of all nodes [simulation units / s^2].
+        slope: the floor; None: there is none.
     """
 
     cells: int = 50
     size: float = 2.0
     damping: float = 0.0
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    slope: Slope | None = None
 
     def __post_init__(self) -> None:
         if self.cells < 4:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gausim.baselines.mpm.config import Grid, Material
+from gausim.baselines.mpm.config import Grid, Material, Slope
 from gausim.baselines.mpm.particles import Particles
 from gausim.baselines.mpm.runtime import warp
 from gausim.kernels.announce import announced
@@ -115,11 +115,15 @@ class Substeps:
         (x, v, C, F), kernels, grid = state, self._kernels, self._grid
         origin, nodes = self._wp.vec3(*map(float, window.origin)), self._wp.vec3i(*window.shape)
         kept = max(0.0, 1 - grid.damping * dt)
+        pull = self._wp.vec3(*(dt * g for g in grid.gravity))
+        slope = grid.slope or Slope()
+        floor = [self._wp.vec3(*slope.normal), slope.level / grid.dx, slope.friction]
         scattered = [x, v, C, self._stress, self._mass, self._volume, 1 / grid.dx, origin, nodes, dt]
+        updated = [window.momentum, self._pinned_nodes, kept, pull, *floor, origin]
         gathered = [x, F, window.velocity, self._held, 1 / grid.dx, origin, nodes, dt]
         return [
             (kernels.stress_kernel, self.count, [F, young, self._material.poisson_ratio], [self._stress]),
             (kernels.particles_to_grid, self.count, scattered, [window.momentum]),
-            (kernels.grid_update, window.shape, [window.momentum, self._pinned_nodes, kept, origin], [window.velocity]),
+            (kernels.grid_update, window.shape, updated, [window.velocity]),
             (kernels.grid_to_particles, self.count, gathered, following),
         ]

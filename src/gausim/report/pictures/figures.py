@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gausim.report.pictures.frames import error_colors, moving_line, space_time_slice
-from gausim.results.curves import ERROR_3D, STATIC, ObjectCurves
+from gausim.results.curves import ERROR_3D, ObjectCurves
 
 _DPI = 110
 SEEN_SHADE = "#dde6ee"
@@ -75,7 +75,7 @@ def _error_panel(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # frames beyond all sequences
             mean, std = np.nanmean(stacked, 0), np.nanstd(stacked, 0)
-        style = "-" if is_method else "--" if label == STATIC else ":"
+        style = "-" if is_method else "--" if label == members[0][0].facts.reference else ":"
         axes.plot(mean, style, color=color, label=label, linewidth=1.8 if is_method else 1.2)
         if is_method and len(stacked) > 1:
             axes.fill_between(np.arange(length), mean - std, mean + std, color=color, alpha=0.15, linewidth=0)

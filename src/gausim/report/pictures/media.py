@@ -21,7 +21,7 @@ from gausim.report.gather.study import Group, Study
 from gausim.report.pictures.figures import contact_frames, error_plot, panels_plot, slices_plot
 from gausim.report.pictures.frames import Timeline, brighten, label_bar, light_gain, timeline_bar
 from gausim.report.pictures.motion import diagnosis_plot
-from gausim.results.curves import STATIC, ObjectCurves, load_curves
+from gausim.results.curves import ObjectCurves, load_curves
 from gausim.results.pictures import Pictures, kept_pictures
 
 TRUTH = "ground truth"
@@ -97,7 +97,8 @@ def _curves(study: Study, name: str, problems: list[str]) -> list[tuple[Group, l
 def _error_curves(name: str, curves: Sequence[tuple[Group, list[ObjectCurves]]]) -> Exhibit:
     """Errors over time of all rows, averaged over sequences and seeds; the seen frames are shaded."""
     rows = [(group.label, [(c, group.method) for c in seeds]) for group, seeds in curves]
-    figure = error_plot([*rows, (STATIC, [(curves[0][1][0], STATIC)])])
+    first = curves[0][1][0]
+    figure = error_plot([*rows, (first.facts.reference, [(first, first.facts.reference)])])
     caption = (
         "Mean over sequences and seeds, band: ± one standard deviation over both. Shaded: frames that training saw."
     )

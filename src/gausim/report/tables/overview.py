@@ -10,6 +10,7 @@ from gausim.report.gather import paper
 from gausim.report.gather.runs import RunRecord, dig
 from gausim.report.gather.study import FULL, NOT_MEASURED, Cell, Group, Study, cell, number
 from gausim.report.tables.diagnosis import diagnosis_sheets
+from gausim.report.tables.further import bounce_sheets, horizon_sheets
 from gausim.report.tables.sheets import (
     ABLATIONS,
     CONTRAST,
@@ -46,7 +47,7 @@ def make_sheets(study: Study) -> list[Sheet]:
     found = {pair: metric_sheet(study, *pair) for pair in TABLES}
     first = [found.pop((metric, "train")) for metric in paper.TABLES]
     sheets = [*first, *ablation_sheets(study), efficiency_sheet(study), *found.values()]
-    sheets += [*diagnosis_sheets(study), contrast_sheet(study)]
+    sheets += [*bounce_sheets(study), *horizon_sheets(study), *diagnosis_sheets(study), contrast_sheet(study)]
     return [sheet for sheet in sheets if sheet is not None]
 
 

@@ -14,7 +14,7 @@ from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.report.gather import paper
 from gausim.report.gather.runs import RunRecord, dig
 from gausim.report.gather.study import NOT_MEASURED, Cell, Group, Study, cell, deviation, pooled, says
-from gausim.results.curves import ERROR_3D
+from gausim.results.curves import CHAMFER, ERROR_3D, IOU, TRACK_ERROR
 from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import NO_FORESIGHT, plus_minus, spread
 
@@ -22,11 +22,12 @@ METHOD, REFERENCE, PAPER = "method", "reference", "paper"
 # The paper's splits; `unseen_all` exists for recordings beyond frame 49.
 SPLITS = ("seen", "unseen", "unseen_all")
 VIEWS = {"train": "training cameras", "heldout": "cameras never trained on", "points": "3D, true points"}
-_IMAGES = ("l2", "ssim", "lpips", "psnr", "flip")
+_IMAGES = ("l2", "ssim", "lpips", "psnr", "flip", IOU)
 # (metric, views) of the tables, the paper's three first. Tables without figures of any run are left out.
 TABLES = (
     *((metric, "train") for metric in _IMAGES),
-    (ERROR_3D, "points"), (MOTION_ENERGY, "points"), (MOTION_ENERGY, "train"),
+    (ERROR_3D, "points"), (TRACK_ERROR, "points"), (CHAMFER, "points"),
+    (MOTION_ENERGY, "points"), (MOTION_ENERGY, "train"),
     *((metric, "heldout") for metric in _IMAGES),
 )  # fmt: skip
 # Sections of tables, in the order of a page.
@@ -122,12 +123,15 @@ def metric_sheet(study: Study, metric: str, views: str) -> Sheet | None:
     title = f"{info['label']}{_unit(info)}, {VIEWS[views]}"
     blind = [f"{group.label}: {NO_FORESIGHT}" for group in study.groups if NO_FORESIGHT in says(group)]
     caption = " ".join([_caption(metric, views, info, lines), *blind])
-    section = MOTION if metric in (ERROR_3D, MOTION_ENERGY) else NEW_VIEWS if views == "heldout" else TRAINING_VIEWS
+    in_3d = metric in (ERROR_3D, TRACK_ERROR, CHAMFER, MOTION_ENERGY)
+    section = MOTION if in_3d else NEW_VIEWS if views == "heldout" else TRAINING_VIEWS
     return Sheet(f"{metric}_{views}", section, title, caption, heads, tuple(lines), "method")
 
 
 def _unit(info: dict[str, Any]) -> str:
-    unit = {"1e-3": "×10⁻³", "1e-2": "×10⁻²", "1e-1": "×10⁻¹"}.get(info["unit"], info["unit"])
+    unit = {"1e-3": "×10⁻³", "1e-2": "×10⁻²", "1e-1": "×10⁻¹", "1e-3 scene units": "10⁻³ scene units"}.get(
+        info["unit"], info["unit"]
+    )
     arrow = {True: "↑", False: "↓"}.get(info["higher_is_better"], "")
     return "".join(f" [{part}]" if i == 0 else f" {part}" for i, part in enumerate((unit, arrow)) if part)
 

@@ -9,19 +9,21 @@ from statistics import fmean
 from typing import Any
 
 from gausim.report.gather.runs import dig
-from gausim.results.curves import ERROR_3D, STATIC
+from gausim.results.curves import BALLISTIC, ERROR_3D, FOLLOW_HANDS, STATIC
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import footnotes_of
+from gausim.results.table import footnotes_of, reference_row
 
-# Error relative to the static prediction's from which a prediction counts as useless.
+# What the references predict, in words.
+NAMES = {STATIC: "no motion", BALLISTIC: "rigid flight", FOLLOW_HANDS: "the hands' motion alone"}
+# Error relative to the reference's from which a prediction counts as useless.
 NO_BETTER = 0.9
-# Upper limits and words, for the error over the static prediction's and for predicted over true energy.
+# Upper limits and words, for the error over the reference's and for predicted over true energy.
 _FORESIGHT = (
     (0.2, "it foresees the motion closely"),
     (0.5, "it foresees most of the motion"),
     (NO_BETTER, "it foresees part of the motion"),
-    (1.1, "that is no better than predicting no motion"),
-    (math.inf, "that is worse than predicting no motion"),
+    (1.1, "that is no better than predicting {reference}"),
+    (math.inf, "that is worse than predicting {reference}"),
 )
 _LIVELINESS = (
     (0.1, "it all but stands still"),
@@ -42,14 +44,15 @@ class Outcome:
 
     frames: tuple[int, int] | None  # first and last unseen frame; None if the recordings end before
     measured: str  # kind of the errors: points (3D), or train (l2 of the images in the training views)
-    error: float | None  # on unseen frames, over the static prediction's
+    error: float | None  # on unseen frames, over the reference's
     seen_error: float | None  # the same on seen frames
     energy: float | None  # predicted over true motion energy on unseen frames
     psnr: dict[str, float | None]  # by train and heldout views, of unseen frames [dB]
-    still_psnr: dict[str, float | None]  # the same of the static prediction
+    still_psnr: dict[str, float | None]  # the same of the reference
     heldout_views: tuple[str, ...]
     seeds: int  # number of evaluations
     repeats: bool  # whether the method repeats its fitted motion instead of extrapolating
+    reference: str  # what the reference predicts, in words
 
     @property
     def merit(self) -> float:
@@ -66,6 +69,7 @@ def outcome(entries: Sequence[dict[str, Any]], method: str) -> Outcome:
         known = [value for value in found if value is not None]
         return fmean(known) if known else None
 
+    reference = reference_row(entries[0])
     unseen = entries[0]["splits"].get("unseen")
     split = "unseen" if unseen else "seen"
     in_3d = [mean(method, part, "points", ERROR_3D, "ratio") for part in ("seen", "unseen")]
@@ -77,10 +81,11 @@ def outcome(entries: Sequence[dict[str, Any]], method: str) -> Outcome:
         seen_error=mean(method, "seen", measured, metric, "ratio"),
         energy=mean(method, split, measured, MOTION_ENERGY, "pooled"),
         psnr={views: mean(method, split, views, "psnr", "mean") for views in ("train", "heldout")},
-        still_psnr={views: mean(STATIC, split, views, "psnr", "mean") for views in ("train", "heldout")},
+        still_psnr={views: mean(reference, split, views, "psnr", "mean") for views in ("train", "heldout")},
         heldout_views=tuple(entries[0].get("heldout_views", ())),
         seeds=len(entries),
         repeats=footnotes_of(entries[0], method).get("extrapolates") is False,
+        reference=NAMES.get(reference, reference),
     )
 
 
@@ -97,21 +102,21 @@ def _error(found: Outcome) -> str:
         return f"{begin}." if seen is None else f"{begin}; on the frames seen, {_off(found, seen)}."
     frames = f"On frames never seen ({found.frames[0]}–{found.frames[1]}{over})"
     if found.error is None:
-        return f"{frames}, nothing says how far off it is beside a model that predicts no motion: {_EVALUATE}"
+        return f"{frames}, nothing says how far off it is beside a model that predicts {found.reference}: {_EVALUATE}"
     aside = "" if seen is None else f" ({seen:.2f} on the frames it was trained on)"
     return f"{frames}, {_off(found, found.error)}{aside}: {_foresight(found)}."
 
 
 def _off(found: Outcome, error: float) -> str:
     what, how = ("points", "") if found.measured == "points" else ("images in the training views", " (l2)")
-    return f"its {what} are {error:.2f} times as far off{how} as those of a model that predicts no motion"
+    return f"its {what} are {error:.2f} times as far off{how} as those of a model that predicts {found.reference}"
 
 
 def _foresight(found: Outcome) -> str:
     assert found.error is not None
     if found.repeats:
         return "it does not foresee, but repeats what was fitted to the frames it was trained on"
-    words = _words(_FORESIGHT, found.error)
+    words = _words(_FORESIGHT, found.error).format(reference=found.reference)
     if found.error < NO_BETTER or found.seen_error is None:
         return words
     learned = found.seen_error < NO_BETTER
@@ -152,12 +157,13 @@ def _names(views: Sequence[str]) -> str:
 
 
 def _gain(found: Outcome, views: str) -> str:
-    """Gain over the static prediction, as the end of a sentence."""
+    """Gain over the reference, as the end of a sentence."""
     own, still = found.psnr[views], found.still_psnr[views]
     if own is None or still is None:
         return ""
     gain = own - still
-    return f" and {abs(gain):.1f} dB {'above' if gain >= 0 else 'below'} those of a model that predicts no motion"
+    side = "above" if gain >= 0 else "below"
+    return f" and {abs(gain):.1f} dB {side} those of a model that predicts {found.reference}"
 
 
 def _words(scale: Sequence[tuple[float, str]], value: float) -> str:

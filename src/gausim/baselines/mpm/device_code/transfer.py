@@ -87,15 +87,28 @@ def grid_update(
     grid: wp.array3d[wp.vec4],
     pinned_nodes: wp.array3d[wp.uint8],
     kept: float,
+    pull: wp.vec3,
+    normal: wp.vec3,
+    level: float,
+    friction: float,
     origin: wp.vec3,
     velocity: wp.array3d[wp.vec3],
 ) -> None:
-    """Velocity of nodes: momentum over mass, damped by the factor ``kept``; 0 where nodes are pinned."""
+    """Velocity of nodes: momentum over mass, damped by the factor ``kept``, plus ``pull``; 0 where nodes are pinned.
+
+    Nodes on or behind the plane n . x = ``level`` [cells] lose their velocity into it, and along it as much as
+    Coulomb's friction takes; without a plane n is 0.
+    """
     i, j, k = wp.tid()
     node = grid[i, j, k]
     v = wp.vec3(0.0, 0.0, 0.0)
     if node[3] >= LEAST_NODE_MASS:
-        v = kept * wp.vec3(node[0], node[1], node[2]) / node[3]
+        v = kept * wp.vec3(node[0], node[1], node[2]) / node[3] + pull
+        place = origin + wp.vec3(float(i), float(j), float(k))
+        into = wp.dot(v, normal)
+        if into < 0.0 and wp.dot(place, normal) <= level:
+            along = v - into * normal
+            v = wp.max(0.0, 1.0 + friction * into / (wp.length(along) + 1.0e-9)) * along
     if pinned_nodes[i + int(origin[0]), j + int(origin[1]), k + int(origin[2])] != wp.uint8(0):
         v = wp.vec3(0.0, 0.0, 0.0)
     velocity[i, j, k] = v

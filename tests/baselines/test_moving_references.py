@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from gausim.baselines.ballistic import BallisticDynamics, rigid_fit
+from gausim.baselines.follow_hands import FollowHandsDynamics, hand_weights
+from gausim.core import Floor, GaussianScene, HandPath, SimState, Surroundings
+
+FPS = 24.0
+
+
+def scene(means: torch.Tensor, **fields: object) -> GaussianScene:
+    count = len(means)
+    made = GaussianScene.create(
+        means=means, log_scales=torch.full((count, 3), -3.0), quats=torch.tensor([1.0, 0, 0, 0]).expand(count, 4),
+        opacity_logits=torch.zeros(count), sh=torch.zeros(count, 1, 3),
+    )  # fmt: skip
+    return replace(made, **fields)
+
+
+def cube(*, floor: float | None = None, gravity: float | None = None) -> GaussianScene:
+    corners = torch.cartesian_prod(*[torch.tensor([0.0, 0.3])] * 3) * torch.tensor([1.0, 1.2, 0.8])
+    plane = None if floor is None else Floor((0.0, 0.0, floor), (0.0, 0.0, 1.0))
+    pull = None if gravity is None else (0.0, 0.0, -gravity)
+    return scene(corners + 2.0, surroundings=Surroundings(free=True, gravity=pull, floor=plane))
+
+
+def placed(body: GaussianScene, shift: list[float], turn: list[float]) -> torch.Tensor:
+    centre = body.means.mean(0)
+    rotation = torch.from_numpy(Rotation.from_rotvec(turn).as_matrix()).float()
+    return (body.means - centre) @ rotation.T + centre + torch.tensor(shift)
+
+
+def test_rigid_fit_finds_rotation_and_centre_of_a_noisy_body() -> None:
+    body = cube()
+    rotation, centre = rigid_fit(body.means, placed(body, [0.1, 0.2, 0.3], [0.2, -0.4, 0.1]))
+    expected = torch.from_numpy(Rotation.from_rotvec([0.2, -0.4, 0.1]).as_matrix())
+    torch.testing.assert_close(rotation, expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(centre.float(), body.means.mean(0) + torch.tensor([0.1, 0.2, 0.3]))
+
+
+def test_flight_is_a_parabola_with_constant_spin() -> None:
+    body = cube(gravity=5.0)
+
+    def at(frame: int) -> torch.Tensor:
+        t = frame / FPS
+        return placed(body, [0.3 * t, -0.1 * t, 0.5 * t - 2.5 * t * t], [0.0, 0.9 * t, 0.0])
+
+    flown = BallisticDynamics(body, fps=FPS).rollout(SimState(at(1), at(0)), 20)
+    for frame in (0, 7, 20):
+        torch.testing.assert_close(flown.positions[frame], at(frame + 1), atol=2e-5, rtol=0)
+    spin = Rotation.from_rotvec([0.0, 0.9 * 21 / FPS, 0.0]).as_matrix()
+    torch.testing.assert_close(flown.rotations[20, 0], torch.from_numpy(spin).float(), atol=1e-5, rtol=0)
+
+
+def test_flight_stops_at_the_floor_for_good_but_may_leave_it() -> None:
+    body = cube(floor=1.5, gravity=5.0)
+    still = placed(body, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+    fallen = BallisticDynamics(body, fps=FPS).rollout(SimState(still, still), 30).positions
+    gap = fallen[..., 2].amin(1) - 1.5
+    assert gap.min() > -1e-6 and gap[-1] < 1e-6
+    landed = int((gap < 1e-6).nonzero()[0, 0])
+    assert landed / FPS == pytest.approx(math.sqrt(2 * 0.5 / 5.0), abs=1.5 / FPS)
+    assert torch.equal(fallen[landed], fallen[-1])
+    # Squeezed below the floor, but on its way up.
+    low, lower = placed(body, [0, 0, -0.52], [0, 0, 0]), placed(body, [0, 0, -0.6], [0, 0, 0])
+    risen = BallisticDynamics(body, fps=FPS).rollout(SimState(low, lower), 3).positions
+    assert risen[3, 0, 2] > still[0, 2] - 0.52 + 0.1
+
+
+def beam(turn: float = 0.0) -> tuple[GaussianScene, HandPath]:
+    """A beam along x from 0 to 1, held at its ends by two hands of four points each, which turn against each other."""
+    x = torch.linspace(0, 1, 11)
+    means = torch.cat([torch.stack((x, torch.full_like(x, y), torch.full_like(x, z)), 1)
+                       for y in (-0.01, 0.01) for z in (-0.01, 0.01)])  # fmt: skip
+    hand = torch.where(means[:, 0] < 0.05, 0, torch.where(means[:, 0] > 0.95, 1, -1))
+    body = scene(means, pinned=hand >= 0, hand=hand)
+    frames = []
+    for part in (0.0, 1.0):
+        moved = means[hand >= 0].clone()
+        for number, side in ((0, 1.0), (1, -1.0)):
+            own = hand[hand >= 0] == number
+            rotation = torch.from_numpy(Rotation.from_rotvec([0, -side * part * turn, 0]).as_matrix()).float()
+            centre = moved[own].mean(0)
+            moved[own] = (moved[own] - centre) @ rotation.T + centre + part * torch.tensor([0.0, 0.1, 0.0])
+        frames.append(moved)
+    return body, HandPath.of(torch.stack(frames), hand[hand >= 0])
+
+
+def test_held_kernels_follow_their_hand_and_all_follow_both_alike() -> None:
+    body, hands = beam()
+    followed = FollowHandsDynamics(body, hands, fps=FPS).rollout(SimState(body.means, body.means), 1)
+    torch.testing.assert_close(followed.positions[0], body.means)
+    torch.testing.assert_close(followed.positions[1], body.means + torch.tensor([0.0, 0.1, 0.0]))
+
+
+def test_turned_ends_bend_a_beam_into_its_static_curve() -> None:
+    """Ends turned by theta and -theta: the middle of a beam rises by theta L / 4, everywhere by theta x (1 - x)."""
+    turn = 0.05
+    body, hands = beam(turn)
+    followed = FollowHandsDynamics(body, hands, fps=FPS).rollout(SimState(body.means, body.means), 1)
+    rise = (followed.positions[1] - body.means)[:, 2]
+    free = body.hand < 0
+    x = body.means[free, 0]
+    torch.testing.assert_close(rise[free], turn * x * (1 - x), atol=2e-3 * turn, rtol=0.03)
+    held = ~free
+    pose = hands.pose(1)
+    torch.testing.assert_close(followed.positions[1, held], pose.move(body.means[held], body.hand[held]))
+    assert followed.rotations[1][free & (body.means[:, 0] == 0.5)].sub(torch.eye(3)).abs().max() < 1e-5
+
+
+def test_pins_that_no_hand_moves_hold_back() -> None:
+    body, hands = beam()
+    hand = torch.where(body.hand == 1, -1, body.hand)
+    weights = hand_weights(replace(body, hand=hand))
+    assert weights.shape == (44, 1)
+    torch.testing.assert_close(weights[:, 0], 1 - body.means[:, 0], atol=0.02, rtol=0)
+    assert weights[body.pinned & (hand < 0)].abs().max() == 0

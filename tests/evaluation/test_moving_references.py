@@ -1,0 +1,120 @@
+"""Evaluation of bodies that fall or are moved by hands: which reference, what figures, and how they are printed."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from helpers import toy_object
+from helpers.evaluations import make_quick
+
+from gausim.core import Trajectory
+from gausim.data.objects import ObjectData
+from gausim.evaluation.evaluation import evaluate_object, write_evaluation
+from gausim.render.reference import ReferenceRenderer
+from gausim.results.summary import frame_splits
+
+FLOOR, GRAVITY, LANDED = 0.0, 6.0, 8
+
+
+def moved(toy, shift: torch.Tensor) -> Trajectory:
+    """The toy as a rigid body, shifted by (F, 3)."""
+    count, identity = len(shift), torch.eye(3).expand(len(shift), 1, 3, 3)
+    units = torch.zeros(toy.scene.count, dtype=torch.long)
+    assert count == toy.frames
+    return Trajectory(toy.scene.means + shift[:, None], identity, identity, units, toy.fps)
+
+
+def rewrite(toy, facts: dict, shift: torch.Tensor) -> None:
+    """Gives the toy other facts, and its sequences another true motion (its pictures stay)."""
+    path = toy.root / "dataset.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **facts}))
+    for folder in (toy.root / "sequences").iterdir():
+        truth = shift[:, None].expand(-1, toy.scene.count, -1)
+        np.savez(folder / "ground_truth.npz", displacement=truth.numpy().astype(np.float32))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quick_evaluations():
+    with pytest.MonkeyPatch.context() as patch:
+        make_quick(patch)
+        yield
+
+
+@pytest.fixture(scope="module")
+def falling(tmp_path_factory):
+    """A rigid body that falls for 8 frames and is thrown up again by the floor."""
+    toy = toy_object.write_toy_object(tmp_path_factory.mktemp("falling") / "toy")
+    t = torch.arange(toy.frames) / toy.fps
+    fall = 0.5 * GRAVITY * (t[LANDED] ** 2 - t**2)
+    later = t - t[LANDED]
+    height = torch.where(later < 0, fall, 1.6 * later - 0.5 * GRAVITY * later**2)
+    shift = torch.stack((0.1 * t, torch.zeros_like(t), height), 1)
+    facts = {"free": True, "gravity": [0.0, 0.0, -GRAVITY], "train_frames": [0, 11],
+             "floor": {"point": [0.0, 0.0, FLOOR], "normal": [0.0, 0.0, 1.0]}}  # fmt: skip
+    rewrite(toy, facts, shift)
+    data = ObjectData(toy.root)
+    oracle = moved(toy, shift)
+    methods = {"oracle": lambda record: oracle}
+    curves = evaluate_object(data, data.scene(), methods, ReferenceRenderer(), sequences=["seq_000"])
+    folder = tmp_path_factory.mktemp("evaluation")
+    return shift, write_evaluation(folder, [curves], {})["objects"]["toy"], (folder / "table.md").read_text()
+
+
+def test_a_falling_body_is_compared_with_rigid_flight(falling):
+    _, entry, _ = falling
+    assert entry["reference"] == "ballistic"
+    assert list(entry["rows"]) == ["oracle", "ballistic"], "linear references need a rest state"
+    cells = entry["rows"]["ballistic"]
+    # Before the contact and after the last seen frame it is right, for the truth is rigid.
+    assert cells["unseen_near"]["points"]["error_3d"]["mean"] < 0.02
+    assert cells["seen"]["points"]["error_3d"]["mean"] > 0.3, "it stays on the floor, the truth leaves it"
+    oracle = entry["rows"]["oracle"]["seen"]["points"]
+    assert oracle["error_3d"]["ratio"] < 1e-3 and oracle["track_error"]["mean"] < 1e-5
+    assert oracle["chamfer"]["mean"] < 1e-5
+
+
+def test_bounce_is_that_of_the_formula(falling):
+    shift, entry, table = falling
+    truth = entry["bounce"]["truth"]
+    assert truth["rise"] == pytest.approx(float(shift[LANDED:, 2].max()), abs=1e-4)
+    assert truth["height_error"] == 0 and truth["depth"] == pytest.approx(0, abs=1e-4)
+    assert entry["bounce"]["oracle"]["rise_error"] < 1e-3
+    assert "centre after the first contact" in table and "/ ballistic" in table
+
+
+def test_errors_by_frames_ahead_begin_after_the_last_seen_frame(falling):
+    _, entry, table = falling
+    assert entry["horizon"]["frames"] == [1, 2, 5]
+    means = entry["horizon"]["rows"]["ballistic"]["points"]["error_3d"]
+    assert len(means) == 3 and means[0] < 1e-3
+    assert "| +1 | +2 | +5 |" in table
+
+
+def test_a_body_in_hands_is_compared_with_following_them(tmp_path):
+    toy = toy_object.write_toy_object(tmp_path / "toy")
+    shift = torch.zeros(toy.frames, 3)
+    shift[:, 1] = 0.2 * torch.sin(0.3 * torch.arange(toy.frames))
+    rewrite(toy, {"grip": 0.05}, shift)
+    rest = toy.scene.means[toy.scene.pinned]
+    for folder in (toy.root / "sequences").iterdir():
+        points = (rest + shift[:, None]).numpy()
+        np.savez(folder / "hands.npz", points=points, hand=np.zeros(len(rest), dtype=np.int64))
+    data, oracle = ObjectData(toy.root), moved(toy, shift)
+    methods = {"oracle": lambda record: oracle}
+    curves = evaluate_object(data, data.scene(), methods, ReferenceRenderer(), sequences=["seq_000"])
+    assert curves.facts.reference == "follow hands"
+    # One hand carries the whole body: the reference is right.
+    assert np.nanmax(curves.values["follow hands"]["error_3d"]) < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("frames", "first", "unseen", "longer"),
+    [(60, 16, (16, 50), (16, 60)), (50, 16, (16, 50), None), (60, 42, (42, 60), None), (90, 63, (63, 90), None)],
+)
+def test_the_last_third_of_a_recording_is_one_range(frames, first, unseen, longer):
+    splits = frame_splits(frames, first)
+    assert splits["unseen"] == unseen and splits.get("unseen_all") == longer
+    assert splits["unseen_near"][1] <= unseen[1]
