@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from data_prep.common.command import Options, add_options, chosen, headline, names, option, run_command, stage_parser
+from data_prep.common.faults import refuse_faults
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, copy_missing, files_in, run_stage
 from gausim.core.errors import ConfigError, DataError
@@ -30,7 +31,6 @@ REVISION = 1
 TRAIN_FRAMES = 16
 # From so many cameras on, one is left out of training unless told otherwise.
 ENOUGH_VIEWS = 3
-MOST_FAULTS = 5
 SCENE = "scene.ply"
 
 
@@ -152,17 +152,11 @@ def _make(
     work: Path, out: Path, found: Gathered, files: Mapping[str, Path], facts: Mapping[str, Any], tick: Tick
 ) -> dict[str, Any]:
     """Copies what is missing in ``work``, checks it, and tells what is there."""
-    from gausim.data.verify import verify
-
     for number, (name, path) in enumerate(files.items(), 1):
         copy_missing(path, work / name)
         tick("copying", number, len(files))
     write_json(work / "dataset.json", facts)
-    faults = verify(work)
-    if faults:
-        shown = [f"{fault.where}: {fault.what.replace(str(work), str(out))}" for fault in faults]
-        more = f" And {len(faults) - MOST_FAULTS} more." if len(faults) > MOST_FAULTS else ""
-        raise DataError(f"{out}: the object would have faults:\n  " + "\n  ".join(shown[:MOST_FAULTS]) + more)
+    refuse_faults(work, out)
     return {
         "stills": len(found.stills.frames) if found.stills is not None else 0,
         "sequences": {name: _length(posed.frames) for name, posed in found.sequences.items()},

@@ -36,6 +36,11 @@ STAGES = {
     "assemble": ("pictures",),
     "pack": ("root",),
     "import_ready": ("root",),
+    "import_springgaus": ("root",),
+    "import_pacnerf": ("root",),
+    "import_phystwin": ("root",),
+    "import_3dgsim": ("root",),
+    "import_physdreamer": ("root",),
 }
 
 
@@ -105,7 +110,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _stage_of(name: Any, config: Path) -> str:
     """The stage that ``segment`` or ``segment-films`` means."""
-    match = re.fullmatch(r"([a-z_]+)(-[A-Za-z0-9_]+)*", name) if isinstance(name, str) else None
+    match = re.fullmatch(r"([a-z_0-9]+)(-[A-Za-z0-9_]+)*", name) if isinstance(name, str) else None
     if match is None or match[1] not in STAGES:
         raise ConfigError(
             f"{config}: stages: no stage '{name}'; expected some of {', '.join(STAGES)}, with an addition such as "

@@ -73,6 +73,7 @@ def import_ready(
 def _make(work: Path, files: ReadyFiles, options: ReadyOptions, tick: Tick) -> dict[str, Any]:
     from data_prep.capture.cameras.output import PosedWriter, write_points
     from data_prep.ready.authors import sequence_poses
+    from data_prep.ready.parts import write_scene
 
     writer = PosedWriter(tick, files.mask)
     results: dict[str, Any] = {"stills": len(files.stills), "sequences": {}, "left_out": files.left_out}
@@ -87,7 +88,7 @@ def _make(work: Path, files: ReadyFiles, options: ReadyOptions, tick: Tick) -> d
     points = files.model.points
     if len(points.ids):
         write_points(work / "points.npz", points, points.xyz, points.rgb)
-    results["scene"] = _scene(work, files, options)
+    results["scene"] = write_scene(work, files.root, options.near)
     results["without_alpha"] = sorted(writer.bare)
     _facts(work / "dataset.json", files, options)
     return results
@@ -105,31 +106,6 @@ def _facts(path: Path, files: ReadyFiles, options: ReadyOptions) -> None:
         "test_sequences": [name for name in files.frames if name in files.meta.lists["test"]],
     }
     write_json(path, facts)
-
-
-def _scene(work: Path, files: ReadyFiles, options: ReadyOptions) -> dict[str, int] | None:
-    """Writes the scene with its masks, where there is one, and returns how many kernels they mark."""
-    import torch
-
-    from data_prep.ready.authors import MOVING, OBJECT, PINS, SCENE, read_pins
-    from data_prep.ready.selections import read_points
-    from gausim.io.ply import load_scene, save_scene
-    from gausim.ops.selection import NearPoints, apply_masks
-
-    path = files.part(SCENE)
-    if path is None:
-        return None
-    scene = load_scene(path, name="scene")
-    masks: dict[str, Any] = {}
-    for mask, cloud in (("simulated", files.part(MOVING)), ("foreground", files.part(OBJECT))):
-        if cloud is not None:
-            masks[mask] = NearPoints(torch.from_numpy(read_points(cloud)), options.near)
-    pins = files.part(PINS)
-    if pins is not None:
-        masks["pinned"] = torch.from_numpy(read_pins(pins, scene.count))
-    scene = apply_masks(scene, **masks)
-    save_scene(scene, work / "scene.ply")
-    return {"kernels": scene.count} | {n: int(getattr(scene, n).sum()) for n in ("simulated", "pinned", "foreground")}
 
 
 def main(argv: list[str] | None = None) -> int:

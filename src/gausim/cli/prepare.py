@@ -22,6 +22,11 @@ STAGES = {
     "assemble": "stills, sequences and scene of one object to a data set",
     "pack": "packs a data set's sequences for streaming",
     "import_ready": "brings a set in the layout of READY's authors to ours",
+    "import_springgaus": "Spring-Gaus: synthetic falls, real captures",
+    "import_pacnerf": "PAC-NeRF: falls with empty plates",
+    "import_phystwin": "PhysTwin: real objects that hands move",
+    "import_3dgsim": "3DGSim: elastic bodies and cloth of Genesis",
+    "import_physdreamer": "PhysDreamer: stills, Gaussians, and one film",
     "dataset": "runs the stages that a YAML file lists, one after the other",
     "compare_poses": "how far poses are from others of the same photos",
     "corpus": "random elastic bodies with known motion and material, to pretrain on",
@@ -32,11 +37,12 @@ STAGES = {
 
 def main(argv: Sequence[str]) -> int:
     """Runs the command; returns the exit status."""
-    if argv and argv[0] in STAGES:
+    stage = argv[0].replace("-", "_") if argv else ""
+    if stage in STAGES:
         root = str(stages_root())
         if root not in sys.path:
             sys.path.insert(0, root)
-        status: int = importlib.import_module(f"data_prep.{argv[0]}").main(list(argv[1:]))
+        status: int = importlib.import_module(f"data_prep.{stage}").main(list(argv[1:]))
         return status
     arguments = _parser().parse_args(argv)
     status = arguments.run(arguments)

@@ -1,0 +1,202 @@
+"""Brings an object of 3DGSim's data (elastic bodies and cloth, simulated by Genesis) to our layout.
+
+ROOT is a sample (a folder with metadata.json) or the folder of an object's samples. Samples with the same cameras become
+sequences of one object; where cameras differ, OUT becomes a folder of objects. Alpha is 1 where the segmentation shows
+the object: anything but its background (0) and its static part (3), or what --segments names. The world is z up, with
+gravity and a floor at z = 0. The files do not say how many frames per second there are: state --fps. The authors hold
+out whole samples, so all frames are trained on unless --train-frames says otherwise.
+"""
+
+from __future__ import annotations
+
+import string
+import sys
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from msgspec import Meta
+
+from data_prep.common.command import option
+from data_prep.common.photos import natural
+from data_prep.common.progress import Tick, silent
+from data_prep.public.fields import check_name, field, inside, lens, read_any_json, viewmat
+from data_prep.public.importing import ImportOptions, import_command, run_import
+from data_prep.public.pictures import read_sized, straight
+from data_prep.public.scene import Motion, Picture, PublicObject, View, floor
+from gausim.core.errors import ConfigError, DataError
+from gausim.io.pixels import decode
+
+# Raise when the same inputs and settings give another result than before.
+REVISION = 1
+STAGE = "import_3dgsim"
+DATA = "metadata.json"
+# Genesis' default [m/s^2].
+GENESIS_GRAVITY = 9.81
+# Segments of their renderer, once the background is 0.
+BACKGROUND, STATIC = 0, 3
+_PLACES = {"cam_ix": 0, "n_step": 0, "img_type": "rgb"}
+_SAME = 1e-5
+
+
+def identities(text: str) -> tuple[int, ...]:
+    """Whole numbers between commas."""
+    return tuple(int(part) for part in text.split(","))
+
+
+@dataclass(frozen=True)
+class GenesisOptions(ImportOptions):
+    """Facts that the folders do not contain."""
+
+    fps: float | None = option(None, "frames per second (has to be stated)", least=1e-3, most=1e4)
+    segments: tuple[int, ...] = option(
+        (),
+        "numbers of the segments that are the object (all but 0 and 3)",
+        type=identities,
+        metavar="N,N",
+        least=1,
+        most=65535,
+    )
+
+
+def import_3dgsim(
+    root: Path, out: Path, options: GenesisOptions, *, force: bool = False, tick: Tick = silent
+) -> dict[str, Any]:
+    """Runs the stage.
+
+    Raises:
+        DataError: ``metadata.json`` or a picture is missing or malformed.
+        ConfigError: --fps is not stated, or an option does not suit the samples.
+    """
+    return run_import(STAGE, REVISION, read_3dgsim(root, options), out, options, force=force, tick=tick)
+
+
+def read_3dgsim(root: Path, options: GenesisOptions) -> list[PublicObject]:
+    """The samples as one object, or as one for each set of cameras.
+
+    Raises:
+        DataError: ``metadata.json`` or a picture is missing or malformed.
+        ConfigError: --fps is not stated.
+    """
+    if options.fps is None:
+        raise ConfigError(f"--fps: {DATA} does not say how many frames per second there are; state it.")
+    single = (root / DATA).is_file()
+    samples = [root] if single else sorted((p.parent for p in root.glob(f"*/{DATA}")), key=lambda p: natural(p.name))
+    if not samples:
+        raise DataError(
+            f"{root}: neither {DATA} nor folders with one. Give a sample, or the folder of an object's samples."
+        )
+    groups: list[list[tuple[Path, Motion]]] = []
+    for sample in samples:
+        motion = _motion(sample, "seq_000" if single else check_name(sample.name, str(root)), options.segments)
+        group = next((g for g in groups if _alike(g[0][1].views, motion.views)), None)
+        if group is None:
+            groups.append(group := [])
+        group.append((sample, motion))
+    name = options.name or root.absolute().name
+    world = {"gravity": [0.0, 0.0, -GENESIS_GRAVITY], "floor": floor((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), "free": True}
+    return [
+        PublicObject(
+            root, name if len(groups) == 1 else f"{name}_{i}", options.fps,
+            options.train_frames or min(motion.count for _, motion in group), tuple(motion for _, motion in group),
+            options.heldout, world,
+            files={(sample / DATA).relative_to(root).as_posix(): sample / DATA for sample, _ in group},
+        )
+        for i, group in enumerate(groups)
+    ]  # fmt: skip
+
+
+def _alike(first: tuple[View, ...], second: tuple[View, ...]) -> bool:
+    """Whether two sets of cameras are the same."""
+    return len(first) == len(second) and all(
+        a.size == b.size and np.allclose(a.k, b.k, rtol=_SAME) and np.allclose(a.viewmat, b.viewmat, atol=_SAME)
+        for a, b in zip(first, second, strict=True)
+    )
+
+
+def _motion(sample: Path, name: str, segments: tuple[int, ...]) -> Motion:
+    path = sample / DATA
+    data, where = read_any_json(path), str(path)
+    steps = field(data, "n_steps", Annotated[int, Meta(ge=1, le=100_000)], where)
+    cameras = field(data, "n_cams", Annotated[int, Meta(ge=1, le=1000)], where)
+    template = _template(field(data, "file_path_template", str, where), f"{where}: field 'file_path_template'")
+
+    def file(camera: int, step: int, kind: str) -> Path:
+        text = template.format(cam_ix=camera, n_step=step, img_type=kind)
+        return inside(sample, f"{text}.png", f"{where}: field 'file_path_template'")
+
+    views = tuple(_view(data, i, where) for i in range(cameras))
+
+    @lru_cache(maxsize=8)
+    def shift(step: int) -> int:
+        """1 where the segments of a step are numbered from 1, that is where no camera shows a 0."""
+        return int(not any((_segments(file(i, step, "seg"), views[i].size) == 0).any() for i in range(cameras)))
+
+    def rgba(camera: int, step: int) -> np.ndarray:
+        rgb = read_sized(file(camera, step, "rgb"), views[camera].size, "a picture")[..., :3]
+        shown = _segments(file(camera, step, "seg"), views[camera].size).astype(np.int64) - shift(step)
+        object_ = np.isin(shown, segments) if segments else (shown > BACKGROUND) & (shown != STATIC)
+        return straight(rgb, np.where(object_, 255, 0))
+
+    pictures = {
+        view.name: tuple(
+            Picture((file(i, t, "rgb"), file(i, t, "seg")), partial(rgba, i, t)) for t in range(steps)
+        )
+        for i, view in enumerate(views)
+    }  # fmt: skip
+    return Motion(name, views, pictures)
+
+
+def _template(text: str, where: str) -> str:
+    """A template of file names that has the fields of the layout and nothing else."""
+    try:
+        parts = [part for part in string.Formatter().parse(text) if part[1] is not None]
+    except ValueError as error:
+        raise DataError(f"{where}: {error}. Expected names with cam_ix, n_step and img_type in braces.") from error
+    for _, name, form, conversion in parts:
+        digits = (form or "").removesuffix("d")
+        if name not in _PLACES or conversion or (digits and not (digits.isdecimal() and int(digits[:4]) <= 9)):
+            raise DataError(f"{where}: expected cam_ix, n_step and img_type in braces, got {text!r:.80}.")
+    if {name for _, name, _, _ in parts} != set(_PLACES):
+        raise DataError(f"{where}: expected all of cam_ix, n_step and img_type in braces, got {text!r:.80}.")
+    try:
+        text.format(**_PLACES)
+    except ValueError as error:
+        raise DataError(f"{where}: {error}, got {text!r:.80}.") from error
+    return text
+
+
+def _view(data: Any, index: int, where: str) -> View:
+    name = f"cam_{index}"
+    camera, here = field(data, name, dict, where), f"{where}: field '{name}"
+    side = Annotated[int, Meta(ge=1, le=100_000)]
+    width, height = field(camera, "resolution", tuple[side, side], f"{here}'")
+    return View(
+        name, (width, height), lens(field(camera, "intrinsics", list, f"{here}'"), f"{here}.intrinsics'"),
+        viewmat(field(camera, "extrinsics", list, f"{here}'"), f"{here}.extrinsics'"),
+    )  # fmt: skip
+
+
+def _segments(path: Path, size: tuple[int, int]) -> np.ndarray:
+    """(H, W) numbers of segments."""
+    numbers = decode(path)
+    if numbers is not None and numbers.ndim == 3 and (numbers[..., :3] == numbers[..., :1]).all():
+        numbers = numbers[..., 0]
+    if numbers is None or numbers.shape != (size[1], size[0]):
+        found = "no picture" if numbers is None else f"shape {numbers.shape}"
+        raise DataError(
+            f"{path}: expected one number per pixel, {size[0]}x{size[1]}, got {found}. Restore the segmentation."
+        )
+    return numbers
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Command line; returns the exit code."""
+    folder = "a sample with metadata.json, or a folder of samples"
+    return import_command(STAGE, __doc__, folder, GenesisOptions, import_3dgsim, argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

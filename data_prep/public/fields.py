@@ -1,0 +1,152 @@
+"""Fields of the public sets' files, checked: numbers of a shape, lenses, poses, file names inside a folder."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gausim.core.errors import DataError
+from gausim.io.plain_json import checked, parse_json
+
+# Larger numbers indicate damage: they would overflow float32 in later computations.
+_LARGEST = 1e9
+# A rotation read from six-digit text is orthonormal to about 1e-5.
+_ROTATION_TOLERANCE = 1e-3
+# Columns of pixels may stand askew by this fraction of the focal length before it shows.
+_SKEW = 1e-3
+_NESTED: dict[int, Any] = {1: list[float], 2: list[list[float]], 3: list[list[list[float]]]}
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+REMEDY = "Take the file that the set's authors publish."
+
+
+def read_any_json(path: Path) -> Any:
+    """The content of a JSON file.
+
+    Raises:
+        DataError: it is missing or no JSON.
+    """
+    if not path.is_file():
+        raise DataError(f"{path}: no such file. Is this the folder that the set's layout names?")
+    try:
+        return parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as JSON ({error}). {REMEDY}") from error
+
+
+def field(data: Any, key: str, kind: Any, where: str) -> Any:
+    """A field of a JSON object, converted to a type.
+
+    Raises:
+        DataError: the object has no such field, or it is of another type.
+    """
+    if not isinstance(data, dict) or key not in data:
+        found = f"fields {sorted(map(str, data))[:12]}" if isinstance(data, dict) else f"a {type(data).__name__}"
+        raise DataError(f"{where}: field '{key}' is missing, found {found}. {REMEDY}")
+    return checked(data[key], kind, f"{where}: field '{key}'", REMEDY)
+
+
+def numbers(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """A float64 array of this shape from nested lists or an array; −1 stands for any length but 0.
+
+    Raises:
+        DataError: it has another shape, or a number is not finite.
+    """
+    wrong = f"{where}: expected finite numbers of shape ({', '.join('?' if n < 0 else str(n) for n in shape)})"
+    try:
+        if isinstance(value, np.ndarray):
+            array = np.array(value, np.float64) if value.dtype.kind in "iuf" else np.empty((0,))
+        else:
+            array = np.array(checked(value, _NESTED[len(shape)], where, REMEDY), np.float64)
+    except ValueError:
+        raise DataError(f"{wrong}, got rows of different lengths. {REMEDY}") from None
+    fits = array.ndim == len(shape) and all(
+        n == m or (n < 0 and m > 0) for n, m in zip(shape, array.shape, strict=True)
+    )
+    if not fits:
+        raise DataError(f"{wrong}, got shape {tuple(array.shape)}. {REMEDY}")
+    if not (np.abs(array) <= _LARGEST).all():
+        raise DataError(f"{wrong} up to {_LARGEST:g}, found NaN, infinity or more. {REMEDY}")
+    return array
+
+
+def lens(value: Any, where: str) -> np.ndarray:
+    """(3, 3) K [pixels] of a pinhole camera.
+
+    Raises:
+        DataError: it is none.
+    """
+    k = numbers(value, (3, 3), where)
+    flat = abs(k[1, 0]) + abs(k[2, 0]) + abs(k[2, 1]) + abs(k[2, 2] - 1) < 1e-6
+    if min(k[0, 0], k[1, 1]) <= 0 or not flat or abs(k[0, 1]) > _SKEW * k[0, 0]:
+        raise DataError(
+            f"{where}: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, got {k.tolist()}. {REMEDY}"
+        )
+    k[0, 1] = 0.0
+    return k
+
+
+def viewmat(value: Any, where: str, *, opengl: bool = False, inverse: bool = False) -> np.ndarray:
+    """(4, 4) world to camera, OpenCV axes, of a pose (3 × 4 or 4 × 4).
+
+    Args:
+        value: the matrix.
+        where: file and field.
+        opengl: the camera's axes are x right, y up, z back.
+        inverse: the matrix is camera to world.
+
+    Raises:
+        DataError: it is no rotation with a translation.
+    """
+    rows = 3 if isinstance(value, list | np.ndarray) and len(value) == 3 else 4
+    matrix = np.eye(4)
+    matrix[:rows] = numbers(value, (rows, 4), where)
+    turn = matrix[:3, :3]
+    error = float(np.abs(turn @ turn.T - np.eye(3)).max())
+    if error > _ROTATION_TOLERANCE or np.linalg.det(turn) < 0 or np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
+        raise DataError(
+            f"{where}: expected a rotation and a translation (R Rᵀ − I is {error:.3g}, det R is "
+            f"{np.linalg.det(turn):.3g}, the last row is {matrix[3].tolist()}). {REMEDY}"
+        )
+    if inverse:
+        matrix[:3, 3] = -turn.T @ matrix[:3, 3]
+        matrix[:3, :3] = turn.T
+    return OPENGL_TO_OPENCV @ matrix if opengl else matrix
+
+
+def inside(folder: Path, name: Any, where: str) -> Path:
+    """The path of a file by its name within a folder.
+
+    Raises:
+        DataError: the name is none, or leads out of the folder.
+    """
+    good = isinstance(name, str) and name.isprintable() and 0 < len(name) <= 1000
+    parts = Path(name).parts if good else ()
+    if not parts or Path(name).is_absolute() or ".." in parts or any(len(part.encode()) > 255 for part in parts):
+        raise DataError(f"{where}: expected a file name inside {folder}, got {name!r:.80}. {REMEDY}")
+    return folder / name
+
+
+def check_name(name: Any, where: str) -> str:
+    """A camera's or a sequence's name, which becomes a folder.
+
+    Raises:
+        DataError: it is no plain name.
+    """
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", name):
+        raise DataError(f"{where}: expected a name of letters, digits, '_', '.' and '-', got {name!r:.80}. {REMEDY}")
+    return name
+
+
+def numbered(paths: dict[int, Path], where: str) -> tuple[Path, ...]:
+    """Frames by number, which must run from 0 without a gap.
+
+    Raises:
+        DataError: there are none, or one is missing.
+    """
+    gap = next((number for number in range(len(paths)) if number not in paths), None)
+    if not paths or gap is not None:
+        raise DataError(f"{where}: frame {gap or 0} is missing; expected frames from 0 on without a gap. Restore it.")
+    return tuple(paths[number] for number in range(len(paths)))

@@ -1,0 +1,105 @@
+"""What all importers of public sets share: their options, the stage, the command line."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from data_prep.common.command import Options, add_options, chosen, headline, names, option, run_command, stage_parser
+from data_prep.common.progress import Tick, silent
+from data_prep.common.stage import Stage, run_stage
+from data_prep.public.scene import PublicObject
+from data_prep.public.writer import ObjectWriter
+
+PACKAGES = ("numpy", "opencv-python-headless", "scipy")
+
+
+@dataclass(frozen=True)
+class ImportOptions(Options):
+    """Options of every importer."""
+
+    name: str | None = option(None, "of the object (the folder's)")
+    train_frames: int | None = option(None, "first frames to train on (the set's own split)", least=2, metavar="N")
+    heldout: tuple[str, ...] = option((), "cameras never to train on (none)", type=names, metavar="CAM,CAM")
+    longest: int | None = option(
+        None, "reduce pictures whose longer side is longer (keep them)", least=16, metavar="PIXELS"
+    )
+
+
+T = TypeVar("T", bound=ImportOptions)
+# Completes an object where that takes long: it is called only where there is something to make.
+Finish = Callable[[PublicObject, Tick], PublicObject]
+
+
+class Importer(Protocol[T]):
+    """The function of an importer: a stage of data preparation."""
+
+    def __call__(
+        self, root: Path, out: Path, options: T, *, force: bool = False, tick: Tick = silent
+    ) -> dict[str, Any]:
+        """Reads ROOT, writes our layout to ``out`` and returns the stage's manifest."""
+
+
+def run_import(
+    stage: str, revision: int, objects: Sequence[PublicObject], out: Path, options: ImportOptions, *,
+    force: bool, tick: Tick, finish: Finish | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Runs the stage: one object becomes ``out``, several become folders of it by their names.
+
+    Raises:
+        DataError: the objects' parts do not go together, a picture is unusable, or an object would have faults.
+    """
+    inputs = {name: path for found in objects for name, path in found.checked().inputs().items()}
+
+    def make(work: Path) -> Mapping[str, Any]:
+        made = {}
+        for found in objects:
+            place = Path(found.name) if len(objects) > 1 else Path()
+            whole = finish(found, tick) if finish is not None else found
+            writer = ObjectWriter(work / place, whole, longest=options.longest, tick=tick)
+            made[found.name] = writer.write(out / place)
+        return {"objects": made}
+
+    # Folders count by the files in them.
+    settings = {name: value for name, value in asdict(options).items() if not isinstance(value, Path)}
+    return run_stage(Stage(stage, revision, inputs, settings, PACKAGES), out, make, force=force)
+
+
+def import_command(
+    stage: str, text: str | None, folder: str, kind: type[T], importer: Importer[T], argv: list[str] | None
+) -> int:
+    """The command line of an importer; returns the exit code."""
+    parser = stage_parser(stage, text or "")
+    parser.add_argument("root", type=Path, metavar="ROOT", help=folder)
+    add_options(parser.add_argument_group("what the set does not say, or may say otherwise"), kind)
+
+    def run(given: argparse.Namespace, tick: Tick) -> str:
+        manifest = importer(given.root, given.out, chosen(kind, given), force=given.force, tick=tick)
+        return "\n".join([headline(given.out, manifest), *summaries(manifest["results"], given.out)])
+
+    return run_command(parser, argv, run)
+
+
+def summaries(results: Mapping[str, Any], out: Path) -> list[str]:
+    """A few lines about every object that was imported, for people."""
+    several = len(results["objects"]) > 1
+    return [summary(made, out / name if several else out) for name, made in results["objects"].items()]
+
+
+def summary(results: Mapping[str, Any], out: Path) -> str:
+    """A few lines about an object that was imported, for people."""
+    facts, frames = results["facts"], sorted(results["sequences"].values())
+    length = str(frames[0]) if frames[0] == frames[-1] else f"{frames[0]} to {frames[-1]}"
+    lines = [
+        f"object      {facts['name']}",
+        f"stills      {results['stills']}",
+        f"sequences   {len(frames)}, {length} frames at {facts['fps']:g} per second",
+        f"cameras     {', '.join(facts['train_views'])}; never trained on: {', '.join(facts['heldout_views']) or 'none'}",
+        f"frames      0 to {facts['train_frames'][1] - 1} are trained on",
+    ]
+    lines += [f"{key:<11} {facts[key]}" for key in ("gravity", "floor", "free", "grip") if key in facts]
+    lines += [f"{key:<11} {value}" for key, value in results.get("notes", {}).items()]
+    return "\n".join([*lines, f"next        gausim reconstruct {out}"])

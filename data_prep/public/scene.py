@@ -1,0 +1,113 @@
+"""What an importer has read of one object, before it is written in our layout."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gausim.core.errors import ConfigError, DataError
+
+# Standard gravity of the sets whose worlds are in metres [m/s^2]; their simulators and ours use this value.
+GRAVITY = 9.8
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A pinhole camera that stands still."""
+
+    name: str  # of the camera, or of a still
+    size: tuple[int, int]  # width and height of its pictures [pixels]
+    k: np.ndarray  # (3, 3) intrinsics [pixels]; the centre of pixel 0 is at 0.5
+    viewmat: np.ndarray  # (4, 4) world to camera, OpenCV axes
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """One picture to be read later."""
+
+    files: tuple[Path, ...]  # everything that it is made of
+    read: Callable[[], np.ndarray]  # its pixels, (H, W, 4) uint8 RGBA with straight alpha
+
+
+@dataclass(frozen=True, eq=False)
+class Hands:
+    """Points of the hands that hold the object."""
+
+    points: np.ndarray  # (F, C, 3) path of C points [scene units]
+    hand: np.ndarray  # (C,) int64 index of the hand that a point belongs to
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """One sequence of F frames."""
+
+    name: str  # of its folder
+    views: tuple[View, ...]  # its cameras
+    pictures: Mapping[str, tuple[Picture, ...]]  # by camera, F each
+    hands: Hands | None = None  # what holds the object
+    tracks: np.ndarray | None = None  # (F, P, 3) true positions of the object's rest points [scene units]
+
+    @property
+    def count(self) -> int:
+        """Number of frames F."""
+        return len(next(iter(self.pictures.values())))
+
+
+@dataclass(frozen=True, eq=False)
+class PublicObject:
+    """One object of a public set."""
+
+    root: Path  # where it was read from
+    name: str  # of the object
+    fps: float  # frames per second
+    train_frames: int  # the first frames, to train on
+    motions: tuple[Motion, ...]  # its sequences, with the same cameras by name
+    heldout: tuple[str, ...] = ()  # cameras that are never trained on
+    world: Mapping[str, Any] = field(default_factory=dict)  # gravity, floor, free, grip, as in dataset.json
+    stills: tuple[tuple[View, Picture], ...] = ()  # posed stills of the rest state; none: frame 0 of the first sequence
+    cloud: tuple[np.ndarray, np.ndarray] | None = None  # points (P, 3) to begin a reconstruction with, colours uint8
+    files: Mapping[str, Path] = field(default_factory=dict)  # what was read besides pictures, by name
+    told: Mapping[str, Any] = field(default_factory=dict)  # what is worth telling (plain data)
+
+    @property
+    def views(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(view.name for view in self.motions[0].views)
+
+    def inputs(self) -> dict[str, Path]:
+        """Everything that is read, by name."""
+        pictures = [picture for _, picture in self.stills]
+        for motion in self.motions:
+            pictures += [picture for row in motion.pictures.values() for picture in row]
+        found = {path for picture in pictures for path in picture.files}
+        return {**self.files, **{Path(os.path.relpath(path, self.root)).as_posix(): path for path in sorted(found)}}
+
+    def checked(self) -> PublicObject:
+        """Itself, or an error where its parts do not go together.
+
+        Raises:
+            DataError: cameras have different numbers of frames, or there are fewer frames than are to be trained on.
+            ConfigError: held-out cameras are no part of the cameras.
+        """
+        for motion in self.motions:
+            counts = {name: len(row) for name, row in motion.pictures.items()}
+            if len(set(counts.values())) > 1:
+                raise DataError(f"{self.root}: {motion.name}: cameras have different numbers of frames: {counts}.")
+            if motion.count < max(2, self.train_frames):
+                raise DataError(
+                    f"{self.root}: {motion.name} has {motion.count} frames, fewer than the {max(2, self.train_frames)} "
+                    "to train on. Restore the frames, or give a smaller --train-frames."
+                )
+        if not set(self.heldout) < set(self.views):
+            raise ConfigError(f"--heldout {','.join(self.heldout)}: expected a part of the cameras {list(self.views)}.")
+        return self
+
+
+def floor(point: tuple[float, float, float], normal: tuple[float, float, float]) -> dict[str, list[float]]:
+    """A floor as dataset.json has it; friction and restitution are left to training."""
+    return {"point": list(point), "normal": list(normal)}

@@ -1,0 +1,153 @@
+"""Writes an object of a public set in our layout, and checks it as `gausim verify` does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_prep.capture.masks.clips import write_picture
+from data_prep.common.faults import refuse_faults
+from data_prep.common.progress import Tick
+from data_prep.common.stage import copy_missing, write_npz
+from data_prep.public.pictures import resized
+from data_prep.public.scene import Motion, Picture, PublicObject, View
+from gausim.core.errors import DataError
+from gausim.io.files import replacing, write_json
+
+
+class ObjectWriter:
+    """Writes one object; pictures that an interrupted attempt has written already stay."""
+
+    def __init__(self, work: Path, found: PublicObject, *, longest: int | None, tick: Tick) -> None:
+        """Takes the folder to write to, what was read, the longest side of pictures [pixels], and who is told."""
+        self._work, self._found, self._longest, self._tick = work, found, longest, tick
+
+    def write(self, out: Path, *, check: bool = True) -> dict[str, Any]:
+        """Writes everything that is missing and returns what is worth telling; ``out`` is the result's later name.
+
+        Raises:
+            DataError: a picture is unusable, or the object would have faults.
+        """
+        found = self._found.checked()
+        for motion in found.motions:
+            self._motion(motion)
+        stills = self._stills()
+        self._truth()
+        if found.cloud is not None:
+            points, colors = found.cloud
+            write_npz(self._work / "points.npz", points=points.astype(np.float32), colors=colors)
+        facts = dataset_facts(found)
+        write_json(self._work / "dataset.json", facts)
+        if check:
+            refuse_faults(self._work, out)
+        frames = {motion.name: motion.count for motion in found.motions}
+        return {"facts": facts, "stills": stills, "sequences": frames, **found.told}
+
+    def _motion(self, motion: Motion) -> None:
+        folder = self._work / "sequences" / motion.name
+        done, entries, posed = 0, [], []
+        for view in motion.views:
+            small = smaller(view, self._longest)
+            for number, picture in enumerate(motion.pictures[view.name]):
+                name = f"{view.name}/{number:04d}.png"
+                self._picture(folder / name, picture, view, small)
+                entries.append({"file_path": name, "camera": view.name, "frame": number})
+                posed.append(small)
+                done += 1
+                self._tick(motion.name, done, len(motion.views) * motion.count)
+        write_poses(folder / "transforms.json", posed, entries, self._found.fps)
+        if motion.hands is not None:
+            write_npz(folder / "hands.npz", points=motion.hands.points.astype(np.float32), hand=motion.hands.hand)
+
+    def _stills(self) -> int:
+        """Posed stills, or frame 0 of the first sequence in the cameras that are trained on."""
+        folder, shots = self._work / "static", list(self._found.stills)
+        if not shots:
+            first = self._found.motions[0]
+            shown = [view for view in first.views if view.name not in self._found.heldout]
+            for view in shown:
+                source = self._work / "sequences" / first.name / view.name / "0000.png"
+                copy_missing(source, folder / "images" / f"{view.name}.png")
+            posed = [smaller(view, self._longest) for view in shown]
+        else:
+            posed = [smaller(view, self._longest) for view, _ in shots]
+            for number, (small, (view, picture)) in enumerate(zip(posed, shots, strict=True), 1):
+                self._picture(folder / "images" / f"{view.name}.png", picture, view, small)
+                self._tick("stills", number, len(shots))
+        entries = [{"file_path": f"images/{view.name}.png"} for view in posed]
+        write_poses(folder / "transforms.json", posed, entries, None)
+        return len(posed)
+
+    def _picture(self, target: Path, picture: Picture, view: View, small: View) -> None:
+        if not target.is_file():
+            pixels = picture.read()
+            if pixels.shape[:2] != (view.size[1], view.size[0]):
+                raise DataError(
+                    f"{picture.files[0]}: is {pixels.shape[1]}x{pixels.shape[0]}, its camera '{view.name}' is for "
+                    f"{view.size[0]}x{view.size[1]}. Use the pictures that belong to the cameras."
+                )
+            write_picture(target, resized(pixels, small.size))
+
+    def _truth(self) -> None:
+        """True motion, where all sequences have it: rest points as in frame 0 of the first sequence."""
+        tracks = [motion.tracks for motion in self._found.motions if motion.tracks is not None]
+        if not tracks or len(tracks) < len(self._found.motions):
+            return
+        rest = tracks[0][0]
+        write_npz(self._work / "rest_points.npz", points=rest.astype(np.float32))
+        for motion, positions in zip(self._found.motions, tracks, strict=True):
+            path = self._work / "sequences" / motion.name / "ground_truth.npz"
+            write_npz(path, displacement=(positions - rest).astype(np.float32))
+
+
+def dataset_facts(found: PublicObject) -> dict[str, Any]:
+    """The content of ``dataset.json``."""
+    return {
+        "name": found.name,
+        "fps": found.fps,
+        "views": list(found.views),
+        "train_views": [view for view in found.views if view not in found.heldout],
+        "heldout_views": [view for view in found.views if view in found.heldout],
+        "train_frames": [0, found.train_frames],
+        **found.world,
+    }
+
+
+def smaller(view: View, longest: int | None) -> View:
+    """The same camera for pictures whose longer side is at most ``longest`` [pixels]."""
+    width, height = view.size
+    if longest is None or max(view.size) <= longest:
+        return view
+    scale = longest / max(view.size)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return View(view.name, size, np.diag([size[0] / width, size[1] / height, 1.0]) @ view.k, view.viewmat)
+
+
+def write_poses(path: Path, posed: Sequence[View], entries: list[dict[str, Any]], fps: float | None) -> None:
+    """Writes a ``transforms.json``, all of it or nothing.
+
+    Raises:
+        DataError: the cameras differ in size.
+    """
+    import torch
+
+    from gausim.core import Cameras
+    from gausim.io.transforms import write_transforms
+
+    for view in posed:
+        if view.size != posed[0].size:
+            raise DataError(
+                f"{path}: '{view.name}' is {view.size[0]}x{view.size[1]}, '{posed[0].name}' is "
+                f"{posed[0].size[0]}x{posed[0].size[1]}. All pictures of a set need one size."
+            )
+    cameras = Cameras(
+        torch.from_numpy(np.stack([view.viewmat for view in posed])).float(),
+        torch.from_numpy(np.stack([view.k for view in posed])).float(),
+        *posed[0].size,
+        tuple(view.name for view in posed),
+    )
+    with replacing(path, typed=True) as temporary:
+        write_transforms(temporary, cameras.validated(str(path)), entries, fps=fps)
