@@ -220,9 +220,8 @@ def _real_motion(root: Path, path: Path, poses: Mapping[str, np.ndarray], model:
         size = size_of(row[0][0])
         views.append(View(camera, size, _film_lens(model, size), pose))
         pictures[camera] = tuple(Picture(pair, partial(masked, *pair, size)) for pair in row)
-    return Motion(
-        f"seq_{path.stem}" if path.stem.isdecimal() else check_name(path.stem, str(path)), tuple(views), pictures
-    )
+    name = check_name(path.stem, str(path))
+    return Motion(f"seq_{int(name):03d}" if name.isdecimal() else name, tuple(views), pictures)
 
 
 def _filmed(root: Path, camera: str, name: str, where: str) -> tuple[Path, Path]:

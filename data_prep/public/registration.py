@@ -30,10 +30,13 @@ CARVED, MISSING = 256, 0.05
 # Points of the hull to try rotations with, and how many of these are refined.
 TRIED_POINTS, REFINED = 1500, 12
 PLACING_ROUNDS, REFINEMENT_STEPS = 4, 260
+# How far neighbours of a fit are looked for at first and at last [radian, or of the body's size].
+COARSE, FINE = 0.15, 0.04
 # Fits whose overlap differs by less than this are decided by colour; turns further apart are other solutions [degree].
 CLOSE, APART = 0.03, 20.0
 # Correlations of colours that differ by less decide nothing.
 UNDECIDED = 0.1
+_Fit = tuple[float, np.ndarray, float, np.ndarray]  # overlap, rotation, scale, shift
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +120,12 @@ def register(
         tick("turns", i + 1, turns)
     tried.sort(key=lambda one: (-one[0], one[1]))
     found = []
-    for i, (_, _, rotation, scale, shift) in enumerate(_spread(tried)):
-        found.append(_refined(body, windows, rotation, scale, shift))
+    for i, (_, _, *start) in enumerate(_spread(tried)):
+        found.append(_refined(body, windows, (0.0, *start), COARSE))
         tick("refining", i + 1, REFINED)
+    top = max(fit[0] for fit in found)
+    for step in (COARSE, FINE):  # begun again, as the method's simplex may have collapsed early
+        found = [_refined(body, windows, fit, step) for fit in found if fit[0] > top - 2 * CLOSE]
     return _best(body, windows, found)
 
 
@@ -127,9 +133,9 @@ def _spread(tried: list[tuple]) -> list[tuple]:
     """The best turns of which none is close to a better one."""
     kept: list[tuple] = []
     for one in tried:
-        if all(_angle(one[2], other[2]) > APART / 2 for other in kept):
+        if len(kept) < REFINED and all(_angle(one[2], other[2]) > APART / 2 for other in kept):
             kept.append(one)
-    return kept[:REFINED]
+    return kept
 
 
 def _turns(count: int) -> np.ndarray:
@@ -290,10 +296,9 @@ def _crossing(windows: Sequence[_Window]) -> np.ndarray:
     return np.asarray(np.linalg.solve(normal, right))
 
 
-def _refined(
-    body: _Body, windows: Sequence[_Window], rotation: np.ndarray, scale: float, shift: np.ndarray
-) -> tuple[float, np.ndarray, float, np.ndarray]:
-    """A locally best fit: overlap, rotation, scale, shift."""
+def _refined(body: _Body, windows: Sequence[_Window], start: _Fit, step: float) -> _Fit:
+    """The best fit near another one; ``step`` is how far its neighbours are looked for [radian, or of the size]."""
+    _, rotation, scale, shift = start
     size = body.size * scale
 
     def parts(values: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
@@ -304,16 +309,14 @@ def _refined(
         turn, factor, place = parts(values)
         return -float(_overlap(body.points @ turn.T * factor + place, windows).mean())
 
-    values = np.zeros(7)
-    for step in (0.15, 0.04):
-        simplex = np.vstack((values, values + step * np.diag([1, 1, 1, 0.5, 0.3, 0.3, 0.3])))
-        options = {"initial_simplex": simplex, "maxfev": REFINEMENT_STEPS, "xatol": 1e-4, "fatol": 1e-5}
-        values = minimize(loss, values, method="Nelder-Mead", options=options).x
+    simplex = np.vstack((np.zeros(7), step * np.diag([1, 1, 1, 0.5, 0.3, 0.3, 0.3])))
+    options = {"initial_simplex": simplex, "maxfev": REFINEMENT_STEPS, "xatol": 1e-4, "fatol": 1e-5}
+    values = minimize(loss, np.zeros(7), method="Nelder-Mead", options=options).x
     return (-loss(values), *parts(values))
 
 
 def _best(
-    body: _Body, windows: Sequence[_Window], found: list[tuple[float, np.ndarray, float, np.ndarray]]
+    body: _Body, windows: Sequence[_Window], found: list[_Fit]
 ) -> Similarity:
     """Of the fits that cover the masks alike, the one whose colours agree best."""
     top = max(fit[0] for fit in found)
@@ -335,7 +338,7 @@ def _angle(first: np.ndarray, second: np.ndarray) -> float:
     return math.degrees(math.acos(float(np.clip((np.trace(first.T @ second) - 1) / 2, -1, 1))))
 
 
-def _agreement(body: _Body, windows: Sequence[_Window], fit: tuple[float, np.ndarray, float, np.ndarray]) -> float:
+def _agreement(body: _Body, windows: Sequence[_Window], fit: _Fit) -> float:
     """Correlation of the hull's colours with those of the frames, over cameras, whatever exposure and balance they have."""
     _, rotation, scale, shift = fit
     points, normals = body.points @ rotation.T * scale + shift, body.normals @ rotation.T
