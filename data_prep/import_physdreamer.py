@@ -22,7 +22,7 @@ from data_prep.common.command import Options, add_options, chosen, headline, opt
 from data_prep.common.faults import refuse_faults
 from data_prep.common.photos import list_images, natural
 from data_prep.common.progress import Tick, silent
-from data_prep.common.stage import Stage, run_stage
+from data_prep.common.stage import Stage, files_in, run_stage
 from data_prep.public.fields import check_name
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.files import write_json
@@ -191,8 +191,8 @@ def _make(
         raise DataError(
             f"{found.root / VIDEOS}: films have different rates {sorted(rates)}. State --fps, or take one out."
         )
-    scene = write_scene(work, found.root, options.near, anchor=options.anchor)
     facts = _facts(found, options, rates.pop(), min(frames.values()))
+    scene = write_scene(work, found.root, options.near, anchor=options.anchor)
     write_json(work / "dataset.json", facts)
     if not writer.bare:
         refuse_faults(work, out)
@@ -202,6 +202,7 @@ def _make(
         "sequences": frames,
         "scene": scene,
         "without_alpha": sorted(writer.bare),
+        "files": files_in(work),
     }
 
 

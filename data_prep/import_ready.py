@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from data_prep.common.command import Options, add_options, chosen, headline, names, option, run_command, stage_parser
 from data_prep.common.progress import Tick, silent
-from data_prep.common.stage import Stage, run_stage
+from data_prep.common.stage import Stage, files_in, run_stage
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.files import write_json
 
@@ -91,7 +91,7 @@ def _make(work: Path, files: ReadyFiles, options: ReadyOptions, tick: Tick) -> d
     results["scene"] = write_scene(work, files.root, options.near)
     results["without_alpha"] = sorted(writer.bare)
     _facts(work / "dataset.json", files, options)
-    return results
+    return {**results, "files": files_in(work)}
 
 
 def _facts(path: Path, files: ReadyFiles, options: ReadyOptions) -> None:

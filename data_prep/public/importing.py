@@ -10,7 +10,7 @@ from typing import Any, Protocol, TypeVar
 
 from data_prep.common.command import Options, add_options, chosen, headline, names, option, run_command, stage_parser
 from data_prep.common.progress import Tick, silent
-from data_prep.common.stage import Stage, run_stage
+from data_prep.common.stage import Stage, files_in, run_stage
 from data_prep.public.scene import PublicObject
 from data_prep.public.writer import ObjectWriter
 
@@ -61,7 +61,7 @@ def run_import(
             whole = finish(found, tick) if finish is not None else found
             writer = ObjectWriter(work / place, whole, longest=options.longest, tick=tick)
             made[found.name] = writer.write(out / place)
-        return {"objects": made}
+        return {"objects": made, "files": files_in(work)}
 
     # Folders count by the files in them.
     settings = {name: value for name, value in asdict(options).items() if not isinstance(value, Path)}

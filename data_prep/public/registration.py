@@ -315,9 +315,7 @@ def _refined(body: _Body, windows: Sequence[_Window], start: _Fit, step: float) 
     return (-loss(values), *parts(values))
 
 
-def _best(
-    body: _Body, windows: Sequence[_Window], found: list[_Fit]
-) -> Similarity:
+def _best(body: _Body, windows: Sequence[_Window], found: list[_Fit]) -> Similarity:
     """Of the fits that cover the masks alike, the one whose colours agree best."""
     top = max(fit[0] for fit in found)
     alike = [fit for fit in found if fit[0] > top - CLOSE]

@@ -14,10 +14,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from data_prep.capture.masks.clips import write_picture
 from data_prep.public.pictures import resized
 
-from . import colmap_files, toy_object
+from helpers import colmap_files, toy_object
 
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 FRAMES = 20
@@ -137,16 +136,15 @@ def fall(body: Body, start: tuple[float, float, float], up: np.ndarray, floor: f
 
 def write_springgaus(root: Path) -> Sample:
     """A synthetic object, `render/<obj>/`."""
-    body = dog(0.15)
-    up = np.array([0.0, 1.0, 0.0])
-    cameras = rig((0.5, 0.5, 0.5), (0, 1, 0), distance=1.2, focal=48)
+    body, up = dog(0.2), np.array([0.0, 1.0, 0.0])
+    cameras = rig((0.5, 0.55, 0.5), (0, 1, 0), distance=1.2, focal=64)
     sample = Sample(root, cameras, fall(body, (0.5, 0.75, 0.5), up, 0.3, 0.03), body)
     entries = [
         {"camera": f"camera_{v}", "K": cameras.k.tolist(), "c2w": cameras.gl_poses[v].tolist()} for v in range(3)
     ]
     for v in range(3):
         for f in range(FRAMES):
-            write_picture(root / f"camera_{v}" / f"{f:03d}.png", sample.image(f, v))
+            save(root / f"camera_{v}" / f"{f:03d}.png", sample.image(f, v))
     dump(root / "camera.json", entries)
     dump(root / "frame.json", [{f"{f:03d}": 0.03 * f} for f in range(FRAMES)])
     return sample
@@ -161,16 +159,17 @@ def write_springgaus_real(root: Path, *, stills: int = 14) -> Sample:
     # The stills' world: x_films = scale · turn x + shift.
     rest = (path[0] - shift) / scale @ turn
     large = Body(rest, body.radii / scale, body.colors)
-    around = rig(tuple(rest.mean(0)), (0.1, 0.2, 1), views=stills, distance=1.6, size=(108, 60), focal=110 * 108 / 96, level=0.7)
+    around = rig(
+        tuple(rest.mean(0)), (0.1, 0.2, 1), views=stills, distance=1.6, size=(108, 60), focal=110 * 108 / 96, level=0.7
+    )
     static = root / "static"
     cameras = {1: ("PINHOLE", 216, 120, [*(2 * around.k[[0, 1], [0, 1]]), 108.0, 60.0])}
     images = {}
     for i, viewmat in enumerate(around.viewmats):
         images[i + 1] = (f"DSC{i:03d}.JPG", 1, *colmap_pose(viewmat), [])
         rgba = paint(large, rest, viewmat, around.k, around.size)
-        over = (rgba[..., :3] * (rgba[..., 3:] / 255.0) + 90 * (1 - rgba[..., 3:] / 255.0)).astype(np.uint8)
-        write_picture(static / "images" / name / f"DSC{i:03d}.JPG", cv2.resize(over, (216, 120)))
-        write_picture(static / "masks" / name / f"DSC{i:03d}.png", rgba[..., 3])
+        save(static / "images" / name / f"DSC{i:03d}.JPG", cv2.resize(before(rgba, 90), (216, 120)))
+        save(static / "masks" / name / f"DSC{i:03d}.png", rgba[..., 3])
     colmap_files.write_binary(static / "colmap" / name, cameras, images, [])
     (static / "colmap" / name / "points3D.bin").unlink()
     sample = Sample(root, dynamic, path, body, {"scale": scale, "turn": turn, "shift": shift, "stills": around})
@@ -182,9 +181,8 @@ def write_springgaus_real(root: Path, *, stills: int = 14) -> Sample:
         sequence[camera] = [f"{f + 100}.jpg" for f in range(FRAMES)]
         for f in range(FRAMES):
             rgba = sample.image(f, v)
-            over = (rgba[..., :3] * (rgba[..., 3:] / 255.0) + 60 * (1 - rgba[..., 3:] / 255.0)).astype(np.uint8)
-            write_picture(root / "dynamic" / "videos_images" / camera / f"{f + 100}.jpg", over)
-            write_picture(root / "dynamic" / "videos_masks" / camera / f"{f + 100}.png", rgba[..., 3])
+            save(root / "dynamic" / "videos_images" / camera / f"{f + 100}.jpg", before(rgba, 70))
+            save(root / "dynamic" / "videos_masks" / camera / f"{f + 100}.png", rgba[..., 3])
     dump(root / "dynamic" / "cameras_calib.json", calibration)
     dump(root / "dynamic" / "sync.json", {})
     dump(root / "dynamic" / "sequences" / name / "0.json", sequence)
@@ -194,27 +192,25 @@ def write_springgaus_real(root: Path, *, stills: int = 14) -> Sample:
 def write_pacnerf(root: Path, *, kind: str = "matted") -> Sample:
     """One object, `data/<obj>/`; ``kind``: ``plate`` (frame −1 only), ``matted`` (m_*) or ``rgba`` (a_*)."""
     body, up = dog(0.5), np.array([0.0, 1.0, 0.0])
-    cameras = rig((0, 0.9, 0), (0, 1, 0), distance=4.0, focal=60, size=(64, 64))
+    cameras = rig((0, 0.9, 0), (0, 1, 0), distance=4.0, focal=80, size=(64, 64))
     sample = Sample(root, cameras, fall(body, (0, 1.6, 0), up, 0.0, 1 / 24), body)
     folder, entries = root / "data", []
     y, x = np.mgrid[:64, :64]
     for v in range(3):
         plate = np.stack((60 + x, 90 + y // 2, 120 - x // 2 + 10 * v), -1).astype(np.uint8)
-        write_picture(folder / f"r_{v}_-1.png", plate)
+        save(folder / f"r_{v}_-1.png", plate)
         for f in range(FRAMES):
             rgba = sample.image(f, v)
-            alpha = rgba[..., 3:] / 255.0
-            write_picture(folder / f"r_{v}_{f}.png", np.round(rgba[..., :3] * alpha + plate * (1 - alpha)).astype(np.uint8))
+            save(folder / f"r_{v}_{f}.png", before(rgba, plate))
             if kind == "matted":
-                white = np.round(rgba[..., :3] * alpha + 255 * (1 - alpha)).astype(np.uint8)
-                write_picture(folder / f"m_{v}_{f}.png", white)
+                save(folder / f"m_{v}_{f}.png", before(rgba, 255))
             elif kind == "rgba":
-                write_picture(folder / f"a_{v}_{f}.png", rgba)
+                save(folder / f"a_{v}_{f}.png", rgba)
             entries.append({"file_path": f"./data/r_{v}_{f}.png", "time": f / 24,
                             "c2w": cameras.gl_poses[v][:3].tolist(), "intrinsic": cameras.k.tolist()})  # fmt: skip
     ignored = np.zeros((64, 64, 4), np.uint8)
     ignored[:4, :, 3] = 255
-    write_picture(folder / "r_1_-2.png", ignored)
+    save(folder / "r_1_-2.png", ignored)
     dump(root / "all_data.json", entries)
     return sample
 
@@ -246,12 +242,11 @@ def write_phystwin(root: Path) -> Sample:
         dump(root / "mask" / f"mask_info_{v}.json", names)
         for f in range(FRAMES):
             rgba = sample.image(f, v)
-            over = (rgba[..., :3] * (rgba[..., 3:] / 255.0) + 70 * (1 - rgba[..., 3:] / 255.0)).astype(np.uint8)
-            write_picture(root / "color" / str(v) / f"{f}.png", over)
-            write_picture(root / "mask" / str(v) / number[v] / f"{f}.png", np.where(rgba[..., 3] > 127, 255, 0).astype(np.uint8))
+            save(root / "color" / str(v) / f"{f}.png", before(rgba, 70))
+            save(root / "mask" / str(v) / number[v] / f"{f}.png", np.where(rgba[..., 3] > 127, 255, 0).astype(np.uint8))
             hidden = np.zeros((36, 64), np.uint8)
             hidden[:, :6] = 255
-            write_picture(human / str(v) / "0" / f"{f}.png", hidden)
+            save(human / str(v) / "0" / f"{f}.png", hidden)
     dump(root / "metadata.json", {"intrinsics": [cameras.k.tolist()] * 3, "serial_numbers": ["a", "b", "c"], "fps": 30,
                                   "WH": [64, 36], "recording": {"0": 1}, "frame_num": FRAMES})  # fmt: skip
     dump(root / "split.json", {"frame_len": FRAMES, "train": [0, 14], "test": [14, FRAMES]})
@@ -273,22 +268,25 @@ def write_3dgsim(root: Path, *, samples: tuple[str, ...] = ("0001", "0002"), mov
     """Samples of one object, `<object>/<sample>/`; the cameras of the sample ``moved`` stand elsewhere."""
     body, up = dog(0.3), np.array([0.0, 0.0, 1.0])
     for number, name in enumerate(samples):
-        cameras = rig((0, 0, 0.6), (0, 0, 1), distance=2.6, first=0.9 if name == moved else 0.3)
+        cameras = rig((0, 0, 0.6), (0, 0, 1), distance=2.4, focal=64, first=0.9 if name == moved else 0.3)
         path = fall(body, (0.1 * number, 0, 1.0), up, 0.0, 0.04)
         sample = Sample(root / name, cameras, path, body)
         # Without a 0 anywhere the numbers begin with 1: background 1, object 3, static part 4.
         first = number % 2
-        meta: dict[str, Any] = {"n_steps": FRAMES, "n_cams": 3, "file_path_template": "cam_{cam_ix}/{img_type}_{n_step:04d}"}
+        meta: dict[str, Any] = {
+            "n_steps": FRAMES,
+            "n_cams": 3,
+            "file_path_template": "cam_{cam_ix}/{img_type}_{n_step:04d}",
+        }
         for v in range(3):
             meta[f"cam_{v}"] = {"extrinsics": cameras.viewmats[v].tolist(), "intrinsics": cameras.k.tolist(),
                                 "resolution": list(cameras.size)}  # fmt: skip
             for f in range(FRAMES):
                 rgba = sample.image(f, v)
-                over = (rgba[..., :3] * (rgba[..., 3:] / 255.0) + 100 * (1 - rgba[..., 3:] / 255.0)).astype(np.uint8)
-                write_picture(root / name / f"cam_{v}" / f"rgb_{f:04d}.png", over)
+                save(root / name / f"cam_{v}" / f"rgb_{f:04d}.png", before(rgba, 100))
                 numbers = np.where(rgba[..., 3] > 127, 2, 0).astype(np.uint8)
                 numbers[-3:] = 3
-                write_picture(root / name / f"cam_{v}" / f"seg_{f:04d}.png", numbers + first)
+                save(root / name / f"cam_{v}" / f"seg_{f:04d}.png", numbers + first)
         dump(root / name / "metadata.json", meta)
     return Sample(root, cameras, path, body)
 
@@ -306,17 +304,30 @@ def write_physdreamer(root: Path) -> toy_object.ToyObject:
     colmap_files.write_binary(root / "sparse" / "0", cameras, images, colmap_files.small_model()[2])
     frames = toy.images("seq_000").numpy()
     for i in range(3):
-        write_picture(root / "images" / f"frame_0000{i + 1}.png", frames[0, i, ..., :3])
-        write_picture(root / "masks" / f"frame_0000{i + 1}_mask.png", frames[0, i, ..., 3])
+        save(root / "images" / f"frame_0000{i + 1}.png", frames[0, i, ..., :3])
+        save(root / "masks" / f"frame_0000{i + 1}_mask.png", frames[0, i, ..., 3])
     film(root / "videos" / "frame_00002_poke.mp4", frames[:, 1, ..., :3])
     for f in range(len(frames)):
-        write_picture(root.parent / "video_masks" / f"{f:04d}.png", frames[f, 1, ..., 3])
+        save(root.parent / "video_masks" / f"{f:04d}.png", frames[f, 1, ..., 3])
     save_scene(scene, root / "point_cloud.ply")
     (root / "point_cloud.masks.npz").unlink()
     means = scene.means.numpy()
     write_cloud(root / "moving_part_points.ply", means[means[:, 2] > 0.5] + 0.004)
     write_cloud(root / "clean_object_points.ply", means + 0.004)
     return toy
+
+
+def save(path: Path, pixels: np.ndarray) -> None:
+    """Writes grey, RGB or RGBA."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    code = {3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}.get(pixels.shape[2] if pixels.ndim == 3 else 1)
+    assert cv2.imwrite(str(path), pixels if code is None else cv2.cvtColor(pixels, code))
+
+
+def before(rgba: np.ndarray, background: float | np.ndarray) -> np.ndarray:
+    """(H, W, 3) uint8 of a picture before a background."""
+    alpha = rgba[..., 3:] / 255.0
+    return np.asarray(np.round(rgba[..., :3] * alpha + background * (1 - alpha)), np.uint8)
 
 
 def write_cloud(path: Path, points: np.ndarray) -> None:
