@@ -1,10 +1,10 @@
 """Brings an object of 3DGSim's data (elastic bodies and cloth, simulated by Genesis) to our layout.
 
-ROOT is a sample (a folder with metadata.json) or the folder of an object's samples. Samples with the same cameras become
-sequences of one object; where cameras differ, OUT becomes a folder of objects. Alpha is 1 where the segmentation shows
-the object: anything but its background (0) and its static part (3), or what --segments names. The world is z up, with
-gravity and a floor at z = 0. The files do not say how many frames per second there are: state --fps. The authors hold
-out whole samples, so all frames are trained on unless --train-frames says otherwise.
+ROOT is a sample (a folder with metadata.json) or the folder of an object's samples. Samples with the same cameras
+become sequences of one object; where cameras differ, OUT becomes a folder of objects. Alpha is 1 where the segmentation
+shows the object: anything but its background (0) and its static part (3), or what --segments names. The world is z up,
+with gravity and a floor at z = 0. The files do not say how many frames per second there are: state --fps. The authors
+hold out whole samples, so all frames are trained on unless --train-frames says otherwise.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ def _motion(sample: Path, name: str, segments: tuple[int, ...]) -> Motion:
         )
         for i, view in enumerate(views)
     }  # fmt: skip
-    return Motion(name, views, pictures)
+    return Motion(name, path, views, pictures)
 
 
 def _template(text: str, where: str) -> str:

@@ -1,10 +1,10 @@
 """Brings an object of PAC-NeRF's data to our layout.
 
-ROOT is data/OBJECT (all_data.json, data/r_CAMERA_FRAME.png). The world is y up, with gravity and a floor at y = 0. Masks
-come from a_CAMERA_FRAME.png (RGBA) where they are there; else from m_CAMERA_FRAME.png (before white) and the empty
-scene, frame -1 of each camera; else the object is cut out against frame -1 as `segment --backend background` does it.
-Pixels that frame -2 marks are left out. There are no stills: frame 0 of the cameras takes their place. The authors have
-no unseen frames: all are trained on unless --train-frames says otherwise.
+ROOT is data/OBJECT (all_data.json, data/r_CAMERA_FRAME.png). The world is y up, with gravity and a floor at y = 0.
+Masks come from a_CAMERA_FRAME.png (RGBA) where they are there; else from m_CAMERA_FRAME.png (before white) and the
+empty scene, frame -1 of each camera; else the object is cut out against frame -1 as `segment --backend background` does
+it. Pixels that frame -2 marks are left out. There are no stills: frame 0 of the cameras takes their place. The authors
+have no unseen frames: all are trained on unless --train-frames says otherwise.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def read_pacnerf(root: Path, options: PacNerfOptions) -> PublicObject:
     count = min(len(row) for row in pictures.values())
     return PublicObject(
         root, options.name or root.name, options.fps or _rate(path, times), options.train_frames or count,
-        (Motion("seq_000", tuple(views), pictures),), options.heldout,
+        (Motion("seq_000", path, tuple(views), pictures),), options.heldout,
         {"gravity": [0.0, -GRAVITY, 0.0], "floor": floor((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), "free": True},
         files={DATA: path},
     )  # fmt: skip

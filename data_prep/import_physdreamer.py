@@ -141,8 +141,8 @@ def _films(folder: Path, posed: Mapping[str, Posed], options: PhysDreamerOptions
     chosen_films = tuple(film for film in films if of[film] == view)
     if view is None or not chosen_films:
         raise ConfigError(
-            f"--view: the films {[f.name for f in films][:6]} in {folder} belong to the stills {sorted(map(str, of.values()))[:6]}; "
-            "state the still from whose place the motion was filmed."
+            f"--view: the films {[f.name for f in films][:6]} in {folder} belong to the stills "
+            f"{sorted(map(str, of.values()))[:6]}; state the still from whose place the motion was filmed."
         )
     return view, chosen_films
 
@@ -259,10 +259,10 @@ def main(argv: list[str] | None = None) -> int:
 
 def summary(results: Mapping[str, Any], out: Path) -> str:
     """A few lines about what was imported, for people."""
-    facts = results["facts"]
+    facts, frames = results["facts"], min(results["sequences"].values())
     lines = [
         f"stills      {results['stills']}",
-        f"sequences   {len(results['sequences'])}, {min(results['sequences'].values())} frames at {facts['fps']:g} per second",
+        f"sequences   {len(results['sequences'])}, {frames} frames at {facts['fps']:g} per second",
         f"camera      {facts['views'][0]}",
         f"scene       {results['scene']}",
     ]

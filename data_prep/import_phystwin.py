@@ -3,9 +3,9 @@
 ROOT is data/different_types/CASE (metadata.json, calibrate.pkl, final_data.pkl, split.json, color/, mask/). Colour and
 the object's mask become RGBA; pixels of the human mask (data/different_types_human_mask/CASE, where it is there) are
 left out. Controller points become the hands' paths, points that stay together one hand; kernels within --grip of them
-in frame 0 are pinned to them. Gravity is along +z, the table is the floor z = 0. split.json says which frames are trained
-on. Labelled tracks (gt_track_3d.pkl) become the ground truth: those of points that are tracked throughout, as ours has
-no gaps. Depth is not read. Pickles go through a reader that executes nothing.
+in frame 0 are pinned to them. Gravity is along +z, the table is the floor z = 0. split.json says which frames are
+trained on. Labelled tracks (gt_track_3d.pkl) become the ground truth: those of points that are tracked throughout, as
+ours has no gaps. Depth is not read. Pickles go through a reader that executes nothing.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from data_prep.common.command import option
 from data_prep.common.progress import Tick, silent
 from data_prep.public.fields import REMEDY, field, lens, numbers, read_any_json, viewmat
 from data_prep.public.importing import ImportOptions, import_command, run_import
-from data_prep.public.pictures import masked, size_of
 from data_prep.public.pickles import read_pickle
+from data_prep.public.pictures import masked, size_of
 from data_prep.public.scene import GRAVITY, Hands, Motion, Picture, PublicObject, View, floor
 from gausim.core.errors import ConfigError, DataError
 
@@ -88,8 +88,7 @@ def read_phystwin(root: Path, options: PhysTwinOptions) -> PublicObject:
     human = _human(root, options.human_masks)
     pictures = {view.name: _pictures(root, i, infos[i][0], human, view.size, count) for i, view in enumerate(views)}
     final = _final(root / FINAL, count)
-    grips = options.hands or max(hands for _, hands in infos)
-    hands = Hands(final["controller_points"], together(final["controller_points"], grips))
+    hands = _hands(root, final["controller_points"], [count for _, count in infos], options.hands)
     tracks, of = _tracks(root / TRACKS, count)
     notes = {"hands": f"{len(hands.hand)} points, " + " + ".join(str(int(n)) for n in np.bincount(hands.hand))}
     if of:
@@ -98,7 +97,7 @@ def read_phystwin(root: Path, options: PhysTwinOptions) -> PublicObject:
     world = {"gravity": [0.0, 0.0, GRAVITY], "floor": floor((0.0, 0.0, 0.0), (0.0, 0.0, -1.0)), "grip": options.grip}
     return PublicObject(
         root, options.name or root.name, options.fps or field(data, "fps", float, str(meta)),
-        options.train_frames or _split(root / SPLIT, count), (Motion("seq_000", views, pictures, hands, tracks),),
+        options.train_frames or _split(root / SPLIT, count), (Motion("seq_000", meta, views, pictures, hands, tracks),),
         options.heldout, world, cloud=_cloud(final), told={"notes": notes},
         files={name: root / name for name in read if (root / name).is_file()},
     )  # fmt: skip
@@ -158,8 +157,8 @@ def _pictures(
     absent = [path for path in paths if not path.is_file()]
     if absent:
         raise DataError(
-            f"{absent[0]}: no such frame, though {META}: field 'frame_num' is {count} ({len(absent)} are missing). Restore "
-            "the frames."
+            f"{absent[0]}: no such frame, though {META}: field 'frame_num' is {count} ({len(absent)} are missing). "
+            "Restore the frames."
         )
     pictures = []
     for t, path in enumerate(paths):
@@ -188,6 +187,18 @@ def _final(path: Path, count: int) -> dict[str, np.ndarray]:
     return found
 
 
+def _hands(root: Path, points: np.ndarray, named: list[int], given: int | None) -> Hands:
+    """The paths of the controller points (F, C, 3), and the hands that they belong to: the most that a camera names."""
+    count = given or max(named)
+    if not 1 <= count <= points.shape[1]:
+        path = root / "mask" / f"mask_info_{named.index(max(named))}.json"
+        said = f"--hands is {count}" if given else f"{path} names {count} hands"
+        raise DataError(
+            f"{said}, {FINAL}: field 'controller_points' has {points.shape[1]} points. State the number of --hands."
+        )
+    return Hands(points, together(points, count))
+
+
 def _cloud(final: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """The object's points in frame 0 with their colours, to begin a reconstruction with."""
     points = final["object_points"][0]
@@ -200,16 +211,11 @@ def together(paths: np.ndarray, count: int) -> np.ndarray:
 
     Points of a hand stay near each other: points are joined by the largest distance that they ever have (average
     linkage). Hands are numbered in the order of their first points.
-
-    Raises:
-        ConfigError: there are fewer points than hands.
     """
     from scipy.cluster.hierarchy import fcluster, linkage
     from scipy.spatial.distance import squareform
 
     points = paths.shape[1]
-    if points < count:
-        raise ConfigError(f"--hands {count}: there are only {points} controller points.")
     if count == 1 or points == 1:
         return np.zeros(points, np.int64)
     apart = np.zeros((points, points))
@@ -239,8 +245,8 @@ def _split(path: Path, count: int) -> int:
     test = field(data, "test", tuple[int, int], str(path))
     if field(data, "frame_len", int, str(path)) != count or first != 0 or not 2 <= end <= count or test != (end, count):
         raise DataError(
-            f"{path}: expected 'frame_len' {count}, 'train' [0, n] and 'test' [n, {count}], got {data}. Restore it, or state "
-            "--train-frames."
+            f"{path}: expected 'frame_len' {count}, 'train' [0, n] and 'test' [n, {count}], got {str(data)[:200]}. "
+            "Restore it, or state --train-frames."
         )
     return end
 

@@ -5,7 +5,7 @@ and a floor at y = 0.3; frames 0 to 19 are trained on. There are no stills: fram
 
 Real: ROOT is data/real_capture, and --object names one of dynamic/sequences. Its stills (static/) and films (dynamic/)
 have worlds of their own. The similarity between them is found by silhouettes: the visual hull of the stills is turned,
-moved and scaled until it covers the masks of every sequence's first frame. What is reached is told; below
+moved and scaled until it covers the masks of the first sequence's first frame. What is reached is told; below
 --least-overlap the command stops.
 """
 
@@ -80,8 +80,8 @@ def import_springgaus(
         return run_import(STAGE, REVISION, [read_synthetic(root, options)], out, options, force=force, tick=tick)
     if not (root / CALIBRATION).is_file():
         raise DataError(
-            f"{root}: neither {CAMERAS} (a synthetic object) nor {CALIBRATION} (real captures) is here. Give the folder "
-            "data/mpm_synthetic/render/OBJECT, or data/real_capture."
+            f"{root}: neither {CAMERAS} (a synthetic object) nor {CALIBRATION} (real captures) is here. Give the "
+            "folder data/mpm_synthetic/render/OBJECT, or data/real_capture."
         )
     found = read_real(root, options)
     finish = None if options.no_stills else partial(_registered, options=options)
@@ -116,7 +116,7 @@ def read_synthetic(root: Path, options: SpringGausOptions) -> PublicObject:
     return PublicObject(
         root, options.name or root.name, options.fps or (_rate(times, count) if times.is_file() else SYNTHETIC_FPS),
         options.train_frames or min(SYNTHETIC_SEEN, count),
-        (Motion("seq_000", tuple(views), pictures),), options.heldout,
+        (Motion("seq_000", root, tuple(views), pictures),), options.heldout,
         {"gravity": [0.0, -GRAVITY, 0.0], "floor": floor((0.0, SYNTHETIC_FLOOR, 0.0), (0.0, 1.0, 0.0)), "free": True},
         files=files,
     )  # fmt: skip
@@ -215,13 +215,14 @@ def _real_motion(root: Path, path: Path, poses: Mapping[str, np.ndarray], model:
     for camera, pose in poses.items():
         where = f"{path}: field '{camera}'"
         row = [_filmed(root, camera, name, where) for name in field(data, camera, list[str], str(path))]
-        if not row:
-            raise DataError(f"{where}: names no frame. Restore the list.")
+        absent = next((p for pair in row for p in pair if not p.is_file()), None)
+        if not row or absent is not None:
+            raise DataError(f"{where}: names {f'a frame without {absent}' if row else 'no frame'}. Restore it.")
         size = size_of(row[0][0])
         views.append(View(camera, size, _film_lens(model, size), pose))
         pictures[camera] = tuple(Picture(pair, partial(masked, *pair, size)) for pair in row)
     name = check_name(path.stem, str(path))
-    return Motion(f"seq_{int(name):03d}" if name.isdecimal() else name, tuple(views), pictures)
+    return Motion(f"seq_{int(name):03d}" if name.isdecimal() else name, path, tuple(views), pictures)
 
 
 def _filmed(root: Path, camera: str, name: str, where: str) -> tuple[Path, Path]:
@@ -284,17 +285,17 @@ def _registered(found: PublicObject, tick: Tick, *, options: SpringGausOptions) 
     """
     first = [(view, motion.pictures[view.name][0]) for motion in found.motions[:1] for view in motion.views]
     fit = register(found.stills, first, turns=options.turns, tick=tick)
+    views = ", ".join(f"{name} {value:.3f}" for name, value in fit.by_view.items())
     if fit.overlap < options.least_overlap:
         raise DataError(
             f"{found.root}: the stills' silhouettes overlap those of {found.motions[0].name}'s first frame by "
-            f"{fit.overlap:.3f} ({', '.join(f'{name} {value:.3f}' for name, value in fit.by_view.items())}), expected at "
-            f"least --least-overlap {options.least_overlap:g}. Check static/masks and dynamic/videos_masks, try more "
-            "--turns, or leave the stills out (--no-stills): frame 0 of the cameras takes their place."
+            f"{fit.overlap:.3f} ({views}), expected at least --least-overlap {options.least_overlap:g}. "
+            "Check static/masks and dynamic/videos_masks, try more --turns, or leave the stills out (--no-stills): "
+            "frame 0 of the cameras takes their place."
         )
     stills = tuple((replace(view, viewmat=fit.moved(view.viewmat)), picture) for view, picture in found.stills)
-    notes = {
-        "registered": f"overlap of silhouettes {fit.overlap:.3f}, agreement of colours {fit.colour:.2f}, scale {fit.scale:.4g}"
-    }
+    reached = f"overlap of silhouettes {fit.overlap:.3f} ({views}), agreement of colours {fit.colour:.2f}"
+    notes = {"registered": f"{reached}, scale {fit.scale:.4g}"}
     if fit.ambiguous:
         notes["look at"] = "another turn of the object fits as well: compare the stills with frame 0"
     return replace(found, stills=stills, told={"registration": fit.told(), "notes": notes})

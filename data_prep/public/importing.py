@@ -30,15 +30,16 @@ class ImportOptions(Options):
 
 
 T = TypeVar("T", bound=ImportOptions)
+Given = TypeVar("Given", bound=ImportOptions, contravariant=True)
 # Completes an object where that takes long: it is called only where there is something to make.
 Finish = Callable[[PublicObject, Tick], PublicObject]
 
 
-class Importer(Protocol[T]):
+class Importer(Protocol[Given]):
     """The function of an importer: a stage of data preparation."""
 
     def __call__(
-        self, root: Path, out: Path, options: T, *, force: bool = False, tick: Tick = silent
+        self, root: Path, out: Path, options: Given, *, force: bool = False, tick: Tick = silent
     ) -> dict[str, Any]:
         """Reads ROOT, writes our layout to ``out`` and returns the stage's manifest."""
 
@@ -93,11 +94,12 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
     """A few lines about an object that was imported, for people."""
     facts, frames = results["facts"], sorted(results["sequences"].values())
     length = str(frames[0]) if frames[0] == frames[-1] else f"{frames[0]} to {frames[-1]}"
+    heldout = ", ".join(facts["heldout_views"]) or "none"
     lines = [
         f"object      {facts['name']}",
         f"stills      {results['stills']}",
         f"sequences   {len(frames)}, {length} frames at {facts['fps']:g} per second",
-        f"cameras     {', '.join(facts['train_views'])}; never trained on: {', '.join(facts['heldout_views']) or 'none'}",
+        f"cameras     {', '.join(facts['train_views'])}; never trained on: {heldout}",
         f"frames      0 to {facts['train_frames'][1] - 1} are trained on",
     ]
     lines += [f"{key:<11} {facts[key]}" for key in ("gravity", "floor", "free", "grip") if key in facts]

@@ -153,7 +153,8 @@ class _Machine:
             _, shape, element, fortran, raw = state
             raw = raw.encode("latin1") if type(raw) is str else raw
             dtype = self._checked(raw, element, shape)
-            self._blank.pop(id(target)).__setstate__((1, shape, dtype, bool(fortran), raw))
+            whole: Any = (1, shape, dtype, bool(fortran), raw)
+            self._blank.pop(id(target)).__setstate__(whole)
         else:
             raise ValueError(f"sets the state of a {type(target).__name__}")
 

@@ -337,7 +337,7 @@ def _angle(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _agreement(body: _Body, windows: Sequence[_Window], fit: _Fit) -> float:
-    """Correlation of the hull's colours with those of the frames, over cameras, whatever exposure and balance they have."""
+    """Correlation of the hull's colours with the frames', over cameras, whatever exposure and balance they have."""
     _, rotation, scale, shift = fit
     points, normals = body.points @ rotation.T * scale + shift, body.normals @ rotation.T
     known = np.isfinite(body.colors[:, 0])

@@ -47,6 +47,7 @@ class Motion:
     """One sequence of F frames."""
 
     name: str  # of its folder
+    source: Path  # the file, or the folder, that lists its frames
     views: tuple[View, ...]  # its cameras
     pictures: Mapping[str, tuple[Picture, ...]]  # by camera, F each
     hands: Hands | None = None  # what holds the object
@@ -97,11 +98,13 @@ class PublicObject:
         for motion in self.motions:
             counts = {name: len(row) for name, row in motion.pictures.items()}
             if len(set(counts.values())) > 1:
-                raise DataError(f"{self.root}: {motion.name}: cameras have different numbers of frames: {counts}.")
+                raise DataError(
+                    f"{motion.source}: cameras have different numbers of frames: {counts}. Restore the frames."
+                )
             if motion.count < max(2, self.train_frames):
                 raise DataError(
-                    f"{self.root}: {motion.name} has {motion.count} frames, fewer than the {max(2, self.train_frames)} "
-                    "to train on. Restore the frames, or give a smaller --train-frames."
+                    f"{motion.source}: {motion.name} has {motion.count} frames, fewer than the "
+                    f"{max(2, self.train_frames)} to train on. Restore the frames, or give a smaller --train-frames."
                 )
         if not set(self.heldout) < set(self.views):
             raise ConfigError(f"--heldout {','.join(self.heldout)}: expected a part of the cameras {list(self.views)}.")

@@ -47,8 +47,8 @@ def write_scene(work: Path, root: Path, near: float, *, anchor: float | None = N
         masks["pinned"] = moving & masks.get("foreground", torch.ones_like(moving)) & ~masks["simulated"]
         if not masks["pinned"].any():
             raise SceneError(
-                f"{files[MOVING]}: no kernel of the object is within {anchor:g} of the moving ones without being one. Give "
-                "a larger --anchor, or mark the pins with `select`."
+                f"{files[MOVING]}: no kernel of the object is within {anchor:g} of the moving ones without being one. "
+                "Give a larger --anchor, or mark the pins with `select`."
             )
         masks["simulated"] = masks["simulated"] | masks["pinned"]
     elif PINS in files:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers import public_sets
 
 from gausim.data.verify import verify
 
@@ -21,8 +22,9 @@ CAPTURE = runpy.run_path(str(Path(__file__).with_name("test_assemble.py")))["Cap
 ROOM = runpy.run_path(str(Path(__file__).with_name("test_poses.py")))
 READY = runpy.run_path(str(ROOT / "tests" / "fuzz" / "corpus.py"))["_ready"]
 Run = Callable[..., dict[str, Any]]
-STAGES = ("ingest", "poses", "segment", "reconstruct", "select", "assemble", "pack", "import_ready", "poses-mapping",
-          "synthesize", "corpus")  # fmt: skip
+STAGES = ("ingest", "poses", "segment", "reconstruct", "select", "assemble", "pack", "import_ready",
+          "import_springgaus", "import_springgaus-real", "import_pacnerf", "import_phystwin", "import_3dgsim",
+          "import_physdreamer", "poses-mapping", "synthesize", "corpus")  # fmt: skip
 SHARES = (0.0, 0.5, 1.0)
 
 
@@ -55,6 +57,12 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
     save_scene(capture.toy.scene, folder / "rest" / "scene.ply")
     list(READY(folder))
     ROOM["write_photos"](folder / "room")
+    public_sets.write_springgaus(folder / "torus")
+    public_sets.write_springgaus_real(folder / "real")
+    public_sets.write_pacnerf(folder / "bird", kind="plate")
+    public_sets.write_phystwin(folder / "different_types" / "sloth")
+    public_sets.write_3dgsim(folder / "genesis", moved="0002")
+    public_sets.write_physdreamer(folder / "hat")
     whole = {stage: folder / "whole" / stage for stage in STAGES}
     arguments = {
         "ingest": [capture.folder / "takes", "--sync", "offsets", "--offsets", "cam_0=0,cam_1=2f,cam_2=0"],
@@ -65,6 +73,12 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
         "assemble": [whole["segment"], "--scene", whole["select"], "--name", "toy"],
         "pack": [whole["assemble"]],
         "import_ready": [folder / "ready", "--train-frames", "2"],
+        "import_springgaus": [folder / "torus"],
+        "import_springgaus-real": [folder / "real", "--object", "bun", "--turns", "20", "--least-overlap", "0"],
+        "import_pacnerf": [folder / "bird"],
+        "import_phystwin": [folder / "different_types" / "sloth"],
+        "import_3dgsim": [folder / "genesis", "--fps", "25"],
+        "import_physdreamer": [folder / "hat", "--anchor", "0.4", "--video-masks", folder / "video_masks"],
         "poses-mapping": [
             "--images",
             folder / "room",

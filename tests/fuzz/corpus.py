@@ -8,6 +8,7 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import av
 import cv2
 import numpy as np
 import torch
-from helpers import colmap_files, toy_corpus, toy_object
+from helpers import colmap_files, public_sets, toy_corpus, toy_object
 
 from data_prep.capture.cameras.sources import read_lens_transforms, read_projections
 from data_prep.capture.films.film import pictures, probe, upright
@@ -24,8 +25,14 @@ from data_prep.capture.masks.clips import read_picture
 from data_prep.common.photos import open_photo, read_photo
 from data_prep.common.stage import read_manifest
 from data_prep.dataset import plan
+from data_prep.import_3dgsim import GenesisOptions, read_3dgsim
+from data_prep.import_pacnerf import PacNerfOptions, read_pacnerf
+from data_prep.import_physdreamer import PhysDreamerOptions, read_capture
+from data_prep.import_phystwin import PhysTwinOptions, read_phystwin
 from data_prep.import_ready import ReadyOptions, import_ready
+from data_prep.import_springgaus import SpringGausOptions, read_real, read_synthetic
 from data_prep.pack import pack
+from data_prep.public.pickles import read_pickle
 from data_prep.ready.authors import read_pins
 from data_prep.ready.gathered import gather
 from gausim.core.errors import GausSimError
@@ -69,7 +76,7 @@ def readers(folder: Path) -> list[Reader]:
     """Writes the good files into ``folder`` and lists who reads them."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    made = (_scenes, _object, _store, _posed, _colmap, _ready, _images, _films, _settings)
+    made = (_scenes, _object, _store, _posed, _colmap, _ready, _public, _images, _films, _settings)
     return [reader for make in made for reader in make(folder)]
 
 
@@ -221,6 +228,59 @@ def _ready(folder: Path) -> Iterator[Reader]:
 
     yield Reader("meta.json", root / "meta.json", "json", imported, 1)
     yield Reader("pin_mask.json", pins, "json", lambda p: read_pins(p, 36))
+
+
+def _public(folder: Path) -> Iterator[Reader]:
+    """The public sets: what their importers read before they write."""
+    root = folder / "public"
+    public_sets.write_springgaus(root / "torus")
+    public_sets.write_springgaus_real(root / "real")
+    public_sets.write_pacnerf(root / "bird")
+    public_sets.write_phystwin(root / "different_types" / "sloth")
+    public_sets.write_3dgsim(root / "genesis")
+    hat = public_sets.write_physdreamer(root / "hat")
+    entries = [{"file_path": f"images/frame_0000{i + 1}.png"} for i in range(3)]
+    write_transforms(root / "hat" / "transforms_train.json", hat.views, entries)
+    real, phystwin = SpringGausOptions(object="bun"), PhysTwinOptions()
+    sets: dict[str, tuple[Callable[[], Any], tuple[str, ...]]] = {
+        "torus": (lambda: [read_synthetic(root / "torus", SpringGausOptions())], ("camera.json", "frame.json")),
+        "real": (lambda: [read_real(root / "real", real)],
+                 ("dynamic/cameras_calib.json", "dynamic/sequences/bun/0.json", "static/colmap/bun/cameras.bin")),
+        "bird": (lambda: [read_pacnerf(root / "bird", PacNerfOptions())], ("all_data.json",)),
+        "different_types/sloth": (lambda: [read_phystwin(root / "different_types" / "sloth", phystwin)],
+                  ("metadata.json", "split.json", "mask/mask_info_1.json", "calibrate.pkl", "final_data.pkl",
+                   "gt_track_3d.pkl")),
+        "genesis": (lambda: read_3dgsim(root / "genesis", GenesisOptions(fps=25)), ("0001/metadata.json",)),
+    }  # fmt: skip
+    kinds = {".json": "json", ".pkl": "binary", ".bin": "binary"}
+    for name, (read, files) in sets.items():
+        for file in files:
+            path = root / name / file
+            yield Reader(f"{name}: {path.name}", path, kinds[path.suffix], partial(_of_public, read), 2)
+    yield Reader("pickle", root / "different_types" / "sloth" / "final_data.pkl", "binary", _pickled, 6)
+    yield Reader("stills of PhysDreamer", root / "hat" / "transforms_train.json", "json", _stills_of_physdreamer, 2)
+    segments = root / "genesis" / "0001" / "cam_0" / "seg_0000.png"
+    shown = read_3dgsim(root / "genesis", GenesisOptions(fps=25))[0].motions[0].pictures["cam_0"][0]
+    yield Reader("segments", segments, "png", lambda p: shown.read())
+
+
+def _of_public(read: Callable[[], Any], _: Path) -> Any:
+    """The numbers that an importer takes over."""
+    found = [one.checked() for one in read()]
+    views = [(view.k, view.viewmat) for one in found for motion in one.motions for view in motion.views]
+    hands = [motion.hands.points for one in found for motion in one.motions if motion.hands is not None]
+    tracks = [motion.tracks for one in found for motion in one.motions if motion.tracks is not None]
+    return [(one.fps, one.train_frames, dict(one.world)) for one in found], views, hands, tracks
+
+
+def _stills_of_physdreamer(path: Path) -> Any:
+    return [shot.viewmat for shot in read_capture(path.parent, PhysDreamerOptions()).posed.values()]
+
+
+def _pickled(path: Path) -> int:
+    """Reads plain data, in which NaN is allowed."""
+    read_pickle(path)
+    return 1
 
 
 def _picture(path: Path, size: tuple[int, int]) -> None:

@@ -1,4 +1,4 @@
-"""Small samples exactly in the layouts of public sets, of bodies of painted balls whose motion and cameras are known."""
+"""Small samples exactly in the layouts of public sets: bodies of painted balls whose motion and cameras are known."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from data_prep.public.pictures import resized
-
 from helpers import colmap_files, toy_object
 
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -151,7 +150,7 @@ def write_springgaus(root: Path) -> Sample:
 
 
 def write_springgaus_real(root: Path, *, stills: int = 14) -> Sample:
-    """Real captures with one object, `real_capture/`; the films' world is that of the stills, turned, scaled and moved."""
+    """Real captures of one object, `real_capture/`; the films' world is the stills' turned, scaled and moved."""
     body, name, down = dog(0.1), "bun", np.array([0.0, 0.0, 1.0])
     dynamic = rig((0, 0, -0.25), (0, 0, -1), distance=0.7, size=(96, 54), focal=110)
     path = fall(body, (0, 0, -0.3), -down, 0.02, 1 / 120)
