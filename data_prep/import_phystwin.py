@@ -38,7 +38,7 @@ HAND = "hand"
 # The distance up to which the authors tie an object's points to a controller point at first [m].
 GRIP = 0.04
 # More points than this say no more about where a hand is.
-_MOST_CONTROLLERS = 10_000
+_MOST_CONTROLLERS = 1000
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,9 @@ def read_phystwin(root: Path, options: PhysTwinOptions) -> PublicObject:
     hands = _hands(root, final["controller_points"], [count for _, count in infos], options.hands)
     tracks, of = _tracks(root / TRACKS, count)
     notes = {"hands": f"{len(hands.hand)} points, " + " + ".join(str(int(n)) for n in np.bincount(hands.hand))}
+    loose = [h for h in range(int(hands.hand.max()) + 1) if stretch(hands.points[:, hands.hand == h]) > options.grip]
+    if loose:
+        notes["look at"] = f"points of hand {loose[0]} move apart by more than --grip: is it several --hands?"
     if of:
         notes["tracks"] = f"{0 if tracks is None else tracks.shape[1]} of {of} labelled points are tracked throughout"
     read = (META, POSES, FINAL, TRACKS, SPLIT, *(f"mask/mask_info_{i}.json" for i in range(len(views))))
@@ -224,6 +227,16 @@ def together(paths: np.ndarray, count: int) -> np.ndarray:
     labels = fcluster(linkage(squareform(apart, checks=False), "average"), count, "maxclust")
     order = {label: i for i, label in enumerate(dict.fromkeys(labels.tolist()))}
     return np.array([order[label] for label in labels.tolist()], np.int64)
+
+
+def stretch(points: np.ndarray) -> float:
+    """The most that a distance between two of the points (F, C, 3) differs from that in frame 0."""
+
+    def apart(frame: np.ndarray) -> np.ndarray:
+        return np.asarray(np.linalg.norm(frame[:, None] - frame[None], axis=-1))
+
+    first = apart(points[0])
+    return float(max(np.abs(apart(frame) - first).max() for frame in points))
 
 
 def _tracks(path: Path, count: int) -> tuple[np.ndarray | None, int]:

@@ -14,6 +14,7 @@ import torch
 import yaml
 from helpers.toy_object import toy_scene
 
+from data_prep.public.pickles import read_pickle
 from gausim.cli.main import main
 from gausim.core import GausSimError
 from gausim.data.objects import ObjectData
@@ -45,6 +46,7 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "masks": ("scene.masks.npz", lambda path: load_masks(toy_scene(), path)),
     "trajectory": ("trajectory.safetensors", load_trajectory),
     "motion": ("m.motion.glb", load_motion),
+    "public pickle": ("final_data.pkl", read_pickle),
     "lpips": ("lpips.safetensors", LPIPS),
     "lpips, jax": ("alexnet.ckpt", convert),
     "lpips, wheel": ("lpips.whl", convert),

@@ -78,7 +78,9 @@ class _Machine:
         for opcode, argument, place in pickletools.genops(self._data):
             name = opcode.name
             if name == "STOP":
-                (result,) = self._stack
+                if len(self._stack) != 1 or place is None or place + 1 < len(self._data):
+                    raise ValueError("holds more or less than one value")
+                result = self._stack[0]
                 self._check_plain(result)
                 return result
             if name in _CONSTANTS:

@@ -134,6 +134,7 @@ CRAFTED = {
     "an old instance": b"(X\x02\x00\x00\x00lsios\nsystem\n.",
     "a list as a key": b"}]K\x01s.",
     "two values": b"K\x01K\x02.",
+    "two pickles": b"].].",
     "no end": b"]",
     "nothing": b"",
     "a mark too few": b"e.",

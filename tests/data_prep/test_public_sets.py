@@ -200,6 +200,9 @@ def test_hands_of_phystwin(phystwin: Sample, tmp_path: Path) -> None:
     np.testing.assert_allclose(truth.positions, phystwin.more["tracks"][:, [0, 2, 3, 4]], atol=1e-6)
     pixels = data.sequences[0].frames(range(FRAMES)).numpy()
     assert (pixels[:, :, :, :6, 3] == 0).all()  # the human's pixels
+    assert "look at" not in notes
+    one = import_phystwin.import_phystwin(phystwin.root, tmp_path / "one", PhysTwinOptions(hands=1))["results"]
+    assert "--hands" in one["objects"][phystwin.root.name]["notes"]["look at"]
     with np.load(tmp_path / "out" / "points.npz") as cloud:
         np.testing.assert_allclose(cloud["points"], phystwin.path[0], atol=1e-6)
         np.testing.assert_array_equal(cloud["colors"], phystwin.body.colors)
