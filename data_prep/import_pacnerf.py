@@ -95,7 +95,7 @@ def read_pacnerf(root: Path, options: PacNerfOptions) -> PublicObject:
         times[view.name] = [row.time for row in rows]
     count = min(len(row) for row in pictures.values())
     return PublicObject(
-        root, options.name or root.name, options.fps or _rate(path, times), options.train_frames or count,
+        root, options.name or root.absolute().name, options.fps or _rate(path, times), options.train_frames or count,
         (Motion("seq_000", path, tuple(views), pictures),), options.heldout,
         {"gravity": [0.0, -GRAVITY, 0.0], "floor": floor((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)), "free": True},
         files={DATA: path},

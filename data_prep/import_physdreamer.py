@@ -24,6 +24,7 @@ from data_prep.common.photos import list_images, natural
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, files_in, run_stage
 from data_prep.public.fields import check_name
+from data_prep.public.importing import train_command
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.files import write_json
 
@@ -269,7 +270,7 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
     if results["without_alpha"]:
         lines.append(f"no alpha    in {', '.join(results['without_alpha'])}: segment {out} next")
     else:
-        lines.append(f"next        gausim train data=object data.root={out}")
+        lines.append(f"next        {train_command(facts, out)}")
     return "\n".join(lines)
 
 

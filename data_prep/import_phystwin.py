@@ -99,7 +99,7 @@ def read_phystwin(root: Path, options: PhysTwinOptions) -> PublicObject:
     read = (META, POSES, FINAL, TRACKS, SPLIT, *(f"mask/mask_info_{i}.json" for i in range(len(views))))
     world = {"gravity": [0.0, 0.0, GRAVITY], "floor": floor((0.0, 0.0, 0.0), (0.0, 0.0, -1.0)), "grip": options.grip}
     return PublicObject(
-        root, options.name or root.name, options.fps or field(data, "fps", float, str(meta)),
+        root, options.name or root.absolute().name, options.fps or field(data, "fps", float, str(meta)),
         options.train_frames or _split(root / SPLIT, count), (Motion("seq_000", meta, views, pictures, hands, tracks),),
         options.heldout, world, cloud=_cloud(final), told={"notes": notes},
         files={name: root / name for name in read if (root / name).is_file()},
@@ -148,7 +148,7 @@ def _human(root: Path, given: Path | None) -> Path | None:
     """The folder of the human's masks, where there is one."""
     if given is not None and not given.is_dir():
         raise ConfigError(f"--human-masks {given}: no such folder.")
-    usual = root.absolute().parent.parent / HUMAN / root.name
+    usual = root.absolute().parent.parent / HUMAN / root.absolute().name
     return given or (usual if usual.is_dir() else None)
 
 

@@ -20,8 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from data_prep.capture.cameras.sources import fitted
 from data_prep.common.command import option
-from data_prep.common.photos import list_images, natural
+from data_prep.common.photos import list_images, natural, open_photo
 from data_prep.common.progress import Tick, silent
 from data_prep.public.fields import check_name, field, inside, lens, numbered, numbers, read_any_json, viewmat
 from data_prep.public.importing import ImportOptions, import_command, run_import
@@ -114,7 +115,8 @@ def read_synthetic(root: Path, options: SpringGausOptions) -> PublicObject:
     times = root / "frame.json"
     files = {CAMERAS: path, **({times.name: times} if times.is_file() else {})}
     return PublicObject(
-        root, options.name or root.name, options.fps or (_rate(times, count) if times.is_file() else SYNTHETIC_FPS),
+        root, options.name or root.absolute().name,
+        options.fps or (_rate(times, count) if times.is_file() else SYNTHETIC_FPS),
         options.train_frames or min(SYNTHETIC_SEEN, count),
         (Motion("seq_000", root, tuple(views), pictures),), options.heldout,
         {"gravity": [0.0, -GRAVITY, 0.0], "floor": floor((0.0, SYNTHETIC_FLOOR, 0.0), (0.0, 1.0, 0.0)), "free": True},
@@ -252,8 +254,7 @@ def _stills(root: Path, name: str, model: ColmapModel) -> tuple[tuple[View, Pict
         mask = root / "static" / "masks" / name / f"{stem}.png"
         photo = _photo(root / "static" / "images" / name, image.name)
         size = size_of(mask)
-        fitted = camera.scaled(size[0] / camera.width, size[1] / camera.height)
-        fx, fy, cx, cy = fitted.intrinsics
+        fx, fy, cx, cy = fitted(camera, open_photo(mask, mask.name)).intrinsics
         k = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
         view = View(check_name(stem, f"{model.path}: image '{image.name}'"), size, k, image.viewmat)
         shots.append((view, Picture((photo, mask), partial(_still, photo, mask, size))))

@@ -12,9 +12,11 @@ from data_prep.common.command import Options, add_options, chosen, headline, nam
 from data_prep.common.progress import Tick, silent
 from data_prep.common.stage import Stage, files_in, run_stage
 from data_prep.public.scene import PublicObject
-from data_prep.public.writer import ObjectWriter
+from data_prep.public.writer import POINTS, ObjectWriter
 
 PACKAGES = ("numpy", "opencv-python-headless", "scipy")
+# Predicted steps that training ends with unless it is told otherwise (conf/data/object.yaml).
+CURRICULUM = 15
 
 
 @dataclass(frozen=True)
@@ -104,4 +106,13 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
     ]
     lines += [f"{key:<11} {facts[key]}" for key in ("gravity", "floor", "free", "grip") if key in facts]
     lines += [f"{key:<11} {value}" for key, value in results.get("notes", {}).items()]
-    return "\n".join([*lines, f"next        gausim reconstruct {out}"])
+    start = f" --points {out / POINTS}" if results["points"] else ""
+    lines.append(f"next        gausim reconstruct {out}{start}")
+    return "\n".join([*lines, f"then        {train_command(facts, out)}"])
+
+
+def train_command(facts: Mapping[str, Any], out: Path) -> str:
+    """The command that trains on an object; a curriculum longer than its frames would be refused."""
+    steps = facts["train_frames"][1] - 1
+    shorter = f" data.curriculum.t_max={steps}" if steps < CURRICULUM else ""
+    return f"gausim train data=object data.root={out}{shorter} name={facts['name']}"

@@ -17,6 +17,8 @@ from data_prep.public.scene import Motion, Picture, PublicObject, View
 from gausim.core.errors import DataError
 from gausim.io.files import replacing, write_json
 
+POINTS = "points.npz"
+
 
 class ObjectWriter:
     """Writes one object; pictures that an interrupted attempt has written already stay."""
@@ -38,13 +40,14 @@ class ObjectWriter:
         self._truth()
         if found.cloud is not None:
             points, colors = found.cloud
-            write_npz(self._work / "points.npz", points=points.astype(np.float32), colors=colors)
+            write_npz(self._work / POINTS, points=points.astype(np.float32), colors=colors)
         facts = dataset_facts(found)
         write_json(self._work / "dataset.json", facts)
         if check:
             refuse_faults(self._work, out)
         frames = {motion.name: motion.count for motion in found.motions}
-        return {"facts": facts, "stills": stills, "sequences": frames, **found.told}
+        told = {"points": found.cloud is not None, **found.told}
+        return {"facts": facts, "stills": stills, "sequences": frames, **told}
 
     def _motion(self, motion: Motion) -> None:
         folder = self._work / "sequences" / motion.name

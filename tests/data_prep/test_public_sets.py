@@ -13,8 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 from helpers import public_sets
-from helpers.public_sets import FRAMES, Sample
+from helpers.public_sets import FRAMES, SEEN, Sample
 
 from data_prep import import_3dgsim, import_pacnerf, import_physdreamer, import_phystwin, import_springgaus
 from data_prep.import_3dgsim import GenesisOptions
@@ -23,6 +24,7 @@ from data_prep.import_physdreamer import PhysDreamerOptions
 from data_prep.import_phystwin import PhysTwinOptions, together
 from data_prep.import_springgaus import SpringGausOptions
 from data_prep.public import registration
+from data_prep.public.importing import CURRICULUM, train_command
 from data_prep.public.pictures import before_white
 from gausim.core import ConfigError, GausSimError
 from gausim.data.objects import ObjectData
@@ -148,7 +150,7 @@ def test_real_captures_are_registered_by_silhouettes(
     alpha = np.take_along_axis(stills.images[..., 3].numpy().reshape(14, -1), y * 108 + x, 1)
     assert (alpha > 127).mean() > 0.8  # points of the films, seen in the stills
     assert data.facts["gravity"] == [0, 0, 9.8] and data.facts["floor"]["normal"] == [0, 0, -1]
-    assert data.train_frames == range(14)
+    assert data.train_frames == range(SEEN)
     with pytest.raises(GausSimError, match=r"overlap those of seq_000's first frame by 0\.8.*--no-stills"):
         refused = SpringGausOptions(object="bun", turns=150, least_overlap=0.99)
         import_springgaus.import_springgaus(real.root, tmp_path / "no", refused)
@@ -188,7 +190,7 @@ def test_hands_of_phystwin(phystwin: Sample, tmp_path: Path) -> None:
     notes = results["objects"][phystwin.root.name]["notes"]
     assert notes["hands"] == "12 points, 6 + 6" and notes["tracks"].startswith("4 of 5 ")
     data = ObjectData(tmp_path / "out")
-    assert data.train_frames == range(14) and data.fps == 30 and "free" not in data.facts
+    assert data.train_frames == range(SEEN) and data.fps == 30 and "free" not in data.facts
     assert data.facts["grip"] == 0.04 and data.facts["gravity"] == [0, 0, 9.8]
     assert data.facts["floor"] == {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, -1.0]}
     check_views(data, phystwin)
@@ -245,7 +247,7 @@ def test_stills_and_a_film_of_physdreamer(physdreamer: Path, tmp_path: Path) -> 
     results = import_physdreamer.import_physdreamer(physdreamer, tmp_path / "out", options, video_masks=masks)[
         "results"
     ]
-    assert results["without_alpha"] == [] and results["stills"] == 3 and results["sequences"] == {"seq_000": 20}
+    assert results["without_alpha"] == [] and results["stills"] == 3 and results["sequences"] == {"seq_000": FRAMES}
     data = ObjectData(tmp_path / "out")
     assert (data.fps, data.views, data.train_frames) == (
         30,
@@ -264,6 +266,14 @@ def test_stills_and_a_film_of_physdreamer(physdreamer: Path, tmp_path: Path) -> 
     assert scene.simulated.tolist() == (z > 0.2).tolist() and scene.pinned.tolist() == ((z > 0.2) & (z < 0.5)).tolist()
     results = import_physdreamer.import_physdreamer(physdreamer, tmp_path / "bare", options)["results"]
     assert results["without_alpha"] == ["seq_000"]
+
+
+def test_the_command_that_trains_fits_the_frames() -> None:
+    with (Path(__file__).parents[2] / "conf" / "data" / "object.yaml").open() as file:
+        assert yaml.safe_load(file)["curriculum"]["t_max"] == CURRICULUM
+    long, short = ({"train_frames": [0, n], "name": "duck"} for n in (CURRICULUM + 1, CURRICULUM))
+    assert train_command(long, Path("out")) == "gausim train data=object data.root=out name=duck"
+    assert " data.curriculum.t_max=14 " in train_command(short, Path("out"))
 
 
 @dataclass(frozen=True)
@@ -337,11 +347,11 @@ SPRINGGAUS = (
     Damage("camera.json", put(0, "camera", to="camera_1"), "field 'camera' 'camera_1' stands twice"),
     Damage("camera.json", put(0, "camera", to="camera_9"), "camera_9", "camera_9"),
     Damage("camera_0/003.png", None, "frame 3 is missing", "camera_0"),
-    Damage("camera_2/019.png", None, "times of 20 frames, the folders have 19", "frame.json"),
+    Damage("camera_2/023.png", None, "times of 24 frames, the folders have 23", "frame.json"),
     Damage("camera_0/001.png", lambda pixels: pixels[..., :3], "no transparent pixel"),
     Damage("camera_0/001.png", narrow, "is 40x48"),
     Damage("frame.json", put(3, to={"003": 0.5}), "rise by equal steps"),
-    Damage("frame.json", drop(3), "times of 19 frames"),
+    Damage("frame.json", drop(3), "times of 23 frames"),
     Damage("frame.json", put(3, to={"003": "x"}), "expected 'float'"),
 )
 REAL_FILES = (
@@ -364,7 +374,7 @@ STILLS = (
     Damage("static/masks/bun/DSC003.png", None, "no such file"),
     Damage("static/images/bun/DSC003.JPG", None, "no such photo"),
     Damage("static/masks/bun/DSC003.png", black, "have no common body", "static/masks/bun"),
-    Damage("static/masks/bun/DSC003.png", narrow, "stills differ in size", "static/images/bun"),
+    Damage("static/masks/bun/DSC003.png", narrow, "another shape"),
     Damage("dynamic/videos_masks/C0733/100.png", black, "the mask is empty"),
 )
 PACNERF = (
@@ -373,8 +383,8 @@ PACNERF = (
     Damage("all_data.json", put(3, "file_path", to="./../../r_0_3.png"), "field 'file_path'"),
     Damage("all_data.json", put(3, "file_path", to="./data/r_0_2.png"), "stands twice"),
     Damage("all_data.json", put(3, "c2w", to=[[1, 0, 0, 0]]), "field 'c2w'"),
-    Damage("all_data.json", put(25, "c2w", 0, 3, to=lambda x: x + 0.1), "field 'c2w' differs"),
-    Damage("all_data.json", put(25, "intrinsic", 0, 0, to=70.0), "field 'intrinsic' differs"),
+    Damage("all_data.json", put(29, "c2w", 0, 3, to=lambda x: x + 0.1), "field 'c2w' differs"),
+    Damage("all_data.json", put(29, "intrinsic", 0, 0, to=70.0), "field 'intrinsic' differs"),
     Damage("all_data.json", put(25, "intrinsic", 0, 1, to=30.0), "field 'intrinsic'"),
     Damage("all_data.json", lambda data: [put("intrinsic", 0, 2, to=40.0)(d) for d in data], "picture of 80x64"),
     Damage("all_data.json", drop(3, "time"), "field 'time'"),
@@ -389,7 +399,7 @@ PACNERF = (
 PHYSTWIN = (
     Damage("metadata.json", drop("intrinsics"), "field 'intrinsics'"),
     Damage("metadata.json", put("intrinsics", 1, 1, 1, to=0), "field 'intrinsics'[1]"),
-    Damage("metadata.json", put("frame_num", to=21), "field 'frame_num' is 21", "color/0/20.png"),
+    Damage("metadata.json", put("frame_num", to=25), "field 'frame_num' is 25", "color/0/24.png"),
     Damage("metadata.json", put("frame_num", to=-1), "field 'frame_num'"),
     Damage("metadata.json", put("WH", to=[848, 480]), "field 'WH'"),
     Damage("calibrate.pkl", lambda data: data[:2], "list of 3 poses"),
@@ -402,9 +412,9 @@ PHYSTWIN = (
     Damage("final_data.pkl", put("controller_points", to=lambda x: x[1:]), "field 'controller_points'"),
     Damage("final_data.pkl", put("controller_points", 3, 0, 0, to=np.nan), "field 'controller_points'"),
     Damage("final_data.pkl", put("object_points", to=lambda x: x > 0), "field 'object_points'"),
-    Damage("gt_track_3d.pkl", lambda data: data[:, :, :2], "shape (20, points, 3)"),
+    Damage("gt_track_3d.pkl", lambda data: data[:, :, :2], "shape (24, points, 3)"),
     Damage("gt_track_3d.pkl", lambda data: data.tolist(), "got a list"),
-    Damage("split.json", put("test", to=[15, 20]), "'train' [0, n]"),
+    Damage("split.json", put("test", to=[15, 24]), "'train' [0, n]"),
     Damage("split.json", None, "no such file"),
     Damage("mask/mask_info_1.json", put("7", to="bear"), "expected one mask"),
     Damage(
@@ -419,7 +429,7 @@ PHYSTWIN = (
 )
 GENESIS = (
     Damage("0001/metadata.json", put("n_steps", to="many"), "field 'n_steps'"),
-    Damage("0001/metadata.json", put("n_steps", to=21), "rgb_0020.png", "0001"),
+    Damage("0001/metadata.json", put("n_steps", to=25), "rgb_0024.png", "0001"),
     Damage("0001/metadata.json", put("n_cams", to=4), "field 'cam_3'"),
     Damage("0001/metadata.json", put("file_path_template", to="cam_{cam_ix}/{n_step}"), "field 'file_path_template'"),
     Damage(
@@ -553,7 +563,7 @@ def test_options_that_do_not_suit_the_folder(
         (import_springgaus, springgaus.root, "--object bun", "--object"),
         (import_springgaus, real.root, "--object cat", "['bun']"),
         (import_springgaus, tmp_path, "", "camera.json"),
-        (import_springgaus, springgaus.root, "--train-frames 30", "20 frames, fewer than the 30"),
+        (import_springgaus, springgaus.root, "--train-frames 30", "24 frames, fewer than the 30"),
         (import_3dgsim, genesis.root, "", "--fps"),
         (import_3dgsim, tmp_path, "--fps 25", "metadata.json"),
         (import_pacnerf, tmp_path, "", "all_data.json"),
@@ -562,7 +572,7 @@ def test_options_that_do_not_suit_the_folder(
         (import_physdreamer, tmp_path, "", "no COLMAP model"),
         (import_physdreamer, physdreamer, "--view frame_9", "frame_00001"),
         (import_physdreamer, physdreamer, "", "--anchor"),
-        (import_physdreamer, physdreamer, "--train-frames 30", "20 frames, fewer than the 30"),
+        (import_physdreamer, physdreamer, "--train-frames 30", "24 frames, fewer than the 30"),
         (import_physdreamer, physdreamer, "--video-masks nowhere", "--video-masks"),
     )
     for module, root, line, told in lines:

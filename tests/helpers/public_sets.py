@@ -18,7 +18,8 @@ from data_prep.public.pictures import resized
 from helpers import colmap_files, toy_object
 
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
-FRAMES = 20
+# 70 % of the frames, which PhysTwin's cases train on.
+FRAMES, SEEN = 24, 16
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def write_springgaus(root: Path) -> Sample:
 def write_springgaus_real(root: Path, *, stills: int = 14) -> Sample:
     """Real captures of one object, `real_capture/`; the films' world is the stills' turned, scaled and moved."""
     body, name, down = dog(0.1), "bun", np.array([0.0, 0.0, 1.0])
-    dynamic = rig((0, 0, -0.25), (0, 0, -1), distance=0.7, size=(96, 54), focal=110)
+    dynamic = rig((0, 0, -0.22), (0, 0, -1), distance=0.75, size=(96, 54), focal=105)
     path = fall(body, (0, 0, -0.3), -down, 0.02, 1 / 120)
     turn, scale, shift = Rotation.from_rotvec([0.5, -1.9, 0.8]).as_matrix(), 0.4, np.array([0.3, -0.2, 0.1])
     # The stills' world: x_films = scale · turn x + shift.
@@ -248,7 +249,7 @@ def write_phystwin(root: Path) -> Sample:
             save(human / str(v) / "0" / f"{f}.png", hidden)
     dump(root / "metadata.json", {"intrinsics": [cameras.k.tolist()] * 3, "serial_numbers": ["a", "b", "c"], "fps": 30,
                                   "WH": [64, 36], "recording": {"0": 1}, "frame_num": FRAMES})  # fmt: skip
-    dump(root / "split.json", {"frame_len": FRAMES, "train": [0, 14], "test": [14, FRAMES]})
+    dump(root / "split.json", {"frame_len": FRAMES, "train": [0, SEEN], "test": [SEEN, FRAMES]})
     tracks = path[:, ::4].copy()
     tracks[5:7, 1] = np.nan
     final = {
@@ -295,7 +296,7 @@ def write_physdreamer(root: Path) -> toy_object.ToyObject:
     from gausim.io.ply import save_scene
 
     scene = toy_object.toy_scene()
-    toy = toy_object.ToyObject(root, scene)
+    toy = toy_object.ToyObject(root, scene, frames=FRAMES)
     views = toy.views
     cameras = {1: ("PINHOLE", 32, 32, [56.0, 56.0, 16.0, 16.0])}
     images = {i + 1: (f"frame_0000{i + 1}.png", 1, *colmap_pose(viewmat), [])
