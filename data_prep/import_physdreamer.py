@@ -151,15 +151,15 @@ def _films(folder: Path, posed: Mapping[str, Posed], options: PhysDreamerOptions
 def _pictures(found: _Capture) -> dict[str, Path]:
     """Photos, their masks and films, by name."""
     paths = [shot.photo.path for shot in found.posed.values()]
-    paths += [mask for mask in map(_mask_of, paths) if mask is not None]
+    paths += [mask for mask in (_still_mask(found.root, path) for path in paths) if mask is not None]
     for film in found.films:
         paths += list_images(film) if film.is_dir() else [film]
     return {path.relative_to(found.root).as_posix(): path for path in paths}
 
 
-def _mask_of(photo: Path) -> Path | None:
+def _still_mask(root: Path, photo: Path) -> Path | None:
     """The mask of a still, where there is one."""
-    path = photo.parent.parent / "masks" / f"{photo.stem}_mask.png"
+    path = root / "masks" / f"{photo.stem}_mask.png"
     return path if path.is_file() else None
 
 
@@ -169,9 +169,11 @@ def _make(
     from data_prep.capture.cameras.output import PosedWriter
     from data_prep.ready.parts import write_scene
 
+    stills = {shot.photo.path for shot in found.posed.values()}
+
     def mask_of(path: Path) -> Path | None:
-        if path.is_relative_to(found.root / "images"):
-            return _mask_of(path)
+        if path in stills:
+            return _still_mask(found.root, path)
         mask = masks / f"{path.stem}.png" if masks is not None else None
         if mask is not None and not mask.is_file():
             raise DataError(f"{mask}: no mask of the frame {path.name}. Restore it, or leave --video-masks out.")

@@ -34,6 +34,12 @@ def test_help_names_the_command(stage: str, capsys: pytest.CaptureFixture[str]) 
     assert f"usage: gausim prepare {stage} " in text and "(None)" not in text
 
 
+def test_names_may_have_hyphens(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="0"):
+        main(["prepare", "import-pacnerf", "--help"])
+    assert "all_data.json" in capsys.readouterr().out
+
+
 def test_stages_load_no_torch_before_they_work() -> None:
     code = f"import sys, {', '.join(f'data_prep.{stage}' for stage in STAGES)}; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)

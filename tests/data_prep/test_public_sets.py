@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -266,6 +267,33 @@ def test_stills_and_a_film_of_physdreamer(physdreamer: Path, tmp_path: Path) -> 
     assert scene.simulated.tolist() == (z > 0.2).tolist() and scene.pinned.tolist() == ((z > 0.2) & (z < 0.5)).tolist()
     results = import_physdreamer.import_physdreamer(physdreamer, tmp_path / "bare", options)["results"]
     assert results["without_alpha"] == ["seq_000"]
+
+
+def test_frames_in_place_of_a_film(physdreamer: Path, tmp_path: Path) -> None:
+    root = tmp_path / "hat"
+    shutil.copytree(physdreamer, root)
+    (root / "videos" / "frame_00002_poke.mp4").unlink()
+    for frame in range(4):
+        public_sets.save(root / "videos" / f"{frame}.png", np.full((32, 32, 3), 60 * frame, np.uint8))
+    run = partial(import_physdreamer.import_physdreamer, root, tmp_path / "out")
+    with pytest.raises(ConfigError, match="--view and --fps"):
+        run(PhysDreamerOptions(anchor=0.4))
+    results = run(PhysDreamerOptions(anchor=0.4, view="frame_00003", fps=25))["results"]
+    assert results["facts"]["views"] == ["frame_00003"] and results["facts"]["train_frames"] == [0, 4]
+    assert results["facts"]["fps"] == 25 and results["sequences"] == {"seq_000": 4}
+
+
+@pytest.mark.slow
+def test_a_body_that_turns_onto_itself_is_ambiguous(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in SMALL.items():
+        monkeypatch.setattr(registration, name, value)
+    plain = public_sets.bar()
+    plain.colors[:] = 150
+    monkeypatch.setattr(public_sets, "dog", lambda scale: plain)
+    sample = public_sets.write_springgaus_real(tmp_path / "real")
+    options = SpringGausOptions(object="bun", turns=150, least_overlap=0)
+    made = import_springgaus.import_springgaus(sample.root, tmp_path / "out", options)["results"]["objects"]["bun"]
+    assert made["notes"]["look at"].startswith("another turn")
 
 
 def test_the_command_that_trains_fits_the_frames() -> None:

@@ -234,7 +234,7 @@ def _public(folder: Path) -> Iterator[Reader]:
     """The public sets: what their importers read before they write."""
     root = folder / "public"
     public_sets.write_springgaus(root / "torus")
-    public_sets.write_springgaus_real(root / "real")
+    public_sets.write_springgaus_real(root / "real", stills=3)
     public_sets.write_pacnerf(root / "bird")
     public_sets.write_phystwin(root / "different_types" / "sloth")
     public_sets.write_3dgsim(root / "genesis")
