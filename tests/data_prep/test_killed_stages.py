@@ -57,12 +57,14 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
     save_scene(capture.toy.scene, folder / "rest" / "scene.ply")
     list(READY(folder))
     ROOM["write_photos"](folder / "room")
-    public_sets.write_springgaus(folder / "torus")
-    public_sets.write_springgaus_real(folder / "real")
-    public_sets.write_pacnerf(folder / "bird", kind="plate")
-    public_sets.write_phystwin(folder / "different_types" / "sloth")
-    public_sets.write_3dgsim(folder / "genesis", moved="0002")
-    public_sets.write_physdreamer(folder / "hat")
+    public = {
+        "import_springgaus": lambda: public_sets.write_springgaus(folder / "torus"),
+        "import_springgaus-real": lambda: public_sets.write_springgaus_real(folder / "real"),
+        "import_pacnerf": lambda: public_sets.write_pacnerf(folder / "bird", kind="plate"),
+        "import_phystwin": lambda: public_sets.write_phystwin(folder / "different_types" / "sloth"),
+        "import_3dgsim": lambda: public_sets.write_3dgsim(folder / "genesis", moved="0002"),
+        "import_physdreamer": lambda: public_sets.write_physdreamer(folder / "hat"),
+    }
     whole = {stage: folder / "whole" / stage for stage in STAGES}
     arguments = {
         "ingest": [capture.folder / "takes", "--sync", "offsets", "--offsets", "cam_0=0,cam_1=2f,cam_2=0"],
@@ -101,6 +103,8 @@ def jobs(run: Run, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[
             for other, result in whole.items():
                 if other != stage and other not in self and result in arguments[stage]:
                     self[other]
+            if stage in public:
+                public[stage]()
             argv = [str(value) for value in arguments[stage]]
             done = run(stage, [*argv, "--out", str(whole[stage])])
             assert done["status"] == 0, done["output"]
