@@ -254,7 +254,10 @@ def _stills(root: Path, name: str, model: ColmapModel) -> tuple[tuple[View, Pict
         mask = root / "static" / "masks" / name / f"{stem}.png"
         photo = _photo(root / "static" / "images" / name, image.name)
         size = size_of(mask)
-        fx, fy, cx, cy = fitted(camera, open_photo(mask, mask.name)).intrinsics
+        try:
+            fx, fy, cx, cy = fitted(camera, open_photo(mask, mask.name)).intrinsics
+        except DataError as error:
+            raise DataError(f"{colmap_files(model.path)['cameras']}: camera {image.camera}: {error}") from error
         k = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
         view = View(check_name(stem, f"{model.path}: image '{image.name}'"), size, k, image.viewmat)
         shots.append((view, Picture((photo, mask), partial(_still, photo, mask, size))))

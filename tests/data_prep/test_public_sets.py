@@ -578,6 +578,16 @@ def test_damaged_captures_of_physdreamer_are_refused(damage: Damage, physdreamer
     check_refused(physdreamer, damage, run, tmp_path)
 
 
+def test_two_sequences_of_one_name_are_refused(real: Sample, tmp_path: Path) -> None:
+    path = real.root / "dynamic" / "sequences" / "bun" / "00.json"
+    shutil.copyfile(path.with_name("0.json"), path)
+    try:
+        with pytest.raises(GausSimError, match="two sequences would get the name 'seq_000'"):
+            import_springgaus.import_springgaus(real.root, tmp_path / "out", REAL)
+    finally:
+        path.unlink()
+
+
 def test_options_that_do_not_suit_the_folder(
     springgaus: Sample,
     real: Sample,
