@@ -97,7 +97,8 @@ def read_phystwin(root: Path, options: PhysTwinOptions) -> PublicObject:
     if of:
         notes["tracks"] = f"{0 if tracks is None else tracks.shape[1]} of {of} labelled points are tracked throughout"
     read = (META, POSES, FINAL, TRACKS, SPLIT, *(f"mask/mask_info_{i}.json" for i in range(len(views))))
-    world = {"gravity": [0.0, 0.0, GRAVITY], "floor": floor((0.0, 0.0, 0.0), (0.0, 0.0, -1.0)), "grip": options.grip}
+    world = {"gravity": [0.0, 0.0, GRAVITY], "floor": floor((0.0, 0.0, 0.0), (0.0, 0.0, -1.0)), "grip": options.grip,
+             "object_diagonal": float(np.linalg.norm(np.ptp(final["object_points"][0], axis=0)))}  # fmt: skip
     return PublicObject(
         root, options.name or root.absolute().name, options.fps or field(data, "fps", float, str(meta)),
         options.train_frames or _split(root / SPLIT, count), (Motion("seq_000", meta, views, pictures, hands, tracks),),

@@ -92,14 +92,15 @@ class PublicObject:
         """Itself, or an error where its parts do not go together.
 
         Raises:
-            DataError: two sequences or stills have one name, cameras have different numbers of frames, or there are fewer
-            frames than are to be trained on.
+            DataError: two sequences or stills have one name, cameras have different numbers of frames, or there are
+                fewer frames than are to be trained on.
             ConfigError: held-out cameras are no part of the cameras.
         """
-        for what, names in (
-            ("sequences", [m.name for m in self.motions]),
-            ("stills", [v.name for v, _ in self.stills]),
-        ):
+        named = {
+            "sequences": [motion.name for motion in self.motions],
+            "stills": [view.name for view, _ in self.stills],
+        }
+        for what, names in named.items():
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:
                 raise DataError(f"{self.root}: two {what} would get the name '{twice[0]}'. Rename one of their files.")

@@ -194,6 +194,7 @@ def test_hands_of_phystwin(phystwin: Sample, tmp_path: Path) -> None:
     assert data.train_frames == range(SEEN) and data.fps == 30 and "free" not in data.facts
     assert data.facts["grip"] == 0.04 and data.facts["gravity"] == [0, 0, 9.8]
     assert data.facts["floor"] == {"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, -1.0]}
+    assert data.diagonal == pytest.approx(np.linalg.norm(np.ptp(phystwin.path[0], axis=0)))
     check_views(data, phystwin)
     with np.load(tmp_path / "out" / "sequences" / "seq_000" / "hands.npz") as hands:
         np.testing.assert_allclose(hands["points"], phystwin.more["hands"], atol=1e-6)
