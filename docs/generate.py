@@ -19,12 +19,19 @@ from mkdocs.structure.files import File, Files
 
 from gausim.cli.main import COMMANDS, command
 from gausim.cli.prepare import STAGES
-from gausim.compose.places import Place, read_places
+from gausim.compose.places import Place, option_of, read_places
 from gausim.compose.root import RootConfig, conf_dir
 from gausim.compose.schema import documented
 
 # Files of these groups set keys of any other group: one table each, of what they set.
-RECIPES = {"experiment": "Experiments", "ablation": "Ablations", "budget": "Budgets", "sweep": "Sweeps"}
+RECIPES = {
+    "experiment": "Experiments",
+    "protocol": "Protocols",
+    "method": "Methods of comparisons",
+    "ablation": "Ablations",
+    "budget": "Budgets",
+    "sweep": "Sweeps",
+}
 GROUPS = ("data", "model", "supervision", "loss", "optimizer", "render", "trainer", "logger", "callbacks", "paths")
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -53,7 +60,7 @@ def configuration() -> str:
         for path in sorted((conf_dir() / group).glob("*.yaml")):
             parts += _file(path, places.children.get(group, Place()))
     for group, title in RECIPES.items():
-        rows = [_recipe(path) for path in sorted((conf_dir() / group).glob("*.yaml"))]
+        rows = [_recipe(path) for path in sorted((conf_dir() / group).rglob("*.yaml"))]
         parts += [f"## {title}", *_table((f"`{group}=`", "what it does", "what it sets"), rows)]
     parts.append("## What files begin with")
     for path in sorted((conf_dir() / "base").glob("*.yaml")):
@@ -88,10 +95,11 @@ def _comments(path: Path) -> dict[str, str]:
 
 
 def _recipe(path: Path) -> tuple[str, str, str]:
-    node = yaml.safe_load(path.read_text()) or {}
-    node.pop(path.parent.name, None)
+    node, (group, name) = yaml.safe_load(path.read_text()) or {}, option_of(path)
+    if group in ("ablation", "experiment"):
+        node.pop(group, None)
     sets = [*_begins_with(node), *(f"`{key}={value}`" for key, value in _flat(node))]
-    return f"`{path.stem}`", _cell(_head(path)), "<br>".join(sets)
+    return f"`{name}`", _cell(_head(path)), "<br>".join(sets)
 
 
 def _begins_with(node: dict[str, Any]) -> list[str]:

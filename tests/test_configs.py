@@ -19,7 +19,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from gausim.compose import config as _config
 from gausim.compose import root as _conf
 from gausim.compose.config import check_targets, compose, instantiate, run_hydra
-from gausim.compose.places import more_settings, read_places
+from gausim.compose.places import more_settings, option_of, read_places
 from gausim.compose.root import conf_dir
 from gausim.compose.schema import training_schema
 from gausim.core.errors import ConfigError
@@ -34,12 +34,12 @@ OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1]
 # They set keys of other groups or of Hydra, and so build nothing of their own under their name.
 NOT_BUILT = ("hydra", "paths")
 # They change other groups under `@package _global_`: everything is built with them.
-GLOBAL = ("experiment", "ablation", "budget", "sweep")
+GLOBAL = ("experiment", "ablation", "budget", "sweep", "method", "protocol")
 SPECIAL = ("_target_", "_partial_", "_recursive_", "_convert_", "_args_")
 
 
 def compose_option(option: str) -> DictConfig:
-    group, _, name = option.rpartition("/")
+    group, name = option_of(conf_dir() / f"{option}.yaml")
     return compose("train", [f"{group}={name}"])
 
 

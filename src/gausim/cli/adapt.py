@@ -81,6 +81,7 @@ def _config(config: dict[str, Any], run: Path, arguments: argparse.Namespace) ->
         "scene": None,
         "masks": None,
         "selections": None,
+        "test": None,
         "sequences": arguments.sequences,
         "repeats": REPEATS,
         "batch_size": min(4, count) if count else config["data"].get("batch_size", 1),
@@ -139,4 +140,5 @@ def _roots(config: dict[str, Any], run: Path, stores: Sequence[str] | None) -> l
 def _entry(root: Path, trained: ObjectData) -> dict[str, Any]:
     paths = {"root": root, "scene": trained.scene_path, "masks": trained.masks_path}
     placed = {key: None if path is None else str(Path(path).resolve()) for key, path in paths.items()}
-    return {**placed, "selections": trained.selections or None}
+    test = trained.test if Path(root).resolve() == trained.root.resolve() else None  # it names sequences of that store
+    return {**placed, "selections": trained.selections or None, "test": test}

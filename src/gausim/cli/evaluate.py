@@ -8,10 +8,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.cli.arguments import add_data_option, command_parser
+from gausim.cli.arguments import add_data_option, command_parser, positive
 from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:
+    from gausim.cli.test_part import Chosen
     from gausim.compose.build import LoadedRun
     from gausim.data.objects import ObjectData
     from gausim.results.curves import ObjectCurves
@@ -28,6 +29,7 @@ def main(argv: list[str]) -> int:
     from rich.markdown import Markdown
 
     from gausim.cli.end import end, error_sentences
+    from gausim.cli.test_part import choose, look
     from gausim.compose.build import load_run
     from gausim.compose.data_paths import data_option
     from gausim.compose.predict import state_of
@@ -37,8 +39,14 @@ def main(argv: list[str]) -> int:
 
     run = load_run(arguments.run, data=data_option(arguments.data))
     facts = {"name": run.config.get("name"), "seed": run.config.get("seed"), "views": arguments.views, **state_of(run)}
-    results = _evaluate(run, arguments)
-    whole, folder = _folder(run, arguments)
+    chosen = choose(run, arguments)
+    if arguments.test:
+        facts |= look(run, arguments, chosen, facts)
+        run = load_run(arguments.run, data=data_option(arguments.data))  # now the test part is open
+    elif chosen.part:
+        facts |= {"part": chosen.part}
+    results = _evaluate(run, arguments, chosen)
+    whole, folder = _folder(run, arguments, chosen.part)
     summary = write_evaluation(folder, results, facts)
     drawn: list[str] = []
     for curves in results:
@@ -66,6 +74,9 @@ def _parser() -> argparse.ArgumentParser:
     add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
     add("--object", nargs="+", metavar="NAME", help="only these objects")
     add("--sequences", nargs="+", metavar="NAME", help="only these sequences (of every object)")
+    add("--test", action="store_true", help="look at the test part that the data declare; counted in evaluation/test.json")
+    add("--trials", type=positive, metavar="N", help="with --test: trials made of the method on the development part "
+        "(default: protocol.trials of the run)")  # fmt: skip
     add("--views", default="all", choices=("all", "train", "heldout"), help="which cameras (default: all)")
     add_data_option(parser)
     add("--out", metavar="DIR", type=Path, help="folder to write; default RUN/evaluation, or RUN/evaluation/partial "
@@ -80,20 +91,20 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _evaluate(run: LoadedRun, arguments: argparse.Namespace) -> list[ObjectCurves]:
+def _evaluate(run: LoadedRun, arguments: argparse.Namespace, chosen: Chosen) -> list[ObjectCurves]:
     from gausim.cli.bars import named_bar
     from gausim.compose.predict import TrainedPrediction, run_objects, scene_of
     from gausim.evaluation.evaluation import evaluate_object
 
-    items = run_objects(run, arguments.object)
-    with named_bar(sum(len(arguments.sequences or item.data.sequences) for item in items), "evaluate") as advance:
+    items = run_objects(run, list(chosen.sequences))
+    with named_bar(sum(map(len, chosen.sequences.values())), "evaluate") as advance:
         return [
             evaluate_object(
                 item.data,
                 scene_of(run, item),
                 {run.module.method_name: TrainedPrediction(run, item)},
                 run.renderer,
-                sequences=arguments.sequences,
+                sequences=chosen.sequences[item.data.name],
                 views=_views(item.data, arguments.views),
                 advance=advance,
             )
@@ -125,9 +136,11 @@ def _views(data: ObjectData, group: str) -> list[str]:
     return list(chosen)
 
 
-def _folder(run: LoadedRun, arguments: argparse.Namespace) -> tuple[bool, Path]:
+def _folder(run: LoadedRun, arguments: argparse.Namespace, part: str | None) -> tuple[bool, Path]:
     """Whether the evaluation covers the whole run (a partial one never overwrites it), and its folder."""
-    whole = run.run_dir / "evaluation"
+    from gausim.cli.test_part import home
+
+    whole = home(run.run_dir, part)
     partial = arguments.object or arguments.sequences or arguments.views != "all"
     folder = arguments.out or (whole / "partial" if partial else whole)
-    return folder == whole, folder
+    return folder == run.run_dir / "evaluation", folder

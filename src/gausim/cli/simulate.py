@@ -78,7 +78,6 @@ def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namesp
     from gausim.cli.end import error_sentences
     from gausim.cli.simulate_forces import write_trajectory
     from gausim.compose.predict import TrainedPrediction, scene_of, sequence_of
-    from gausim.data.records import SequenceRecord
     from gausim.evaluation.evaluation import evaluate_object
     from gausim.report.pictures.figures import error_figure
     from gausim.results.summary import summarise
@@ -95,7 +94,7 @@ def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namesp
             advance=advance,
         )  # fmt: skip
         for name in names:
-            record = SequenceRecord(sequence_of(item, name).root, views=item.data.views, fps=item.data.fps)
+            record = item.data.record(sequence_of(item, name).name)
             trajectory = predict(record, arguments.frames)
             error_figure(curves, folder / name / "errors.png", sequence=name)
             write_trajectory(run, item, name, trajectory, folder / name)

@@ -18,6 +18,7 @@ from gausim.data.pretraining import CorpusDataModule
 from gausim.losses.objective import Objective
 from gausim.runs.checkpoint import check_scenes, load_weights, read_checkpoint
 from gausim.runs.directory import RunDirectory
+from gausim.runs.names import TEST
 from gausim.training.fitted.fitting import StagedFit
 from gausim.training.fitted.stages import StagedCurriculum
 from gausim.training.method import SharedSimulator
@@ -50,15 +51,21 @@ class LoadedRun:
     run_dir: Path
 
 
-def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyDataModule]:
+def build(
+    cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True
+) -> tuple[GausSimModule, ReadyDataModule]:
     """Builds the module and the data of a training configuration.
+
+    Args:
+        cfg: the configuration.
+        sealed: refuse unseen frames and the true motion of the test part.
 
     Raises:
         GausSimError: a node is wrong, the model cannot be trained, or the data or a rest scene is missing or damaged.
     """
     config = cfg if isinstance(cfg, DictConfig) else OmegaConf.create(dict(cfg))
     if "method" in config.model:
-        return _build_fit(config)
+        return _build_fit(config, sealed)
     if "simulator" not in config.model or "initial_states" not in config.model:
         raise ConfigError(
             "model: expected the entries 'simulator' and 'initial_states' of a model that learns (gausim, "
@@ -66,6 +73,7 @@ def build(cfg: DictConfig | Mapping[str, Any]) -> tuple[GausSimModule, ReadyData
             f"{sorted(str(k) for k in config.model)}."
         )
     datamodule = instantiate(config.data)
+    datamodule.sealed = sealed
     objects = datamodule.objects
     scenes = [item.scene() for item in objects]
     model = instantiate(config.model.simulator, scenes=scenes, fps=[item.fps for item in objects])()
@@ -95,13 +103,14 @@ def _supervision(config: DictConfig, sources: Sources) -> Supervision | None:
     return made
 
 
-def _build_fit(config: DictConfig) -> tuple[GausSimModule, ReadyDataModule]:
+def _build_fit(config: DictConfig, sealed: bool) -> tuple[GausSimModule, ReadyDataModule]:
     """The module and data of a method that is fitted in stages; its plan sets T and the shows per epoch."""
     plan = instantiate(config.model.plan)
     seen = int(config.data.curriculum.t_max)
     curriculum = StagedCurriculum(t_start=1, t_max=seen, plan=plan)
     alone = config.data.batch_size or 1  # sequences are fitted independently
     datamodule = instantiate(config.data, curriculum=curriculum, repeats=plan.shows, batch_size=alone)
+    datamodule.sealed = sealed
     objects = datamodule.objects
     scenes = [item.scene() for item in objects]
     fitted = instantiate(
@@ -124,7 +133,7 @@ def _build_fit(config: DictConfig) -> tuple[GausSimModule, ReadyDataModule]:
 
 
 def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mapping[str, Any] | None = None) -> LoadedRun:
-    """Loads a run.
+    """Loads a run; its test part is sealed until `gausim evaluate --test` has looked at it.
 
     Args:
         run_dir: the run directory.
@@ -144,7 +153,7 @@ def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mappin
             f"{directory.path}: pretrained on a corpus of bodies, of which there are no videos. Start a training from "
             f"it: `gausim train experiment=finetune model=gausim init_from={directory.path} data.root=OBJECT`."
         )
-    module, datamodule = build(config)
+    module, datamodule = build(config, sealed=not (directory.path / TEST).is_file())
     check_scenes(loaded, module.simulator.scenes, str(directory.path / checkpoint))
     load_weights(module, loaded)
     module.take_notes(loaded)

@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -55,8 +56,16 @@ def choices() -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for path in sorted(conf_dir().rglob("*.yaml")):
         if path.parent != conf_dir() and path.parent.name != BASE:
-            found.setdefault(path.parent.relative_to(conf_dir()).as_posix(), []).append(path.stem)
+            group, name = option_of(path)
+            found.setdefault(group, []).append(name)
     return found
+
+
+def option_of(path: Path) -> tuple[str, str]:
+    """Group and name of a file in conf/: (experiment, tables/comparison); below hydra/ every folder is a group."""
+    *folders, name = path.relative_to(conf_dir()).with_suffix("").parts
+    depth = len(folders) if folders[:1] == ["hydra"] else 1
+    return "/".join(folders[:depth]), "/".join([*folders[depth:], name])
 
 
 def read_places() -> Place:

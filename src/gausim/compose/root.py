@@ -36,6 +36,19 @@ class SweepConfig:
 
 
 @dataclass
+class ProtocolConfig:
+    """Evaluation after training on data with a test part.
+
+    Attributes:
+        part: part that `evaluate=true` measures: `development` or `test`; null: data without a test part.
+        trials: trials that were made of the method on the development part, declared in every table of the test part.
+    """
+
+    part: str | None = None
+    trials: int | None = None
+
+
+@dataclass
 class RootConfig:
     """Schema of the root keys of a training configuration: a misspelt root key is an error.
 
@@ -53,6 +66,7 @@ class RootConfig:
         ablation: record of the chosen ablation.
         experiment: record of the chosen experiment.
         sweep: handling of existing runs by the jobs of a sweep.
+        protocol: evaluation after training on data with a test part.
         seed: seed of every random generator.
         init_from: run from which the network and its input statistics are copied; null: random initialisation.
         freeze: `network` freezes that network, so that only parameters of scenes are trained; `model` copies the whole
@@ -77,6 +91,7 @@ class RootConfig:
     ablation: Any = None
     experiment: Any = None
     sweep: SweepConfig = field(default_factory=SweepConfig)
+    protocol: ProtocolConfig = field(default_factory=ProtocolConfig)
     seed: int = 0
     init_from: str | None = None
     freeze: str | None = None

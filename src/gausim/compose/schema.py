@@ -14,7 +14,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 from omegaconf import MISSING
 
 from gausim.compose.places import Place, choices, read_places
-from gausim.compose.root import RootConfig, SweepConfig
+from gausim.compose.root import ProtocolConfig, RootConfig, SweepConfig
 
 Schema = dict[str, Any]
 
@@ -31,6 +31,8 @@ _SPECIAL: Schema = {
 _PLAIN = {bool: "boolean", int: "integer", float: "number", str: "string", type(None): "null", Path: "string"}
 # Keys with arbitrary content.
 _RECORDS = ("ablation", "experiment")
+# Root keys whose dataclass says everything.
+_PLAIN_NODES: dict[str, Any] = {"sweep": SweepConfig, "protocol": ProtocolConfig}
 # Mappings with arbitrary names, whose entries have targets.
 _NAMED = ("callbacks", "logger")
 
@@ -45,8 +47,9 @@ def training_schema() -> Schema:
     root, notes = read_places(), documented(RootConfig)
     properties: Schema = {"defaults": _defaults(), "hydra": {"type": "object"}}
     for entry in fields(RootConfig):
-        if entry.name == "sweep":
-            found = _closed({f.name: _leaf(bool) for f in fields(SweepConfig)})
+        if entry.name in _PLAIN_NODES:
+            node = _PLAIN_NODES[entry.name]
+            found = _closed({f.name: _leaf(_hint(f.type, vars(inspect.getmodule(node)))) for f in fields(node)})
         elif entry.name in _RECORDS:
             found = {"type": ["object", "null"]}
         elif entry.name in root.children and (root.children[entry.name].children or root.children[entry.name].targets):

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gausim.compose.config import compose_leniently, instantiate
-from gausim.compose.places import GLOBAL_PACKAGE, ROOT_FILE, choices
+from gausim.compose.places import GLOBAL_PACKAGE, ROOT_FILE, choices, option_of
 from gausim.compose.root import conf_dir
 from gausim.compose.schema import required_keys, training_schema
 from gausim.compose.targets import target_faults
@@ -75,7 +75,7 @@ def _group(path: Path) -> str | None:
     """The group of a file, by its folder in conf/ or its folder's name elsewhere; "" for conf/ itself."""
     folder = path.resolve().parent
     if folder.is_relative_to(conf_dir()):
-        return folder.relative_to(conf_dir()).as_posix().removeprefix(".")
+        return option_of(path.resolve())[0]
     return folder.name if folder.name in choices() else None
 
 
@@ -90,7 +90,8 @@ def _override(argument: str) -> str:
     """The argument as an override of `gausim train`; empty for conf/train.yaml itself."""
     path, experiments = Path(argument), choices()["experiment"]
     if path.is_file() and (group := _group(path)) is not None:
-        return f"{group}={path.stem}" if group else ""
+        own = path.resolve().is_relative_to(conf_dir())
+        return f"{group}={option_of(path.resolve())[1] if own else path.stem}" if group else ""
     if "=" in argument or argument.startswith("~"):
         return argument
     if argument in experiments:

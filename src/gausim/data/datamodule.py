@@ -28,6 +28,7 @@ class ReadyDataModule(LightningDataModule):
         repeats: how many times each sequence is shown per epoch.
         curriculum: predicted steps per epoch.
         has_videos: whether its objects were filmed.
+        sealed: whether unseen frames and the true motion of the test part are refused; set before objects are read.
     """
 
     has_videos = True
@@ -46,12 +47,13 @@ class ReadyDataModule(LightningDataModule):
         prefetch: int = 1,
         names: Sequence[str] | None = None,
         sequences: int | Sequence[str] | None = None,
+        test: Mapping[str, Any] | None = None,
     ) -> None:
         """Stores the settings; files are first read by :attr:`objects` or :meth:`setup`.
 
         Args:
             root: an object directory, a folder of such, or a list of either; an entry of the list may be a mapping
-                with ``root`` and separate ``scene``, ``masks`` and ``selections``.
+                with ``root`` and separate ``scene``, ``masks``, ``selections`` and ``test``.
             scene: PLY of the rest scene of a single object; ``scene.ply`` in its directory when None.
             masks: npz of its masks; beside the PLY when None.
             selections: replacements of its masks, see :func:`gausim.data.objects.select_masks`.
@@ -62,10 +64,13 @@ class ReadyDataModule(LightningDataModule):
             prefetch: number of batches read ahead, which stay in memory.
             names: names of the objects to use; all when None.
             sequences: number of sequences per object to use, or their names; all when None.
+            test: the test part of the objects (:class:`gausim.data.reserved.ReservedPart`), in addition to what their
+                ``dataset.json`` declares.
         """
         super().__init__()
         self._root, self._names, self._sequences = root, names, sequences
-        self._options: dict[str, Any] = {"scene": scene, "masks": masks, "selections": selections}
+        self._options: dict[str, Any] = {"scene": scene, "masks": masks, "selections": selections, "test": test}
+        self.sealed = True
         self._batch_size, self.repeats, self._seed, self._prefetch = batch_size, repeats, seed, prefetch
         self.curriculum = curriculum if curriculum is not None else Curriculum()
         self._sampler: SequenceBatchSampler | None = None
@@ -125,6 +130,12 @@ class ReadyDataModule(LightningDataModule):
                 f"{item.name}: {len(item.sequences)} sequences, {len(item.train_views)} views of "
                 f"{cameras.width}x{cameras.height}, {item.fps:g} fps"
             )
+            sealed = [record.name for record in item.sequences if record.limit is not None]
+            if sealed:
+                lines.append(
+                    f"{item.name}: {', '.join(sealed)} are of the test part: only images of frames 0.."
+                    f"{item.train_frames.stop - 1} are looked at, and their motion is not watched"
+                )
         return lines
 
     def training_sample(self, sequence: int, steps: int) -> SequenceSample:
@@ -178,7 +189,7 @@ class ReadyDataModule(LightningDataModule):
         roots = find_objects(root)
         if len(roots) > 1 and any(options[key] is not None for key in ("scene", "masks")):
             raise ConfigError(f"data.root: 'scene' and 'masks' are of one object, but {root} holds {len(roots)}.")
-        return [ObjectData(r, sequences=self._sequences, **options) for r in roots]
+        return [ObjectData(r, sequences=self._sequences, sealed=self.sealed, **options) for r in roots]
 
     def _check_curriculum(self) -> None:
         for item in self.objects:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gausim.core import ConfigError, DataError, GaussianScene
 from gausim.data.records import GroundTruth, SequenceRecord, Stills, read_array, read_stills
+from gausim.data.reserved import reserved_part
 from gausim.data.surroundings import gripped, read_surroundings
 from gausim.io.plain_json import checked
 from gausim.io.ply import MASK_NAMES, load_scene
@@ -48,6 +49,8 @@ class ObjectData:
         scene_path: the rest scene's PLY file.
         masks_path: its masks; None: the file beside the PLY.
         selections: replacements of masks.
+        test: the test part that was given, in addition to that of ``dataset.json``.
+        sealed: whether the test part shows no more than the images of its seen frames.
     """
 
     def __init__(
@@ -58,6 +61,8 @@ class ObjectData:
         scene: Path | str | None = None,
         masks: Path | str | None = None,
         selections: Mapping[str, Selection | str] | None = None,
+        test: Mapping[str, Any] | None = None,
+        sealed: bool = False,
     ) -> None:
         """Reads ``dataset.json``; all other files are read on first use.
 
@@ -67,6 +72,8 @@ class ObjectData:
             scene: PLY of the rest scene; ``root/scene.ply`` when None.
             masks: npz of its masks; beside the PLY when None.
             selections: replacements of its masks, see :func:`gausim.data.objects.select_masks`.
+            test: the test part, in addition to that of ``dataset.json`` (:class:`gausim.data.reserved.ReservedPart`).
+            sealed: refuse unseen frames and the true motion of the test part.
 
         Raises:
             DataError: ``dataset.json`` is missing or has a wrong field.
@@ -82,13 +89,36 @@ class ObjectData:
         self._check_views(path)
         self.scene_path = Path(scene) if scene is not None else self.root / "scene.ply"
         self.masks_path = Path(masks) if masks is not None else None
-        self._chosen, self.selections = sequences, dict(selections or {})
+        self._chosen, self.selections, self.test, self.sealed = sequences, dict(selections or {}), test, sealed
+        declared = (reserved_part(self.facts.get("test"), f"{path}: test"), reserved_part(test, "data.test"))
+        self._reserved = [part for part in declared if part is not None]
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Names of all sequences of the directory."""
+        folder = self.root / "sequences"
+        return sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
+
+    @cached_property
+    def test_part(self) -> frozenset[str]:
+        """Names of the sequences reserved for the final test, of all of the directory; empty where none is declared.
+
+        Raises:
+            DataError: a reserved sequence does not exist.
+        """
+        seed = self.facts.get("seed")
+        parts = [part.of(self.names, seed, str(self.root / "dataset.json")) for part in self._reserved]
+        return frozenset[str]().union(*parts)
+
+    def record(self, name: str) -> SequenceRecord:
+        """A new record of a sequence, which is freed with all that it has decoded."""
+        limit = self.train_frames.stop if self.sealed and name in self.test_part else None
+        return SequenceRecord(self.root / "sequences" / name, views=self.views, fps=self.fps, limit=limit)
 
     @cached_property
     def sequences(self) -> list[SequenceRecord]:
         """The object's sequences in the order of their names."""
-        folder = self.root / "sequences"
-        found = sorted(p.name for p in folder.iterdir() if p.is_dir()) if folder.is_dir() else []
+        folder, found = self.root / "sequences", self.names
         chosen = found
         if isinstance(self._chosen, int):
             chosen = found[: self._chosen]
@@ -101,7 +131,7 @@ class ObjectData:
                 f"{folder}: sequences {self._chosen if self._chosen is not None else 'of any name'} "
                 f"asked for, it has {len(found)}: {found}."
             )
-        records = [SequenceRecord(folder / name, views=self.views, fps=self.fps) for name in chosen]
+        records = [self.record(name) for name in chosen]
         for record in records:
             if record.count < self.train_frames.stop:
                 raise DataError(

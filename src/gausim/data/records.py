@@ -70,20 +70,26 @@ class SequenceRecord:
         fps: frames per second.
         hands: path of the hands that move the pins; None without hands.
         holds: points of the hands at frame 0 (C, 3) and the hand of each (C,); None without hands.
+        limit: of a sealed sequence of the test part, the number of frames that may be read; None: all.
     """
 
-    def __init__(self, root: Path, *, views: Sequence[str], fps: float) -> None:
+    def __init__(self, root: Path, *, views: Sequence[str], fps: float, limit: int | None = None) -> None:
         """Reads and checks ``transforms.json``, or ``frames.json`` of packed frames; but no image.
 
         Raises:
             DataError: a view or a frame is missing, or a camera moves.
         """
-        self.root, self.name, self.views, self.fps = root, root.name, tuple(views), fps
+        self.root, self.name, self.views, self.fps, self.limit = root, root.name, tuple(views), fps, limit
         self._source = open_frames(root, self.views, fps)
         self.count, self.cameras = self._source.count, self._source.cameras
         found = read_hands(root, self.count)
         self.hands: HandPath | None = None if found is None else found[0]
         self.holds: tuple[Tensor, Tensor] | None = None if found is None else found[1:]
+
+    @property
+    def visible(self) -> int:
+        """Number of frames that may be read."""
+        return self.count if self.limit is None else min(self.count, self.limit)
 
     def camera_indices(self, views: Sequence[str] | None = None) -> list[int]:
         """Indices of these views in :attr:`views` (all when None), or :class:`DataError`."""
@@ -100,10 +106,13 @@ class SequenceRecord:
         """Straight-alpha RGBA of these frames and views.
 
         Raises:
-            DataError: a frame or view does not exist, or an image is missing or malformed.
+            DataError: a frame or view does not exist, an image is missing or malformed, or the frame is an unseen one
+                of the sealed test part.
         """
         if len(frames) == 0 or frames[0] < 0 or frames[-1] >= self.count:
             raise DataError(f"{self.root}: frames {frames} asked for, it has frames 0..{self.count - 1}.")
+        if frames[-1] >= self.visible:
+            raise DataError(f"{self.root}: frames {frames} asked for, but {self._sealed()}")
         return self._source.read(frames, self.camera_indices(views))
 
     def absent(self) -> list[Path]:
@@ -115,6 +124,8 @@ class SequenceRecord:
         path = self.root / "ground_truth.npz"
         if rest is None or not path.is_file():
             return None
+        if self.limit is not None:
+            raise DataError(f"{path}: true motion asked for, but {self._sealed()}")
         displacement = torch.from_numpy(read_array(path, "displacement").astype(np.float32))
         if displacement.shape != (self.count, *rest.shape) or not torch.isfinite(displacement).all():
             raise DataError(
@@ -122,6 +133,12 @@ class SequenceRecord:
                 f"got {tuple(displacement.shape)}. Re-export the true motion."
             )
         return GroundTruth(rest, rest + displacement)
+
+    def _sealed(self) -> str:
+        return (
+            f"the sequence belongs to the test part, of which only the images of frames 0..{self.visible - 1} are shown "
+            "until `gausim evaluate RUN --test` has looked. Use sequences of the development part."
+        )
 
 
 def read_array(path: Path, field: str) -> np.ndarray:

@@ -108,8 +108,8 @@ def gather(data: ObjectData, scene: GaussianScene | None) -> Evidence:
     chosen = [name for name in names if name in watched_names or name in first_names]
     for name in with_bar(chosen, "frames"):
         # A new record, because those of data.sequences keep all decoded images.
-        record = SequenceRecord(data.root / "sequences" / name, views=data.views, fps=data.fps)
-        frames = min(record.count, WATCHED_FRAMES) if name in watched_names else 1
+        record = data.record(name)
+        frames = min(record.visible, WATCHED_FRAMES) if name in watched_names else 1
         item, scale = _reduced(record, frames), _factor(record.cameras)
         watched += [item] if name in watched_names else []
         first.append(Watched(item.name, item.cameras, item.rgb[:1], item.alpha[:1]))

@@ -124,7 +124,7 @@ def evaluate_object(
     pictures = PictureRecorder(data, records[0].name, measure.views)
     for record in records:
         # A separate record, so that its decoded frames are freed with it.
-        fresh = SequenceRecord(record.root, views=record.views, fps=record.fps)
+        fresh = data.record(record.name)
         results.append(measure.sequence(fresh, methods, references, pictures if record is records[0] else None))
         if advance is not None:
             advance(record.name)
@@ -168,7 +168,8 @@ def _chosen(data: ObjectData, names: Sequence[str] | None) -> list[SequenceRecor
 
 def _linear_references(data: ObjectData) -> dict[str, LinearAR2]:
     """Linear AR(2) about the rest state, fitted to the seen frames of every sequence whose truth is known."""
-    truths = [t for t in (data.ground_truth(s) for s in data.sequences) if t is not None]
+    shown = [record for record in data.sequences if record.limit is None]
+    truths = [t for t in (data.ground_truth(record) for record in shown) if t is not None]
     seen = [(t.positions - t.rest)[: data.train_frames.stop] for t in truths]
     if not seen or min(len(d) for d in seen) < 3:
         return {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import Any
 
@@ -122,7 +122,8 @@ def _opening(study: Study, name: str, group: Group, run: RunRecord, *, pictures:
 def first_table(study: Study, group: Group, name: str) -> Table:
     """The table of a first screen: frames and views of a single row, else all rows on unseen frames."""
     rivals = [g for g in study.groups if name in g.objects]
-    return _own_table(study, group, name) if len(rivals) == 1 else _comparison(study, rivals, name)
+    table = _own_table(study, group, name) if len(rivals) == 1 else _comparison(study, rivals, name)
+    return replace(table, title=f"{table.title} {study.test}") if study.test else table
 
 
 def _own_table(study: Study, group: Group, name: str) -> Table:

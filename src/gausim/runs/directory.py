@@ -22,7 +22,7 @@ from gausim.io.files import remove_leftovers, write_durably
 from gausim.runs.checkpoint import BEFORE_THE_END, PREVIOUS_CHECKPOINT, check_resumable
 from gausim.runs.defaults import with_defaults
 from gausim.runs.files import sole_writer, unwritable
-from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT, MOTION
+from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT, MOTION, TEST
 
 from gausim.runs.names import MLFLOW_ID, WANDB_ID  # isort: skip
 from gausim.runs.renamed import with_present_names
@@ -33,7 +33,7 @@ FETCHED = "FETCHED"  # source of a directory made by `gausim fetch`
 DAMAGED_CHECKPOINT = "last.damaged.ckpt"
 # Keys that may differ when a run is resumed: paths, display and hardware, which do not change the learned weights.
 FREE_KEYS = (
-    "paths", "logger", "callbacks", "sweep", "ablation", "experiment", "task_name", "doctor", "evaluate",
+    "paths", "logger", "callbacks", "sweep", "ablation", "experiment", "protocol", "task_name", "doctor", "evaluate",
     "trainer.threads", "render.threads",
     "trainer.accelerator", "trainer.devices", "trainer.num_nodes", "trainer.timeout_minutes",
     "trainer.log_every_n_steps", "trainer.progress", "overwrite",
@@ -252,8 +252,10 @@ class RunDirectory:
         return None
 
     def awaits_evaluation(self, config: Mapping[str, Any]) -> bool:
-        """Whether a run of equal configuration is finished here, but not evaluated."""
+        """Whether a run of equal configuration is finished here, but not evaluated (on the part of its protocol)."""
         finished, measured = self.path / FINISHED, self.path / EVALUATION
+        if dict(config.get("protocol") or {}).get("part") == "test":
+            measured = self.path / TEST
         if not self.is_finished or self.was_pruned or changed_keys(self.config(), config):
             return False
         return not measured.is_file() or measured.stat().st_mtime < finished.stat().st_mtime

@@ -34,8 +34,8 @@ class Films:
         self.views: tuple[str, ...] = tuple(next(iter(self._records.values())).views)
 
     def truth(self, sequence: str, view: str, number: int) -> UInt8[np.ndarray, "H W 3"] | None:
-        """The recorded frame on black; None after the end of the recording."""
-        return self._decoded(sequence, view, number) if number < self._records[sequence].count else None
+        """The recorded frame on black; None after the end of the recording, or of what a sealed test part shows."""
+        return self._decoded(sequence, view, number) if number < self._records[sequence].visible else None
 
     def _decode(self, sequence: str, view: str, number: int) -> np.ndarray:
         rgb, _ = composite(self._records[sequence].frames(range(number, number + 1), [view])[:, 0])

@@ -235,6 +235,10 @@ class MaterialPoints(Fitted):
         """Young's modulus of the particles [simulation units]."""
         raise NotImplementedError
 
+    def kept(self, scene_id: int) -> Float[Tensor, ""] | None:
+        """Fraction of the velocity that fitted damping leaves in a frame; None without it."""
+        return None
+
     def _body(self, scene_id: int, driven: Driven) -> Body:
         scene, domain = self.scenes[scene_id], self.domain
         settings, grid = domain.settings, domain.grid_of(scene)
@@ -284,8 +288,10 @@ class MaterialPoints(Fitted):
             DivergenceError: a particle left the domain or is not finite.
         """
         scene_id = self.scene_of_sequence[state.sequence_id]
-        body = self.body(scene_id)
-        particles = body.solver.advance(ParticleState(*state.inner), state.frame, young_modulus=self.modulus(scene_id))
+        body, particles, kept = self.body(scene_id), ParticleState(*state.inner), self.kept(scene_id)
+        if kept is not None:
+            particles = replace(particles, velocities=kept * particles.velocities, affine=kept * particles.affine)
+        particles = body.solver.advance(particles, state.frame, young_modulus=self.modulus(scene_id))
         x = body.mapping.to_scene(particles.positions)
         return FittedState(
             state.sequence_id,

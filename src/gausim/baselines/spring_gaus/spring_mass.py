@@ -14,7 +14,7 @@ from typing import Unpack
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import eigsh
 from torch import Tensor, nn
 from torch.nn import Parameter
@@ -207,8 +207,8 @@ class SpringMass(AnchoredMotion):
         }
 
 
-def slowest_vibration(net: Net, anchors: Anchors, kappa: Float[Tensor, " E"]) -> float:
-    """Squared angular frequency of the slowest vibration about rest [1 / frames^2], without rigid motions."""
+def stiffness_matrix(net: Net, anchors: Anchors, kappa: Float[Tensor, " E"]) -> csc_matrix:
+    """Stiffness of the free anchors' coordinates about rest [1 / frames^2], in the order of the anchors."""
     d = ((anchors.rest[net.second] - anchors.rest[net.first]) / net.length[:, None]).double()
     blocks = (kappa.double()[:, None, None] * d[:, :, None] * d[:, None, :]).numpy()
     rows, columns, values = [], [], []
@@ -221,7 +221,12 @@ def slowest_vibration(net: Net, anchors: Anchors, kappa: Float[Tensor, " E"]) ->
     size = 3 * len(anchors.rest)
     whole = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), (size, size)).tocsc()
     free = np.repeat(~anchors.pinned.numpy(), 3)
-    stiff = whole[free][:, free]
+    return whole[free][:, free]
+
+
+def slowest_vibration(net: Net, anchors: Anchors, kappa: Float[Tensor, " E"]) -> float:
+    """Squared angular frequency of the slowest vibration about rest [1 / frames^2], without rigid motions."""
+    stiff = stiffness_matrix(net, anchors, kappa)
     largest = float(abs(stiff).sum(0).max())
     count = min(7, stiff.shape[0] - 1)  # six of them may be rigid
     start = np.ones(stiff.shape[0])  # a random vector would make runs differ

@@ -23,7 +23,7 @@ from gausim.runs.renamed import with_present_names
 _TRACES = (FINISHED, FAILED, EPOCHS, LAST_CHECKPOINT)
 _KEYS_OF_A_RUN = {"model", "data", "seed"}
 # Keys without an effect on the result, and those of seeds.
-_FREE = ("paths", "logger", "callbacks", "sweep", "task_name", "evaluate", "seed", "data.seed", "trainer")
+_FREE = ("paths", "logger", "callbacks", "sweep", "protocol", "task_name", "evaluate", "seed", "data.seed", "trainer")
 _DIGITS = 12  # of hashes and commits
 _HYDRA = ".hydra"  # Hydra's folder, also of a job that did not start a run
 
@@ -80,6 +80,12 @@ class RunRecord:
         """Epoch and updates of the evaluated checkpoint, or ``?``."""
         state = (self.summary or {}).get("run", {})
         return "?" if state.get("epoch") is None else f"epoch {state['epoch']}, {state.get('updates')} updates"
+
+    @property
+    def part(self) -> tuple[str | None, Any, Any]:
+        """Evaluated part of the data (None: no test part is declared), declared trials, and looks at the test part."""
+        state = (self.summary or {}).get("run", {})
+        return state.get("part"), state.get("trials"), state.get("looks")
 
     @property
     def commit(self) -> str:

@@ -17,7 +17,7 @@ from gausim.results.table import footnotes
 FULL = "full"
 NOT_MEASURED = "not measured"
 # Settings that select the object of a run.
-_WHICH_OBJECT = ("data.root", "data.names", "data.scene", "data.masks", "data.selections")
+_WHICH_OBJECT = ("data.root", "data.names", "data.scene", "data.masks", "data.selections", "data.test")
 # The paper's order of rows and columns; others follow.
 _ORDER = ("jointly", "w/o mass", "w/o momentum", "w/o hierarchy")
 # Largest number of differing settings in a row's name.
@@ -103,6 +103,7 @@ class Study:
     groups: tuple[Group, ...]  # rows of the tables
     objects: tuple[str, ...]  # columns, those with numbers first
     notes: tuple[str, ...]  # notes on the reliability of the tables
+    test: str = ""  # what every table says where figures are of the test part
 
     def splits(self, name: str) -> dict[str, Sequence[int]]:
         """Splits of an object's frames, from its first evaluated run."""
@@ -135,7 +136,7 @@ def make_study(runs: Sequence[RunRecord]) -> Study:
     # A dictionary keeps the order and removes duplicates.
     known = dict.fromkeys(o for g in groups for run in g.evaluated for o in run.objects)
     every = known | dict.fromkeys(o for g in groups for o in g.objects)
-    return Study(tuple(runs), tuple(groups), tuple(every), tuple(_notes(groups)))
+    return Study(tuple(runs), tuple(groups), tuple(every), tuple(_notes(groups)), _test_part(groups))
 
 
 def _rows(members: Sequence[tuple[RunRecord, ...]], runs: Sequence[RunRecord]) -> list[About]:
@@ -155,8 +156,14 @@ def _rows(members: Sequence[tuple[RunRecord, ...]], runs: Sequence[RunRecord]) -
 def _continues(row: About, names: tuple[str, ...], run: RunRecord) -> bool:
     """Whether a run on one object belongs to a row of single objects: another object, other settings equal."""
     first = next(iter(row.values()))[0]
-    settings, own = (r.settings_besides(_WHICH_OBJECT) for r in (first, run))
+    settings, own = (_besides_object(r) for r in (first, run))
     return names not in row and all(len(other) == 1 for other in row) and bool(run.config) and settings == own
+
+
+def _besides_object(run: RunRecord) -> dict[str, str]:
+    """The settings that do not select the object: names of sequences do, their number does not."""
+    found = run.settings_besides(_WHICH_OBJECT)
+    return {k: v for k, v in found.items() if k != "data.sequences" or not v.startswith("[")}
 
 
 def _place(variation: str) -> list[int]:
@@ -291,6 +298,30 @@ def _notes(groups: Sequence[Group]) -> list[str]:
         if missing and group.evaluated:
             notes.append(f"{group.label}: {missing} of {len(group.runs)} runs have no numbers.")
     return notes
+
+
+def _test_part(groups: Sequence[Group]) -> str:
+    """A sentence on the test part with trials and looks of every row; empty where no figure is of a test part."""
+    told, others = [], []
+    for group in groups:
+        facts = [run.part for run in group.evaluated]
+        tested = [(trials, looks) for part, trials, looks in facts if part == "test"]
+        if tested:
+            trials, looks = (_range([pair[i] for pair in tested]) for i in (0, 1))
+            told.append(f"{group.label}: {trials} trials, {looks} look{'' if looks == '1' else 's'}")
+        others += [group.label] if len(tested) < len(facts) else []
+    if not told:
+        return ""
+    more = f" Not of a test part: {', '.join(others)}." if others else ""
+    return (
+        "Figures of the test part, on which nothing was tuned; declared trials on the development part and looks at the "
+        f"test part: {'; '.join(told)}.{more}"
+    )
+
+
+def _range(values: Sequence[Any]) -> str:
+    known = sorted({str(v) for v in values})
+    return known[0] if len(known) == 1 else f"{known[0]} to {known[-1]}"
 
 
 def cell(group: Group, name: str, split: str, views: str, metric: str, *, row: str | None = None) -> Cell:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from statistics import fmean
 from typing import Any
 
@@ -48,7 +49,8 @@ def make_sheets(study: Study) -> list[Sheet]:
     first = [found.pop((metric, "train")) for metric in paper.TABLES]
     sheets = [*first, *ablation_sheets(study), efficiency_sheet(study), *found.values()]
     sheets += [*bounce_sheets(study), *horizon_sheets(study), *diagnosis_sheets(study), contrast_sheet(study)]
-    return [sheet for sheet in sheets if sheet is not None]
+    made = [sheet for sheet in sheets if sheet is not None]
+    return [replace(sheet, caption=f"{sheet.caption} {study.test}") for sheet in made] if study.test else made
 
 
 def ablation_sheets(study: Study) -> list[Sheet]:

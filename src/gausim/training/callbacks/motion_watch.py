@@ -31,7 +31,7 @@ LEVELS = 3
 class MotionWatch(Callback):
     """Predicts the first training sequences of every object whose true motion is known, and measures the errors.
 
-    It uses unseen frames, as evaluation does, without an effect on training: ``gap`` is the generalisation gap, the
+    It uses unseen frames, as evaluation does, without an effect on training, and leaves the test part out. ``gap`` is the generalisation gap, the
     error on unseen frames less that on seen frames, both over the static prediction's. Rows go to ``motion.csv`` of the
     run, means over objects to every logger.
     """
@@ -92,7 +92,8 @@ class MotionWatch(Callback):
             return
         scene = module.simulator.scenes[scene_id]
         attached = attach_points(scene, points)
-        for number, record in enumerate(item.sequences[: self._sequences]):
+        shown = [(number, record) for number, record in enumerate(item.sequences) if _is_shown(record)]
+        for number, record in shown[: self._sequences]:
             truth = item.ground_truth(record)
             if truth is None:
                 continue
@@ -102,6 +103,11 @@ class MotionWatch(Callback):
                 module.print(f"motion of {item.name}/{record.name} is not told: {error}")
                 continue
             yield truth, made.carry(truth.rest, attached, scene.means).to(truth.positions), attached
+
+
+def _is_shown(record: object) -> bool:
+    """Whether unseen frames of a sequence may be looked at: not those of the test part."""
+    return getattr(record, "limit", None) is None
 
 
 def figures(

@@ -1,0 +1,111 @@
+"""The development and the test part of a run's data, in `gausim evaluate`."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gausim.core.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from gausim.compose.build import LoadedRun
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Sequences to evaluate.
+
+    Attributes:
+        part: ``development`` or ``test``; None where the data declare no test part.
+        sequences: their names by object.
+    """
+
+    part: str | None
+    sequences: Mapping[str, list[str]]
+
+
+def choose(run: LoadedRun, arguments: argparse.Namespace) -> Chosen:
+    """The sequences that are asked for, of one part.
+
+    Raises:
+        ConfigError: no sequence belongs to the part, or ``--test`` or ``--trials`` does not apply.
+        DataError: an object or sequence does not exist, or a sequence belongs to the other part.
+    """
+    from gausim.compose.predict import run_objects, sequence_of
+    from gausim.results.looks import DEVELOPMENT, TEST_PART
+
+    items = run_objects(run, arguments.object)
+    declared = any({r.name for r in item.data.sequences} & item.data.test_part for item in items)
+    if not declared and (arguments.test or arguments.trials):
+        raise ConfigError(
+            f"--test, --trials: {run.run_dir} was trained on data without a test part. Leave the options out, or "
+            "declare one (field 'test' of dataset.json, or data.test)."
+        )
+    if arguments.trials and not arguments.test:
+        raise ConfigError("--trials: declares the trials before a look at the test part; give --test with it.")
+    found = {}
+    for item in items:
+        names = arguments.sequences or [record.name for record in item.data.sequences]
+        own = [sequence_of(item, name).name for name in names]
+        fitting = [name for name in own if (name in item.data.test_part) == arguments.test]
+        if arguments.sequences and len(fitting) < len(own):
+            other = [name for name in own if name not in fitting]
+            part, how = ("development", "without") if arguments.test else ("test", "with")
+            raise DataError(f"{item.data.root}: {other} belong to the {part} part, which is evaluated {how} --test.")
+        if fitting:
+            found[item.data.name] = fitting
+    if not found:
+        raise ConfigError(
+            f"{run.run_dir}: every sequence of it belongs to the test part. When all decisions are made, look with "
+            f"`gausim evaluate {run.run_dir} --test --trials N`, N: the trials made on the development part."
+            if not arguments.test
+            else f"{run.run_dir}: no sequence of the chosen objects belongs to the test part. Leave --test out."
+        )
+    return Chosen((TEST_PART if arguments.test else DEVELOPMENT) if declared else None, found)
+
+
+def look(run: LoadedRun, arguments: argparse.Namespace, chosen: Chosen, state: Mapping[str, Any]) -> dict[str, Any]:
+    """Records a look at the test part; returns what the summary says of it.
+
+    Raises:
+        ConfigError: the number of trials is not declared.
+    """
+    from gausim.results.looks import record_look
+    from gausim.runs.names import TEST
+    from gausim.runs.provenance import code_provenance
+
+    trials = arguments.trials or (run.config.get("protocol") or {}).get("trials")
+    if not trials:
+        raise ConfigError(
+            "--test: expected the number of trials that were made of the method on the development part. Declare it "
+            "with --trials N, or train with protocol.trials=N."
+        )
+    path, development = run.run_dir / TEST, run.run_dir / "evaluation" / "development"
+    if not path.is_file():
+        _move(run.run_dir / "evaluation", development)
+    made = record_look(
+        path, trials=trials, provenance=code_provenance(), state=state, sequences=dict(chosen.sequences)
+    )
+    again = f", look {made.looks}" if made.looks > 1 else ""
+    print(f"test part: {trials} trials declared{again}; recorded in {path}")
+    return {"part": chosen.part, "trials": trials, "looks": made.looks}
+
+
+def home(run_dir: Path, part: str | None) -> Path:
+    """Folder of a whole evaluation: that of the development part makes room for the test part once it was looked at."""
+    from gausim.results.looks import DEVELOPMENT
+    from gausim.runs.names import TEST
+
+    folder = run_dir / "evaluation"
+    return folder / DEVELOPMENT if part == DEVELOPMENT and (run_dir / TEST).is_file() else folder
+
+
+def _move(folder: Path, target: Path) -> None:
+    """Moves the files of an earlier evaluation of the development part."""
+    if (folder / "metrics.json").is_file():
+        target.mkdir(parents=True, exist_ok=True)
+        for path in sorted(p for p in folder.iterdir() if p.is_file()):
+            path.replace(target / path.name)
