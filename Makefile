@@ -20,7 +20,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 # Each process begins with one stretch of the files and then takes from the others, so that few files are set up twice.
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: help install test test-slow test-types fuzz test-notebooks docs lint format data demo dataset train evaluate simulate report benchmark clean
+.PHONY: help install test test-slow test-types fuzz test-notebooks docs results lint format data demo dataset train evaluate simulate report benchmark clean
 
 help: ## Show this text
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-14s %s\n", $$1, $$2}'
@@ -50,9 +50,12 @@ test-notebooks: install ## Execute the notebooks on the embedded synthetic data
 fuzz: install ## Feed 20,000 damaged files to the readers: make fuzz ARGS="--count 1000 --seed 7"
 	PYTHONPATH=.:tests $(ONE_THREAD) $(BIN)/python tests/fuzz/run.py $(ARGS)
 
-docs: install ## Build the documentation into site/ (serve it: .venv/bin/mkdocs serve)
+docs: install results ## Build the documentation into site/ (serve it: .venv/bin/mkdocs serve)
 	$(BIN)/python -c "import material" 2>/dev/null || $(BIN)/python -m pip install -q -c constraints.txt -e ".[docs]"
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+results: install ## Make docs/results.md from its records (docs/results/, which `gausim report DIR --record` writes)
+	$(BIN)/gausim report --page docs/results.md
 
 lint: install ## Check style, formatting, types, import directions and declared dependencies
 	$(BIN)/ruff check .

@@ -56,7 +56,7 @@ class LinearTracks(AnchoredMotion):
                 "model.method: expected neighbours, basis, modes >= 1 and data.curriculum.t_max >= 2, got "
                 f"{neighbours}, {basis}, {modes} and {self.seen}."
             )
-        self.modes = modes
+        self.modes, self.velocity = modes, nn.ParameterList()
         for scene_id, own in enumerate(self._anchors):
             self.register_buffer(f"basis_{scene_id}", smooth_basis(own, neighbours, basis))
         counts = [self._basis(i).shape[0] for i in self.scene_of_sequence]

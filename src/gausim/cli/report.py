@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gausim.cli.arguments import command_parser
+from gausim.core.errors import ConfigError, RunError
 
 if TYPE_CHECKING:
     from gausim.report.write import Report
@@ -16,6 +17,12 @@ if TYPE_CHECKING:
 def main(argv: list[str]) -> int:
     """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
+    if arguments.page:
+        return _write_page(arguments.page)
+    if not arguments.dirs:
+        raise ConfigError("DIR: expected run directories, sweeps, or folders of them, got none.")
+    if arguments.results or arguments.record:
+        return _write_results(arguments)
     from gausim.cli.end import end
     from gausim.report.render import summary_line
     from gausim.report.write import write_report
@@ -32,6 +39,43 @@ def main(argv: list[str]) -> int:
         print("\n".join(f"wrote {path}" for path in report.files))
     result = [f"{best.title}: {best.sentences[0]}" for best in report.openings[:1]]
     end([summary_line(report.study), *result], "page", report.files[0], *_next(report))
+    return 0
+
+
+def _write_page(target: Path) -> int:
+    """Writes a page from the template and the records in the folder of its name."""
+    from gausim.io.files import write_durably
+    from gausim.report.records.print import page
+
+    write_durably(target, page(target.with_suffix("")).encode())
+    print(f"page: {target.resolve().as_uri()}")
+    return 0
+
+
+def _write_results(arguments: argparse.Namespace) -> int:
+    """Writes the record of runs, and tables of it."""
+    from gausim.io.files import write_durably
+    from gausim.report.gather.runs import find_runs
+    from gausim.report.gather.study import make_study
+    from gausim.report.records.measure import measured_record
+    from gausim.report.records.print import results_latex, results_page
+    from gausim.report.records.record import save_record
+
+    record = measured_record(make_study(find_runs(arguments.dirs, skip=arguments.results)), arguments.title)
+    if not record.tables:
+        raise RunError(
+            f"{' '.join(map(str, arguments.dirs))}: no run here is evaluated, so there is no figure. "
+            "Evaluate them with `gausim evaluate RUN`."
+        )
+    if arguments.results:
+        arguments.results.mkdir(parents=True, exist_ok=True)
+        write_durably(arguments.results / "results.md", results_page(record).encode())
+        write_durably(arguments.results / "tables.tex", results_latex(record).encode())
+        print(f"tables: {(arguments.results / 'results.md').resolve().as_uri()}")
+    if arguments.record:
+        arguments.record.parent.mkdir(parents=True, exist_ok=True)
+        save_record(arguments.record, record)
+        print(f"record: {arguments.record.resolve().as_uri()}")
     return 0
 
 
@@ -55,9 +99,13 @@ def _parser() -> argparse.ArgumentParser:
         "shown as such.",
     )
     add = parser.add_argument
-    add("dirs", metavar="DIR", type=Path, nargs="+", help="run directories, sweeps, or any folder of them")
+    add("dirs", metavar="DIR", type=Path, nargs="*", help="run directories, sweeps, or any folder of them")
     add("--out", metavar="DIR", type=Path, help="folder to write; default report in the first DIR")
     add("--title", default="GausSim report", help="heading (default: %(default)s)")
+    add("--results", metavar="OUT", type=Path, help="write results.md and tables.tex to this folder instead: all figures "
+        "with commit, command, hardware and cost")  # fmt: skip
+    add("--record", metavar="FILE.json", type=Path, help="write the same as a small record, from which pages are made")
+    add("--page", metavar="FILE.md", type=Path, help="make FILE.md from FILE/page.md and the records FILE/*.json; no DIR")
     add("--verbose", action="store_true", help="list the files that are written")
     add("--no-pictures", action="store_true", help="leave figures and videos out (a small page, in a second)")
     return parser

@@ -3,8 +3,10 @@
 ``metrics.json`` (schema ``gausim.evaluation/1``)::
 
     {"schema": "gausim.evaluation/1",
-     "run": {...},                                    what was evaluated, as the caller states it
-     "provenance": {"gausim", "torch", "python", "commit", "modified"},   of the program that evaluated
+     "run": {...},                                    what was evaluated, as the caller states it; where the data
+                                                      declare a test part, with its "part" (development or test), and of
+                                                      the test part the declared "trials" and the number of "looks"
+     "provenance": {"gausim", "torch", "python", "machine", "commit", "modified"},  of the program that evaluated
      "objects": {NAME: {
         "fps", "sequences", "frames", "views", "train_views", "heldout_views", "methods",
         "reference": ROW,                             the row that ratios divide by: static, ballistic, follow hands

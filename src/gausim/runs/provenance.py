@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import subprocess
 from pathlib import Path
@@ -22,15 +23,27 @@ def code_provenance(package: Path = PACKAGE) -> dict[str, Any]:
     """Versions, and the git commit where the package is part of a checkout (else null).
 
     Returns:
-        ``gausim``, ``torch``, ``python``: versions; ``commit``; ``modified``: whether tracked files of the package
-        differ from the commit.
+        ``gausim``, ``torch``, ``python``: versions; ``machine``: processor and GPU; ``commit``; ``modified``: whether
+        tracked files of the package differ from the commit.
     """
     facts = {"gausim": gausim.__version__, "torch": torch.__version__, "python": platform.python_version()}
+    facts["machine"] = machine()
     # A package installed inside another project's checkout is not tracked by that repository.
     tracked = _git(package, "ls-files", "--error-unmatch", "__init__.py") is not None
     commit = _git(package, "rev-parse", "HEAD") if tracked else None
     status = _git(package, "status", "--porcelain", "--untracked-files=no", "--", ".") if commit else None
     return {**facts, "commit": commit, "modified": None if status is None else bool(status)}
+
+
+def machine() -> str:
+    """Processor with its number of cores, and the GPU in use, if any."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    processor = f"{next(named, platform.processor() or platform.machine())}, {os.cpu_count()} cores"
+    return f"{torch.cuda.get_device_name()}, {processor}" if torch.cuda.is_initialized() else processor
 
 
 def data_provenance(data: ObjectData) -> dict[str, Any]:

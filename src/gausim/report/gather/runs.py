@@ -6,8 +6,9 @@ import csv
 import hashlib
 import json
 import os
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ _KEYS_OF_A_RUN = {"model", "data", "seed"}
 # Keys without an effect on the result, and those of seeds.
 _FREE = ("paths", "logger", "callbacks", "sweep", "protocol", "task_name", "evaluate", "seed", "data.seed", "trainer")
 _DIGITS = 12  # of hashes and commits
+_SWEEP = "multirun.yaml"  # Hydra's record of a sweep
 _HYDRA = ".hydra"  # Hydra's folder, also of a job that did not start a run
 
 EVALUATED, NOT_EVALUATED, UNFINISHED = "evaluated", "not evaluated", "unfinished"
@@ -42,6 +44,7 @@ class RunRecord:
     config: dict[str, Any] = field(default_factory=dict, repr=False)  # empty if unreadable
     choices: dict[str, str] = field(default_factory=dict, repr=False)  # Hydra's, of every config group
     summary: dict[str, Any] | None = field(default=None, repr=False)  # content of evaluation/metrics.json
+    command: str = "not recorded"  # by which it was trained, of a sweep that of the whole
 
     @property
     def seed(self) -> Any:
@@ -190,6 +193,26 @@ def _yaml(path: Path) -> dict[str, Any]:
 
 
 def _read_run(folder: Path, name: str) -> RunRecord:
+    return replace(_read_files(folder, name), command=_command(folder))
+
+
+def _command(folder: Path) -> str:
+    """The command of a run from Hydra's records, of a job the command of its sweep (the nearest ``multirun.yaml``)."""
+    sweep = next((parent for parent in folder.resolve().parents if (parent / _SWEEP).is_file()), None)
+    try:
+        hydra = dig(_yaml(folder / _HYDRA / "hydra.yaml"), "hydra")
+        is_job = sweep is not None and dig(hydra, "mode") == "MULTIRUN"
+        if is_job:
+            assert sweep is not None
+            hydra = dig(_yaml(sweep / _SWEEP), "hydra")
+        words = dig(hydra, "overrides", "task")
+    except RunError:
+        return "not recorded"
+    shown = [shlex.quote(str(word)) for word in words] if isinstance(words, list) else []
+    return " ".join(["gausim train", *(["-m"] if is_job else []), *shown])
+
+
+def _read_files(folder: Path, name: str) -> RunRecord:
     choices = _choices(folder)
     is_run = (folder / CONFIG).is_file()
     path = (folder if is_run else folder / _HYDRA) / CONFIG

@@ -1,0 +1,176 @@
+"""Tables of records as Markdown and LaTeX, and pages from templates that name them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from jinja2 import Environment, StrictUndefined, TemplateError
+
+from gausim.core import RunError
+from gausim.report.records.record import Cell, Column, Figure, Made, Record, RecordTable, load_record, value_of
+from gausim.report.render import latex_escape
+
+TEMPLATE = "page.md"
+SEEDS_APART = "± deviation over seeds; in brackets, deviation over sequences (mean over seeds)."
+
+
+def markdown_table(table: RecordTable) -> str:
+    """The table as GitHub Markdown, the best figures bold."""
+    lines = [[*table.stub, *(column.label for column in table.columns)]]
+    lines.append(["---"] * len(lines[0]))
+    for row, texts, best in _printed(table):
+        lines.append([*row, *(f"**{text}**" if mark else text for text, mark in zip(texts, best, strict=True))])
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines).replace("|  |", "| |").replace("|  |", "| |")
+
+
+def latex_table(table: RecordTable, record: Record) -> str:
+    """The table for LaTeX, its origin in comments and caption."""
+    heads = [*table.stub, *(column.label for column in table.columns)]
+    body = []
+    for row, texts, best in _printed(table):
+        cells = [
+            rf"\textbf{{{latex_escape(text)}}}" if mark else latex_escape(text)
+            for text, mark in zip(texts, best, strict=True)
+        ]
+        body.append(" & ".join([*map(latex_escape, row), *cells]) + r" \\")
+    caption = latex_escape(" ".join(filter(None, (f"{table.title or record.title}.", table.caption, record.made.test))))
+    return "\n".join([
+        *(f"% {line}" for line in origin(record.made)),
+        r"\begin{table*}[ht]", r"\centering", rf"\caption{{{caption}}}", rf"\label{{tab:{_label(table.key)}}}",
+        r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
+        rf"\begin{{tabular}}{{{'l' * len(table.stub)}{'c' * len(table.columns)}}}", r"\toprule",
+        " & ".join(map(latex_escape, heads)) + r" \\", r"\midrule", *body, r"\bottomrule", r"\end{tabular}}",
+        r"\end{table*}", "",
+    ])  # fmt: skip
+
+
+def origin(made: Made) -> list[str]:
+    """Date, commits, hardware and commands, one line each."""
+    return [
+        f"Recorded: {made.recorded}",
+        f"Commits: {', '.join(made.commits) or 'unknown'}",
+        f"Hardware: {'; '.join(made.hardware) or 'unknown'}",
+        *(f"Command: {command}" for command in made.commands),
+    ]
+
+
+def results_page(record: Record) -> str:
+    """All tables of one record as a page, with their origin."""
+    parts = [f"# {record.title}", *([record.made.test] if record.made.test else []), "\n".join(_listed(record.made))]
+    for table in record.tables:
+        parts += [f"## {table.title or table.key}", *([table.caption] if table.caption else []), markdown_table(table)]
+    return "\n\n".join(parts) + "\n"
+
+
+def results_latex(record: Record) -> str:
+    r"""All tables of one record for ``\input``."""
+    return "% \\usepackage{booktabs,graphicx} and T1 font encoding\n\n" + "\n".join(
+        latex_table(table, record) for table in record.tables
+    )
+
+
+def page(folder: Path) -> str:
+    """The page of ``folder/page.md``, a template that names tables and facts of the records ``folder/*.json``.
+
+    In the template ``table("RECORD", "KEY")`` is a table, ``made("RECORD")`` its commits and commands, and
+    ``RECORD.NAME`` a fact.
+
+    Raises:
+        RunError: the template or a record is missing or malformed, or names something that is not there.
+    """
+    records = {path.stem: load_record(path) for path in sorted(folder.glob("*.json"))}
+
+    def known(name: str) -> Record:
+        if name not in records:
+            raise RunError(f"{folder / TEMPLATE}: names the record '{name}', expected one of {list(records)}.")
+        return records[name]
+
+    # Anchors such as {#step} are no comments.
+    comments = {"comment_start_string": "<#", "comment_end_string": "#>"}
+    environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True, **comments)
+    environment.globals = {
+        "table": lambda name, key: markdown_table(known(name).table(key)),
+        "made": lambda name: _block(known(name).made),
+        **{name: _Facts(record.facts) for name, record in records.items()},
+    }
+    try:
+        text = environment.from_string((folder / TEMPLATE).read_text()).render()
+    except (OSError, TemplateError) as error:
+        raise RunError(f"{folder / TEMPLATE}: cannot be made into a page ({error}).") from error
+    return f"<!-- Made by `make results` from docs/results/: change the template or the records there. -->\n{text}"
+
+
+class _Facts(dict[str, str]):
+    """Facts as attributes of a template's names, as printed."""
+
+    def __init__(self, facts: Mapping[str, float | str]) -> None:
+        super().__init__({name: v if isinstance(v, str) else _number(v, None) for name, v in facts.items()})
+
+
+def _block(made: Made) -> str:
+    """Commits and commands for a page."""
+    told = f"Made by ({', '.join(made.commits)}; recorded {made.recorded})"
+    return "\n".join([told, "", *(f"    {line}" for command in made.commands for line in command.splitlines())])
+
+
+def _listed(made: Made) -> list[str]:
+    return [f"* {line.replace('Command: ', 'Command: `') + ('`' if line.startswith('Command') else '')}"
+            for line in origin(made)]  # fmt: skip
+
+
+def _printed(table: RecordTable) -> list[tuple[list[str], list[str], list[bool]]]:
+    """Labels, texts and marks of the best of every row."""
+    found = []
+    for row in table.rows:
+        group = row.label[: table.groups]
+        rivals = [other for other in table.rows if other.label[: table.groups] == group and not other.reference]
+        texts = [_text(cell, column) for cell, column in zip(row.cells, table.columns, strict=True)]
+        marks = [
+            not row.reference and _is_best(row.cells[i], [other.cells[i] for other in rivals], column)
+            for i, column in enumerate(table.columns)
+        ]
+        found.append((row.label, texts, marks))
+    return found
+
+
+def _is_best(cell: Cell, rivals: Sequence[Cell], column: Column) -> bool:
+    """Whether a figure, as printed, is the best of at least two."""
+    digits = 6 if column.digits is None else column.digits
+    values = [round(v, digits) for c in rivals if (v := value_of(c)) is not None]
+    own = value_of(cell)
+    if not column.better or own is None or len(values) < 2:
+        return False
+    merit = {"low": lambda v: v, "high": lambda v: -v, "one": lambda v: round(abs(v - 1), digits)}[column.better]
+    return merit(round(own, digits)) == min(map(merit, values))
+
+
+def _text(cell: Cell, column: Column) -> str:
+    if cell is None:
+        return ""
+    if isinstance(cell, str):
+        return cell
+    if not isinstance(cell, Figure):
+        return _number(cell, column.digits)
+    if cell.seed_std is None and len(cell.seeds) > 1:
+        text = ", ".join(_number(value, column.digits) for value in cell.seeds)
+    else:
+        spread = "" if cell.seed_std is None else f" ± {_printed_number(cell.seed_std, column.digits)}"
+        text = _number(cell.mean, column.digits) + spread
+    return text if cell.std is None else f"{text} (± {_printed_number(cell.std, column.digits)})"
+
+
+def _number(value: float, digits: int | None) -> str:
+    """A number as printed; 0 itself, which is exact, is 0."""
+    return "0" if value == 0 else _printed_number(value, digits)
+
+
+def _printed_number(value: float, digits: int | None) -> str:
+    """A number without a zero before the point."""
+    text = f"{value:,.{digits}f}" if digits is not None else f"{value:,.10g}"
+    return re.sub(r"^(-?)0\.", r"\1.", text)
+
+
+def _label(key: str) -> str:
+    return re.sub(r"[^A-Za-z0-9]+", "-", key)
