@@ -106,10 +106,10 @@ def test_a_network_of_another_shape_is_refused_by_name(joint: Path, other: Path,
         (["experiment=finetune"], r"init_from: name the trained run.*init_from=RUN"),
         (["freeze=network"], r"freeze: a network at random.*init_from=RUN"),
         (["init_from=nowhere"], r"nowhere/last\.ckpt: no such checkpoint"),
-        (["experiment=separate"], r"data\.names: \[\] asked for, the roots hold \['toy', 'other'\]"),
+        (["data.names=[]"], r"data\.names: \[\] asked for, the roots hold \['toy', 'other'\]"),
     ],
 )
 def test_what_is_missing_is_said(asked: list[str], message: str, toy: Path, other: Path, tmp_path: Path) -> None:
-    root = both(toy, other) if "experiment=separate" in asked else f"data.root={other}"
+    root = both(toy, other) if "data.names=[]" in asked else f"data.root={other}"
     with pytest.raises((ConfigError, RunError), match=message):
         command.main([*asked, root, f"hydra.run.dir={tmp_path}/seed_0", *TINY])

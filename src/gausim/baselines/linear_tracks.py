@@ -38,17 +38,13 @@ class LinearTracks(AnchoredMotion):
     def __init__(
         self, *, anchors: int, neighbours: int = 64, basis: int = 48, modes: int = 8, **recorded: Unpack[Recorded]
     ) -> None:
-        """Places the anchors and finds their slowest modes.
+        """Places at most ``anchors`` per scene and finds their slowest modes.
 
         Args:
             anchors: maximum number per scene.
             neighbours: number of nearest anchors to which an anchor has springs.
             basis: number of modes in which frames are tracked.
             modes: number of principal motions of the linear model.
-
-        Raises:
-            ConfigError: a number out of range.
-            SceneError: too few anchors.
         """
         super().__init__(anchors=anchors, **recorded)
         if min(neighbours, basis, modes) < 1 or self.seen < 2:
@@ -59,16 +55,13 @@ class LinearTracks(AnchoredMotion):
         self.modes, self.velocity = modes, nn.ParameterList()
         for scene_id, own in enumerate(self._anchors):
             self.register_buffer(f"basis_{scene_id}", smooth_basis(own, neighbours, basis))
-        counts = [self._basis(i).shape[0] for i in self.scene_of_sequence]
+        counts = [self.get_buffer(f"basis_{i}").shape[0] for i in self.scene_of_sequence]
         # Changes from frame to frame, so that a frame begins where the one before it was found.
         self.changes = nn.ParameterList(torch.zeros(self.seen, count) for count in counts)
 
-    def _basis(self, scene_id: int) -> Float[Tensor, "M A 3"]:
-        return self.get_buffer(f"basis_{scene_id}")
-
     def tracked(self, sequence_id: int) -> Float[Tensor, "F A 3"]:
         """Displacement of the anchors in the seen frames, frame 0 (rest) first [diagonals]."""
-        basis = self._basis(self.scene_of_sequence[sequence_id])
+        basis = self.get_buffer(f"basis_{self.scene_of_sequence[sequence_id]}")
         coordinates = torch.cat((self.changes[sequence_id][:1] * 0, self.changes[sequence_id].cumsum(0)))
         return torch.einsum("fm,mai->fai", coordinates, basis)
 
@@ -76,7 +69,7 @@ class LinearTracks(AnchoredMotion):
         """The linear model of an object, fitted to all its sequences."""
         own = [i for i, scene in enumerate(self.scene_of_sequence) if scene == scene_id]
         found = fit_linear_ar2([self.tracked(i).detach() for i in own], self.modes)
-        like = self._basis(scene_id)
+        like = self.get_buffer(f"basis_{scene_id}")
         return LinearAR2(*(x.to(like) for x in (found.modes, found.first, found.second)))
 
     def begin(self, sequence_id: int) -> FittedState:
@@ -91,11 +84,11 @@ class LinearTracks(AnchoredMotion):
     def advance(self, state: FittedState) -> FittedState:
         """The next frame."""
         rest, frame = self.anchors(state.sequence_id).rest, state.frame + 1
-        if len(state.inner) == 1:
-            motion = state.inner[0][frame]
-            made, inner = motion, state.inner
+        inner: tuple[Tensor, ...] = state.inner
+        if len(inner) == 1:
+            made = inner[0][frame]
         else:
-            latest, *linear = state.inner
+            latest, *linear = inner
             made = latest[1] if frame == 1 else LinearAR2(*linear).rollout(latest, 2)[2]
             inner = (latest if frame == 1 else torch.stack((latest[1], made)), *linear)
         return replace(self.state(state.sequence_id, frame, rest + made, torch.zeros_like(made)), inner=inner)

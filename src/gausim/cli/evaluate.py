@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
     add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
     add("--object", nargs="+", metavar="NAME", help="only these objects")
     add("--sequences", nargs="+", metavar="NAME", help="only these sequences (of every object)")
-    add("--test", action="store_true", help="look at the test part that the data declare; counted in evaluation/test.json")
+    add("--test", action="store_true", help="look at the test part of the data; counted in evaluation/test.json")
     add("--trials", type=positive, metavar="N", help="with --test: trials made of the method on the development part "
         "(default: protocol.trials of the run)")  # fmt: skip
     add("--views", default="all", choices=("all", "train", "heldout"), help="which cameras (default: all)")

@@ -1,4 +1,4 @@
-"""The development and the test part of a run's data, in `gausim evaluate`."""
+"""The development and the test part of a run's data, in `gausim evaluate` and in evaluations after training."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from typing import TYPE_CHECKING, Any
 from gausim.core.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
     from gausim.compose.build import LoadedRun
+    from gausim.data.datamodule import ReadyDataModule
 
 
 @dataclass(frozen=True)
@@ -86,9 +89,7 @@ def look(run: LoadedRun, arguments: argparse.Namespace, chosen: Chosen, state: M
     path, development = run.run_dir / TEST, run.run_dir / "evaluation" / "development"
     if not path.is_file():
         _move(run.run_dir / "evaluation", development)
-    made = record_look(
-        path, trials=trials, provenance=code_provenance(), state=state, sequences=dict(chosen.sequences)
-    )
+    made = record_look(path, trials=trials, provenance=code_provenance(), state=state, sequences=dict(chosen.sequences))
     again = f", look {made.looks}" if made.looks > 1 else ""
     print(f"test part: {trials} trials declared{again}; recorded in {path}")
     return {"part": chosen.part, "trials": trials, "looks": made.looks}
@@ -109,3 +110,26 @@ def _move(folder: Path, target: Path) -> None:
         target.mkdir(parents=True, exist_ok=True)
         for path in sorted(p for p in folder.iterdir() if p.is_file()):
             path.replace(target / path.name)
+
+
+def check_protocol(cfg: DictConfig, datamodule: ReadyDataModule) -> None:
+    """Raises ConfigError where the evaluation after training could not be made as the protocol demands."""
+    from gausim.results.looks import DEVELOPMENT, TEST_PART
+
+    part, trials = cfg.protocol.part, cfg.protocol.trials
+    if part not in (None, DEVELOPMENT, TEST_PART):
+        raise ConfigError(f"protocol.part: expected null, {DEVELOPMENT} or {TEST_PART}, got '{part}'.")
+    if not cfg.evaluate or not datamodule.has_videos:
+        return
+    names = [(item.test_part, record.name) for item in datamodule.objects for record in item.sequences]
+    reserved = [name in part_of for part_of, name in names]
+    if part == TEST_PART and (not trials or not any(reserved)):
+        raise ConfigError(
+            f"protocol.part: expected protocol.trials for a look at the test part, got {trials}, and sequences of a "
+            f"test part in the data, got {sum(reserved)} of {len(reserved)}."
+        )
+    if part != TEST_PART and all(reserved):
+        raise ConfigError(
+            "evaluate: every sequence of the data belongs to the test part. Set protocol.part=test and "
+            "protocol.trials=N (trials made on the development part), or evaluate=false."
+        )

@@ -39,8 +39,6 @@ checkpoint; cut short by trainer.max_minutes or max_epochs before it had learned
 again; once finished it is refused, unless overwrite=true. A sweep (-m) that is started again leaves out
 what is finished, resumes what is not, and tries again what failed if sweep.retry_failed=true."""
 
-# Parts of data with a test part, as `gausim.results.looks` has them, which loads msgspec.
-DEVELOPMENT, TEST_PART = "development", "test"
 # Largest first displacement per frame observed for small pushes [diagonals].
 FIRST_STEP = 0.065
 
@@ -94,7 +92,7 @@ def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
     else:
         objective = _train(cfg, run)
     if cfg.evaluate and not run.was_pruned:
-        _evaluate(run, is_test=cfg.protocol.part == TEST_PART)
+        _evaluate(run, is_test=cfg.protocol.part == "test")
     return objective
 
 
@@ -108,7 +106,7 @@ def _plain(cfg: DictConfig) -> dict[str, Any]:
 
 
 def _evaluate(run: RunDirectory, *, is_test: bool) -> None:
-    """`gausim evaluate RUN` (with ``--test`` for the test part) in a separate process, so that it measures time and memory of predictions alone."""
+    """`gausim evaluate RUN` in a separate process, so that it measures time and memory of predictions alone."""
     import os
     import subprocess
 
@@ -157,39 +155,17 @@ def follow(crew: Crew) -> float | None:
 def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataModule]:
     from lightning.pytorch import seed_everything
 
+    from gausim.cli.test_part import check_protocol
     from gausim.compose.build import build
     from gausim.training.first_frames import begin_free_bodies
 
     seed_everything(cfg.seed, workers=True, verbose=False)
     module, datamodule = build(cfg)
-    _check_protocol(cfg, datamodule)
+    check_protocol(cfg, datamodule)
     _take_over(cfg, module, resumed=resumed)
     if module.initial_states is not None and not resumed:
         begin_free_bodies(module, datamodule)
     return module, datamodule
-
-
-def _check_protocol(cfg: DictConfig, datamodule: ReadyDataModule) -> None:
-    """Raises ConfigError where the evaluation after training could not be made as the protocol demands."""
-    from gausim.core import ConfigError
-
-    part, trials = cfg.protocol.part, cfg.protocol.trials
-    if part not in (None, DEVELOPMENT, TEST_PART):
-        raise ConfigError(f"protocol.part: expected null, {DEVELOPMENT} or {TEST_PART}, got '{part}'.")
-    if not cfg.evaluate or not datamodule.has_videos:
-        return
-    names = [(item.test_part, record.name) for item in datamodule.objects for record in item.sequences]
-    reserved = [name in part_of for part_of, name in names]
-    if part == TEST_PART and (not trials or not any(reserved)):
-        raise ConfigError(
-            f"protocol.part: the test part is to be evaluated, expected protocol.trials (got {trials}) and at least one "
-            f"sequence of a test part in the data (got {sum(reserved)} of {len(reserved)})."
-        )
-    if part != TEST_PART and all(reserved):
-        raise ConfigError(
-            "evaluate: every sequence of the data belongs to the test part. Set protocol.part=test and "
-            "protocol.trials=N (trials made on the development part), or evaluate=false."
-        )
 
 
 def _fit(

@@ -51,9 +51,7 @@ class LoadedRun:
     run_dir: Path
 
 
-def build(
-    cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True
-) -> tuple[GausSimModule, ReadyDataModule]:
+def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[GausSimModule, ReadyDataModule]:
     """Builds the module and the data of a training configuration.
 
     Args:

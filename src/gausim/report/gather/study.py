@@ -314,8 +314,8 @@ def _test_part(groups: Sequence[Group]) -> str:
         return ""
     more = f" Not of a test part: {', '.join(others)}." if others else ""
     return (
-        "Figures of the test part, on which nothing was tuned; declared trials on the development part and looks at the "
-        f"test part: {'; '.join(told)}.{more}"
+        "Figures of the test part, on which nothing was tuned; declared trials on the development part and looks at "
+        f"the test part: {'; '.join(told)}.{more}"
     )
 
 

@@ -68,15 +68,13 @@ def _metrics(study: Study, name: str, split: str, views: str) -> list[str]:
     return sorted((metric for metric in found if study.info(metric)), key=lambda metric: metric == MOTION_ENERGY)
 
 
-def _table(
-    study: Study, name: str, split: str, keys: Sequence[tuple[str, str]], *, costs: bool
-) -> RecordTable | None:
+def _table(study: Study, name: str, split: str, keys: Sequence[tuple[str, str]], *, costs: bool) -> RecordTable | None:
     """Rows of methods, then of references, with a column per metric; None without any figure."""
     groups = [group for group in study.groups if group.entries(name)]
     rows = [Row([g.label], [_figure(g, name, split, *key, row=None) for key in keys]) for g in groups]
-    for row in _references(groups, name):
-        cells = (_figure(g, name, split, *key, row=row) for g in groups[:1] for key in keys)
-        rows.append(Row([row], list(cells), reference=row != STATIC))
+    for label in _references(groups, name):
+        cells = [_figure(groups[0], name, split, *key, row=label) for key in keys]
+        rows.append(Row([label], cells, reference=label != STATIC))
     columns = [_column(study, *key) for key in keys]
     if costs:
         columns += [Column("fit [CPU min]", 1), Column("per frame [s]", 4)]
@@ -86,7 +84,8 @@ def _table(
     kept = [i for i in range(len(columns)) if any(row.cells[i] is not None for row in rows)]
     if not kept:
         return None
-    shown = [Row(r.label, [r.cells[i] for i in kept], r.reference) for r in rows if any(r.cells[i] is not None for i in kept)]
+    shown = [Row(row.label, [row.cells[i] for i in kept], row.reference) for row in rows]
+    shown = [row for row in shown if any(cell is not None for cell in row.cells)]
     return RecordTable("", [columns[i] for i in kept], shown, caption=SEEDS_APART)
 
 

@@ -87,9 +87,12 @@ def page(folder: Path) -> str:
             raise RunError(f"{folder / TEMPLATE}: names the record '{name}', expected one of {list(records)}.")
         return records[name]
 
-    # Anchors such as {#step} are no comments.
-    comments = {"comment_start_string": "<#", "comment_end_string": "#>"}
-    environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True, **comments)
+    environment = Environment(
+        undefined=StrictUndefined,
+        keep_trailing_newline=True,
+        comment_start_string="<#",  # anchors such as {#step} are no comments
+        comment_end_string="#>",
+    )
     environment.globals = {
         "table": lambda name, key: markdown_table(known(name).table(key)),
         "made": lambda name: _block(known(name).made),

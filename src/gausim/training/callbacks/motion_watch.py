@@ -31,9 +31,9 @@ LEVELS = 3
 class MotionWatch(Callback):
     """Predicts the first training sequences of every object whose true motion is known, and measures the errors.
 
-    It uses unseen frames, as evaluation does, without an effect on training, and leaves the test part out. ``gap`` is the generalisation gap, the
-    error on unseen frames less that on seen frames, both over the static prediction's. Rows go to ``motion.csv`` of the
-    run, means over objects to every logger.
+    It uses unseen frames, as evaluation does, without an effect on training, and leaves the test part out. ``gap`` is
+    the generalisation gap, the error on unseen frames less that on seen frames, both over the static prediction's. Rows
+    go to ``motion.csv`` of the run, means over objects to every logger.
     """
 
     COLUMNS = (
