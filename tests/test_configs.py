@@ -13,6 +13,7 @@ from typing import Any
 import hydra
 import pytest
 import torch
+import yaml
 from jsonschema import Draft7Validator
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
@@ -30,7 +31,9 @@ from gausim.training.trainer import make_trainer
 FILES = sorted(
     path.relative_to(conf_dir()).with_suffix("") for path in conf_dir().rglob("*.yaml") if path.parent.name != "base"
 )
-OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1]
+# Searches of one method each, which are composed with the values that they try.
+TRIALS = [path for path in FILES if path.parts[:2] == ("sweep", "trials")]
+OPTIONS = [path.as_posix() for path in FILES if len(path.parts) > 1 and path not in TRIALS]
 # They set keys of other groups or of Hydra, and so build nothing of their own under their name.
 NOT_BUILT = ("hydra", "paths")
 # They change other groups under `@package _global_`: everything is built with them.
@@ -138,6 +141,51 @@ def test_settings_that_no_configuration_lists_are_set_like_others(capsys: pytest
     assert "trainer.overwrite is called overwrite now" in capsys.readouterr().err
     with pytest.raises(ConfigError, match=r"model\.simulator\.network\.compile: unknown key"):
         compose("train", ["model=spring_mass", "model.simulator.network.compile=true"])
+
+
+def sweep_of(path: Path) -> dict[str, list[str]]:
+    """The values of every key that a file sweeps over."""
+    node = yaml.safe_load((conf_dir() / path.with_suffix(".yaml")).read_text())
+    params = node["hydra"]["sweeper"]["params"]
+    return {key: re.findall(r"\[[^]]*\]|[^,]+", str(value)) for key, value in params.items()}
+
+
+def test_every_method_of_the_comparison_gets_the_same_number_of_trials() -> None:
+    comparison = sweep_of(Path("experiment/tables/comparison"))
+    declared = compose("train", ["experiment=tables/comparison"]).protocol.trials
+    assert {path.name for path in TRIALS} == set(comparison["method"]) - {"static"}
+    for path in TRIALS:
+        params = sweep_of(path)
+        assert math.prod(map(len, params.values())) == declared == 8, path
+        config = compose("train", [f"sweep=trials/{path.name}", *(f"{key}={v[-1]}" for key, v in params.items())])
+        assert config.protocol.part == "development" and config.data.sequences[-1] == "seq_007"
+        for key, values in params.items():
+            assert str(OmegaConf.select(config, key)) == str(yaml.safe_load(values[-1])), (path, key)
+
+
+TABLES = [path for path in FILES if path.parts[:2] == ("experiment", "tables")]
+
+
+@pytest.mark.parametrize("path", TABLES, ids=[path.name for path in TABLES])
+def test_jobs_of_a_table_compose(path: Path) -> None:
+    params = sweep_of(path)
+    for place in (0, -1):
+        chosen = [f"{key}={values[place]}" for key, values in params.items()]
+        config = compose("train", [f"experiment=tables/{path.name}", *chosen])
+        assert config.evaluate is True
+        for key, values in params.items():
+            known = OmegaConf.select(config, key) if "." in key or key == "seed" else None
+            assert known is None or known == yaml.safe_load(values[place]), key
+
+
+def test_a_comparison_is_at_strength_on_sealed_data() -> None:
+    config = compose("train", ["experiment=tables/comparison", "method=physdreamer", "protocol=bunny_test"])
+    assert config.model.method.discretisation.filling.dense == 5.0 and config.model.method.discretisation.cells == 32
+    assert config.data.sequences == config.data.test.sequences == ["seq_008", "seq_009", "seq_010", "seq_011"]
+    assert config.protocol.part == "test" and config.trainer.max_minutes == 10
+    config = compose("train", ["method=gausim_paper", "protocol=pudding_soft_test", "budget=gpu"])
+    assert config.data.repeats == 70 and config.loss.backprop_steps == 1 and config.data.names == ["pudding_soft"]
+    assert config.data.test.seeds == [101, 102, 103] and str(config.data.root).endswith("synthetic_test")
 
 
 def leaves(node: Any) -> list[Any]:

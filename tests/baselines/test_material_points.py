@@ -183,6 +183,27 @@ def test_the_gradient_with_respect_to_the_modulus_is_its_difference_quotient() -
     assert float(slope) < 0  # stiffer is better
 
 
+def test_a_known_rayleigh_damping_is_found_again() -> None:
+    truth, method = dreamer(rayleigh=6.0), dreamer(rayleigh=2.0)
+    assert set(method.parameter_groups()) == {"velocity", "modulus", "damping"}
+    assert "a fitted Rayleigh damping of 2 / s" in method.notes()[-1]
+    with torch.no_grad():
+        targets = [state.positions for state in rolled(truth, swaying(truth), 4)]
+        kept = truth.kept(0)
+        undamped = rolled(dreamer(), swaying(dreamer()), 1)[-1]
+        damped = rolled(truth, swaying(truth), 1)[-1]
+    assert kept is not None and float(kept) == pytest.approx(math.exp(-6 / 24)) and dreamer().kept(0) is None
+    energies = [float(state.inner[1].square().sum()) for state in (damped, undamped)]
+    assert energies[0] < 0.8 * energies[1]
+    optimizer = torch.optim.Adam(method.damping.parameters(), lr=0.1)
+    for _ in range(15):
+        optimizer.zero_grad()
+        states = rolled(method, swaying(method), 4)
+        torch.stack([(s.positions - t).square().sum() for s, t in zip(states, targets, strict=True)]).sum().backward()
+        optimizer.step()
+    assert 10 ** abs(float(method.damping[0].detach()) - math.log10(6.0)) < 1.15
+
+
 def test_sequences_share_the_modulus_and_nothing_else() -> None:
     method = dreamer()
     state = method.advance(replace(swaying(method), sequence_id=1))

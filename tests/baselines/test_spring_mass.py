@@ -83,6 +83,20 @@ def test_the_slowest_vibration_has_the_period_that_was_asked_for() -> None:
     assert signs[0] in (2, 3, 4)  # back at rest after about half a period
 
 
+def loss_of(method: SpringMass, targets: list[torch.Tensor]) -> torch.Tensor:
+    states = rolled(method, len(targets) - 1)
+    return torch.stack([(s.positions - t).square().mean() for s, t in zip(states, targets, strict=True)]).sum()
+
+
+def fitted(method: SpringMass, parameters: torch.nn.ParameterList, targets: list[torch.Tensor], rate: float) -> float:
+    optimizer = torch.optim.Adam(parameters.parameters(), lr=rate)
+    for _ in range(40):
+        optimizer.zero_grad()
+        loss_of(method, targets).backward()
+        optimizer.step()
+    return float(parameters[0].detach().mean())
+
+
 def test_a_known_stiffness_is_found_again() -> None:
     truth = swaying(springs(period=7.0))
     with torch.no_grad():
@@ -90,16 +104,25 @@ def test_a_known_stiffness_is_found_again() -> None:
     method = swaying(springs(period=9.0))
     known = float(truth.stiffness[0].detach().mean())
     assert abs(float(method.stiffness[0].detach().mean()) - known) > 0.2
-    optimizer = torch.optim.Adam(method.stiffness.parameters(), lr=0.02)
-    for _ in range(40):
-        optimizer.zero_grad()
-        state, loss = method.begin(0), torch.zeros(())
-        for target in targets[1:]:
-            state = method.advance(state)
-            loss = loss + (state.positions - target).square().mean()
-        loss.backward()
-        optimizer.step()
-    assert 10 ** abs(float(method.stiffness[0].detach().mean()) - known) < 1.2
+    assert 10 ** abs(fitted(method, method.stiffness, targets, 0.02) - known) < 1.2
+
+
+def test_a_known_damping_is_found_again_by_a_right_gradient() -> None:
+    truth = swaying(springs(damping=0.5))
+    with torch.no_grad():
+        targets = [s.positions for s in rolled(truth, 8)]
+    method = swaying(springs(damping=0.1))
+    loss_of(method, targets).backward()
+    slope, rest = method.damping[0].grad, method.damping[0].detach().clone()
+    quotient = []
+    with torch.no_grad():
+        for step in (0.05, -0.05):  # of the common logarithm
+            method.damping[0].copy_(rest + step)
+            quotient.append(float(loss_of(method, targets)))
+        method.damping[0].copy_(rest)
+    assert slope is not None and slope < 0  # too little
+    assert float(slope) == pytest.approx((quotient[0] - quotient[1]) / 0.1, rel=0.02)
+    assert 10 ** abs(fitted(method, method.damping, targets, 0.05) - math.log10(0.5)) < 1.2
 
 
 def test_stiff_springs_get_more_substeps_and_too_stiff_ones_a_message() -> None:

@@ -1,0 +1,182 @@
+"""Records of tables, the pages made from them, and the figures of the repository's own pages."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from helpers import report_runs
+
+from gausim.cli import main as cli
+from gausim.core import RunError
+from gausim.report.gather.runs import find_runs
+from gausim.report.gather.study import make_study
+from gausim.report.records.measure import measured_record
+from gausim.report.records.print import markdown_table, page, results_latex, results_page
+from gausim.report.records.record import (
+    SCHEMA,
+    Column,
+    Figure,
+    Made,
+    Record,
+    RecordTable,
+    Row,
+    load_record,
+    save_record,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Path:
+    return report_runs.write_sweep(tmp_path / "sweep")
+
+
+def test_a_record_holds_every_figure_with_seeds_and_sequences_apart(sweep: Path, tmp_path: Path) -> None:
+    record = measured_record(make_study(find_runs([sweep])), "Sweep")
+    keys = [table.key for table in record.tables]
+    assert keys[0] == "toy_bunny_comparison" and {"toy_bunny_seen_train", "toy_bunny_unseen_points"} < set(keys)
+    first = record.tables[0]
+    heads = [column.label for column in first.columns]
+    assert heads == ["l2 [1e-3]", "SSIM [1e-1]", "3D ÷ static", "motion energy", "fit [CPU min]", "per frame [s]"]
+    rows = {row.label[0]: row for row in first.rows}
+    assert list(rows) == ["gausim", "gausim w/o mass", "static"]
+    l2 = rows["gausim"].cells[0]
+    assert isinstance(l2, Figure) and l2.seeds == [10.0, 12.0] and l2.mean == 11.0
+    assert l2.seed_std == pytest.approx(2**0.5, rel=1e-5) and l2.std == pytest.approx(5.52268, rel=1e-5)
+    one = rows["gausim w/o mass"].cells[0]
+    assert isinstance(one, Figure) and one.seeds == [] and one.seed_std is None and one.std == 7.5
+    ratio = rows["gausim"].cells[2]
+    assert isinstance(ratio, Figure) and ratio.mean == pytest.approx(1.1 / 4) and ratio.std is not None
+    fit = rows["gausim"].cells[4]
+    assert isinstance(fit, Figure) and fit.mean == pytest.approx(1.1) and rows["static"].cells[4] is None
+    assert record.made.commits == ["c0ffeec0ffee"] and record.made.hardware == ["not recorded"]
+    save_record(tmp_path / "record.json", record)
+    assert load_record(tmp_path / "record.json") == record
+
+
+def test_a_metric_that_is_new_is_a_column(sweep: Path) -> None:
+    runs = find_runs([sweep])
+    for run in runs:
+        for entry in run.objects.values():
+            entry["metrics"]["iou"] = {"label": "mask IoU", "scale": 1.0, "unit": "", "higher_is_better": True}
+            entry["rows"]["gausim"]["unseen"]["train"]["iou"] = {"mean": 0.5, "std": 0.1, "ratio": None}
+    tables = {table.key: table for table in measured_record(make_study(runs), "Sweep").tables}
+    column = [c.label for c in tables["toy_bunny_unseen_train"].columns].index("mask IoU")
+    assert "mask IoU" not in [c.label for c in tables["toy_bunny_seen_train"].columns]
+    cells = {row.label[0]: row.cells[column] for row in tables["toy_bunny_unseen_train"].rows}
+    assert cells["gausim w/o mass"] == Figure(0.5, std=0.1) and cells["static"] is None
+
+
+def test_results_come_with_commit_command_and_hardware(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in sweep.rglob(".hydra/hydra.yaml"):
+        hydra = yaml.safe_load(path.read_text())
+        hydra["hydra"] |= {"mode": "MULTIRUN", "overrides": {"task": ["seed=0"]}}
+        path.write_text(yaml.safe_dump(hydra))
+    words = ["experiment=tables/ablations", "seed=0,1", "data.names=[a]"]
+    (sweep / "multirun.yaml").write_text(yaml.safe_dump({"hydra": {"overrides": {"task": words}}}))
+    out = sweep.parent / "results"
+    assert cli.main(["report", str(sweep), "--results", str(out), "--record", str(out / "sweep.json")]) == 0
+    assert "tables: file://" in (said := capsys.readouterr().out) and "record: file://" in said
+    text = (out / "results.md").read_text()
+    command = "gausim train -m experiment=tables/ablations seed=0,1 'data.names=[a]'"
+    assert f"* Command: `{command}`" in text and "* Commits: c0ffeec0ffee" in text and "* Hardware: " in text
+    assert "| gausim | **11.00 ± 1.41 (± 5.52)** |" in text
+    latex = (out / "tables.tex").read_text()
+    assert (
+        latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == len(load_record(out / "sweep.json").tables)
+    )
+    assert f"% Command: {command}" in latex and r"\textbf{11.00 $\pm$ 1.41 ($\pm$ 5.52)}" in latex
+    assert cli.main(["report", str(sweep / "no_hierarchy"), "--results", str(out)]) == 2
+    assert "no run here is evaluated" in capsys.readouterr().err
+    assert cli.main(["report", "--results", str(out)]) == 2
+    assert "DIR: expected run directories" in capsys.readouterr().err
+
+
+def record(*rows: Row, columns: list[Column], **options: object) -> Record:
+    table = RecordTable("t", columns, list(rows), **options)  # type: ignore[arg-type]
+    return Record(SCHEMA, "Title", Made("2026-01-01", ["abc"], ["gausim train"]), [table], {"minutes": 0.5, "of": "6"})
+
+
+def test_figures_as_printed() -> None:
+    columns = [Column("low", 1, "low"), Column("one", 2, "one"), Column("as stored", None), Column("high", 2, "high")]
+    rows = [
+        Row(["a"], [1.24, 1.2, 0.0001, Figure(0.5, [0.4, 0.6])]),
+        Row(["b"], [1.16, 0.8, 12345.0, Figure(0.75, seed_std=0.0, std=0.125)]),
+        Row(["c"], [0.0, None, "6 to 7", None]),
+        Row(["truth"], [-1.0, 1.0, None, 9.0], reference=True),
+    ]
+    lines = markdown_table(record(*rows, columns=columns).tables[0]).splitlines()
+    assert lines[2:] == [
+        "| a | 1.2 | **1.20** | .0001 | .40, .60 |",
+        "| b | 1.2 | **.80** | 12,345 | **.75 ± .00 (± .12)** |",
+        "| c | **0** | | 6 to 7 | |",
+        "| truth | -1.0 | 1.00 | | 9.00 |",
+    ]
+    grouped = [Row(["x", "a"], [1.0]), Row(["x", "b"], [2.0]), Row(["y", "a"], [3.0]), Row(["y", "b"], [2.5])]
+    table = record(*grouped, columns=[Column("low", 1, "low")], stub=["object", "row"], groups=1).tables[0]
+    assert [line.split("|")[3].strip() for line in markdown_table(table).splitlines()[2:]] == [
+        "**1.0**", "2.0", "3.0", "**2.5**",
+    ]  # fmt: skip
+
+
+def test_pages_name_records(tmp_path: Path) -> None:
+    made = record(Row(["a"], [1.0]), columns=[Column("l2", 1)])
+    save_record(tmp_path / "mine.json", made)
+    template = '## A {#a}\n{{ mine.minutes }} of {{ mine.of }}\n\n{{ table("mine", "t") }}\n\n{{ made("mine") }}\n'
+    (tmp_path / "page.md").write_text(template)
+    text = page(tmp_path)
+    assert "## A {#a}\n.5 of 6\n" in text and "| a | 1.0 |" in text and "Made by (abc; recorded 2026-01-01)" in text
+    assert "\n    gausim train\n" in text
+    made.tables[0].rows[0].cells[0] = 1.1
+    save_record(tmp_path / "mine.json", made)
+    assert page(tmp_path) == text.replace("| a | 1.0 |", "| a | 1.1 |")
+    for wrong, message in (("table('mine', 'u')", "no table 'u'"), ("table('no', 't')", "record 'no', expected one of"),
+                           ("mine.hours", "cannot be made into a page")):  # fmt: skip
+        (tmp_path / "page.md").write_text(f"{{{{ {wrong} }}}}")
+        with pytest.raises(RunError, match=message):
+            page(tmp_path)
+    (tmp_path / "mine.json").write_text("{}")
+    with pytest.raises(RunError, match=r"mine\.json: expected a record"):
+        page(tmp_path)
+
+
+def test_a_damaged_record_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "r.json"
+    save_record(path, record(Row(["a"], [1.0]), columns=[Column("l2")]))
+    path.write_text(path.read_text().replace('"cells": [1.0]', '"cells": [1.0, 2.0]'))
+    with pytest.raises(RunError, match=r"row \['a'\]: expected 1 labels and 1 cells, got 1 and 2"):
+        load_record(path)
+    path.write_text(path.read_text().replace(SCHEMA, "gausim.record/0").replace("[1.0, 2.0]", "[1.0]"))
+    with pytest.raises(RunError, match="field 'schema' is 'gausim.record/0'"):
+        load_record(path)
+
+
+def test_whole_pages_of_one_record() -> None:
+    made = record(Row(["a"], [1.0]), columns=[Column("l2", 1)])
+    made.made.test = "Looked at once."
+    assert "# Title\n\nLooked at once.\n\n* Recorded: 2026-01-01" in results_page(made)
+    assert "Looked at once." in results_latex(made)
+
+
+# ---------------------------------------------------------------------------------------- the repository's own figures
+
+
+def test_the_page_of_results_is_what_its_records_give() -> None:
+    assert (ROOT / "docs" / "results.md").read_text() == page(ROOT / "docs" / "results"), "run `make results`"
+
+
+def test_the_table_of_the_readme_is_that_of_the_record() -> None:
+    found = re.search(r"\[start:results\] -->\n(\|.*?)\n\n", (ROOT / "README.md").read_text(), re.DOTALL)
+    table = load_record(ROOT / "docs" / "results" / "comparison.json").table("summary")
+    assert found is not None and found[1] == markdown_table(table)
+
+
+def test_no_figure_is_typed_into_the_template() -> None:
+    """Every decimal of the page comes from a record: the template has integers and settings only."""
+    text = (ROOT / "docs" / "results" / "page.md").read_text()
+    prose = re.sub(r"\{\{.*?\}\}|`[^`]*`|\]\([^)]*\)", "", text)
+    assert not re.findall(r"(?<![\w.])\d*\.\d+", prose)
