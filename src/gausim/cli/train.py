@@ -92,7 +92,7 @@ def train_run(cfg: DictConfig, run: RunDirectory) -> float | None:
     else:
         objective = _train(cfg, run)
     if cfg.evaluate and not run.was_pruned:
-        _evaluate(run, is_test=cfg.protocol.part == "test")
+        _evaluate(run)
     return objective
 
 
@@ -105,7 +105,7 @@ def _plain(cfg: DictConfig) -> dict[str, Any]:
     return cast("dict[str, Any]", with_defaults(OmegaConf.to_container(cfg, resolve=True)))
 
 
-def _evaluate(run: RunDirectory, *, is_test: bool) -> None:
+def _evaluate(run: RunDirectory) -> None:
     """`gausim evaluate RUN` in a separate process, so that it measures time and memory of predictions alone."""
     import os
     import subprocess
@@ -117,7 +117,15 @@ def _evaluate(run: RunDirectory, *, is_test: bool) -> None:
 
     if getattr(rank_zero_only, "rank", 0):
         return
-    command = [sys.executable, "-m", "gausim.cli.main", "evaluate", str(run.path), *(["--test"] if is_test else [])]
+    part = (run.config().get("protocol") or {}).get("part")
+    command = [
+        sys.executable,
+        "-m",
+        "gausim.cli.main",
+        "evaluate",
+        str(run.path),
+        *(["--test"] if part == "test" else []),
+    ]
     status = subprocess.run(command, env={**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())}).returncode
     if status:
         raise RunError(

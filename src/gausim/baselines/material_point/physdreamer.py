@@ -158,7 +158,7 @@ class PhysDreamer(MaterialPoints):
             f"{SUBSTEPS} substeps per frame and has a particle for 10 to 25 kernels.",
             *(f"{self.description(i)}; it began with {self.initial:.3g}." for i in range(len(self.scenes))),
             *(
-                f"{scene.name}: a fitted Rayleigh damping of {10 ** float(rate.detach()):.2g} / s, which the original lacks."
+                f"{scene.name}: a fitted Rayleigh damping of {10 ** rate.item():.2g} / s, which the original lacks."
                 for scene, rate in zip(self.scenes, self.damping, strict=False)
             ),
         )
