@@ -180,7 +180,7 @@ def test_jobs_of_a_table_compose(path: Path) -> None:
 
 def test_a_comparison_is_at_strength_on_sealed_data() -> None:
     config = compose("train", ["experiment=tables/comparison", "method=physdreamer", "protocol=bunny_test"])
-    assert config.model.method.discretisation.filling.dense == 5.0 and config.model.method.discretisation.cells == 32
+    assert config.model.method.discretisation.filling.dense == 1.0 and config.model.method.discretisation.cells == 32
     assert config.data.sequences == config.data.test.sequences == ["seq_008", "seq_009", "seq_010", "seq_011"]
     assert config.protocol.part == "test" and config.trainer.max_minutes == 10
     config = compose("train", ["method=gausim_paper", "protocol=pudding_soft_test", "budget=gpu"])

@@ -110,7 +110,10 @@ def test_transparent_kernels_follow_the_nearest_particle() -> None:
 def test_filled_interiors_are_particles_and_pinned_near_pins() -> None:
     scene = replace(toy_scene(), log_scales=torch.full((36, 3), math.log(0.2)))
     filling = Filling(cells=16, dense=0.5, per_cell=2)
-    driven = gaussian(scene, filling=filling).body(0).driven
+    method = gaussian(scene, filling=filling)
+    driven = method.body(0).driven
+    assert f"the interior filled with {len(driven.rest) - 36} points" in method.notes()[-1]
+    assert "the interior filled with nothing" in gaussian(scene).notes()[-1]
     assert len(driven.rest) > 36 and torch.equal(driven.rest[:36], scene.means)
     interior, pinned = driven.rest[36:], driven.pinned[36:]
     assert torch.equal(pinned, scene.pinned[torch.cdist(interior, scene.means).argmin(1)]) and 0 < pinned.sum() < len(

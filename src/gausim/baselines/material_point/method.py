@@ -221,6 +221,7 @@ class MaterialPoints(Fitted):
             )
         warp()  # raises early where it is not installed
         self.material, self.domain, self.velocity_scale = material, domain, velocity_scale
+        self.filled: list[int] = []  # points that fill the interior of each scene
         self._bodies = [self._body(i, self.drive(scene)) for i, scene in enumerate(self.scenes)]
         self.velocity = nn.ModuleList(TriPlaneField(velocity_resolution, outputs=3) for _ in self.scene_of_sequence)
         # Where free bodies begin, from rest [longest sides].
@@ -230,6 +231,12 @@ class MaterialPoints(Fitted):
     def drive(self, scene: GaussianScene) -> Driven:
         """The particles of a scene and the kernels that follow them."""
         raise NotImplementedError
+
+    def interior(self, scene: GaussianScene) -> Float[Tensor, "M 3"] | None:
+        """Points that fill the interior of a scene, which are counted in :attr:`filled`; None without filling."""
+        found = self.domain.interior(scene)
+        self.filled.append(0 if found is None else len(found))
+        return found
 
     def modulus(self, scene_id: int) -> Float[Tensor, " P"]:
         """Young's modulus of the particles [simulation units]."""
@@ -316,9 +323,11 @@ class MaterialPoints(Fitted):
             moduli, speed = self.modulus(scene_id), float(self.speed(scene_id).log().mean().exp())
         least, mean, most = (f"{float(e):.3g}" for e in (moduli.amin(), moduli.log().mean().exp(), moduli.amax()))
         spread = "" if least == most else f" ({least} to {most})"
+        inside = f"{self.filled[scene_id]} points" if self.filled[scene_id] else "nothing"
         return (
-            f"{self.scenes[scene_id].name}: {len(self._bodies[scene_id].driven.rest)} particles, Young's modulus "
-            f"{mean}{spread}, waves of {speed:.2g} sides per frame, {self.substeps(scene_id)} substeps per frame"
+            f"{self.scenes[scene_id].name}: {len(self._bodies[scene_id].driven.rest)} particles, the interior filled "
+            f"with {inside}, Young's modulus {mean}{spread}, waves of {speed:.2g} sides per frame, "
+            f"{self.substeps(scene_id)} substeps per frame"
         )
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:

@@ -130,7 +130,7 @@ class PhysDreamer(MaterialPoints):
 
     def drive(self, scene: GaussianScene) -> Driven:
         """K-means of the simulated kernels and of the points that fill the interior."""
-        return clustered(scene, self.most, self.domain.interior(scene))
+        return clustered(scene, self.most, self.interior(scene))
 
     def modulus(self, scene_id: int) -> Float[Tensor, " P"]:
         """Young's modulus of the driving particles [simulation units]."""

@@ -68,7 +68,7 @@ class PhysGaussian(MaterialPoints):
 
     def drive(self, scene: GaussianScene) -> Driven:
         """Every opaque kernel and every point that fills the interior."""
-        return opaque(scene, self.opacity, self.domain.interior(scene))
+        return opaque(scene, self.opacity, self.interior(scene))
 
     def modulus(self, scene_id: int) -> Float[Tensor, " P"]:
         """Young's modulus of the particles [simulation units]."""
