@@ -71,10 +71,21 @@ def test_a_metric_that_is_new_is_a_column(sweep: Path) -> None:
     assert cells["gausim w/o mass"] == Figure(0.5, std=0.1) and cells["static"] is None
 
 
+def test_rows_of_different_sequences_are_told_apart(sweep: Path) -> None:
+    runs = find_runs([sweep])
+    entry = next(run for run in runs if "no_mass" in run.name).objects["toy_bunny"]
+    entry["sequences"] = ["a"]
+    first = measured_record(make_study(runs), "Sweep").tables[0]
+    assert "Rows of different sequences cannot be compared: gausim: a, b; gausim w/o mass: a." in first.caption
+    cell = first.rows[1].cells[0]
+    assert isinstance(cell, Figure) and cell.std is None  # over one sequence there is none
+
+
 def test_results_come_with_commit_command_and_hardware(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for path in sweep.rglob(".hydra/hydra.yaml"):
         hydra = yaml.safe_load(path.read_text())
-        hydra["hydra"] |= {"mode": "MULTIRUN", "overrides": {"task": ["seed=0"]}}
+        own = [f"seed={path.parents[1].name[-1]}", "experiment=tables/ablations", "data.names=[a]"]
+        hydra["hydra"] |= {"mode": "MULTIRUN", "overrides": {"task": own}}
         path.write_text(yaml.safe_dump(hydra))
     words = ["experiment=tables/ablations", "seed=0,1", "data.names=[a]"]
     (sweep / "multirun.yaml").write_text(yaml.safe_dump({"hydra": {"overrides": {"task": words}}}))
@@ -85,6 +96,10 @@ def test_results_come_with_commit_command_and_hardware(sweep: Path, capsys: pyte
     command = "gausim train -m experiment=tables/ablations seed=0,1 'data.names=[a]'"
     assert f"* Command: `{command}`" in text and "* Commits: c0ffeec0ffee" in text and "* Hardware: " in text
     assert "| gausim | **11.00 ± 1.41 (± 5.52)** |" in text
+    # Another sweep of the same name has taken the place of the first.
+    (sweep / "multirun.yaml").write_text(yaml.safe_dump({"hydra": {"overrides": {"task": [*words, "model=other"]}}}))
+    commands = {run.command for run in find_runs([sweep / "full"])}
+    assert commands == {f"gausim train seed={i} experiment=tables/ablations 'data.names=[a]'" for i in (0, 1)}
     latex = (out / "tables.tex").read_text()
     assert (
         latex.count(r"\begin{tabular}") == latex.count(r"\end{tabular}") == len(load_record(out / "sweep.json").tables)

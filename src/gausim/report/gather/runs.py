@@ -197,19 +197,23 @@ def _read_run(folder: Path, name: str) -> RunRecord:
 
 
 def _command(folder: Path) -> str:
-    """The command of a run from Hydra's records, of a job the command of its sweep (the nearest ``multirun.yaml``)."""
+    """The command of a run from Hydra's records: of a job that of its sweep, unless another has taken its place."""
     sweep = next((parent for parent in folder.resolve().parents if (parent / _SWEEP).is_file()), None)
     try:
-        hydra = dig(_yaml(folder / _HYDRA / "hydra.yaml"), "hydra")
-        is_job = sweep is not None and dig(hydra, "mode") == "MULTIRUN"
-        if is_job:
-            assert sweep is not None
-            hydra = dig(_yaml(sweep / _SWEEP), "hydra")
-        words = dig(hydra, "overrides", "task")
+        job = _yaml(folder / _HYDRA / "hydra.yaml")
+        whole = _yaml(sweep / _SWEEP) if sweep is not None and dig(job, "hydra", "mode") == "MULTIRUN" else {}
     except RunError:
         return "not recorded"
-    shown = [shlex.quote(str(word)) for word in words] if isinstance(words, list) else []
-    return " ".join(["gausim train", *(["-m"] if is_job else []), *shown])
+    own, words = _words(job), _words(whole)
+    values = dict(word.lower().partition("=")[::2] for word in own)
+    asked = [word.lower().partition("=")[::2] for word in words]  # Hydra writes the booleans of jobs as False, True
+    is_its = bool(words) and all(key in values and values[key] in value for key, value in asked)
+    return " ".join(["gausim train", *(["-m", *words] if is_its else own)])
+
+
+def _words(config: dict[str, Any]) -> list[str]:
+    words = dig(config, "hydra", "overrides", "task")
+    return [shlex.quote(str(word)) for word in words] if isinstance(words, list) else []
 
 
 def _read_files(folder: Path, name: str) -> RunRecord:

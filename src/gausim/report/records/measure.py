@@ -86,7 +86,16 @@ def _table(study: Study, name: str, split: str, keys: Sequence[tuple[str, str]],
         return None
     shown = [Row(row.label, [row.cells[i] for i in kept], row.reference) for row in rows]
     shown = [row for row in shown if any(cell is not None for cell in row.cells)]
-    return RecordTable("", [columns[i] for i in kept], shown, caption=SEEDS_APART)
+    return RecordTable("", [columns[i] for i in kept], shown, caption=SEEDS_APART + _unlike(groups, name))
+
+
+def _unlike(groups: Sequence[Group], name: str) -> str:
+    """What to say where rows were not measured on the same sequences, and so cannot be compared."""
+    measured = {group.label: tuple(group.entries(name)[0][1]["sequences"]) for group in groups}
+    if len(set(measured.values())) < 2:
+        return ""
+    counted = "; ".join(f"{label}: {', '.join(sequences)}" for label, sequences in measured.items())
+    return f" Rows of different sequences cannot be compared: {counted}."
 
 
 def _references(groups: Sequence[Group], name: str) -> list[str]:
@@ -116,6 +125,8 @@ def _figure(group: Group, name: str, split: str, metric: str, views: str, *, row
         mean, ratio, std = (found.get(key) for key in ("mean", "ratio", "std"))
         return {"mean": ratio, "std": std * ratio / mean if mean and ratio and std is not None else None}
 
+    several = any(len(entry["sequences"]) > 1 for _, entry in group.entries(name))
+
     value = pooled(group, name, find, metric).value
     if value is None:
         return None
@@ -130,7 +141,7 @@ def _figure(group: Group, name: str, split: str, metric: str, views: str, *, row
         _rounded(value.mean * scale),
         seeds if len(seeds) > 1 else [],
         _rounded(value.seed_std * scale) if value.seed_std is not None and row is None else None,
-        None if value.std is None else _rounded(value.std * scale),
+        _rounded(value.std * scale) if value.std is not None and several else None,
     )
 
 
