@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 from helpers.evaluations import make_quick
+from omegaconf import OmegaConf
 
 from gausim.cli import evaluate, report, simulate, train
 from gausim.cli.test_part import check_protocol
@@ -202,8 +203,10 @@ def test_an_evaluation_after_training_that_could_not_be_made_is_refused_before(
 ) -> None:
     names: Any = "all" if reserved == "all" else [name for name in [reserved] if name]
     data: Any = SimpleNamespace(objects=[ObjectData(toy, test={"sequences": names})], has_videos=True)
-    cfg: Any = SimpleNamespace(protocol=SimpleNamespace(part=part, trials=trials), evaluate=True)
+    cfg = OmegaConf.create({"protocol": {"part": part, "trials": trials}, "evaluate": True})
     if not message:
+        check_protocol(cfg, data)
+        del cfg.protocol  # of an earlier version
         check_protocol(cfg, data)
         return
     with pytest.raises(ConfigError, match=message):

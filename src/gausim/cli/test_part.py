@@ -116,7 +116,8 @@ def check_protocol(cfg: DictConfig, datamodule: ReadyDataModule) -> None:
     """Raises ConfigError where the evaluation after training could not be made as the protocol demands."""
     from gausim.results.looks import DEVELOPMENT, TEST_PART
 
-    part, trials = cfg.protocol.part, cfg.protocol.trials
+    protocol = cfg.get("protocol") or {}  # configurations of earlier versions have none
+    part, trials = protocol.get("part"), protocol.get("trials")
     if part not in (None, DEVELOPMENT, TEST_PART):
         raise ConfigError(f"protocol.part: expected null, {DEVELOPMENT} or {TEST_PART}, got '{part}'.")
     if not cfg.evaluate or not datamodule.has_videos:
