@@ -41,7 +41,10 @@ def test_a_record_holds_every_figure_with_seeds_and_sequences_apart(sweep: Path,
     assert keys[0] == "toy_bunny_comparison" and {"toy_bunny_seen_train", "toy_bunny_unseen_points"} < set(keys)
     first = record.tables[0]
     heads = [column.label for column in first.columns]
-    assert heads == ["l2 [1e-3]", "SSIM [1e-1]", "3D ÷ static", "motion energy", "fit [CPU min]", "per frame [s]"]
+    assert heads == [
+        "l2 [1e-3]", "SSIM [1e-1]", "3D ÷ static", "motion energy", "units", "fit [CPU min]", "fit, memory [GB]",
+        "per frame [s]", "prediction, memory [MB]",
+    ]  # fmt: skip
     rows = {row.label[0]: row for row in first.rows}
     assert list(rows) == ["gausim", "gausim w/o mass", "static"]
     l2 = rows["gausim"].cells[0]
@@ -51,11 +54,27 @@ def test_a_record_holds_every_figure_with_seeds_and_sequences_apart(sweep: Path,
     assert isinstance(one, Figure) and one.seeds == [] and one.seed_std is None and one.std == 7.5
     ratio = rows["gausim"].cells[2]
     assert isinstance(ratio, Figure) and ratio.mean == pytest.approx(1.1 / 4) and ratio.std is not None
-    fit = rows["gausim"].cells[4]
-    assert isinstance(fit, Figure) and fit.mean == pytest.approx(1.1) and rows["static"].cells[4] is None
+    fit, memory = rows["gausim"].cells[5], rows["gausim"].cells[8]
+    assert isinstance(fit, Figure) and fit.mean == pytest.approx(1.1) and rows["static"].cells[5] is None
+    assert isinstance(memory, Figure) and memory.mean == pytest.approx(3.3)
+    assert rows["gausim"].cells[4] == "200 → 20 → 4"
+    assert record.made.missing == ["no_hierarchy/seed_0 (failed)", "no_momentum/seed_0 (unfinished)"]
     assert record.made.commits == ["c0ffeec0ffee"] and record.made.hardware == ["not recorded"]
     save_record(tmp_path / "record.json", record)
     assert load_record(tmp_path / "record.json") == record
+
+
+def test_the_size_of_an_ablation_is_told_against_the_spread_of_seeds(sweep: Path) -> None:
+    report_runs.evaluate(
+        report_runs.write_run(sweep / "no_mass" / "seed_1", report_runs.config(1, conserve_mass=False)),
+        report_runs.make_curves(1.7),
+    )
+    table = measured_record(make_study(find_runs([sweep])), "Sweep").table("toy_bunny_ablations_gausim")
+    full, without = table.rows
+    assert (full.label, without.label) == (["full"], ["w/o mass"]) and full.cells[-2:] == [None, None]
+    # Means 11 and 16, deviations over two seeds the square root of 2 each: a difference of 5 in units of that.
+    assert without.cells[-2:] == [pytest.approx(100 * 5 / 11, rel=1e-4), pytest.approx(5 / 2**0.5, rel=1e-4)]
+    assert [column.label for column in table.columns][:2] == ["l2 [1e-3], seen", "l2 [1e-3], unseen"]
 
 
 def test_a_metric_that_is_new_is_a_column(sweep: Path) -> None:
@@ -94,6 +113,7 @@ def test_results_come_with_commit_command_and_hardware(sweep: Path, capsys: pyte
     assert "tables: file://" in (said := capsys.readouterr().out) and "record: file://" in said
     text = (out / "results.md").read_text()
     command = "gausim train -m experiment=tables/ablations seed=0,1 'data.names=[a]'"
+    assert "* Without figures: no_hierarchy/seed_0 (failed)" in text
     assert f"* Command: `{command}`" in text and "* Commits: c0ffeec0ffee" in text and "* Hardware: " in text
     assert "| gausim | **11.00 ± 1.41 (± 5.52)** |" in text
     # Another sweep of the same name has taken the place of the first.

@@ -1,9 +1,8 @@
 """Linear AR(2) on motion tracked in the images: what images alone give a linear model.
 
-Each seen frame is a displacement of the anchors of Spring-Gaus in the slowest modes of their springs, fitted to the
-images of that frame; modes are scaled to equal elastic energy, so that what no camera sees stays at rest. A linear
-AR(2) (:mod:`gausim.baselines.linear_ar`) is then fitted to these displacements by least squares, and predicts from the
-tracked frames 0 and 1, like the reference row on true states.
+Each seen frame is a displacement of Spring-Gaus' anchors in the slowest modes of their springs, fitted to its images;
+modes have equal elastic energy, so that what no camera sees stays at rest. A linear AR(2) is fitted to these
+displacements by least squares, and predicts from the tracked frames 0 and 1, like the reference row on true states.
 """
 
 from __future__ import annotations
@@ -56,8 +55,7 @@ class LinearTracks(AnchoredMotion):
         for scene_id, own in enumerate(self._anchors):
             self.register_buffer(f"basis_{scene_id}", smooth_basis(own, neighbours, basis))
         counts = [self.get_buffer(f"basis_{i}").shape[0] for i in self.scene_of_sequence]
-        # Changes from frame to frame, so that a frame begins where the one before it was found.
-        self.changes = nn.ParameterList(torch.zeros(self.seen, count) for count in counts)
+        self.changes = nn.ParameterList(torch.zeros(self.seen, n) for n in counts)  # a frame begins where the last is
 
     def tracked(self, sequence_id: int) -> Float[Tensor, "F A 3"]:
         """Displacement of the anchors in the seen frames, frame 0 (rest) first [diagonals]."""
@@ -95,10 +93,8 @@ class LinearTracks(AnchoredMotion):
 
     def notes(self) -> tuple[str, ...]:
         """How the motion is found, and how it goes on."""
-        return (
-            f"A linear AR(2) in {self.modes} principal motions, fitted by least squares to the motion tracked in the "
-            "images of the seen frames; it starts from the tracked frames 0 and 1.",
-        )
+        fit = f"A linear AR(2) in {self.modes} principal motions, fitted by least squares to the motion tracked in the "
+        return (fit + "images of the seen frames; it starts from the tracked frames 0 and 1.",)
 
     def parameter_groups(self) -> Mapping[str, Sequence[Parameter]]:
         """``changes`` of the tracked coordinates from frame to frame, one matrix per sequence."""

@@ -8,7 +8,7 @@ from statistics import fmean
 from typing import Any
 
 from gausim.report.gather.runs import RunRecord, dig
-from gausim.report.gather.study import Group, Study, deviation, number, pooled
+from gausim.report.gather.study import FULL, Group, Study, cell, deviation, number, pooled
 from gausim.report.records.print import SEEDS_APART
 from gausim.report.records.record import SCHEMA, Cell, Column, Figure, Made, Record, RecordTable, Row
 from gausim.results.curves import ERROR_3D, STATIC
@@ -17,6 +17,20 @@ from gausim.results.table import GROUP_TITLES, SPLIT_TITLES, footnotes_of
 
 # Columns of an object's first table, of unseen frames: metric, views.
 _FIRST = (("l2", "train"), ("ssim", "train"), ("lpips", "train"), (ERROR_3D, "points"), (MOTION_ENERGY, "points"))
+
+# Costs beside them. Memory: the most that the training process held; what a prediction adds, on a GPU the peak.
+_COSTS = (
+    Column("units", 0),
+    Column("fit [CPU min]", 1),
+    Column("fit, memory [GB]", 1),
+    Column("per frame [s]", 4),
+    Column("prediction, memory [MB]", 1),
+)
+# Columns of an ablation table: metric, views, frames.
+_ABLATED = (
+    ("l2", "train", "seen"), ("l2", "train", "unseen"), ("lpips", "train", "unseen"), ("l2", "heldout", "unseen"),
+    (ERROR_3D, "points", "seen"), (ERROR_3D, "points", "unseen"), (MOTION_ENERGY, "points", "unseen"),
+)  # fmt: skip
 
 
 def measured_record(study: Study, title: str) -> Record:
@@ -28,6 +42,7 @@ def measured_record(study: Study, title: str) -> Record:
         commands=_distinct(run.command for run in runs),
         hardware=_distinct(machine(run) for run in runs),
         test=study.test,
+        missing=[f"{run.name} ({run.status})" for run in study.runs if run.summary is None],
     )
     tables = [table for name in study.objects for table in _tables(study, name)]
     return Record(SCHEMA, title, made, tables)
@@ -47,6 +62,7 @@ def _tables(study: Study, name: str) -> Iterator[RecordTable]:
     if first is not None:
         first.key, first.title = f"{name}_comparison", f"{name}, {_frames(last, splits)}"
         yield first
+    yield from _ablations(study, name)
     for split in splits:
         for views, place in GROUP_TITLES.items():
             keys = [(metric, views) for metric in _metrics(study, name, split, views)]
@@ -54,6 +70,35 @@ def _tables(study: Study, name: str) -> Iterator[RecordTable]:
             if found is not None:
                 found.key, found.title = f"{name}_{split}_{views}", f"{name}, {place}, {_frames(split, splits)}"
                 yield found
+
+
+def _ablations(study: Study, name: str) -> Iterator[RecordTable]:
+    """Per model with several variations: figures, and the change of l2 in unseen frames against the full model."""
+    about = [group for group in study.groups if group.entries(name)]
+    for family in dict.fromkeys(group.family for group in about):
+        groups = sorted((g for g in about if g.family == family), key=lambda g: g.variation != FULL)
+        if len(groups) < 2 or groups[0].variation != FULL or "unseen" not in study.splits(name):
+            continue
+        keys = [key for key in _ABLATED if study.info(key[0])]
+        rows = [Row([g.variation], [_figure(g, name, s, m, v, row=None) for m, v, s in keys]) for g in groups]
+        columns = [_column(study, m, v, f", {'new view, ' * (v == 'heldout')}{s}") for m, v, s in keys]
+        for group, row in zip(groups, rows, strict=True):
+            row.cells += _effect(groups[0], group, name)
+        columns += [Column("l2, unseen, against full [%]", 1), Column("the same [σ]", 1)]
+        caption = f"{SEEDS_APART} σ: standard error of the difference over seeds.{_unlike(groups, name)}"
+        yield RecordTable(f"{name}_ablations_{family}", columns, rows, ["variation"], f"{name}, {family}", caption)
+
+
+def _effect(full: Group, group: Group, name: str) -> list[Cell]:
+    """Change of l2 in unseen frames against the full model, in per cent and in standard errors over seeds."""
+    a, b = (cell(g, name, "unseen", "train", "l2").value for g in (full, group))
+    if full is group or a is None or b is None or not a.mean:
+        return [None, None]
+    change = b.mean - a.mean
+    spread = None
+    if a.seed_std is not None and b.seed_std is not None:
+        spread = (a.seed_std**2 / a.seeds + b.seed_std**2 / b.seeds) ** 0.5
+    return [_rounded(100 * change / a.mean), _rounded(change / spread) if spread else None]
 
 
 def _frames(split: str, splits: dict[str, Sequence[int]]) -> str:
@@ -77,10 +122,10 @@ def _table(study: Study, name: str, split: str, keys: Sequence[tuple[str, str]],
         rows.append(Row([label], cells, reference=label != STATIC))
     columns = [_column(study, *key) for key in keys]
     if costs:
-        columns += [Column("fit [CPU min]", 1), Column("per frame [s]", 4)]
+        columns += _COSTS
         own = [_costs(group, name) for group in groups]
         for i, row in enumerate(rows):
-            row.cells += own[i] if i < len(own) else [None, None]
+            row.cells += own[i] if i < len(own) else [None] * len(_COSTS)
     kept = [i for i in range(len(columns)) if any(row.cells[i] is not None for row in rows)]
     if not kept:
         return None
@@ -104,15 +149,15 @@ def _references(groups: Sequence[Group], name: str) -> list[str]:
     return list(dict.fromkeys(row for entry in entries for row in entry["rows"] if row not in methods))
 
 
-def _column(study: Study, metric: str, views: str) -> Column:
+def _column(study: Study, metric: str, views: str, more: str = "") -> Column:
     info = study.info(metric) or {}
     if metric == MOTION_ENERGY:
-        return Column("motion energy", 2, "one")
+        return Column(f"motion energy{more}", 2, "one")
     if metric == ERROR_3D:
-        return Column("3D ÷ static", 3, "low")
+        return Column(f"3D ÷ static{more}", 3, "low")
     better = {True: "high", False: "low"}.get(info.get("higher_is_better"), "")  # type: ignore[arg-type]
     unit = f" [{info['unit']}]" if info.get("unit") else ""
-    return Column(f"{info['label']}{unit}", 2, better)  # type: ignore[arg-type]
+    return Column(f"{info['label']}{unit}{more}", 2, better)  # type: ignore[arg-type]
 
 
 def _figure(group: Group, name: str, split: str, metric: str, views: str, *, row: str | None) -> Cell:
@@ -146,14 +191,24 @@ def _figure(group: Group, name: str, split: str, metric: str, views: str, *, row
 
 
 def _costs(group: Group, name: str) -> list[Cell]:
-    """Minutes of processor time of training, over seeds, and seconds per predicted frame."""
+    """Costs of training and of a prediction, in the columns of ``_COSTS``, over seeds."""
     entries = [entry for _, entry in group.entries(name)]
-    fits = [number(dig(footnotes_of(entry, group.method).get("fit"), "cpu_seconds")) for entry in entries]
-    frames = [number(dig(entry, "efficiency", group.method, "seconds_per_frame", "mean")) for entry in entries]
-    return [_over_seeds([v / 60 for v in fits if v is not None]), _over_seeds([v for v in frames if v is not None])]
+    costs = [dig(entry, "efficiency", group.method) for entry in entries]
+    fits = [footnotes_of(entry, group.method).get("fit") for entry in entries]
+    added = "peak_bytes" if str(dig(costs[0], "memory", "kind")).startswith("CUDA") else "added_bytes"
+    counts = dig(costs[0], "levels", "counts")
+    return [
+        " → ".join(map(str, counts)) if isinstance(counts, list) else None,
+        _over_seeds(fits, 1 / 60, "cpu_seconds"),
+        _over_seeds(fits, 1e-9, "peak_bytes"),
+        _over_seeds(costs, 1.0, "seconds_per_frame", "mean"),
+        _over_seeds(costs, 1e-6, "memory", added),
+    ]
 
 
-def _over_seeds(values: Sequence[float]) -> Cell:
+def _over_seeds(nodes: Sequence[Any], scale: float, *keys: str) -> Cell:
+    """A number of every seed, times ``scale``."""
+    values = [scale * value for node in nodes if (value := number(dig(node, *keys))) is not None]
     if not values:
         return None
     spread = deviation(values)

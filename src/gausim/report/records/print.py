@@ -13,7 +13,7 @@ from gausim.report.records.record import Cell, Column, Figure, Made, Record, Rec
 from gausim.report.render import latex_escape
 
 TEMPLATE = "page.md"
-SEEDS_APART = "± deviation over seeds; in brackets, deviation over sequences (mean over seeds)."
+SEEDS_APART = "± deviation over seeds; in brackets, deviation over sequences (root mean square over seeds)."
 
 
 def markdown_table(table: RecordTable) -> str:
@@ -47,12 +47,13 @@ def latex_table(table: RecordTable, record: Record) -> str:
 
 
 def origin(made: Made) -> list[str]:
-    """Date, commits, hardware and commands, one line each."""
+    """Date, commits, hardware, commands and runs without figures, one line each."""
     return [
         f"Recorded: {made.recorded}",
         f"Commits: {', '.join(made.commits) or 'unknown'}",
         f"Hardware: {'; '.join(made.hardware) or 'unknown'}",
         *(f"Command: {command}" for command in made.commands),
+        *(f"Without figures: {run}" for run in made.missing),
     ]
 
 

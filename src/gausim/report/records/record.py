@@ -1,7 +1,7 @@
 """Records of measured tables: small JSON files that outlive the run directories, from which pages are made.
 
     {"schema": "gausim.record/1", "title",
-     "made": {"recorded", "commits": [...], "commands": [...], "hardware": [...], "test"},
+     "made": {"recorded", "commits": [...], "commands": [...], "hardware": [...], "test", "missing": [...]},
      "facts": {NAME: number or text},                       single figures that a page's sentences name
      "tables": [{"key", "title", "caption", "stub": [heading, ...], "columns": [{"label", "digits", "better"}],
                  "rows": [{"label": [text, ...], "cells": [CELL, ...], "reference"}], "groups"}]}
@@ -74,7 +74,7 @@ class RecordTable(msgspec.Struct, omit_defaults=True, forbid_unknown_fields=True
                 )
 
 
-class Made(msgspec.Struct, forbid_unknown_fields=True):
+class Made(msgspec.Struct, omit_defaults=True, forbid_unknown_fields=True):
     """Origin of the figures."""
 
     recorded: str  # date, or that it was before records existed
@@ -82,6 +82,7 @@ class Made(msgspec.Struct, forbid_unknown_fields=True):
     commands: list[str] = []
     hardware: list[str] = []
     test: str = ""  # trials and looks, where figures are of a test part
+    missing: list[str] = []  # runs without figures, with their state
 
 
 class Record(msgspec.Struct, forbid_unknown_fields=True):
