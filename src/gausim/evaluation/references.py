@@ -38,8 +38,9 @@ class Reference:
         self.name = STATIC
         if any(record.hands is not None for record in data.sequences):
             self.name = FOLLOW_HANDS
-        elif data.surroundings.free and all(data.ground_truth(record) is not None for record in data.sequences):
-            self.name = BALLISTIC
+        elif data.surroundings.free:
+            shown = [record for record in data.sequences if record.limit is None]  # not of a sealed test part
+            self.name = BALLISTIC if all(data.ground_truth(record) is not None for record in shown) else STATIC
 
     def trajectory(self, record: SequenceRecord, truth: GroundTruth | None) -> Trajectory:
         """Its prediction of a sequence."""

@@ -11,9 +11,9 @@ from gausim.report.gather.runs import RunRecord, dig
 from gausim.report.gather.study import FULL, Group, Study, cell, deviation, number, pooled
 from gausim.report.records.print import SEEDS_APART
 from gausim.report.records.record import SCHEMA, Cell, Column, Figure, Made, Record, RecordTable, Row
-from gausim.results.curves import ERROR_3D, STATIC
+from gausim.results.curves import ERROR_3D, FOLLOW_HANDS, STATIC
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import GROUP_TITLES, SPLIT_TITLES, footnotes_of
+from gausim.results.table import GROUP_TITLES, SPLIT_TITLES, footnotes_of, reference_row
 
 # Columns of an object's first table, of unseen frames: metric, views.
 _FIRST = (("l2", "train"), ("ssim", "train"), ("lpips", "train"), (ERROR_3D, "points"), (MOTION_ENERGY, "points"))
@@ -81,7 +81,7 @@ def _ablations(study: Study, name: str) -> Iterator[RecordTable]:
             continue
         keys = [key for key in _ABLATED if study.info(key[0])]
         rows = [Row([g.variation], [_figure(g, name, s, m, v, row=None) for m, v, s in keys]) for g in groups]
-        columns = [_column(study, m, v, f", {'new view, ' * (v == 'heldout')}{s}") for m, v, s in keys]
+        columns = [_column(study, name, m, f", {'new view, ' * (v == 'heldout')}{s}") for m, v, s in keys]
         for group, row in zip(groups, rows, strict=True):
             row.cells += _effect(groups[0], group, name)
         columns += [Column("l2, unseen, against full [%]", 1), Column("the same [σ]", 1)]
@@ -119,8 +119,8 @@ def _table(study: Study, name: str, split: str, keys: Sequence[tuple[str, str]],
     rows = [Row([g.label], [_figure(g, name, split, *key, row=None) for key in keys]) for g in groups]
     for label in _references(groups, name):
         cells = [_figure(groups[0], name, split, *key, row=label) for key in keys]
-        rows.append(Row([label], cells, reference=label != STATIC))
-    columns = [_column(study, *key) for key in keys]
+        rows.append(Row([label], cells, reference=label not in (STATIC, FOLLOW_HANDS)))  # others see the truth
+    columns = [_column(study, name, metric) for metric, _ in keys]
     if costs:
         columns += _COSTS
         own = [_costs(group, name) for group in groups]
@@ -149,12 +149,13 @@ def _references(groups: Sequence[Group], name: str) -> list[str]:
     return list(dict.fromkeys(row for entry in entries for row in entry["rows"] if row not in methods))
 
 
-def _column(study: Study, metric: str, views: str, more: str = "") -> Column:
+def _column(study: Study, name: str, metric: str, more: str = "") -> Column:
     info = study.info(metric) or {}
     if metric == MOTION_ENERGY:
         return Column(f"motion energy{more}", 2, "one")
     if metric == ERROR_3D:
-        return Column(f"3D ÷ static{more}", 3, "low")
+        entries = (entry for group in study.groups for _, entry in group.entries(name))
+        return Column(f"3D ÷ {reference_row(next(entries))}{more}", 3, "low")
     better = {True: "high", False: "low"}.get(info.get("higher_is_better"), "")  # type: ignore[arg-type]
     unit = f" [{info['unit']}]" if info.get("unit") else ""
     return Column(f"{info['label']}{unit}{more}", 2, better)  # type: ignore[arg-type]
