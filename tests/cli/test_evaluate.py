@@ -17,7 +17,7 @@ def run(toy, tmp_path, monkeypatch):
     """A run whose model knows the toy's formula and reads the sequence from its initial state."""
     toy = toy_object.ToyObject(toy, toy_object.toy_scene())
     names = list(toy.amplitudes)
-    initial = SimpleNamespace(previous=lambda sequence: toy.scene.means + sequence)
+    initial = SimpleNamespace(state=lambda sequence: SimState(toy.scene.means, toy.scene.means + sequence))
 
     def rollout(state, steps):
         return toy.truth(names[round(float((state.previous - toy.scene.means).mean()))], frames=steps + 1)

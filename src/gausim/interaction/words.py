@@ -38,7 +38,7 @@ _HELP = {
 EPILOG = """\
 parts of an object (on=PART):
   whole                 all of it (the default)
-  tip[:RADIUS]          a ball about the kernel farthest from the pinned ones; RADIUS in diagonals (default 0.15)
+  tip[:RADIUS]          a ball about the kernel farthest from the pins (or the middle); RADIUS in diagonals (0.15)
   unit:LEVEL/INDEX      a unit of the hierarchy, e.g. unit:1/7 (`gausim inspect SCENE` draws them)
   ball:X,Y,Z,RADIUS     kernels at rest within RADIUS diagonals of a point
   kernels:0-9,12        listed kernels
@@ -123,7 +123,8 @@ def parse_part(text: str, scene: GaussianScene) -> Selected:
         return Whole()
     if kind == "tip":
         free = scene.means[scene.simulated & ~scene.pinned]
-        x, y, z = free[(free - scene.means[scene.pinned].mean(0)).norm(dim=-1).argmax()].tolist()
+        root = (scene.means[scene.pinned] if bool(scene.pinned.any()) else free).mean(0)
+        x, y, z = free[(free - root).norm(dim=-1).argmax()].tolist()
         return Ball((x, y, z), _number(rest) if rest else _TIP)
     if kind == "unit" and rest.count("/") == 1:
         level, _, index = rest.partition("/")

@@ -10,7 +10,18 @@ from pathlib import Path
 from typing import Any
 
 from gausim.interaction.selections import Selected
-from gausim.interaction.session import Event, Gravity, Impulse, Pin, Release, Unpin, Wind, parse_session, save_session
+from gausim.interaction.session import (
+    Event,
+    Gravity,
+    Hand,
+    Impulse,
+    Pin,
+    Release,
+    Unpin,
+    Wind,
+    parse_session,
+    save_session,
+)
 from gausim.interaction.words import parse_direction
 from gausim.viewer.coloring import VIEW, Legend, gradient_css
 from gausim.viewer.live import Live
@@ -22,6 +33,9 @@ AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _AT_LIMIT = "At the limit of what was learned: the forces act only in part. Pull less for what would really happen."
 # Largest refresh rate of the panel [1 / s].
 _REFRESHES = 4.0
+
+# Time in which a hand follows its slider [s].
+HAND_SECONDS = 0.15
 
 
 class Page:
@@ -90,6 +104,24 @@ class Page:
             self._toward = gui.add_dropdown("Towards", AXES, initial_value="+x")
             self._on_press(gui.add_button("Push once"), lambda: self._on_selection(self._impulse))
         self._strengths = [self._steady(gui, "Wind", "+x", Wind), self._steady(gui, "Gravity", self._down, Gravity)]
+        if bool(self._live.interaction.scene.pinned.any()):
+            self._strengths += self._hand(gui)
+
+    def _hand(self, gui: Any) -> list[Any]:
+        """Sliders of where the pins are held, relative to rest."""
+        scene, fps = self._live.interaction.scene, self._live.interaction.fps
+        with gui.add_folder("Hand", expand_by_default=False):
+            hint = "Moves what is pinned, in diagonals of the object"
+            places = [gui.add_slider(f"Hand {axis}", -0.5, 0.5, 0.01, 0.0, hint=hint) for axis in "xyz"]
+
+        def move(_: object) -> None:
+            x, y, z = (scene.diagonal * float(place.value) for place in places)
+            event = Hand((x, y, z), max(1, round(HAND_SECONDS * fps)))
+            self._live.do(lambda: self._live.act(event))
+
+        for place in places:
+            self._on_change(place, (-0.5, 0.5), move)
+        return places
 
     def _steady(self, gui: Any, name: str, axis: str, kind: type[Wind] | type[Gravity]) -> Any:
         with gui.add_folder(name, expand_by_default=False):
