@@ -40,6 +40,79 @@ def test_a_frame_is_decoded_once(blob: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert torch.equal(record.frames(range(3), ["cam_0"]), first), "samples must not share memory with the store"
 
 
+def _state(root: Path, **facts: object) -> None:
+    path = root / "dataset.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **facts}))
+
+
+def test_surroundings_are_those_of_the_facts(spoilt: Path) -> None:
+    _state(spoilt, free=True, gravity="trained", floor={"point": [0, 0, 1], "normal": [0, 0, 2]})
+    world = ObjectData(spoilt).surroundings
+    assert world.free and world.trains_gravity and world.gravity is None and not world.still
+    assert world.floor is not None and world.floor.normal == (0.0, 0.0, 1.0) and world.floor.friction is None
+    assert ObjectData(spoilt).scene().surroundings == world
+
+
+@pytest.mark.parametrize(
+    ("facts", "message"),
+    [
+        ({"gravity": [0, 0]}, "gravity"),
+        ({"floor": {"point": [0, 0, 0]}}, "normal"),
+        ({"floor": {"point": [0, 0, 0], "normal": [0, 0, 0]}}, "'floor.normal'"),
+        ({"floor": {"point": [0, 0, 0], "normal": [0, 0, 1], "friction": -1}}, "friction"),
+        ({"free": "yes"}, "free"),
+        ({"grip": 0}, "grip"),
+    ],
+)
+def test_wrong_surroundings_are_refused(spoilt: Path, facts: dict[str, object], message: str) -> None:
+    _state(spoilt, **facts)
+    with pytest.raises(DataError, match=rf"dataset\.json.*{message}"):
+        ObjectData(spoilt)
+
+
+def _hold(root: Path, **changed: object) -> None:
+    """Hands at the first and the last kernel of the scene, in every sequence."""
+    means = ObjectData(root).scene().means.numpy()
+    arrays = {"points": np.repeat(means[[0, -1]][None], FRAMES, 0), "hand": np.array([0, 1])} | changed
+    for folder in (root / "sequences").iterdir():
+        np.savez(folder / "hands.npz", **arrays)
+
+
+def test_kernels_near_a_hand_are_pinned_to_it(spoilt: Path) -> None:
+    _hold(spoilt)
+    _state(spoilt, grip=1e-6)
+    item = ObjectData(spoilt)
+    scene, path = item.scene(), item.sequences[0].hands
+    assert scene.hand is not None and (scene.hand[0], scene.hand[-1]) == (0, 1)
+    assert scene.pinned[scene.hand >= 0].all()
+    assert path is not None and path.frames == FRAMES
+    pose = path.pose(FRAMES + 5)
+    torch.testing.assert_close(pose.move(scene.means[:1], torch.tensor([0])), scene.means[:1])
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"points": np.zeros((3, 2, 3))}, "'points' is of shape"),
+        ({"points": np.full((FRAMES, 2, 3), np.nan)}, "'points' must hold finite"),
+        ({"hand": np.array([0, 2])}, "'hand' has"),
+        ({"hand": np.array([0.0, 1.0])}, "'hand' is"),
+        ({"hand": np.array([0])}, "'hand' is"),
+    ],
+)
+def test_wrong_hands_are_refused(spoilt: Path, changed: dict[str, object], message: str) -> None:
+    _hold(spoilt, **changed)
+    with pytest.raises(DataError, match=rf"hands\.npz.*{message}"):
+        _ = ObjectData(spoilt).sequences
+
+
+def test_a_hand_that_holds_nothing_is_refused(spoilt: Path) -> None:
+    _hold(spoilt, points=np.full((FRAMES, 2, 3), 99.0))
+    _state(spoilt, grip=0.1)
+    with pytest.raises(DataError, match="'grip' is 0.1: hand 0 holds none"):
+        ObjectData(spoilt).scene()
+
+
 def test_facts_and_true_motion(blob: Path) -> None:
     item = ObjectData(blob)
     assert (item.name, item.fps, item.diagonal) == ("blob", 24.0, 1.5)

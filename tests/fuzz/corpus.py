@@ -142,6 +142,7 @@ def _object(folder: Path) -> Iterator[Reader]:
     yield Reader("array", root / "rest_points.npz", "npz", lambda p: read_array(p, "points"), 2)
     yield Reader("frame", sequence / "cam_0" / "0000.png", "png", whole)
     yield Reader("any json", root / "dataset.json", "json", read_json, 2)
+    yield from _surroundings(folder)
     bodies = toy_corpus.write_toy_corpus(folder / "bodies", bodies=1)
 
     def body(_: Path) -> Any:
@@ -150,6 +151,27 @@ def _object(folder: Path) -> Iterator[Reader]:
 
     yield Reader("manifest of a corpus", bodies / "manifest.json", "json", body)
     yield Reader("shard of a corpus", bodies / "shard_00000.safetensors", "binary", body)
+
+
+def _surroundings(folder: Path) -> Iterator[Reader]:
+    root = toy_object.write_toy_object(folder / "held", frames=8).root
+    facts = json.loads((root / "dataset.json").read_text())
+    floor = {"point": [0.0, 0.0, -1.0], "normal": [0.0, 0.0, 1.0], "friction": 0.3, "restitution": 0.1}
+    facts |= {"gravity": [0.0, 0.0, -9.8], "floor": floor, "free": False, "grip": 0.5}
+    (root / "dataset.json").write_text(json.dumps(facts))
+    points = np.repeat(SCENE.means[SCENE.pinned][:4].numpy()[None], 8, 0)
+    for sequence in (root / "sequences").iterdir():
+        np.savez(sequence / "hands.npz", points=points, hand=np.zeros(4, np.int64))
+
+    def held(_: Path) -> Any:
+        data = ObjectData(root)
+        hands = [record.hands.pose(3) for record in data.sequences if record.hands is not None]
+        scene, world = data.scene(), data.surroundings
+        assert world.floor is None or scene.surroundings == world
+        return world.gravity, world.floor and world.floor.normal, [(h.rotations, h.centres) for h in hands]
+
+    yield Reader("surroundings", root / "dataset.json", "json", held, 6)
+    yield Reader("hands", root / "sequences" / "seq_000" / "hands.npz", "npz", held, 6)
 
 
 def _store(folder: Path) -> Iterator[Reader]:
