@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gausim.cli.main import COMMANDS
@@ -11,6 +12,11 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from gausim.core.scene import GaussianScene
+    from gausim.interaction.interaction import Interaction
+
+
+# Vertical axes of scenes; a minus where the axis points down.
+UPS = ("x", "y", "z", "-x", "-y", "-z")
 
 
 def command_parser(name: str, more: str = "", epilog: str = "") -> argparse.ArgumentParser:
@@ -42,6 +48,39 @@ def pinned_by(scene: GaussianScene, arguments: argparse.Namespace) -> GaussianSc
     sides = ((arguments.pin_below, False), (arguments.pin_above, True))
     chosen = [parse_half_space(text, above=above) for text, above in sides if text]
     return apply_masks(scene, pinned=chosen[0] | chosen[-1]) if chosen else scene
+
+
+def add_scene_options(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """Adds the options of a scene without videos, which :func:`opened_scene` reads; returns their group."""
+    group = parser.add_argument_group("a scene without a run")
+    add = group.add_argument
+    add("--from", dest="base", metavar="RUN", type=Path, help="run of model=gausim whose network moves the scene")
+    add("--stiffness", type=float, metavar="S",
+        help="with --from: the slowest swing takes S^(-1/2) seconds (default: 1)")  # fmt: skip
+    add("--damping", type=float, metavar="D",
+        help="with --from: amplitudes fall as exp(-D t / 2) [1 / s] (default: 0.5)")  # fmt: skip
+    add("--fps", type=float, default=30.0, help="frames per second (default: 30)")
+    add("--seed", type=int, default=0, help="of the random weights of an untrained model (default: 0)")
+    add_pin_options(parser)
+    return group
+
+
+def opened_scene(scene: GaussianScene, arguments: argparse.Namespace, **options: Any) -> Interaction:
+    """The scene with the model of :func:`add_scene_options`; ``options`` are those of `open_scene`.
+
+    Raises:
+        ConfigError: a material is given without a run, or a number is not positive.
+    """
+    from gausim.compose.bare import EvenMaterial, open_scene
+    from gausim.core.errors import ConfigError
+
+    given = {name: getattr(arguments, name) for name in ("stiffness", "damping")}
+    material = {name: value for name, value in given.items() if value is not None}
+    if material and arguments.base is None:
+        raise ConfigError(f"--{next(iter(material))}: the material of a scene needs a trained network, --from RUN.")
+    return open_scene(
+        scene, fps=arguments.fps, base=arguments.base, seed=arguments.seed, material=EvenMaterial(**material), **options
+    )
 
 
 def positive(text: str) -> int:

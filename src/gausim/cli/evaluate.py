@@ -30,13 +30,15 @@ def main(argv: list[str]) -> int:
 
     from gausim.cli.end import end, error_sentences
     from gausim.cli.test_part import choose, look
-    from gausim.compose.build import load_run
+    from gausim.compose.build import is_pretrained, load_run
     from gausim.compose.data_paths import data_option
     from gausim.compose.predict import state_of
     from gausim.evaluation.evaluation import write_evaluation
     from gausim.report.pictures.figures import error_figure
     from gausim.report.pictures.motion import diagnosis_figure
 
+    if is_pretrained(arguments.run):
+        return _evaluate_bodies(arguments)
     run = load_run(arguments.run, data=data_option(arguments.data))
     facts = {"name": run.config.get("name"), "seed": run.config.get("seed"), "views": arguments.views, **state_of(run)}
     chosen = choose(run, arguments)
@@ -65,6 +67,27 @@ def main(argv: list[str]) -> int:
         print("\n".join(f"wrote {folder / name}" for name in [*WRITTEN, *drawn]))
     commands = [["report", arguments.run], ["simulate", arguments.run]] if whole else [["evaluate", arguments.run]]
     end(error_sentences(summary["objects"]), "tables", folder / "table.md", *commands)
+    return 0
+
+
+def _evaluate_bodies(arguments: argparse.Namespace) -> int:
+    """Measures a run on a corpus: the motion, and where it was fitted the stiffness, of the bodies held out."""
+    from gausim.cli.end import end
+    from gausim.compose.build import load_corpus_run
+    from gausim.compose.data_paths import data_option
+    from gausim.evaluation.corpus import FILE, body_figures, sentences, write_figures
+
+    if arguments.object or arguments.sequences or arguments.views != "all" or arguments.endurance is not None:
+        raise ConfigError(
+            f"{arguments.run}: a run on a corpus is measured as a whole, on true points. Leave out --object, --sequences, "
+            "--views and --endurance."
+        )
+    folder = arguments.out or arguments.run / "evaluation"
+    whole = write_figures(folder, body_figures(*load_corpus_run(arguments.run, data=data_option(arguments.data))))
+    if arguments.json:
+        print((folder / FILE).read_text(), end="")
+        return 0
+    end(sentences(whole), "figures", folder / FILE)
     return 0
 
 

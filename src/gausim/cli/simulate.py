@@ -7,7 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.cli.arguments import add_data_option, command_parser, parse_background, positive
+from gausim.cli.arguments import (
+    UPS,
+    add_data_option,
+    add_scene_options,
+    command_parser,
+    parse_background,
+    positive,
+)
+from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,6 +33,12 @@ def main(argv: list[str]) -> int:
 
     arguments = _parser().parse_args(argv)
     parse_background(arguments.background)  # raises on a wrong value before the simulation
+    if (arguments.run is None) == (arguments.scene is None):
+        raise ConfigError("expected a RUN, or --scene SCENE.ply and the run whose network moves it, --from RUN.")
+    if arguments.scene is not None:
+        from gausim.cli.simulate_scene import simulate_scene
+
+        return simulate_scene(arguments)
     from gausim.cli.end import end, push
     from gausim.compose.build import load_run
     from gausim.compose.data_paths import data_option
@@ -56,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog=EPILOG,
     )
     add = parser.add_argument
-    add("run", metavar="RUN", type=Path, help="run directory of `gausim train`")
+    add("run", metavar="RUN", nargs="?", type=Path, help="run directory of `gausim train`")
     add("--object", nargs="+", metavar="NAME", help="only these objects")
     add("--sequence", nargs="+", metavar="NAME", help="sequences, or `all`; default the first of each object")
     add("--frames", type=positive, metavar="N", help="frames to predict; default as many as were recorded")
@@ -69,6 +83,10 @@ def _parser() -> argparse.ArgumentParser:
     add("--gif", action="store_true", help="write GIFs besides")
     add("--verbose", action="store_true", help="list the files that are written")
     add_force_options(parser)
+    group = add_scene_options(parser)
+    group.add_argument("--scene", metavar="SCENE.ply", type=Path, help="3DGS scene; give --from, and pins if it has none")
+    group.add_argument("--up", choices=UPS, default="z", help="vertical axis of the scene (write --up=-y; default: z)")
+    group.add_argument("--azimuth", type=float, default=0.0, metavar="DEGREES", help="of the camera (default: 0)")
     return parser
 
 

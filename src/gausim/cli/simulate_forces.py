@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from gausim.compose.build import LoadedRun
     from gausim.compose.predict import RunObject
-    from gausim.core import Cameras, Trajectory
+    from gausim.core import Cameras, GaussianScene, Renderer, Trajectory
     from gausim.interaction.arrows import Arrow
     from gausim.interaction.interaction import Interaction
     from gausim.interaction.session import ForceSession
@@ -53,11 +53,12 @@ def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) ->
     write_trajectory(run, item, session.made_with.initial, trajectory, folder)
     save_session(session, folder / "session.json")
     for view in views:
-        _write_view(run, item, trajectory, arrows, view, arguments, folder)
+        cameras = _sharp(item.data.sequences[0].cameras_of([view]))
+        write_film(run.renderer, interaction.scene, trajectory, arrows, cameras, arguments, folder)
     if arguments.verbose:
         print("\n".join(f"wrote {path}" for path in sorted(folder.iterdir())))
     replayed = ["simulate", arguments.run, "--session", folder / "session.json"]
-    end(_told(interaction, trajectory), "videos", folder, ["view", arguments.run], replayed)
+    end(told(interaction, trajectory), "videos", folder, ["view", arguments.run], replayed)
     return 0
 
 
@@ -114,29 +115,28 @@ def write_trajectory(run: LoadedRun, item: RunObject, sequence: str, trajectory:
     save_trajectory(folder / "trajectory.safetensors", trajectory, facts=facts)
 
 
-def _write_view(
-    run: LoadedRun,
-    item: RunObject,
+def write_film(
+    renderer: Renderer,
+    scene: GaussianScene,
     trajectory: Trajectory,
     arrows: list[list[Arrow]],
-    view: str,
+    cameras: Cameras,
     arguments: argparse.Namespace,
     folder: Path,
 ) -> None:
+    """Writes the video and the contact sheet of a motion and its forces in one view, named after the camera."""
     import numpy as np
 
-    from gausim.compose.predict import scene_of
     from gausim.interaction.arrows import draw_arrows
     from gausim.io.video import write_gif, write_video
     from gausim.render.draw import film
     from gausim.report.pictures.figures import picture_grid
     from gausim.report.pictures.frames import brighten, label_bar
 
-    scene, cameras = scene_of(run, item), _sharp(item.data.sequences[0].cameras_of([view]))
-    background = parse_background(arguments.background)
-    drawn = film(run.renderer, scene, trajectory, cameras, background=background, mask=scene.foreground)
+    (view,), background = cameras.names, parse_background(arguments.background)
+    drawn = film(renderer, scene, trajectory, cameras, background=background, mask=scene.foreground)
     images = brighten(drawn[:, 0].cpu().numpy(), arguments.brighten)
-    fps, title = item.data.fps / arguments.slow, f"{item.data.name} {view}"
+    fps, title = trajectory.fps / arguments.slow, f"{scene.name} {view}"
 
     def pictures() -> Iterator[np.ndarray]:
         for number, image in enumerate(images):
@@ -166,7 +166,7 @@ def _sharp(cameras: Cameras) -> Cameras:
     return Cameras(cameras.viewmats, Ks, round(cameras.width * zoom), round(cameras.height * zoom), cameras.names)
 
 
-def _told(interaction: Interaction, trajectory: Trajectory) -> list[str]:
+def told(interaction: Interaction, trajectory: Trajectory) -> list[str]:
     """Sentences on the largest displacement and on limits that applied."""
     scene = interaction.scene
     away = (trajectory.positions - scene.means.to(trajectory.positions)).norm(dim=-1) / scene.diagonal

@@ -9,7 +9,14 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.cli.arguments import add_data_option, add_pin_options, command_parser, pinned_by
+from gausim.cli.arguments import (
+    UPS,
+    add_data_option,
+    add_scene_options,
+    command_parser,
+    opened_scene,
+    pinned_by,
+)
 
 if TYPE_CHECKING:
     from gausim.cli.view_subject import Playable
@@ -45,7 +52,7 @@ def main(argv: list[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(
         "view",
-        " A scene without a run is moved by the elastic template of the untrained default model.",
+        " A scene without a run is moved by the network of the run given by --from, or by the template of an untrained model.",
         epilog="GAUSIM_VIEW_TOKEN in the environment sets the token (16 or more letters and digits) and has it asked "
         "for on 127.0.0.1 too.",
     )
@@ -56,22 +63,19 @@ def _parser() -> argparse.ArgumentParser:
     add("--beside", metavar="RUN", type=Path, help="another run of the same object, to which the same is done")
     add_data_option(parser)
     add("--gravity", type=float, metavar="G", help="what makes a weight of a mass [scene units / s^2] (default: 9.81)")
-    add("--up", choices=("x", "y", "z", "-x", "-y", "-z"), default="z", help="vertical axis of the scene (default: z)")
+    add("--up", choices=UPS, default="z", help="vertical axis of the scene (default: z)")
     add("--sessions", metavar="DIR", type=Path, help="where sessions are saved; default RUN/sessions or ./sessions")
     add("--host", default="127.0.0.1", metavar="ADDRESS", help="address to listen at (default: 127.0.0.1)")
     add("--port", type=int, default=8080, help="0 takes a free one (default: 8080)")
     add("--allow-remote", action="store_true", help="with --host: other machines may connect, with the printed token")
     add("--name", action="append", default=[], metavar="HOST", help="host name by which the page may be asked for")
     add("--seconds", type=int, metavar="N", help="stop after so many seconds; default when interrupted")
-    bare = parser.add_argument_group("a scene without a run")
-    bare.add_argument("--fps", type=float, default=30.0, help="frames per second (default: 30)")
-    bare.add_argument("--seed", type=int, default=0, help="of the random weights (default: 0)")
-    add_pin_options(parser)
+    add_scene_options(parser)
     return parser
 
 
 def _subject(arguments: argparse.Namespace) -> Subject:
-    from gausim.cli.view_subject import playable_scene, subject_of
+    from gausim.cli.view_subject import Playable, subject_of
     from gausim.core.errors import ConfigError
     from gausim.io.ply import load_scene
 
@@ -82,12 +86,13 @@ def _subject(arguments: argparse.Namespace) -> Subject:
         made = _of_run(arguments.what, arguments, arguments.object)
     else:
         bare = pinned_by(load_scene(arguments.what), arguments)
-        made = playable_scene(bare, fps=arguments.fps, seed=arguments.seed, gravity=arguments.gravity)
+        made = Playable(opened_scene(bare, arguments, gravity=arguments.gravity))
     if arguments.beside is not None:
         beside = _of_run(arguments.beside, arguments, made.interaction.scene.name)
     sessions = arguments.sessions or (arguments.what / "sessions" if is_run else Path("sessions"))
     scene = made.interaction.scene
-    method = made.run.module.method_name if made.run is not None else "untrained: elastic template only"
+    untrained = "untrained: template only" if arguments.base is None else f"network of {arguments.base}"
+    method = made.run.module.method_name if made.run is not None else untrained
     title = f"{scene.name}: {scene.count} kernels, {method}"
     return subject_of(made, title=title, beside=beside, up=arguments.up, sessions=sessions)
 

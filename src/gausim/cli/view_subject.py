@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.compose.live import REST, energy_ceiling, open_interaction
-from gausim.core import ConfigError, GaussianScene, SimState, Trajectory
-from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.compose.live import REST, open_interaction
+from gausim.core import Trajectory
 
 if TYPE_CHECKING:
     from gausim.compose.build import LoadedRun
@@ -20,9 +18,6 @@ if TYPE_CHECKING:
     from gausim.models.template.template import Property
     from gausim.viewer.shown import Take
     from gausim.viewer.subject import Subject
-
-# The model of a bare scene: its untrained network outputs zero, so that only the elastic template acts.
-BARE_MODEL = "gausim"
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,37 +57,6 @@ def playable_run(
 
     item = run_objects(run, [name] if name is not None else None)[0]
     return Playable(open_interaction(run, name=name, sequence=sequence, gravity=gravity, keep=keep), item, run)
-
-
-def playable_scene(
-    scene: GaussianScene, *, fps: float, seed: int, gravity: float | None = None, keep: int | None = 0
-) -> Playable:
-    """A scene without a run: the elastic template of the default model with a network that outputs zero.
-
-    Raises:
-        SceneError: no kernel is pinned.
-        ConfigError: the frame rate is not positive and finite.
-    """
-    import torch
-
-    from gausim.compose.config import compose, instantiate
-    from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction
-    from gausim.interaction.session import MadeWith
-    from gausim.ops.selection import require_pinned
-
-    if not (math.isfinite(fps) and fps > 0):
-        raise ConfigError(f"--fps {fps}: expected frames per second > 0.")
-    require_pinned(scene)
-    torch.manual_seed(seed)
-    model = instantiate(compose(f"model/{BARE_MODEL}").model.simulator)(scenes=[scene], fps=[fps])
-    dynamics, initial = SceneDynamics(model), SimState(scene.means, scene.means)
-    dynamics.energy_ceiling = energy_ceiling(model, 0, ())
-    made_with = MadeWith.of(scene, model, initial, settings=BARE_MODEL, run="untrained")
-    interaction = Interaction(
-        scene, dynamics, dynamics.masses, initial, made_with=made_with, units=tuple(model.units_of_kernels(0)),
-        gravity=STANDARD_GRAVITY if gravity is None else gravity, keep=keep,
-    )  # fmt: skip
-    return Playable(interaction)
 
 
 def takes_of(made: Playable, beside: Playable | None) -> list[Take]:

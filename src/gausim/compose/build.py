@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -26,7 +26,7 @@ from gausim.training.module import GausSimModule
 from gausim.training.pretraining import KnownStates
 from gausim.training.supervision.images import Sources, Supervision
 
-# Target of the data of pretraining, which runs are not loaded with.
+# Target of the data of pretraining.
 PRETRAINING = "gausim.data.pretraining.CorpusDataModule"
 
 
@@ -143,17 +143,38 @@ def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mappin
         DataError: the data set or scene of the configuration is not on this machine, and no replacement is given.
     """
     directory = RunDirectory(run_dir)
-    config = directory.config()
-    loaded = read_checkpoint(directory.path / checkpoint)
-    config["data"] = located(directory.path, config.get("data", {}), data or {})
-    if config["data"].get("_target_") == PRETRAINING:
+    if is_pretrained(directory.path):
         raise ConfigError(
             f"{directory.path}: pretrained on a corpus of bodies, of which there are no videos. Start a training from "
             f"it: `gausim train experiment=finetune model=gausim init_from={directory.path} data.root=OBJECT`."
         )
+    config, module, datamodule = _load(directory, checkpoint, data)
+    return LoadedRun(config, module, datamodule.objects, datamodule, module.renderer, directory.path)
+
+
+def is_pretrained(run_dir: Path | str) -> bool:
+    """Whether a run was trained on, or fitted to, bodies of a corpus."""
+    return bool(RunDirectory(run_dir).config().get("data", {}).get("_target_") == PRETRAINING)
+
+
+def load_corpus_run(
+    run_dir: Path | str, *, data: Mapping[str, Any] | None = None
+) -> tuple[GausSimModule, CorpusDataModule]:
+    """Loads a run of which :func:`is_pretrained` is true; arguments and errors are those of :func:`load_run`."""
+    _, module, datamodule = _load(RunDirectory(run_dir), "last.ckpt", data)
+    return module, cast(CorpusDataModule, datamodule)
+
+
+def _load(
+    directory: RunDirectory, checkpoint: str, data: Mapping[str, Any] | None
+) -> tuple[dict[str, Any], GausSimModule, ReadyDataModule]:
+    """Configuration, module and data of a run, in evaluation mode with the run's weights."""
+    config = directory.config()
+    loaded = read_checkpoint(directory.path / checkpoint)
+    config["data"] = located(directory.path, config.get("data", {}), data or {})
     module, datamodule = build(config, sealed=not (directory.path / TEST).is_file())
     check_scenes(loaded, module.simulator.scenes, str(directory.path / checkpoint))
     load_weights(module, loaded)
     module.take_notes(loaded)
     module.eval()
-    return LoadedRun(config, module, datamodule.objects, datamodule, module.renderer, directory.path)
+    return config, module, datamodule

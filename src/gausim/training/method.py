@@ -168,7 +168,9 @@ class SharedSimulator(Method):
 
     def begin_step(self, optimizer: Optimizer, settings: OptimizerSettings, now: Moment) -> Task:
         """Sets the learning rates by the schedule."""
-        return Task(settings.network_lr * settings.set_rates(optimizer, now.done, now.epochs))
+        shared = getattr(self.model, "shared_groups", ("network",))
+        factor = settings.set_rates(optimizer, now.done, now.epochs, shared)
+        return Task(settings.network_lr * factor)
 
     def terms(self) -> Sequence[Term]:
         """The static loss and the penalty on mode mixing."""

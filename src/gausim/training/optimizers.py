@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -92,7 +92,8 @@ class OptimizerSettings:
     """Optimiser and learning rates; ``conf/optimizer/default.yaml`` and ``conf/base/more.yaml`` explain the settings.
 
     ``decay`` is the weight decay by group, of matrices and of all initial states: parameters that the data hardly
-    determine return to zero, where Adam alone would let them drift. The default ``optimizer`` is Adam; without a
+    determine return to zero, where Adam alone would let them drift. Weights common to all scenes are trained from the
+    fraction ``shared_from`` of the run on; before, only the parameters of scenes and initial states are. The default ``optimizer`` is Adam; without a
     ``schedule`` the rates are constant.
     """
 
@@ -106,13 +107,16 @@ class OptimizerSettings:
     clip_per_group: bool = False
     decay: Mapping[str, float] = field(default_factory=dict)
     ema_decay: float = 0.0
+    shared_from: float = 0.0
 
     def __post_init__(self) -> None:
         if (
             min(self.network_lr, self.scene_lr, self.template_lr or 0.0, self.initial_lr, self.clip_norm) < 0
-            or not 0 <= self.ema_decay < 1
+            or not (0 <= self.ema_decay < 1 and 0 <= self.shared_from < 1)
         ):
-            raise ConfigError(f"optimizer: expected rates and clip_norm >= 0 and ema_decay in [0, 1), got {self}.")
+            raise ConfigError(
+                f"optimizer: expected rates and clip_norm >= 0, ema_decay and shared_from in [0, 1), got {self}."
+            )
         wrong = [name for name, value in self.decay.items() if name not in GROUPS or not value >= 0]
         if wrong:
             raise ConfigError(f"optimizer.decay: expected values >= 0 for some of {', '.join(GROUPS)}, got {wrong}.")
@@ -136,11 +140,15 @@ class OptimizerSettings:
                     made.append({"params": part, "lr": rates[name], "base_lr": rates[name], "name": name, **own})
         return (self.optimizer or Adam)(made)
 
-    def set_rates(self, optimizer: Optimizer, epoch: float, epochs: int) -> float:
-        """Sets the learning rates of all groups; returns the schedule's factor."""
+    def set_rates(self, optimizer: Optimizer, epoch: float, epochs: int, shared: Collection[str] = ()) -> float:
+        """Sets the learning rates of all groups; returns the schedule's factor.
+
+        Those of the ``shared`` groups are zero before ``shared_from``.
+        """
         factor = self.schedule.factor(epoch, epochs) if self.schedule is not None else 1.0
+        waiting = shared if epoch < self.shared_from * epochs else ()
         for group in optimizer.param_groups:
-            group["lr"] = group["base_lr"] * factor
+            group["lr"] = 0.0 if group["name"] in waiting else group["base_lr"] * factor
         return factor
 
     def clip(self, optimizer: Optimizer) -> dict[str, Tensor]:

@@ -8,6 +8,9 @@ from typing import Any, cast
 
 import torch
 
+from jaxtyping import Float
+from torch import Tensor
+
 from gausim.core import ConfigError, SimState, Trajectory
 from gausim.data.corpus import CorpusBody
 from gausim.data.dataset import SequenceSample
@@ -18,6 +21,9 @@ from gausim.models.step.simulator import GausSim
 from gausim.models.template.material import REFERENCE_FPS, MaterialTemplate
 from gausim.training.contracts import Simulator
 from gausim.training.method import SharedSimulator
+
+# Damping below which it is not told apart from none [of the reference's].
+LEAST_DAMPING = 1e-3
 
 
 class KnownStates(SharedSimulator):
@@ -59,13 +65,40 @@ class KnownStates(SharedSimulator):
         return SceneDynamics(self._gausim, scene_id).rollout(initial, steps)
 
 
-@torch.no_grad()
 def give_material(model: GausSim, scene_id: int, body: CorpusBody) -> None:
-    """Sets densities and attributes of a scene from a body's true material.
+    """Sets densities and attributes of a scene to a body's true material (:func:`_give`)."""
+    kernels = model.hierarchies[scene_id].kernels
+    density, stiffness, damping = (x.index_select(0, kernels) for x in (body.density, body.stiffness, body.damping))
+    _give(model, scene_id, density / density.mean(), stiffness / stiffness.mean(), damping, body.record.period / body.fps)
 
-    Attribute 0 of kernel k is ln(E_k / E_0), where the template at zero attributes has a homogeneous stiffness E_0. E_0
-    is not known in the units of the corpus; it follows from the lowest period of the body, which is that of the
-    template's matrices with these factors. Attribute 1 is ln(c_k / c_0) of the damping c [1 / s].
+
+def give_even_material(model: GausSim, scene_id: int, *, period: float, damping: float) -> None:
+    """Sets densities and attributes of a scene to a material that is the same everywhere.
+
+    Args:
+        model: the simulator; its template decodes material.
+        scene_id: index of the scene.
+        period: period of the slowest mode [s].
+        damping: force over momentum; amplitudes fall as exp(-damping t / 2) [1 / s].
+    """
+    ones = torch.ones_like(model.log_density[scene_id])
+    _give(model, scene_id, ones, ones, damping * ones, period)
+
+
+@torch.no_grad()
+def _give(
+    model: GausSim,
+    scene_id: int,
+    density: Float[Tensor, " M"],
+    stiffness: Float[Tensor, " M"],
+    damping: Float[Tensor, " M"],
+    period: float,
+) -> None:
+    """Sets densities and attributes of the simulated kernels of a scene.
+
+    Attribute 0 is the logarithm of the stiffness over that of the template's reference material. That ratio follows
+    from the ``period`` of the slowest mode [s], since the matrices of the template are known; ``stiffness`` and
+    ``density`` are relative. Attribute 1 is the logarithm of the damping [1 / s] over the reference's.
 
     Raises:
         ConfigError: the model's template decodes no material.
@@ -73,24 +106,13 @@ def give_material(model: GausSim, scene_id: int, body: CorpusBody) -> None:
     template = model.template
     if not isinstance(template, MaterialTemplate) or model.attributes[scene_id].shape[1] < 2:
         raise ConfigError(
-            "model: pretraining needs a template that decodes material from two or more attributes (gausim)."
+            "model: a known material needs a template that decodes material from two or more attributes (gausim)."
         )
-    kernels, attributes = model.hierarchies[scene_id].kernels, model.attributes[scene_id]
-    density, stiffness, damping = (x.index_select(0, kernels) for x in (body.density, body.stiffness, body.damping))
-    model.log_density[scene_id].copy_((density / density.mean()).log())
-    attributes[:, 0] = (stiffness / stiffness.mean()).log()
-    attributes[:, 1] = (damping / (REFERENCE_FPS * math.exp(template.start[1]))).clamp_min(1e-3).log()
-    attributes[:, 0] += math.log(_stiffness_for(model, template, scene_id, body.record.period / body.fps))
-
-
-def _stiffness_for(model: GausSim, template: MaterialTemplate, scene_id: int, period: float) -> float:
-    """Factor on the stiffness by which the lowest mode has the ``period`` [s]."""
+    attributes = model.attributes[scene_id].zero_()
+    model.log_density[scene_id].copy_(density.log())
+    attributes[:, 0] = stiffness.log()
+    attributes[:, 1] = (damping / (REFERENCE_FPS * math.exp(template.start[1]))).clamp_min(LEAST_DAMPING).log()
     batch = model.batch((scene_id,))
-    _, levels = fixed_units(batch, model.masses(batch)[0], model.attributes[scene_id])
-    unit, body = levels[-1], template.body(scene_id)
-    stiffness = torch.einsum("n,pnlm->lm", unit.attributes[:, 0].exp(), body.stiffness)
-    inertia = torch.einsum("nal,n,nam->lm", body.inertia, unit.log_density.exp(), body.inertia)
-    root = torch.linalg.inv(torch.linalg.cholesky(inertia))
-    lowest = float(torch.linalg.eigvalsh(root @ stiffness @ root.mT)[0])
-    reference = 2 * math.pi / math.exp(template.start[0] / 2) / REFERENCE_FPS
-    return (reference / period) ** 2 / lowest
+    _, levels = fixed_units(batch, model.masses(batch)[0], attributes)
+    made = template.slowest_period(scene_id, levels[-1].log_density, levels[-1].attributes)
+    attributes[:, 0] += 2 * math.log(made / period)

@@ -191,6 +191,11 @@ class SceneModel(nn.Module, ABC):
             "template": list(self.template.parameters()),
         }
 
+    @property
+    def shared_groups(self) -> tuple[str, ...]:
+        """Those of :meth:`parameter_groups` that all scenes have in common."""
+        return ("network", "template") if self.template.is_shared else ("network",)
+
     def shared(self) -> dict[str, nn.Module]:
         """Modules common to all scenes, by name: the predictor with its statistics, and a shared template."""
         return {"predictor": self.predictor, **({"template": self.template} if self.template.is_shared else {})}

@@ -161,6 +161,7 @@ class GausSim(SceneModel):
         template = prepared.template(seen, units.load)
         states = [prepared.per_level(x) for x in (seen.now, seen.before, template.positions)]
         above, momentum, predicted = prepared.roots, rest.new_zeros(()), []
+        unit_of_correction = prepared.template.correction_unit()
         for position, (level, fixed, x, previous, target) in enumerate(
             zip(prepared.batch.levels, prepared.levels, *states, strict=True)
         ):
@@ -170,9 +171,10 @@ class GausSim(SceneModel):
             output = self.predictor(level, unit, above, target, position)
             outputs.append(output)
             moved = output if prepared.still is None else output - prepared.still[position]
-            deformation_gradient, rotation = self.predictor.deformation_gradient(
-                moved * (correction_scale * level.free), level, above, target
-            )
+            scale = correction_scale * level.free
+            if unit_of_correction is not None:
+                scale = scale * unit_of_correction.index_select(0, level.member)[:, None]
+            deformation_gradient, rotation = self.predictor.deformation_gradient(moved * scale, level, above, target)
             predicted.append(deformation_gradient)
             accumulated, turned, after = advance(deformation_gradient, rotation, target, above)
             if position and self.conserve_momentum:

@@ -3,9 +3,11 @@
 The geometry is computed once per scene: the lowest modes Phi of the solid body around the kernels
 (:mod:`gausim.models.template.solid`) and the contributions of each unit i and of each link (i, j) of neighbouring units
 to elastic energy and mass, as matrices between these modes. The material is learned: decoders common to all scenes map
-each unit's attributes a_i (its density rho_i enters directly) to logarithms of factors,
+each unit's attributes a_i (its density rho_i enters directly) to logarithms of factors. The first attribute is itself
+the logarithm of stiffness over that of a reference material, the second that of damping; the decoders add to them,
 
-    s_i, b_i, d_i = decode(a_i)     p_ij, q_ij, g_ij = decode(a_i, a_j, distance)
+    s_i, b_i, d_i = (a_i1, a_i1, a_i2) + decode(a_i)
+    p_ij, q_ij, g_ij = (a_1, 0, a_1) + decode(a_i, a_j, distance)     with the mean a_1 of a_i1 and a_j1
 
 which give, in modal coordinates z,
 
@@ -37,6 +39,7 @@ from jaxtyping import Float
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from gausim.core import ConfigError
 from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.clusters import Hierarchy
 from gausim.models.hierarchy.units import FixedUnits
@@ -45,7 +48,7 @@ from gausim.models.template.springs import Springs, neighbour_pairs
 from gausim.models.template.template import DENSITY, ModalScene, PreparedScenes, Property, Template
 from gausim.nn.mlp import mlp
 
-# Bound of the decoded logarithms: factors between 1/12 and 12.
+# Bound of what the decoders add to the logarithms: factors between 1/12 and 12.
 LARGEST_LOG = 2.5
 # Initial stiffness and inertia of all linear links together, as fractions (of the trace) of the body's.
 LINK_FRACTION = 0.3
@@ -194,8 +197,15 @@ class MaterialTemplate(Template):
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
             damping: initial c_0 and c_1 [1 / frame, frames].
             conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).
+
+        Raises:
+            ConfigError: fewer than two attributes.
         """
         super().__init__()
+        if attributes < 2:
+            raise ConfigError(
+                f"model.simulator.features.attributes: {attributes}; expected at least 2, stiffness and damping."
+            )
         self.conserve_volume = conserve_volume
         self.bodies = nn.ModuleList(
             BodyModes(h, finest, f, modes=modes, spacing=spacing, links=links)
@@ -217,12 +227,17 @@ class MaterialTemplate(Template):
     ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "E 3"]]:
         """s, b and d of every unit; p, q and g of every link (see the module's docstring).
 
-        The decoded values at zero attributes are subtracted from those of units, so that zero attributes give zero.
+        The decoded values at zero attributes are subtracted from those of units, so that zero attributes give zero. What
+        the decoders add is bounded; the first two attributes are not, so that one material may be many times as stiff as
+        another.
         """
         units = self.unit_decoder(attributes) - self.unit_decoder(torch.zeros_like(attributes[:1]))
         a, b = (attributes.index_select(0, end) for end in body.links)
         links = self.link_decoder(torch.cat((a + b, (a - b).square(), a * b, body.distance[:, None]), -1))
-        return _saturated(units), _saturated(links)
+        stiffness, damping = attributes[:, 0], attributes[:, 1]
+        own, mean = torch.stack((stiffness, stiffness, damping), -1), (a + b)[:, 0] / 2
+        between = torch.stack((mean, torch.zeros_like(mean), mean), -1)
+        return own + _saturated(units), between + _saturated(links)
 
     def matrices(
         self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"], dt: float
@@ -265,13 +280,20 @@ class MaterialTemplate(Template):
             "density": Property(_saturated(units.log_density).exp(), DENSITY),
         }
 
+    def slowest_period(self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"]) -> float:
+        """Period of the slowest mode of a scene of undamped small motions [s], from its units' material."""
+        found = self.matrices(scene_id, log_density, attributes, 1 / REFERENCE_FPS)
+        root = torch.linalg.inv(torch.linalg.cholesky(found.inertia))
+        squared = torch.linalg.eigvalsh(root @ found.stiffness @ root.mT)[0]
+        return 2 * math.pi / math.sqrt(float(squared)) / REFERENCE_FPS
+
     def prepare(self, batch: SceneBatch, units: FixedUnits) -> PreparedScenes:
         """Template of a batch with constant matrices."""
 
         def made(scene_id: int, rows: Tensor) -> PreparedMaterial:
             density, attributes = (x.index_select(0, rows) for x in (units.log_density, units.attributes))
             matrices = self.matrices(scene_id, density, attributes, float(batch.levels[-1].dt[rows[0]]))
-            return PreparedMaterial(self.body(scene_id), matrices)
+            return PreparedMaterial(self.body(scene_id), matrices, math.exp(self.start[0]))
 
         return PreparedScenes(batch, made, conserve_volume=self.conserve_volume)
 
@@ -289,10 +311,11 @@ def _saturated(logarithms: Tensor) -> Tensor:
 class PreparedMaterial(ModalScene):
     """Matrices of a scene's step between two updates of the parameters."""
 
-    def __init__(self, body: BodyModes, matrices: Matrices) -> None:
-        """Computes the constants; loss gradients flow through them."""
+    def __init__(self, body: BodyModes, matrices: Matrices, reference: float) -> None:
+        """Computes the constants; loss gradients flow through them. ``reference`` is k at the start [1 / frame^2]."""
         super().__init__(body.projection, body.modes, body.gradients)
         self.matrices, self.springs, self.positions = matrices, body.springs, body.modes.flatten(0, 1)
+        self.values, self.reference = body.values, reference
         self.operator = matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2
         self.inertia, self.stiffness, self.damping = matrices.inertia, matrices.stiffness, matrices.damping
 
@@ -302,6 +325,16 @@ class PreparedMaterial(ModalScene):
         force = nonlinear - z @ self.matrices.stiffness - (z - previous) @ self.matrices.damping
         operator = self.operator + stiffer / 4
         return torch.linalg.solve(operator, force[..., None])[..., 0]
+
+    def correction_unit(self) -> Float[Tensor, ""]:
+        """Ratio of the body's stiffness over inertia [1 / frame^2] to the reference's at 24 frames per second.
+
+        A network that corrects accelerations then needs to know neither frame rate nor stiffness. Stiff bodies are reduced
+        as the trapezoidal rule reduces their pull.
+        """
+        reference = self.reference * self.values.sum()
+        pace = self.matrices.stiffness.trace() / self.matrices.inertia.trace() * len(self.values) / reference
+        return pace * (1 + self.reference / 4) / (1 + pace * self.reference / 4)
 
     def after(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
         """z_{t+1}."""

@@ -86,6 +86,10 @@ class PreparedTemplate:
         """
         raise NotImplementedError("the rest state has no energy")
 
+    def correction_unit(self) -> Float[Tensor, " S"] | None:
+        """Factor on the network's output of every member of the batch; None for a factor of 1."""
+        return None
+
 
 class Template(nn.Module, ABC):
     """Interface of templates: the next configuration of the finest predicted level from the last two.
@@ -171,6 +175,10 @@ class ModalScene(ABC):
         """The part of a displacement that is input to template and network; here all of it."""
         return displacement
 
+    def correction_unit(self) -> Float[Tensor, ""] | None:
+        """Factor on the network's output; None for a factor of 1."""
+        return None
+
     @abstractmethod
     def after(self, z: Float[Tensor, "S M"], previous: Float[Tensor, "S M"]) -> Float[Tensor, "S M"]:
         """z_{t+1}."""
@@ -234,7 +242,18 @@ class PreparedScenes(PreparedTemplate):
         found = [
             p.energy(*p.coordinates(*self._displacements(motion, rows, members))) for p, rows, members in self.parts
         ]
-        order = torch.tensor([m for _, _, members in self.parts for m in members], device=motion.rest.device)
+        return self._by_member(found, motion.rest)
+
+    def correction_unit(self) -> Float[Tensor, " S"] | None:
+        """Factor on the network's output of every member of the batch; None for a factor of 1."""
+        found = [part.correction_unit() for part, _, _ in self.parts]
+        if any(unit is None for unit in found):
+            return None
+        made = [unit.expand(len(members)) for unit, (_, _, members) in zip(found, self.parts, strict=True)]
+        return self._by_member(made, made[0])
+
+    def _by_member(self, found: list[Tensor], like: Tensor) -> Tensor:
+        order = torch.tensor([m for _, _, members in self.parts for m in members], device=like.device)
         return torch.cat(found).index_select(0, order.argsort())
 
 

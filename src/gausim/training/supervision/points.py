@@ -20,6 +20,8 @@ from gausim.training.supervision.images import Sources, StaticFigures
 LEAST_RATIO = 0.05
 # Root mean square displacement from rest below which a relative loss is not magnified further [diagonals].
 LEAST_SWING = 1e-3
+# Error over the sequence's mean displacement below which a relative loss is quadratic.
+LEAST_ERROR = 0.02
 # Sequences whose true motion stays in memory.
 MOST_KNOWN = 256
 
@@ -63,7 +65,7 @@ class PointSupervision:
         attached = [self._attached[sample.scene_id].to(batch.rest.device) for sample in samples]
         scales = [self._scale(sample) for sample in samples]
         known = [_from(sample.start, truth, batch.rest) for sample, truth in zip(samples, truths, strict=True)]
-        return _PointComparison(batch, known, attached, scales, self._energy_weight)
+        return _PointComparison(batch, known, attached, scales, self._energy_weight, root=self._relative)
 
     def static(self, sample: SequenceSample, rest: Float[Tensor, "K 3"], first: int) -> StaticFigures:
         """Losses of the rest state on frames ``first`` .. T of a sample."""
@@ -71,7 +73,8 @@ class PointSupervision:
         positions = truth.positions[sample.start + first : sample.start + sample.steps + 1]
         motion = _squared(positions.diff(dim=0))
         losses = _squared(positions - truth.rest) * (1 + self._energy_weight * math.log(1 + 1 / LEAST_RATIO) ** 2)
-        return StaticFigures((self._scale(sample) * losses).tolist(), (self._scale(sample) * motion).tolist())
+        scaled = _distance(self._scale(sample) * losses) if self._relative else self._scale(sample) * losses
+        return StaticFigures(scaled.tolist(), (self._scale(sample) * motion).tolist())
 
     def _scale(self, sample: SequenceSample) -> float:
         if self._relative:
@@ -107,7 +110,10 @@ class _PointComparison:
         attached: Sequence[Int[Tensor, " _"]],
         scales: Sequence[float],
         energy_weight: float,
+        *,
+        root: bool,
     ) -> None:
+        self._root = root
         self._batch, self._truths, self._scales = batch, truths, scales
         self._energy_weight = energy_weight
         self._kernels, self._units, self._offsets = [], [], []
@@ -131,7 +137,7 @@ class _PointComparison:
                 true_steps = truth.positions[start : span.stop].diff(dim=0)
                 still, energies = _squared(truth.positions[span] - truth.rest), (_squared(steps), _squared(true_steps))
                 loss = loss + self._energy_weight * still * _energy_mismatch(*energies)
-            losses.append(scale * loss)
+            losses.append(_distance(scale * loss) if self._root else scale * loss)
             motion += scale * _squared(steps.detach()).sum()
             self._last[i] = points[-1].detach()
         return torch.stack(losses, 1), motion
@@ -143,6 +149,11 @@ def _energy_mismatch(made: Float[Tensor, " T"], true: Float[Tensor, " T"]) -> Fl
     energies = torch.stack([torch.stack((a.mean(), b.mean())) for a, b in halves])
     least = LEAST_RATIO * energies[:, 1].clamp_min(torch.finfo(true.dtype).tiny)
     return ((energies[:, 0] + least) / (energies[:, 1] + least)).log().square().mean()
+
+
+def _distance(squares: Float[Tensor, " T"]) -> Float[Tensor, " T"]:
+    """Root of squared errors, with a finite derivative at zero."""
+    return (squares + LEAST_ERROR**2).sqrt() - LEAST_ERROR
 
 
 def _squared(vectors: Float[Tensor, "T P 3"]) -> Float[Tensor, " T"]:
