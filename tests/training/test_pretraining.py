@@ -1,26 +1,31 @@
 """Pretraining: known states and materials of a corpus, and the fit of a body of unknown material."""
 
 import csv
+import json
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import scipy.linalg
 import torch
 from helpers.corpus import FRAMES, SEQUENCES, write_corpus
+from msgspec.structs import replace
 
-from gausim.cli import evaluate, train
+from gausim.cli import evaluate, simulate, train
+from gausim.compose.bare import EvenMaterial, open_scene
 from gausim.compose.build import build
 from gausim.compose.config import compose
-from gausim.core import GausSimError
+from gausim.core import ConfigError, GausSimError
 from gausim.data.dataset import SampleKey
-from gausim.models.template.material import REFERENCE_FPS, MaterialTemplate
+from gausim.evaluation.corpus import BodyFigures, summary
+from gausim.io.ply import save_scene
+from gausim.io.trajectory import load_trajectory
+from gausim.models.template.material import MaterialTemplate
 
 SMALL = (
     "model.simulator.hierarchy.levels=[{diameter: 0.5, edge_length: 2.0}]", "model.simulator.template.modes=12",
     "model.simulator.template.spacing=0.2", "model.simulator.network.hidden=8", "model.simulator.network.layers=1",
-    "data.held_out=1", "data.batch_size=2", "data.curriculum.t_max=4", "logger=none",
+    "data.held_out=1", "data.batch_size=2", "data.curriculum.t_start=2", "data.curriculum.t_max=4", "logger=none",
 )  # fmt: skip
 
 
@@ -63,26 +68,59 @@ def test_the_known_material_gives_the_body_its_lowest_period(corpus: Path) -> No
     model = module.model
     assert isinstance(model.template, MaterialTemplate)
     for scene_id, item in enumerate(data.objects):
-        attributes = model.attributes[scene_id].double().detach()
+        attributes = model.attributes[scene_id].detach()
         kernels, unit = model.hierarchies[scene_id].kernels, model.hierarchies[scene_id].ancestor(0, 1)
-        assert torch.allclose(attributes[:, 0].diff(), item.body.stiffness[kernels].log().diff().double(), atol=1e-5)
+        assert torch.allclose(attributes[:, 0].diff(), item.body.stiffness[kernels].log().diff(), atol=1e-5)
         count = int(unit.max()) + 1
-        stiffness, density = (
-            np.array([float(values[unit == i].mean()) for i in range(count)])
-            for values in (attributes[:, 0], model.log_density[scene_id].exp())
+        own, density = (
+            torch.stack([values[unit == i].mean(0) for i in range(count)])
+            for values in (attributes, model.log_density[scene_id].detach().exp())
         )
-        body = model.template.body(scene_id)
-        k = np.einsum("n,pnlm->lm", np.exp(stiffness), body.stiffness.double().numpy())
-        m = np.einsum("nal,n,nam->lm", body.inertia, density, body.inertia)
-        lowest = scipy.linalg.eigh(k, m, eigvals_only=True)[0] * math.exp(model.template.start[0])
-        period = 2 * math.pi / math.sqrt(lowest) * item.fps / REFERENCE_FPS
-        assert period == pytest.approx(item.body.record.period, rel=1e-3)
+        found = model.template.matrices(scene_id, density.log(), own, 1 / item.fps)
+        stiffness, inertia = (x.detach().double().numpy() for x in (found.stiffness, found.inertia))
+        lowest = scipy.linalg.eigh(stiffness, inertia, eigvals_only=True)[0]
+        assert 2 * math.pi / math.sqrt(lowest) == pytest.approx(item.body.record.period, rel=1e-3)
 
 
-def test_a_pretrained_network_is_fitted_to_bodies_held_out(corpus: Path, tmp_path: Path, capsys) -> None:
-    base, fit = tmp_path / "base", tmp_path / "fit"
-    common = [f"data.root={corpus}", "trainer.max_epochs=2", "trainer.progress=false", *SMALL]
-    assert train.main(["experiment=pretrain", f"hydra.run.dir={base}", *common]) == 0
+COMMON = ("trainer.max_epochs=2", "trainer.progress=false", *SMALL)
+
+
+@pytest.fixture(scope="module")
+def base(corpus: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("pretrained") / "base"
+    assert train.main(["experiment=pretrain", f"data.root={corpus}", f"hydra.run.dir={run}", *COMMON]) == 0
+    return run
+
+
+def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(corpus: Path, base: Path, tmp_path: Path) -> None:
+    _, data = build(compose("train", ["experiment=pretrain", f"data.root={corpus}", *SMALL]))
+    body = data.objects[0].scene()
+    periods = {}
+    for stiffness in (1.0, 4.0):
+        live = open_scene(body, fps=24.0, base=base, material=EvenMaterial(stiffness, damping=0.1), sway=0.02)
+        tip = [float(live.step().positions[8, 0]) for _ in range(25 // int(stiffness**0.5))]
+        periods[stiffness] = 4 * (1 + tip.index(max(tip)))  # frames to the first turn
+    assert periods[1.0] == pytest.approx(24, abs=6) and periods[4.0] == pytest.approx(12, abs=3)
+
+    scene, out = tmp_path / "beam.ply", tmp_path / "out"
+    save_scene(body, scene)
+    common = ["--scene", str(scene), "--from", str(base), "--pin-below", "z=0.01", "--out", str(out), "--frames", "5"]
+    assert simulate.main([*common, "--impulse", "on=tip", "weight_seconds=0.1", "direction=y"]) == 0
+    names = {"trajectory.safetensors", "session.json", "azimuth_0.mp4", "azimuth_0_sheet.png"}
+    assert {p.name for p in out.iterdir()} == names
+    moved = load_trajectory(out / "trajectory.safetensors").positions
+    assert float(moved.diff(dim=0)[..., 1].abs().max()) > 1e-3
+    for wrong, message in (
+        (["--scene", str(scene)], "needs a trained network"),
+        ([str(base), "--scene", str(scene)], "expected a RUN, or --scene"),
+        ([*common, "--stiffness", "-1"], "--stiffness -1: expected a number > 0"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            simulate.main(wrong)
+
+
+def test_a_pretrained_network_is_fitted_to_bodies_held_out(corpus: Path, base: Path, tmp_path: Path, capsys) -> None:
+    fit, common = tmp_path / "fit", [f"data.root={corpus}", *COMMON]
     assert {row["object"] for row in csv.DictReader((base / "motion.csv").open())} == {"beam2"}
     assert (
         train.main(["experiment=pretrain_fit", f"init_from={base}", f"hydra.run.dir={fit}", "data.seen=6", *common])
@@ -93,4 +131,25 @@ def test_a_pretrained_network_is_fitted_to_bodies_held_out(corpus: Path, tmp_pat
     assert shared and all(torch.equal(before[name], after[name]) for name in shared)
     assert after["model.attributes.0"].abs().max() > 0
     with pytest.raises(GausSimError, match="pretrained on a corpus"):
-        evaluate.main([str(base)])
+        simulate.main([str(base)])
+    capsys.readouterr()
+    assert evaluate.main([str(base)]) == 0 and "Rank correlation" not in capsys.readouterr().out  # it was given
+    assert evaluate.main([str(fit)]) == 0
+    assert "Rank correlation of fitted and true stiffness: " in capsys.readouterr().out
+    (body,) = json.loads((fit / "evaluation" / "corpus.json").read_text())["bodies"]
+    assert body["name"] == "beam2" and body["period"] == pytest.approx(14 / 24) and abs(body["within"]) <= 1
+    with pytest.raises(GausSimError, match="measured as a whole"):
+        evaluate.main([str(fit), "--sequences", "seq_000"])
+
+
+def test_a_fit_to_the_truth_has_no_error_and_keeps_the_order_of_stiffness() -> None:
+    names, periods = ("error", "static", "energy"), (1.0, 0.5, 2.0, 0.25)
+    values = {name: tuple(float(i + 1) for i in range(3 if name != "energy" else 2)) for name in names}
+    found = [
+        BodyFigures(f"b{i}", "split" if i % 2 else "smooth", **values, period=p, fitted_period=1.1 * p, within=0.5 * i)
+        for i, p in enumerate(periods)
+    ]
+    whole = summary(found)
+    assert whole.error == (1.0, 1.0, 1.0) and whole.energy == 0.5 and whole.stiffness == pytest.approx(1.0)
+    assert whole.within == 1.0 and whole.within_smooth == 0.5
+    assert summary([replace(x, fitted_period=-x.period) for x in found]).stiffness == pytest.approx(-1.0)

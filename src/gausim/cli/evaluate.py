@@ -79,8 +79,8 @@ def _evaluate_bodies(arguments: argparse.Namespace) -> int:
 
     if arguments.object or arguments.sequences or arguments.views != "all" or arguments.endurance is not None:
         raise ConfigError(
-            f"{arguments.run}: a run on a corpus is measured as a whole, on true points. Leave out --object, --sequences, "
-            "--views and --endurance."
+            f"{arguments.run}: a run on a corpus is measured as a whole, on true points. Leave out --object, "
+            "--sequences, --views and --endurance."
         )
     folder = arguments.out or arguments.run / "evaluation"
     whole = write_figures(folder, body_figures(*load_corpus_run(arguments.run, data=data_option(arguments.data))))

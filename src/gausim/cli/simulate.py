@@ -84,7 +84,9 @@ def _parser() -> argparse.ArgumentParser:
     add("--verbose", action="store_true", help="list the files that are written")
     add_force_options(parser)
     group = add_scene_options(parser)
-    group.add_argument("--scene", metavar="SCENE.ply", type=Path, help="3DGS scene; give --from, and pins if it has none")
+    group.add_argument(
+        "--scene", metavar="SCENE.ply", type=Path, help="3DGS scene; give --from, and pins if it has none"
+    )
     group.add_argument("--up", choices=UPS, default="z", help="vertical axis of the scene (write --up=-y; default: z)")
     group.add_argument("--azimuth", type=float, default=0.0, metavar="DEGREES", help="of the camera (default: 0)")
     return parser

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.cli.arguments import opened_scene, parse_background, pinned_by
+from gausim.cli.arguments import opened_scene, pinned_by
 from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -52,7 +52,9 @@ def simulate_scene(arguments: argparse.Namespace) -> int:
     session, arrows = _session(interaction, arguments), list[list["Arrow"]]()
     trajectory = replay(interaction, session, watch=lambda live: arrows.append(arrows_of(live)))
     folder = arguments.out or Path(f"{arguments.scene.stem}_simulation")
-    save_trajectory(folder / "trajectory.safetensors", trajectory, facts={"object": scene.name, "run": arguments.base.name})
+    save_trajectory(
+        folder / "trajectory.safetensors", trajectory, facts={"object": scene.name, "run": arguments.base.name}
+    )
     save_session(session, folder / "session.json")
     cameras = orbit_cameras(
         scene.means[scene.foreground], azimuths=[arguments.azimuth], up=arguments.up, size=SIZE

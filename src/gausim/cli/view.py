@@ -52,7 +52,8 @@ def main(argv: list[str]) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(
         "view",
-        " A scene without a run is moved by the network of the run given by --from, or by the template of an untrained model.",
+        " A scene without a run is moved by the network of the run given by --from, or by the template of an untrained "
+        "model.",
         epilog="GAUSIM_VIEW_TOKEN in the environment sets the token (16 or more letters and digits) and has it asked "
         "for on 127.0.0.1 too.",
     )

@@ -61,8 +61,8 @@ class CorpusFigures(msgspec.Struct, frozen=True):
         error: error over the static prediction's, of the sums over all bodies: seen, the ten frames after, unseen.
         median: median over bodies of the unseen error over the static prediction's.
         energy: predicted over true motion energy of the unseen frames.
-        stiffness: rank correlation over bodies of the fitted and true stiffness; motion shows it relative to density and
-            size, as (1 / period of the slowest mode)^2.
+        stiffness: rank correlation over bodies of the fitted and true stiffness; motion shows it relative to density
+            and size, as (1 / period of the slowest mode)^2.
         within: mean over bodies of two materials of the rank correlation of stiffness over the units.
         within_smooth: the same over bodies whose stiffness varies smoothly.
     """
@@ -154,8 +154,8 @@ def sentences(whole: CorpusFigures) -> list[str]:
     """The summary in two sentences."""
     seen, near, unseen = whole.error
     lines = [
-        f"{whole.bodies} bodies: 3D error over static's {seen:.3f} in seen frames, {near:.3f} in the ten after, {unseen:.3f} "
-        f"in all unseen ones (median of bodies {whole.median:.3f}), motion energy {whole.energy:.2f}."
+        f"{whole.bodies} bodies: 3D error over static's {seen:.3f} in seen frames, {near:.3f} in the ten after, "
+        f"{unseen:.3f} in all unseen ones (median of bodies {whole.median:.3f}), motion energy {whole.energy:.2f}."
     ]
     known = {"over bodies": whole.stiffness, "within bodies of two materials": whole.within,
              "within smooth ones": whole.within_smooth}  # fmt: skip

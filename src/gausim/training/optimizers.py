@@ -93,8 +93,8 @@ class OptimizerSettings:
 
     ``decay`` is the weight decay by group, of matrices and of all initial states: parameters that the data hardly
     determine return to zero, where Adam alone would let them drift. Weights common to all scenes are trained from the
-    fraction ``shared_from`` of the run on; before, only the parameters of scenes and initial states are. The default ``optimizer`` is Adam; without a
-    ``schedule`` the rates are constant.
+    fraction ``shared_from`` of the run on; before, only parameters of scenes and initial states are. The default
+    ``optimizer`` is Adam; without a ``schedule`` the rates are constant.
     """
 
     optimizer: Callable[..., Optimizer] | None = None
@@ -110,9 +110,8 @@ class OptimizerSettings:
     shared_from: float = 0.0
 
     def __post_init__(self) -> None:
-        if (
-            min(self.network_lr, self.scene_lr, self.template_lr or 0.0, self.initial_lr, self.clip_norm) < 0
-            or not (0 <= self.ema_decay < 1 and 0 <= self.shared_from < 1)
+        if min(self.network_lr, self.scene_lr, self.template_lr or 0.0, self.initial_lr, self.clip_norm) < 0 or not (
+            0 <= self.ema_decay < 1 and 0 <= self.shared_from < 1
         ):
             raise ConfigError(
                 f"optimizer: expected rates and clip_norm >= 0, ema_decay and shared_from in [0, 1), got {self}."

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 import torch
-
 from jaxtyping import Float
 from torch import Tensor
 
@@ -24,6 +23,8 @@ from gausim.training.method import SharedSimulator
 
 # Damping below which it is not told apart from none [of the reference's].
 LEAST_DAMPING = 1e-3
+# Corrections of the stiffness, to which the decoders add a little that depends on it.
+ROUNDS = 6
 
 
 class KnownStates(SharedSimulator):
@@ -69,7 +70,9 @@ def give_material(model: GausSim, scene_id: int, body: CorpusBody) -> None:
     """Sets densities and attributes of a scene to a body's true material (:func:`_give`)."""
     kernels = model.hierarchies[scene_id].kernels
     density, stiffness, damping = (x.index_select(0, kernels) for x in (body.density, body.stiffness, body.damping))
-    _give(model, scene_id, density / density.mean(), stiffness / stiffness.mean(), damping, body.record.period / body.fps)
+    _give(
+        model, scene_id, density / density.mean(), stiffness / stiffness.mean(), damping, body.record.period / body.fps
+    )
 
 
 def give_even_material(model: GausSim, scene_id: int, *, period: float, damping: float) -> None:
@@ -113,6 +116,7 @@ def _give(
     attributes[:, 0] = stiffness.log()
     attributes[:, 1] = (damping / (REFERENCE_FPS * math.exp(template.start[1]))).clamp_min(LEAST_DAMPING).log()
     batch = model.batch((scene_id,))
-    _, levels = fixed_units(batch, model.masses(batch)[0], attributes)
-    made = template.slowest_period(scene_id, levels[-1].log_density, levels[-1].attributes)
-    attributes[:, 0] += 2 * math.log(made / period)
+    for _ in range(ROUNDS):
+        unit = fixed_units(batch, model.masses(batch)[0], attributes)[1][-1]
+        made = template.slowest_period(scene_id, unit.log_density, unit.attributes)
+        attributes[:, 0] += 2 * math.log(made / period)

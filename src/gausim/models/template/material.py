@@ -227,9 +227,9 @@ class MaterialTemplate(Template):
     ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "E 3"]]:
         """s, b and d of every unit; p, q and g of every link (see the module's docstring).
 
-        The decoded values at zero attributes are subtracted from those of units, so that zero attributes give zero. What
-        the decoders add is bounded; the first two attributes are not, so that one material may be many times as stiff as
-        another.
+        The decoded values at zero attributes are subtracted from those of units, so that zero attributes give zero.
+        What the decoders add is bounded; the first two attributes are not, so that one material may be many times as
+        stiff as another.
         """
         units = self.unit_decoder(attributes) - self.unit_decoder(torch.zeros_like(attributes[:1]))
         a, b = (attributes.index_select(0, end) for end in body.links)
@@ -280,7 +280,9 @@ class MaterialTemplate(Template):
             "density": Property(_saturated(units.log_density).exp(), DENSITY),
         }
 
-    def slowest_period(self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"]) -> float:
+    def slowest_period(
+        self, scene_id: int, log_density: Float[Tensor, " N"], attributes: Float[Tensor, "N A"]
+    ) -> float:
         """Period of the slowest mode of a scene of undamped small motions [s], from its units' material."""
         found = self.matrices(scene_id, log_density, attributes, 1 / REFERENCE_FPS)
         root = torch.linalg.inv(torch.linalg.cholesky(found.inertia))
@@ -329,8 +331,8 @@ class PreparedMaterial(ModalScene):
     def correction_unit(self) -> Float[Tensor, ""]:
         """Ratio of the body's stiffness over inertia [1 / frame^2] to the reference's at 24 frames per second.
 
-        A network that corrects accelerations then needs to know neither frame rate nor stiffness. Stiff bodies are reduced
-        as the trapezoidal rule reduces their pull.
+        A network that corrects accelerations then needs to know neither frame rate nor stiffness. For stiff bodies it
+        is reduced as the trapezoidal rule reduces their pull.
         """
         reference = self.reference * self.values.sum()
         pace = self.matrices.stiffness.trace() / self.matrices.inertia.trace() * len(self.values) / reference
