@@ -128,6 +128,19 @@ def test_schedules() -> None:
     assert stable.factor(75, 80) < 0.5  # an end that comes earlier brings the fall forward
 
 
+def test_shared_weights_wait_for_their_part_of_the_run() -> None:
+    settings = OptimizerSettings(network_lr=0.1, scene_lr=0.2, template_lr=0.3, shared_from=0.5)
+    groups = {name: [nn.Parameter(torch.zeros(1))] for name in ("network", "scene", "template")}
+    optimizer = settings.build(groups)
+    found = []
+    for epoch, shared in ((9.9, ("network", "template")), (9.9, ("network",)), (10.0, ("network", "template"))):
+        settings.set_rates(optimizer, epoch, 20, shared)
+        found.append([group["lr"] for group in optimizer.param_groups])
+    assert found == [[0.0, 0.2, 0.0], [0.0, 0.2, 0.3], [0.1, 0.2, 0.3]]
+    with pytest.raises(ConfigError, match="shared_from in"):
+        OptimizerSettings(shared_from=1.0)
+
+
 def test_clipping_by_group_and_altogether() -> None:
     for per_group, expected in ((True, (1.0, 1.0)), (False, (0.6, 0.8))):
         a, b = nn.Parameter(torch.zeros(2)), nn.Parameter(torch.zeros(2))
