@@ -105,10 +105,9 @@ def _figures(
             away = (points - truth).norm(dim=-1).mean(-1) / body.record.diagonal
             total += torch.stack([away[span].sum() for span in ranges])
         energy += torch.stack([motion_energy(x)[seen - 1 :].sum() for x in (made, truth)]) / body.record.diagonal**2
-    return BodyFigures(
-        item.name, body.record.material, *(tuple(x.tolist()) for x in (error, static, energy)),
-        period=body.record.period / body.fps, fitted_period=fitted, within=within,
-    )  # fmt: skip
+    sums = {"error": tuple(error.tolist()), "static": tuple(static.tolist()), "energy": tuple(energy.tolist())}
+    facts: dict[str, Any] = {"name": item.name, "material": body.record.material, **sums}
+    return BodyFigures(**facts, period=body.record.period / body.fps, fitted_period=fitted, within=within)
 
 
 def _fitted(model: GausSim, scene_id: int, item: BodyData) -> tuple[float, float | None]:

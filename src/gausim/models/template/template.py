@@ -246,10 +246,12 @@ class PreparedScenes(PreparedTemplate):
 
     def correction_unit(self) -> Float[Tensor, " S"] | None:
         """Factor on the network's output of every member of the batch; None for a factor of 1."""
-        found = [part.correction_unit() for part, _, _ in self.parts]
-        if any(unit is None for unit in found):
-            return None
-        made = [unit.expand(len(members)) for unit, (_, _, members) in zip(found, self.parts, strict=True)]
+        made = []
+        for part, _, members in self.parts:
+            unit = part.correction_unit()
+            if unit is None:
+                return None
+            made.append(unit.expand(len(members)))
         return self._by_member(made, made[0])
 
     def _by_member(self, found: list[Tensor], like: Tensor) -> Tensor:
