@@ -32,8 +32,8 @@ class KnownStates(SharedSimulator):
 
     Where the material is known, densities and attributes start from it: attribute 0 is the logarithm of a kernel's
     stiffness over that of the template at zero attributes, attribute 1 that of its damping. They are trained on, since
-    the modes of the template are not those of the simulator that moved the body. The two damping numbers of the template
-    are not: errors of phase would make them too large, and the bodies' damping is known.
+    the modes of the template are not those of the simulator that moved the body. The template's two damping numbers
+    are not trained: errors of phase would make them too large, and the bodies' damping is known.
     """
 
     def __init__(self, model: GausSim, data: CorpusDataModule, scene_of_sequence: Sequence[int]) -> None:
