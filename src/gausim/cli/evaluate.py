@@ -77,10 +77,11 @@ def _evaluate_bodies(arguments: argparse.Namespace) -> int:
     from gausim.compose.data_paths import data_option
     from gausim.evaluation.corpus import FILE, body_figures, sentences, write_figures
 
-    if arguments.object or arguments.sequences or arguments.views != "all" or arguments.endurance is not None:
+    parts = arguments.object or arguments.sequences or arguments.views != "all" or arguments.test
+    if parts or arguments.endurance is not None:
         raise ConfigError(
             f"{arguments.run}: a run on a corpus is measured as a whole, on true points. Leave out --object, "
-            "--sequences, --views and --endurance."
+            "--sequences, --views, --test and --endurance."
         )
     folder = arguments.out or arguments.run / "evaluation"
     whole = write_figures(folder, body_figures(*load_corpus_run(arguments.run, data=data_option(arguments.data))))

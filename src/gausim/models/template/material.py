@@ -211,7 +211,7 @@ class MaterialTemplate(Template):
             BodyModes(h, finest, f, modes=modes, spacing=spacing, links=links)
             for h, f in zip(hierarchies, frames, strict=True)
         )
-        # Weights from before the first two attributes were logarithms of stiffness and damping lack it, and are refused.
+        # Weights from before the first two attributes were logarithms of stiffness and damping lack it: refused.
         self.register_buffer("attributes_are_logarithms", torch.ones(()))
         self.start = 2 * math.log(2 * math.pi / period), math.log(damping)
         self.stiffness, self.damping = nn.Parameter(torch.zeros(())), nn.Parameter(torch.zeros(2))
