@@ -109,9 +109,10 @@ def _give(
         ConfigError: the model's template decodes no material.
     """
     template = model.template
-    if not isinstance(template, MaterialTemplate) or model.attributes[scene_id].shape[1] < 2:
+    if not isinstance(template, MaterialTemplate) or not template.named_attributes:
         raise ConfigError(
-            "model: a known material needs a template that decodes material from two or more attributes (gausim)."
+            "model.simulator.template.named_attributes: expected true (of model=gausim), so that attributes can be set "
+            "to a known material."
         )
     attributes = model.attributes[scene_id].zero_()
     model.log_density[scene_id].copy_(density.log())

@@ -3,13 +3,13 @@
 The geometry is computed once per scene: the lowest modes Phi of the solid body around the kernels
 (:mod:`gausim.models.template.solid`) and the contributions of each unit i and of each link (i, j) of neighbouring units
 to elastic energy and mass, as matrices between these modes. The material is learned: decoders common to all scenes map
-each unit's attributes a_i (its density rho_i enters directly) to logarithms of factors. The first attribute is itself
-the logarithm of stiffness over that of a reference material, the second that of damping; the decoders add to them,
+each unit's attributes a_i (its density rho_i enters directly) to logarithms of factors,
 
-    s_i, b_i, d_i = (a_i1, a_i1, a_i2) + decode(a_i)
-    p_ij, q_ij, g_ij = (a_1, 0, a_1) + decode(a_i, a_j, distance)     with the mean a_1 of a_i1 and a_j1
+    s_i, b_i, d_i = decode(a_i)     p_ij, q_ij, g_ij = decode(a_i, a_j, distance)
 
-which give, in modal coordinates z,
+With ``named_attributes`` the first attribute is itself the logarithm of stiffness over that of a reference material,
+the second that of damping, and the decoders add to them: (a_i1, a_i1, a_i2) to s, b and d, and the mean of a_i1 and
+a_j1 to p and g. These factors give, in modal coordinates z,
 
     K = k (sum_i (e^{s_i} K_i + e^{b_i} B_i) + sum_ij (e^{p_ij} + e^{g_ij}) S_ij)  stiffness: shear, volume, links
     M = sum_i rho_i M_i + sum_ij e^{q_ij} T_ij             inertia: of units, and of matter between them
@@ -181,6 +181,7 @@ class MaterialTemplate(Template):
         hidden: int = 48,
         period: float = 8.0,
         damping: float = 0.02,
+        named_attributes: bool = False,
         conserve_volume: bool = True,
     ) -> None:
         """Builds the scenes and the decoders; for the equations see the module's docstring.
@@ -196,23 +197,23 @@ class MaterialTemplate(Template):
             hidden: width of the decoders.
             period: initial period of the lowest mode of a homogeneous body [frames at 24 per second].
             damping: initial c_0 and c_1 [1 / frame, frames].
+            named_attributes: the first two attributes are the logarithms of stiffness and damping, and the network's
+                correction scales with the body's stiffness, so that a network knows bodies of any stiffness.
             conserve_volume: scale the template's deformation gradients to determinant 1 (METHOD's mass conservation).
 
         Raises:
-            ConfigError: fewer than two attributes.
+            ConfigError: fewer than two attributes where they are named.
         """
         super().__init__()
-        if attributes < 2:
+        if named_attributes and attributes < 2:
             raise ConfigError(
                 f"model.simulator.features.attributes: {attributes}; expected at least 2, stiffness and damping."
             )
-        self.conserve_volume = conserve_volume
+        self.conserve_volume, self.named_attributes = conserve_volume, named_attributes
         self.bodies = nn.ModuleList(
             BodyModes(h, finest, f, modes=modes, spacing=spacing, links=links)
             for h, f in zip(hierarchies, frames, strict=True)
         )
-        # Weights from before the first two attributes were logarithms of stiffness and damping lack it: refused.
-        self.register_buffer("attributes_are_logarithms", torch.ones(()))
         self.start = 2 * math.log(2 * math.pi / period), math.log(damping)
         self.stiffness, self.damping = nn.Parameter(torch.zeros(())), nn.Parameter(torch.zeros(2))
         self.unit_decoder = mlp((attributes, hidden, 3))
@@ -230,12 +231,14 @@ class MaterialTemplate(Template):
         """s, b and d of every unit; p, q and g of every link (see the module's docstring).
 
         The decoded values at zero attributes are subtracted from those of units, so that zero attributes give zero.
-        What the decoders add is bounded; the first two attributes are not, so that one material may be many times as
-        stiff as another.
+        What the decoders give is bounded; named attributes are not, so that one material may be many times as stiff as
+        another.
         """
         units = self.unit_decoder(attributes) - self.unit_decoder(torch.zeros_like(attributes[:1]))
         a, b = (attributes.index_select(0, end) for end in body.links)
         links = self.link_decoder(torch.cat((a + b, (a - b).square(), a * b, body.distance[:, None]), -1))
+        if not self.named_attributes:
+            return _saturated(units), _saturated(links)
         stiffness, damping = attributes[:, 0], attributes[:, 1]
         own, mean = torch.stack((stiffness, stiffness, damping), -1), (a + b)[:, 0] / 2
         between = torch.stack((mean, torch.zeros_like(mean), mean), -1)
@@ -297,7 +300,8 @@ class MaterialTemplate(Template):
         def made(scene_id: int, rows: Tensor) -> PreparedMaterial:
             density, attributes = (x.index_select(0, rows) for x in (units.log_density, units.attributes))
             matrices = self.matrices(scene_id, density, attributes, float(batch.levels[-1].dt[rows[0]]))
-            return PreparedMaterial(self.body(scene_id), matrices, math.exp(self.start[0]))
+            reference = math.exp(self.start[0]) if self.named_attributes else None
+            return PreparedMaterial(self.body(scene_id), matrices, reference)
 
         return PreparedScenes(batch, made, conserve_volume=self.conserve_volume)
 
@@ -315,8 +319,11 @@ def _saturated(logarithms: Tensor) -> Tensor:
 class PreparedMaterial(ModalScene):
     """Matrices of a scene's step between two updates of the parameters."""
 
-    def __init__(self, body: BodyModes, matrices: Matrices, reference: float) -> None:
-        """Computes the constants; loss gradients flow through them. ``reference`` is k at the start [1 / frame^2]."""
+    def __init__(self, body: BodyModes, matrices: Matrices, reference: float | None) -> None:
+        """Computes the constants; loss gradients flow through them.
+
+        ``reference`` is k at the start [1 / frame^2], to which corrections are relative; None: they are not.
+        """
         super().__init__(body.projection, body.modes, body.gradients)
         self.matrices, self.springs, self.positions = matrices, body.springs, body.modes.flatten(0, 1)
         self.values, self.reference = body.values, reference
@@ -330,12 +337,14 @@ class PreparedMaterial(ModalScene):
         operator = self.operator + stiffer / 4
         return torch.linalg.solve(operator, force[..., None])[..., 0]
 
-    def correction_unit(self) -> Float[Tensor, ""]:
+    def correction_unit(self) -> Float[Tensor, ""] | None:
         """Ratio of the body's stiffness over inertia [1 / frame^2] to the reference's at 24 frames per second.
 
         A network that corrects accelerations then needs to know neither frame rate nor stiffness. For stiff bodies it
         is reduced as the trapezoidal rule reduces their pull.
         """
+        if self.reference is None:
+            return None
         reference = self.reference * self.values.sum()
         pace = self.matrices.stiffness.trace() / self.matrices.inertia.trace() * len(self.values) / reference
         return pace * (1 + self.reference / 4) / (1 + pace * self.reference / 4)
