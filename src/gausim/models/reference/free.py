@@ -53,6 +53,8 @@ class FreeBody(Body):
             elasticity: how the body yields to a contact.
         """
         self.mass, self.gravity, self.contact, self.elasticity = mass / mass.sum(), gravity, contact, elasticity
+        # Far from the origin a step is small against the positions: their means are taken in double precision.
+        self.fractions = mass.double() / mass.double().sum()
         self.centre = self.mass @ kernels
         self.kernels, self.units = kernels, rest
         self.simulated = mass > 0
@@ -64,16 +66,16 @@ class FreeBody(Body):
         self.weighted = self.mass[:, None] * offset
 
     def pose(self, positions: Float[Tensor, "K 3"]) -> tuple[Tensor, Tensor]:
-        """Centre of mass c and rotation R of the best fit of the rest shape."""
-        centre = self.mass @ positions
-        affine = (positions - centre).mT @ self.weighted @ self.inverse
+        """Centre of mass c, in double precision, and rotation R of the best fit of the rest shape."""
+        centre = self.fractions @ positions.double()
+        affine = about(positions, centre).mT @ self.weighted @ self.inverse
         return centre, polar_rotation(affine)
 
     def isolated(self, state: SimState, hands: HandMotion | None) -> SimState:
         """The kernels in the axes of the body."""
         (centre, rotation), (last_centre, last) = self.pose(state.positions), self.pose(state.previous)
-        now = self.centre + (state.positions - centre) @ rotation
-        before = self.centre + (state.previous - last_centre) @ last
+        now = self.centre + about(state.positions, centre) @ rotation
+        before = self.centre + about(state.previous, last_centre) @ last
         still = ~self.simulated[:, None]
         return SimState(torch.where(still, self.kernels, now), torch.where(still, self.kernels, before))
 
@@ -97,7 +99,9 @@ class FreeMotion(BodyMotion):
         offset = body.units - body.centre
         load = -(offset @ acceleration.mT) @ self.turned
         self.relative = UnitMotion(
-            body.centre + (now - self.centre) @ self.turned, body.centre + (before - self.last_centre) @ last, load
+            body.centre + about(now, self.centre) @ self.turned,
+            body.centre + about(before, self.last_centre) @ last,
+            load,
         )
 
     def place(self, made: Placed) -> Placed:
@@ -105,26 +109,32 @@ class FreeMotion(BodyMotion):
         body = self.body
         shape = made.positions - body.mass @ made.positions
         rotation = self._rotation(shape)
-        centre = 2 * self.centre - self.last_centre + body.gravity
-        positions = torch.where(body.simulated[:, None], centre + shape @ rotation.mT, made.positions)
+        centre = 2 * self.centre - self.last_centre + body.gravity.double()
+        moved = (centre + (shape @ rotation.mT).double()).to(shape)
+        positions = torch.where(body.simulated[:, None], moved, made.positions)
         placed = Placed(positions, rotation @ made.deformation_gradients, rotation @ made.rotations)
         placed = _with_identity_row(placed, made)
         if body.contact is None:
             return placed
-        return body.contact.resolve(placed, self.state, body.elasticity, rotation, centre)
+        return body.contact.resolve(placed, self.state, body.elasticity, rotation, centre.to(shape))
 
     def _rotation(self, shape: Float[Tensor, "K 3"]) -> Float[Tensor, "3 3"]:
         """R with sum m r_t x R w = sum m r_{t-1} x r_t, in double precision."""
         mass = self.body.mass[:, None].double()
-        now, before = self.state.positions - self.centre, self.state.previous - self.last_centre
-        target = axial((mass * now.double()).mT @ before.double())
-        carried = (mass * shape.double()).mT @ now.double()
+        now, before = self.state.positions.double() - self.centre, self.state.previous.double() - self.last_centre
+        target = axial((mass * now).mT @ before)
+        carried = (mass * shape.double()).mT @ now
         rotation, identity = self.guess.double(), torch.eye(3, dtype=torch.float64, device=shape.device)
         for _ in range(NEWTON_STEPS):
             turned = rotation @ carried
             change = torch.linalg.solve(turned.trace() * identity - turned, target - axial(turned))
             rotation = rotation_of(change) @ rotation
         return rotation.to(shape)
+
+
+def about(positions: Float[Tensor, "N 3"], centre: Float[Tensor, " 3"]) -> Float[Tensor, "N 3"]:
+    """Positions relative to a centre that is given in double precision."""
+    return (positions.double() - centre).to(positions)
 
 
 def _with_identity_row(placed: Placed, made: Placed) -> Placed:
