@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -112,12 +113,19 @@ class HandPath:
         return len(self.centres)
 
     def pose(self, frame: int) -> HandPose:
-        """The pose at a frame; after the last one the hands stand still, before frame 0 they move as after it."""
-        if frame < 0:
-            back, centre = self.rotations[1].mT, 2 * self.centres[0] - self.centres[1]
-            return HandPose(back, self.centres[0], centre)
-        number = min(frame, self.frames - 1)
-        return HandPose(self.rotations[number], self.centres[0], self.centres[number])
+        """The pose at a frame; after the last one the hands stand still, before frame 0 they move as after it.
+
+        A frame has one pose object, by which what follows from it is found again.
+        """
+        return self._poses[min(max(frame, -1), self.frames - 1) + 1]
+
+    @cached_property
+    def _poses(self) -> tuple[HandPose, ...]:
+        """The poses of frames -1, 0, ..., F - 1."""
+        second = min(1, self.frames - 1)
+        before = HandPose(self.rotations[second].mT, self.centres[0], 2 * self.centres[0] - self.centres[second])
+        recorded = zip(self.rotations, self.centres, strict=True)
+        return before, *(HandPose(rotation, self.centres[0], centre) for rotation, centre in recorded)
 
 
 def _kabsch(offset: Float[Tensor, "F C 3"]) -> Float[Tensor, "F 3 3"]:
