@@ -7,6 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import Forces, GaussianScene, SimState, Trajectory
+from gausim.core.surroundings import best_rotation
 
 
 class BallisticDynamics:
@@ -66,7 +67,4 @@ class BallisticDynamics:
 def rigid_fit(rest: Float[Tensor, "P 3"], moved: Float[Tensor, "P 3"]) -> tuple[Tensor, Tensor]:
     """Rotation R (3, 3) and centre c (3,) that minimise sum |R (X - mean X) + c - x|^2, in float64 (Kabsch)."""
     offset, centre = rest.double() - rest.double().mean(0), moved.double().mean(0)
-    u, _, vt = torch.linalg.svd((moved.double() - centre).mT @ offset)
-    sign = torch.ones_like(centre)
-    sign[2] = torch.linalg.det(u @ vt)
-    return (u * sign) @ vt, centre
+    return best_rotation(moved.double() - centre, offset), centre

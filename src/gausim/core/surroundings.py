@@ -102,7 +102,11 @@ class HandPath:
             offset = own - centre[:, None]
             spread = torch.linalg.svdvals(offset[0]) if own.shape[1] > 2 else torch.zeros(3)
             fixed = spread[1] > FLAT * spread[0]
-            turned = _kabsch(offset) if bool(fixed) else torch.eye(3, dtype=own.dtype).expand(len(own), 3, 3)
+            turned = (
+                best_rotation(offset, offset[0])
+                if bool(fixed)
+                else torch.eye(3, dtype=own.dtype).expand(len(own), 3, 3)
+            )
             rotations.append(turned)
             centres.append(centre)
         return HandPath(torch.stack(rotations, 1).float(), torch.stack(centres, 1).float())
@@ -128,8 +132,9 @@ class HandPath:
         return before, *(HandPose(rotation, self.centres[0], centre) for rotation, centre in recorded)
 
 
-def _kabsch(offset: Float[Tensor, "F C 3"]) -> Float[Tensor, "F 3 3"]:
-    u, _, vt = torch.linalg.svd(offset.mT @ offset[0])
-    sign = torch.ones(len(offset), 3, dtype=offset.dtype)
-    sign[:, 2] = torch.linalg.det(u @ vt)
-    return (u * sign[:, None]) @ vt
+def best_rotation(moved: Float[Tensor, "*F C 3"], rest: Float[Tensor, "C 3"]) -> Float[Tensor, "*F 3 3"]:
+    """The rotation R that minimises sum |R rest - moved|^2 of points about their means (Kabsch 1976)."""
+    u, _, vt = torch.linalg.svd(moved.mT @ rest)
+    sign = torch.ones_like(u[..., 0])
+    sign[..., 2] = torch.linalg.det(u @ vt)
+    return (u * sign[..., None, :]) @ vt
