@@ -103,7 +103,7 @@ class FreeInitialStates(InitialStates):
         return self.offset[sequence_id]
 
     def motion(self, sequence_id: int) -> Float[Tensor, "K 3"]:
-        """O [scene units]; the parameter is in diagonals of the scene."""
+        """The motion o [scene units]; the parameter is in diagonals of the scene."""
         scene = self.scene_of_sequence[sequence_id]
         offset = self.offset[sequence_id][: len(self._rest[scene])]
         free = self._free[scene].to(offset.device)
@@ -153,7 +153,7 @@ class ModalInitialStates(InitialStates):
         return self.velocity[sequence_id]
 
     def motion(self, sequence_id: int) -> Float[Tensor, "K 3"]:
-        """O [scene units]."""
+        """The motion o [scene units]."""
         basis, velocity = self._basis[self.scene_of_sequence[sequence_id]], self.velocity[sequence_id]
         return basis.to(velocity) @ velocity[: basis.shape[-1]]
 

@@ -46,6 +46,11 @@ def bounded_deformation(
     return bounded * torch.where(kept, det, 1.0).pow(-1 / 3)[:, None, None] if unit else bounded
 
 
+def apply(matrix: Float[Tensor, "N 3 3"], vector: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    """A v."""
+    return (matrix @ vector[..., None])[..., 0]
+
+
 def determinant(a: Float[Tensor, "*N 3 3"]) -> Float[Tensor, " *N"]:
     """Determinant of 3x3 matrices, written out: several times faster than LU on the CPU and exact to rounding."""
     return (a[..., 0, :] * torch.linalg.cross(a[..., 1, :], a[..., 2, :])).sum(-1)

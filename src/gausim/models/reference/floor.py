@@ -26,7 +26,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import Floor, SimState
-from gausim.models.reference.placed import Placed
+from gausim.models.reference.placed import Placed, turned_units
+from gausim.ops.deformation import apply
 from gausim.ops.rotation import cross_matrix, rotation_of
 
 # Added to the diagonal of J (M + ...)^-1 J^T, as a fraction of its mean: near contact points are hardly independent.
@@ -99,7 +100,7 @@ class Coordinates:
         modal, none = amount[: body.modes.shape[-1]], positions.new_zeros(1, 3, 3)
         shift = torch.einsum("nab,nbm,m->na", self.rotation, body.modes, modal)
         slope = torch.cat((torch.einsum("nab,nbcm,m->nac", self.rotation, body.slopes, modal), none))
-        moved = positions + torch.cat((shift, none[0, :1]))[unit] + (slope[unit] @ body.offset[..., None])[..., 0]
+        moved = positions + torch.cat((shift, none[0, :1]))[unit] + apply(slope[unit], body.offset)
         turn = torch.eye(3).to(positions)
         if self.centre is not None:
             rigid, turn = amount[-6:], rotation_of(amount[-3:])
@@ -134,11 +135,8 @@ class Contact:
             now, before = self._deviation(placed, state, coordinates, points)
             moved, slope, turn = coordinates.applied(placed.positions, now)
             earlier, _, _ = coordinates.applied(state.positions, before)
-            deformation = torch.cat(
-                (turn @ (placed.deformation_gradients + slope)[:-1], placed.deformation_gradients[-1:])
-            )
-            rotations = torch.cat((turn @ placed.rotations[:-1], placed.rotations[-1:]))
-            placed = Placed(moved, deformation, rotations, earlier)
+            deformation = turned_units(turn, placed.deformation_gradients + slope)
+            placed = Placed(moved, deformation, turned_units(turn, placed.rotations), earlier)
         moving = body.unit_of_kernel < len(body.modes)
         below = torch.where(moving, -self.floor.height(placed.positions), 0.0).clamp_min(0)[:, None]
         lift = below * placed.positions.new_tensor(self.floor.normal)

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gausim.core import SimState
 from gausim.models.reference.floor import Contact, Elasticity
-from gausim.models.reference.placed import Placed
+from gausim.models.reference.placed import Placed, turned_units
 from gausim.models.reference.reference import Body, BodyMotion, HandMotion, UnitMotion
 from gausim.ops.deformation import polar_rotation
 from gausim.ops.rotation import rotation_of
@@ -112,8 +112,9 @@ class FreeMotion(BodyMotion):
         centre = 2 * self.centre - self.last_centre + body.gravity.double()
         moved = (centre + (shape @ rotation.mT).double()).to(shape)
         positions = torch.where(body.simulated[:, None], moved, made.positions)
-        placed = Placed(positions, rotation @ made.deformation_gradients, rotation @ made.rotations)
-        placed = _with_identity_row(placed, made)
+        placed = Placed(
+            positions, turned_units(rotation, made.deformation_gradients), turned_units(rotation, made.rotations)
+        )
         if body.contact is None:
             return placed
         return body.contact.resolve(placed, self.state, body.elasticity, rotation, centre.to(shape))
@@ -135,8 +136,3 @@ class FreeMotion(BodyMotion):
 def about(positions: Float[Tensor, "N 3"], centre: Float[Tensor, " 3"]) -> Float[Tensor, "N 3"]:
     """Positions relative to a centre that is given in double precision."""
     return (positions.double() - centre).to(positions)
-
-
-def _with_identity_row(placed: Placed, made: Placed) -> Placed:
-    """Kernels that are never simulated keep the identity, the last row."""
-    return Placed(placed.positions, *(torch.cat((x[:-1], y[-1:])) for x, y in zip(placed[1:3], made[1:3], strict=True)))

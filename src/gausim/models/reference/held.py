@@ -22,7 +22,7 @@ from gausim.models.reference.floor import Contact, Elasticity
 from gausim.models.reference.placed import Placed
 from gausim.models.reference.reference import Body, BodyMotion, HandMotion, UnitMotion
 from gausim.models.template.solid import static_responses
-from gausim.ops.deformation import polar_rotation
+from gausim.ops.deformation import apply, polar_rotation
 from gausim.ops.rotation import rotation_vector
 
 # Poses whose static shape is kept: those of recorded sequences are asked for again and again.
@@ -86,7 +86,7 @@ class StaticShape:
         place, _, gradient = self.at(pose)
         own = self.of_kernel >= 0
         unit, rest = self.of_kernel[own], self._scene_rest[own]
-        moved = place[unit] - rest + _apply(gradient[unit], rest - self.rest[unit])
+        moved = place[unit] - rest + apply(gradient[unit], rest - self.rest[unit])
         return torch.zeros_like(self._scene_rest).masked_scatter(own[:, None], moved.to(self._scene_rest))
 
     def with_still(self, pose: HandPose) -> HandPose:
@@ -133,7 +133,7 @@ class HeldBody(Body):
         """a, B and A at the units' centres of mass, which depend on the learned densities."""
         place, rotation, gradient = (x.to(self.units) for x in self.shape.at(pose))
         offset = self.units - self.shape.rest.to(self.units)
-        return place + (gradient @ offset[..., None])[..., 0], rotation, gradient
+        return place + apply(gradient, offset), rotation, gradient
 
     def isolated(self, state: SimState, hands: HandMotion | None) -> SimState:
         """The kernels relative to the static shape."""
@@ -143,7 +143,7 @@ class HeldBody(Body):
     def _relative(self, positions: Tensor, pose: HandPose | None) -> Tensor:
         place, rotation, gradient = self.at(pose)
         unit = self.unit_of_kernel.clamp_max(len(self.units) - 1)
-        static = place[unit] + _apply(gradient[unit], self.kernels - self.units[unit])
+        static = place[unit] + apply(gradient[unit], self.kernels - self.units[unit])
         moved = self.kernels + _back(rotation[unit], positions - static)
         still = (self.of >= 0) | (self.unit_of_kernel == len(self.units))
         return torch.where(still[:, None], self.kernels, moved)
@@ -178,7 +178,7 @@ class HeldMotion(BodyMotion):
         units = torch.cat((body.units, body.units.new_zeros(1, 3)))
         unit = body.unit_of_kernel
         offset = body.kernels - units[unit]
-        positions = place[unit] + _apply(gradient[unit], offset) + _apply(rotation[unit], made.positions - body.kernels)
+        positions = place[unit] + apply(gradient[unit], offset) + apply(rotation[unit], made.positions - body.kernels)
         if self.hands.after is not None:
             pose = body.shape.with_still(self.hands.after.to(positions))
             positions = torch.where((body.of < 0)[:, None], positions, pose.move(body.kernels, body.of.clamp_min(0)))
@@ -189,9 +189,5 @@ class HeldMotion(BodyMotion):
         return body.contact.resolve(placed, self.state, body.elasticity, rotation[:-1], None)
 
 
-def _apply(matrix: Float[Tensor, "N 3 3"], vector: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    return (matrix @ vector[..., None])[..., 0]
-
-
 def _back(matrix: Float[Tensor, "N 3 3"], vector: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    return _apply(matrix.mT, vector)
+    return apply(matrix.mT, vector)

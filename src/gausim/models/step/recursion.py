@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gausim.models.hierarchy.batch import Inheritance
-from gausim.ops.deformation import polar_rotation
+from gausim.ops.deformation import apply, polar_rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +49,6 @@ class Solved:
         deformation_gradient = self.deformation_gradient.index_select(0, self.index)
         offset = target - self.template.index_select(0, self.index)
         return self.after.index_select(0, self.index) + apply(deformation_gradient, offset)
-
-
-def apply(matrix: Float[Tensor, "N 3 3"], vector: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """A v."""
-    return (matrix @ vector[..., None])[..., 0]
 
 
 def advance(
