@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from helpers import toy_object
-from helpers.evaluations import make_quick
 
 from gausim.baselines.static import StaticDynamics
 from gausim.core import DataError, RunError, SimState, Trajectory
@@ -19,11 +18,7 @@ from gausim.results.summary import load_summary, summarise
 LINEAR = "linear AR(2) on true states, 8 modes"
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_evaluations():
-    with pytest.MonkeyPatch.context() as patch:
-        make_quick(patch)
-        yield
+pytestmark = pytest.mark.usefixtures("quick_evaluations")
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import torch
 from helpers import toy_object
-from helpers.evaluations import make_quick
 
 from gausim.core import Trajectory
 from gausim.data.objects import ObjectData
@@ -36,11 +35,7 @@ def rewrite(toy, facts: dict, shift: torch.Tensor) -> None:
         np.savez(folder / "ground_truth.npz", displacement=truth.numpy().astype(np.float32))
 
 
-@pytest.fixture(scope="module", autouse=True)
-def quick_evaluations():
-    with pytest.MonkeyPatch.context() as patch:
-        make_quick(patch)
-        yield
+pytestmark = pytest.mark.usefixtures("quick_evaluations")
 
 
 @pytest.fixture(scope="module")

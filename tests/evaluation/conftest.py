@@ -1,0 +1,11 @@
+from __future__ import annotations
+
+import pytest
+from helpers.evaluations import make_quick
+
+
+@pytest.fixture(scope="module")
+def quick_evaluations():
+    with pytest.MonkeyPatch.context() as patch:
+        make_quick(patch)
+        yield
