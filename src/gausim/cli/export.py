@@ -20,27 +20,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion to export.
+    """A motion to export."""
 
-    Attributes:
-        name: base name of the files.
-        fps: frames per second.
-        frames: number of frames.
-        scenes: generator function of the deformed scenes.
-        first: the first deformed scene, or the rest scene.
-        trajectory: the motion as a trajectory, if it was read as one.
-        cameras: cameras of the data set, if any.
-        renderer: renderer of the run, if any.
-    """
-
-    name: str
-    fps: float
-    frames: int
-    scenes: Callable[[], Iterator[GaussianScene]]
-    first: GaussianScene
-    trajectory: Trajectory | None = None
-    cameras: Cameras | None = None
-    renderer: Renderer | None = None
+    name: str  # base name of the files
+    fps: float  # frames per second
+    frames: int  # number of frames
+    scenes: Callable[[], Iterator[GaussianScene]]  # generator function of the deformed scenes
+    first: GaussianScene  # the first deformed scene, or the rest scene
+    trajectory: Trajectory | None = None  # the motion as a trajectory, if it was read as one
+    cameras: Cameras | None = None  # cameras of the data set, if any
+    renderer: Renderer | None = None  # renderer of the run, if any
 
 
 def main(argv: list[str]) -> int:

@@ -19,15 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Chosen:
-    """Sequences to evaluate.
+    """Sequences to evaluate."""
 
-    Attributes:
-        part: ``development`` or ``test``; None where the data declare no test part.
-        sequences: their names by object.
-    """
-
-    part: str | None
-    sequences: Mapping[str, list[str]]
+    part: str | None  # ``development`` or ``test``; None where the data declare no test part
+    sequences: Mapping[str, list[str]]  # their names by object
 
 
 def choose(run: LoadedRun, arguments: argparse.Namespace) -> Chosen:

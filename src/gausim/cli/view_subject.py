@@ -22,17 +22,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Playable:
-    """A method for one object.
+    """A method for one object."""
 
-    Attributes:
-        interaction: the interactive simulation of the object.
-        item: the object of the run; None for a bare scene.
-        run: the run; None for a bare scene.
-    """
-
-    interaction: Interaction
-    item: RunObject | None = None
-    run: LoadedRun | None = None
+    interaction: Interaction  # the interactive simulation of the object
+    item: RunObject | None = None  # the object of the run; None for a bare scene
+    run: LoadedRun | None = None  # the run; None for a bare scene
 
     def predictions(self) -> dict[str, Callable[[], Trajectory]]:
         """Functions that predict the recorded sequences, by name."""

@@ -23,16 +23,13 @@ UNTRAINED = "gausim"
 class EvenMaterial:
     """The material of a body that was never filmed, the same everywhere.
 
-    Attributes:
-        stiffness: over that of the material whose slowest swing takes one second; the period is stiffness^(-1/2) [s].
-        damping: amplitudes fall as exp(-damping t / 2) [1 / s].
-
     Raises:
         ConfigError: a number is not positive and finite.
     """
 
+    # over that of the material whose slowest swing takes one second; the period is stiffness^(-1/2) [s]
     stiffness: float = 1.0
-    damping: float = 0.5
+    damping: float = 0.5  # amplitudes fall as exp(-damping t / 2) [1 / s]
 
     def __post_init__(self) -> None:
         """Checks the numbers."""

@@ -32,23 +32,14 @@ PRETRAINING = "gausim.data.pretraining.CorpusDataModule"
 
 @dataclass(frozen=True, eq=False)
 class LoadedRun:
-    """A trained run, loaded for evaluation or simulation.
+    """A trained run, loaded for evaluation or simulation."""
 
-    Attributes:
-        config: the resolved configuration.
-        module: the module in evaluation mode, with the run's weights (averaged ones if there are any).
-        objects: the objects; their index is the ``scene_id`` of the module's scenes.
-        datamodule: the data.
-        renderer: the renderer of the training.
-        run_dir: the run directory.
-    """
-
-    config: dict[str, Any]
-    module: GausSimModule
-    objects: list[ObjectData]
-    datamodule: ReadyDataModule
-    renderer: Renderer
-    run_dir: Path
+    config: dict[str, Any]  # the resolved configuration
+    module: GausSimModule  # the module in evaluation mode, with the run's weights (averaged ones if there are any)
+    objects: list[ObjectData]  # the objects; their index is the ``scene_id`` of the module's scenes
+    datamodule: ReadyDataModule  # the data
+    renderer: Renderer  # the renderer of the training
+    run_dir: Path  # the run directory
 
 
 def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[GausSimModule, ReadyDataModule]:

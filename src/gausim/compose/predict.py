@@ -22,17 +22,11 @@ PUSHED_FRAMES = 240
 
 @dataclass(frozen=True)
 class RunObject:
-    """One object of a run.
+    """One object of a run."""
 
-    Attributes:
-        scene_id: index of the object in the run.
-        data: data of the object.
-        first_sequence: index of its first sequence over all objects.
-    """
-
-    scene_id: int
-    data: ObjectData
-    first_sequence: int
+    scene_id: int  # index of the object in the run
+    data: ObjectData  # data of the object
+    first_sequence: int  # index of its first sequence over all objects
 
 
 def run_objects(run: LoadedRun, names: list[str] | None = None) -> list[RunObject]:

@@ -36,17 +36,11 @@ _REMEDY = "Export it again with `gausim export`."
 
 @dataclass
 class Glb:
-    """A document of glTF and its binary part, to be written or as read.
+    """A document of glTF and its binary part, to be written or as read."""
 
-    Attributes:
-        document: the JSON part.
-        binary: the bytes that its buffer views name.
-        source: the file that it was read from, for messages.
-    """
-
-    document: dict[str, Any]
-    binary: bytearray | bytes = field(default_factory=bytearray)
-    source: str = ""
+    document: dict[str, Any]  # the JSON part
+    binary: bytearray | bytes = field(default_factory=bytearray)  # the bytes that its buffer views name
+    source: str = ""  # the file that it was read from, for messages
 
     def add_view(self, array: np.ndarray, **more: int) -> int:
         """Appends an array as a buffer view that begins at a multiple of four bytes; returns its index."""

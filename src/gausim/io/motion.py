@@ -64,19 +64,12 @@ class _Facts(Struct, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class UnitMotion:
-    """The motion of N units over F frames, and the unit that every kernel follows.
+    """The motion of N units over F frames, and the unit that every kernel follows."""
 
-    Attributes:
-        rest_centres: X_c, mean of the kernels of each unit at rest [scene units].
-        displacements: x_c - X_c of every frame [scene units].
-        deformation_gradients: G_c of every frame.
-        unit_of_kernel: the unit of each kernel.
-    """
-
-    rest_centres: Float[Tensor, "N 3"]
-    displacements: Float[Tensor, "F N 3"]
-    deformation_gradients: Float[Tensor, "F N 3 3"]
-    unit_of_kernel: Int[Tensor, " K"]
+    rest_centres: Float[Tensor, "N 3"]  # X_c, mean of the kernels of each unit at rest [scene units]
+    displacements: Float[Tensor, "F N 3"]  # x_c - X_c of every frame [scene units]
+    deformation_gradients: Float[Tensor, "F N 3 3"]  # G_c of every frame
+    unit_of_kernel: Int[Tensor, " K"]  # the unit of each kernel
 
     @staticmethod
     def of(scene: GaussianScene, trajectory: Trajectory) -> UnitMotion:

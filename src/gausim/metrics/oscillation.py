@@ -41,15 +41,10 @@ def coordinates(displacement: NDArray, shapes: Array) -> Array:
 
 @dataclass(frozen=True)
 class Oscillation:
-    """One damped oscillation.
+    """One damped oscillation."""
 
-    Attributes:
-        frequency: [Hz]; 0 for a motion that only decays.
-        damping: fraction of critical damping; negative if the motion grows, NaN if it does not oscillate.
-    """
-
-    frequency: float
-    damping: float
+    frequency: float  # [Hz]; 0 for a motion that only decays
+    damping: float  # fraction of critical damping; negative if the motion grows, NaN if it does not oscillate
 
 
 def oscillation(series: Sequence[Array], fps: float) -> Oscillation:

@@ -17,21 +17,13 @@ from gausim.ops.spherical_harmonics import spherical_harmonics_basis
 
 @dataclass(frozen=True, eq=False)
 class SceneAppearance:
-    """Constants of a scene for drawing, computed once for all frames.
+    """Constants of a scene for drawing, computed once for all frames."""
 
-    Attributes:
-        covars: rest covariances of the n kernels that are drawn [scene units^2].
-        opacities: opacities in [0, 1].
-        sh: colour coefficients.
-        sh_degree: their degree, 0..3.
-        index: indices of the drawn kernels in the scene; None means all.
-    """
-
-    covars: Float[Tensor, "n 3 3"]
-    opacities: Float[Tensor, " n"]
-    sh: Float[Tensor, "n basis 3"]
-    sh_degree: int
-    index: Int[Tensor, " n"] | None
+    covars: Float[Tensor, "n 3 3"]  # rest covariances of the n kernels that are drawn [scene units^2]
+    opacities: Float[Tensor, " n"]  # opacities in [0, 1]
+    sh: Float[Tensor, "n basis 3"]  # colour coefficients
+    sh_degree: int  # their degree, 0..3
+    index: Int[Tensor, " n"] | None  # indices of the drawn kernels in the scene; None means all
 
     @staticmethod
     def of(scene: GaussianScene, mask: Bool[Tensor, " K"] | None = None) -> SceneAppearance:

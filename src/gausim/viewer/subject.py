@@ -16,26 +16,14 @@ from gausim.viewer.shown import Take
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """The contents of a viewer.
+    """The contents of a viewer."""
 
-    Attributes:
-        title: heading of the page, one line.
-        interaction: the simulation.
-        takes: recordings that can be played.
-        companion: a second method shown beside the first, or None.
-        films: the recorded videos, or None.
-        cameras: cameras of the data set, or None.
-        material: learned properties of the kernels by name.
-        up: vertical axis: x, y, z, -x, -y or -z.
-        sessions: folder of saved sessions.
-    """
-
-    title: str
-    interaction: Interaction
-    takes: Sequence[Take] = ()
-    companion: Companion | None = None
-    films: Films | None = None
-    cameras: Cameras | None = None
-    material: Mapping[str, Property] = field(default_factory=dict)
-    up: str = "z"
-    sessions: Path = field(default_factory=lambda: Path("sessions"))
+    title: str  # heading of the page, one line
+    interaction: Interaction  # the simulation
+    takes: Sequence[Take] = ()  # recordings that can be played
+    companion: Companion | None = None  # a second method shown beside the first, or None
+    films: Films | None = None  # the recorded videos, or None
+    cameras: Cameras | None = None  # cameras of the data set, or None
+    material: Mapping[str, Property] = field(default_factory=dict)  # learned properties of the kernels by name
+    up: str = "z"  # vertical axis: x, y, z, -x, -y or -z
+    sessions: Path = field(default_factory=lambda: Path("sessions"))  # folder of saved sessions

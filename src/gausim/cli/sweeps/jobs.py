@@ -28,17 +28,11 @@ OBJECTIVE = "excess_static"
 
 
 class JobResult(float):
-    """The objective of a job as a float for any sweeper (nan if it has none), with the outcome of the job.
+    """The objective of a job as a float for any sweeper (nan if it has none), with the outcome of the job."""
 
-    Attributes:
-        state: one of the constants of this module.
-        directory: the run directory.
-        detail: the error of a failed job.
-    """
-
-    state: str
-    directory: str
-    detail: str
+    state: str  # one of the constants of this module
+    directory: str  # the run directory
+    detail: str  # the error of a failed job
 
     @classmethod
     def of(cls, objective: float | None, state: str, run: RunDirectory, detail: str = "") -> JobResult:
