@@ -55,18 +55,12 @@ def open_scene(
     most_force: float | None = None,
     keep: int | None = 0,
 ) -> Interaction:
-    """Opens a scene without videos for interaction.
+    """Opens a scene without videos, some of its kernels pinned, for interaction.
 
-    Args:
-        scene: the rest scene, some of its kernels pinned.
-        fps: frames per second.
-        base: trained run of the neural simulator whose network and decoders are used; None: an untrained model.
-        material: the material with ``base``; the default one when None.
-        seed: seed of an untrained model.
-        sway: initial displacement per frame of the kernel farthest from the pins [diagonals].
-        gravity: acceleration that defines the unit of weight [scene units / s^2]; 9.81 when None.
-        most_force: the largest force [weights]; the default of interactions when None.
-        keep: number of latest frames to keep; None keeps all.
+    ``base`` is a trained run of the neural simulator whose network and decoders move it, with an even ``material``;
+    None: an untrained model of this ``seed``. ``sway`` is the initial displacement per frame of the kernel farthest
+    from the pins [diagonals], ``gravity`` the unit of weight [scene units / s^2] (9.81), ``most_force`` the largest
+    force [weights], ``keep`` the number of latest frames that are kept (None: all).
 
     Raises:
         SceneError: no kernel is pinned.

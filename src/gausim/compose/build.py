@@ -45,9 +45,7 @@ class LoadedRun:
 def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[GausSimModule, ReadyDataModule]:
     """Builds the module and the data of a training configuration.
 
-    Args:
-        cfg: the configuration.
-        sealed: refuse unseen frames and the true motion of the test part.
+    ``sealed`` refuses unseen frames and the true motion of the test part.
 
     Raises:
         GausSimError: a node is wrong, the model cannot be trained, or the data or a rest scene is missing or damaged.
@@ -124,10 +122,7 @@ def _build_fit(config: DictConfig, sealed: bool) -> tuple[GausSimModule, ReadyDa
 def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mapping[str, Any] | None = None) -> LoadedRun:
     """Loads a run; its test part is sealed until `gausim evaluate --test` has looked at it.
 
-    Args:
-        run_dir: the run directory.
-        checkpoint: file in this directory.
-        data: keys of the data configuration to replace, e.g. ``{"root": "/elsewhere"}``.
+    ``data`` replaces keys of the data configuration, e.g. ``{"root": "/elsewhere"}``.
 
     Raises:
         RunError: the run or checkpoint is missing, or the scene differs from the one it was trained on.

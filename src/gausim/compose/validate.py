@@ -25,14 +25,10 @@ _BUILT = ("data", "supervision", "loss", "optimizer", "render")
 
 
 def faults(arguments: Sequence[str]) -> list[str]:
-    """Errors of a configuration, key by key.
+    """Errors of a configuration, key by key, a sentence each; data sets are not checked.
 
-    Args:
-        arguments: one saved configuration (a YAML file, or a run directory); or arguments of `gausim train`: overrides,
-            names of experiments, and files of conf/ or of a folder like it (`MINE/experiment/NAME.yaml`).
-
-    Returns:
-        A sentence per error; empty if the configuration is valid. Data sets are not checked.
+    The arguments are one saved configuration (a YAML file, or a run directory); or those of `gausim train`:
+    overrides, names of experiments, and files of conf/ or of a folder like it (`MINE/experiment/NAME.yaml`).
 
     Raises:
         ConfigError: an argument is not a configuration, or a saved one is combined with other arguments.

@@ -18,13 +18,10 @@ _LEFTOVER = re.compile(r"\..+\.\d+\.tmp(\.\w+)?")
 def replacing(path: Path, *, previous: Path | None = None, typed: bool = False) -> Iterator[Path]:
     """A temporary file that takes the name ``path`` when the block ends without an error.
 
-    After a crash the file has either the old or the new content: the temporary file is in the same directory (made if
-    missing) and is flushed to the disk before it is renamed; then the directory entry is flushed, too.
-
-    Args:
-        path: the file.
-        previous: new name of an existing file ``path``; None replaces it.
-        typed: give the temporary file the same suffix, for writers that depend on it.
+    After a crash the file has either the old or the new content: the temporary file is in the same directory (made
+    if missing) and is flushed to the disk before it is renamed; then the directory entry is flushed, too. An
+    existing file is renamed to ``previous``, if given. ``typed`` gives the temporary file the same suffix, for
+    writers that depend on it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp{path.suffix if typed else ''}")

@@ -140,17 +140,11 @@ def motion_glb(scene: GaussianScene, trajectory: Trajectory, *, up: str = "z") -
 
 
 def save_motion(path: Path | str, scene: GaussianScene, trajectory: Trajectory, *, up: str = "z") -> None:
-    """Writes a rest scene and its motion; replaces the file atomically.
+    """Writes a rest scene and its motion; replaces the file atomically. ``up`` (y or z) is for readers of glTF.
 
-    Kept: the rest scene (float32; spherical harmonics above degree 0 with 8 bits), its masks, every unit's centre and
-    deformation gradient with 11 significant bits. Lost: rotations, which on reading are those of the deformation
-    gradients.
-
-    Args:
-        path: the file.
-        scene: the rest scene.
-        trajectory: its motion.
-        up: vertical axis, ``y`` or ``z``, for readers of glTF.
+    Kept: the rest scene (float32; spherical harmonics above degree 0 with 8 bits), its masks, every unit's centre
+    and deformation gradient with 11 significant bits. Lost: rotations, which on reading are those of the
+    deformation gradients.
 
     Raises:
         DataError: the trajectory is of another scene, or goes beyond half floats or the size of a GLB.

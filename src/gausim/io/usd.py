@@ -55,13 +55,9 @@ class UsdClip:
 
 
 def save_usd(path: Path | str, frames: Iterable[GaussianScene], fps: float, *, up: str = "z") -> int:
-    """Writes moving Gaussians; replaces the file atomically. Returns the number of frames.
+    """Writes moving Gaussians of equal number, atomically; returns the number of frames. Frame n has time code n.
 
-    Args:
-        path: the file: .usd and .usdc are binary, .usda is text.
-        frames: deformed scenes of equal size; frame n has time code n.
-        fps: frames per second.
-        up: vertical axis, ``y`` or ``z``.
+    Files named .usd and .usdc are binary, .usda is text; the vertical axis ``up`` is y or z.
 
     Raises:
         ConfigError: usd-core is not installed, or the suffix or axis is not supported.

@@ -44,15 +44,9 @@ class ImageMetric(Metric, ABC):
 
     @abstractmethod
     def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
-        """The metric of every image.
+        """The metric of every image in [0, 1]; NaN for a foreground metric of an image without foreground.
 
-        Args:
-            prediction: predicted images in [0, 1].
-            target: true images in [0, 1].
-            mask: foreground pixels of the true images (unused by whole-image metrics).
-
-        Returns:
-            One value per image; NaN for a foreground metric of an image without foreground.
+        ``mask`` is the foreground of the true images (unused by whole-image metrics).
         """
 
     def update(self, prediction: Images, target: Images, mask: Mask) -> None:

@@ -13,16 +13,9 @@ def level_error(
     rest: Float[Tensor, "P 3"],
     unit: Int[Tensor, " P"],
 ) -> tuple[Float[Tensor, " F"], Float[Tensor, " F"]]:
-    """Mean over units of the distance between the predicted and the true mean of their points.
+    """Error of every frame, and of the rest state: mean distance of units' predicted and true centres [scene units].
 
-    Args:
-        prediction: predicted positions [scene units].
-        target: true positions.
-        rest: rest positions.
-        unit: the unit of each point at the level; -1 for points without a unit.
-
-    Returns:
-        The error of every frame, and the error of the rest state.
+    ``unit`` is the unit of each point at the level; -1 for points without a unit.
     """
     known = unit >= 0
     _, index = unit[known].unique(return_inverse=True)

@@ -66,20 +66,9 @@ def draw(
     """Draws B deformed states of one scene in every camera (METHOD section 2).
 
     Kernel k of unit c has covariance G_c S_k G_c^T and the colour of its spherical harmonics at Q_c^T d, d the unit
-    vector from the camera to the kernel. Differentiable in ``positions``, ``deformation_gradients`` and
-    ``rotations``, and in the tensors of a SceneAppearance.
-
-    Args:
-        renderer: the renderer.
-        scene: the rest scene, or its SceneAppearance, which training computes once.
-        positions: kernel means of each state [scene units].
-        deformation_gradients: accumulated deformation gradients G of the N units.
-        rotations: accumulated rotations Q of the units.
-        unit_of_kernel: the unit of each kernel.
-        cameras: V views.
-        background: colour behind the kernels; black when absent.
-        mask: draw only these kernels of a GaussianScene (a SceneAppearance is masked when it is made).
-        depth: draw the depth, too (core.Rendered).
+    vector from the camera to the kernel. Differentiable in ``positions`` [scene units], ``deformation_gradients`` G
+    and ``rotations`` Q, and in the tensors of a SceneAppearance, which training computes once in the place of the
+    scene. ``mask`` selects kernels of a GaussianScene; the background is black when absent.
 
     Raises:
         ConfigError: a mask is given with a SceneAppearance.
@@ -119,18 +108,9 @@ def deformed_appearance(
     sh: Float[Tensor, "n basis 3"],
     centers: Float[Tensor, "V 3"],
 ) -> tuple[Float[Tensor, "B n 3 3"], Float[Tensor, "B V n 3"]]:
-    """Covariances G S G^T of the kernels and their colours max(0, 0.5 + sum_b sh_b Y_b(Q^T d)) for each camera.
+    """Covariances G S G^T [scene units^2] and colours max(0, 0.5 + sum_b sh_b Y_b(Q^T d)) for each camera.
 
-    Differentiable in all but the camera centres.
-
-    Args:
-        positions: kernel means of B states [scene units].
-        deformation_gradients: accumulated deformation gradients G of the N units.
-        rotations: accumulated rotations Q of the units.
-        unit_of_kernel: the unit of each kernel.
-        covars: rest covariances S [scene units^2].
-        sh: colour coefficients of degree 0..3.
-        centers: centres of V cameras [scene units].
+    Differentiable in all but the camera centres [scene units]; colour coefficients have degree 0..3.
     """
     deformed = transport_covariance(covars, deformation_gradients.index_select(1, unit_of_kernel))
     away = torch.nn.functional.normalize(positions[:, None] - centers[:, None], dim=-1)

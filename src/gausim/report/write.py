@@ -36,14 +36,9 @@ def write_report(
     pictures: bool = True,
     say: Callable[[str], None] = lambda text: None,
 ) -> Report:
-    """Writes the report of all runs at or below ``roots`` to ``out``.
+    """Writes the report of all runs at or below ``roots`` to ``out``, which is not searched for runs.
 
-    Args:
-        roots: run directories, sweeps, or folders of them.
-        out: folder of the report; not searched for runs.
-        title: heading.
-        pictures: whether the page has figures and videos.
-        say: called with messages on the progress.
+    ``pictures``: whether the page has figures and videos. ``say`` is called with messages on the progress.
 
     Raises:
         RunError: a root is no directory, or there is no run.

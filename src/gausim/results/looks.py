@@ -62,14 +62,10 @@ def record_look(
     state: Mapping[str, Any],
     sequences: Mapping[str, Sequence[str]],
 ) -> Looks:
-    """Adds a look to the file and returns all of them.
+    """Adds a look at ``sequences`` (by object) to the file and returns all looks.
 
-    Args:
-        path: the file.
-        trials: declared trials on the development part.
-        provenance: commit of the program (:func:`gausim.runs.provenance.code_provenance`).
-        state: epoch and updates of the checkpoint.
-        sequences: the sequences looked at, by object.
+    ``trials`` are those declared on the development part, ``provenance`` is
+    :func:`gausim.runs.provenance.code_provenance`, ``state`` epoch and updates of the checkpoint.
 
     Raises:
         RunError: the file is malformed.

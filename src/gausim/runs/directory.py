@@ -139,11 +139,9 @@ class RunDirectory:
             raise explained from error
 
     def prepare(self, config: Mapping[str, Any], *, overwrite: bool = False) -> Path | None:
-        """Makes the directory and writes the configuration; returns the checkpoint to resume from, if there is one.
+        """Makes the directory and writes the resolved configuration; returns the checkpoint to resume from, if any.
 
-        Args:
-            config: the resolved configuration, plain containers only.
-            overwrite: remove the files of an earlier run.
+        ``overwrite`` removes the files of an earlier run.
 
         Raises:
             RunError: the run is finished (unless it was cut short: then it gets the same epochs and minutes once more),

@@ -69,14 +69,9 @@ class Painter:
         mode: str,
         eye: Float[Tensor, " 3"],
     ) -> tuple[Float[Tensor, "K 3 3"], Float[Tensor, "K 3"], Legend]:
-        """Covariances [scene units^2], colours in [0, 1] and their legend.
+        """Covariances [scene units^2], colours in [0, 1] and their legend, in one of the :attr:`modes`.
 
-        Args:
-            frame: the frame to colour.
-            unit_of_kernel: the unit of each kernel, a row of the frame's deformation gradients.
-            speed: speeds of the kernels [scene units / s].
-            mode: one of :attr:`modes`.
-            eye: position of the camera [scene units].
+        Speeds are in scene units / s, ``eye`` is the position of the camera [scene units].
         """
         positions, unit = frame.positions.cpu(), unit_of_kernel.cpu()
         deformation_gradients, look = frame.deformation_gradients.cpu(), self._look.to(positions)

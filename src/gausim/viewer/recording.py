@@ -29,21 +29,11 @@ def record(
     up: str = "z",
     colors: Literal["base", "view"] = "base",
 ) -> Path:
-    """Writes a trajectory for viser's player, which plays it at its frame rate, in a loop.
+    """Writes a trajectory for viser's player, which plays it at its frame rate, in a loop; returns the path.
 
     Kept: positions (float32), covariances (float16, with the object scaled to :data:`SIZE` units), colours and
-    opacities (8 bit). Lost: view-dependent colours (one colour per kernel and frame), masks, masses, the hierarchy.
-
-    Args:
-        scene: the rest scene.
-        trajectory: the trajectory to play.
-        path: the file; an existing one is replaced.
-        every: interval of the exported frames [frames].
-        up: vertical axis: x, y, z, -x, -y or -z.
-        colors: ``base`` (independent of the view) or ``view`` (as seen from the initial camera).
-
-    Returns:
-        The path.
+    opacities (8 bit). Lost: view-dependent colours (one colour per kernel and frame: ``base``, or the ``view`` of
+    the initial camera), masks, masses, the hierarchy. Takes every ``every``-th frame.
 
     Raises:
         DataError: the trajectory is of another scene or too long, or ``every`` is not positive.

@@ -73,10 +73,7 @@ class Search:
         self._results: list[JobResult] = []
 
     def run(self, arguments: Sequence[str]) -> None:
-        """Trains trials until ``n_trials`` are complete, then prints and writes the best.
-
-        Args:
-            arguments: overrides of the command line.
+        """Trains trials, by the command line's overrides, until ``n_trials`` are complete; writes the best.
 
         Raises:
             ConfigError: no parameter is searched, or the stored study has other parameters.

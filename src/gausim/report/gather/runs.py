@@ -130,11 +130,7 @@ def flatten(value: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
 
 
 def find_runs(roots: Sequence[Path], *, skip: Path | None = None) -> list[RunRecord]:
-    """All runs at or below ``roots``, in the order of their paths, each once.
-
-    Args:
-        roots: directories.
-        skip: a directory that is not searched (that of the report).
+    """All runs at or below the directories ``roots``, but not in ``skip``, in the order of their paths, each once.
 
     Raises:
         RunError: a root is no directory, or there is no run at all.

@@ -29,17 +29,10 @@ def draw_clusters(
     sides: tuple[tuple[int, int], tuple[int, int]],
     flip: bool = False,
 ) -> None:
-    """Writes a picture with one column per level and one row per side.
+    """Writes a picture of kernels at ``means`` [scene units], one column per level and one row per side.
 
-    Args:
-        path: PNG to write.
-        means: rest positions of the kernels [scene units].
-        labels: for each level the unit of every kernel.
-        pinned: pinned kernels, drawn dark grey.
-        title: title of the picture.
-        names: heading of each level.
-        sides: for each row the horizontal and the vertical axis (0, 1, 2 for x, y, z).
-        flip: draw the vertical axis downwards (scenes whose up is negative).
+    ``labels`` has the unit of every kernel at each level; pinned kernels are dark grey. ``sides`` are the
+    horizontal and the vertical axis of each row (0, 1, 2 for x, y, z); ``flip`` draws the vertical one downwards.
     """
     figure = Figure(figsize=(4.2 * len(labels), 8.4), layout="constrained")
     figure.suptitle(title)

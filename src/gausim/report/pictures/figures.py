@@ -32,11 +32,8 @@ def error_plot(
 ) -> Figure:
     """Errors over time of every row: 3D if the truth is known, then l2 in the training and held-out views.
 
-    Args:
-        rows: label, and the evaluations (seeds) with the name of their row; the mean and, for methods, a band of one
-            standard deviation are over all of them.
-        title: heading.
-        sequence: one sequence; all when None.
+    ``rows`` are labels, and the evaluations (seeds) with the name of their row; the mean and, for methods, a band
+    of one standard deviation are over all of them, and over all sequences unless one is named.
     """
     first = rows[0][1][0][0]
     panels = [("l2", views) for views in ("train", "heldout") if first.view_indices(views)]
@@ -97,14 +94,10 @@ def _lines(curves: ObjectCurves, row: str, panel: tuple[str, str], sequence: str
 def slices_plot(
     columns: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], first_unseen: int
 ) -> tuple[Figure, list[tuple[str, int]]]:
-    """Space-time slices below each other, through the line with the most motion in a column's first film.
+    """Space-time slices below each other, and the line ("column" | "row", index) of every column.
 
-    Args:
-        columns: heading of each, and its films: label and (F, H, W, 3) uint8, of any length.
-        first_unseen: first unseen frame, marked by a line.
-
-    Returns:
-        The figure, and the line of each column: ("column" | "row", index).
+    It is the line with the most motion in the column's first film. A column is a heading and films, each a label
+    and (F, H, W, 3) uint8 of any length; a line marks ``first_unseen``.
     """
     rows, wide = len(columns[0][1]), len(columns) > 1
     size = (5.2 * len(columns) if wide else 7.0, 1.5 * rows + 0.6 if wide else 2.6 * rows)

@@ -38,15 +38,7 @@ def property_colors(values: Float[Tensor, " K"], scale: LogNorm) -> Float[Tensor
 
 
 def draw_property(path: Path, images: Float[np.ndarray, "V H W 3"], scale: LogNorm, *, title: str, text: str) -> None:
-    """Writes images side by side with a colour bar.
-
-    Args:
-        path: PNG to write.
-        images: the coloured scene from several sides, in [0, 1].
-        scale: the scale of the colours.
-        title: title of the picture.
-        text: label of the colour bar.
-    """
+    """Writes images of the coloured scene, in [0, 1], side by side with a colour bar labelled ``text``."""
     figure = Figure(figsize=(4.0 * len(images) + 1.2, 4.4), layout="constrained")
     figure.suptitle(title)
     panels = figure.subplots(1, len(images), squeeze=False)[0]
