@@ -6,20 +6,26 @@ import argparse
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
+from msgspec.structs import replace
 
 from gausim.cli.arguments import parse_background
+from gausim.cli.end import end
+from gausim.compose.build import LoadedRun
+from gausim.compose.live import REST, open_interaction
+from gausim.compose.predict import RunObject, run_objects
+from gausim.core import Cameras, GaussianScene, Renderer, Trajectory
 from gausim.core.errors import ConfigError, DataError
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from gausim.compose.build import LoadedRun
-    from gausim.compose.predict import RunObject
-    from gausim.core import Cameras, GaussianScene, Renderer, Trajectory
-    from gausim.interaction.arrows import Arrow
-    from gausim.interaction.interaction import Interaction
-    from gausim.interaction.session import ForceSession
+from gausim.interaction.arrows import Arrow, arrows_of, draw_arrows
+from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction, differences, replay
+from gausim.interaction.session import ForceSession, load_session, save_session
+from gausim.interaction.words import entries_of, has_forces
+from gausim.io.trajectory import save_trajectory
+from gausim.io.video import write_gif, write_video
+from gausim.render.draw import film
+from gausim.report.pictures.figures import picture_grid
+from gausim.report.pictures.frames import PANEL_HEIGHT, brighten, label_bar
 
 
 def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -> int:
@@ -30,12 +36,6 @@ def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) ->
         DataError: the session is malformed or of another scene, or an object, sequence or view does not exist.
         DivergenceError: a simulated position is not finite.
     """
-    from gausim.cli.end import end
-    from gausim.interaction.arrows import arrows_of
-    from gausim.interaction.interaction import replay
-    from gausim.interaction.session import load_session, save_session
-    from gausim.interaction.words import has_forces
-
     if arguments.session and has_forces(arguments):
         raise ConfigError("--session has its own forces: leave --force and the like out, or edit the session's file.")
     if len(arguments.object or []) > 1 or len(arguments.sequence or []) > 1:
@@ -64,10 +64,6 @@ def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) ->
 
 def _opened(run: LoadedRun, arguments: argparse.Namespace, found: ForceSession | None) -> tuple[RunObject, Interaction]:
     """The named object and its interaction; by default the object of the session, or the first."""
-    from gausim.compose.live import REST, open_interaction
-    from gausim.compose.predict import run_objects
-    from gausim.interaction.interaction import STANDARD_GRAVITY
-
     names = arguments.object
     if names is None and found and found.made_with.scene in [item.data.name for item in run_objects(run)]:
         names = [found.made_with.scene]
@@ -80,9 +76,6 @@ def _opened(run: LoadedRun, arguments: argparse.Namespace, found: ForceSession |
 
 
 def _new_session(item: RunObject, interaction: Interaction, arguments: argparse.Namespace) -> ForceSession:
-    from gausim.interaction.session import ForceSession
-    from gausim.interaction.words import entries_of
-
     steps = (arguments.frames or item.data.sequences[0].count) - 1
     entries = tuple(entries_of(arguments, interaction.scene))
     late = [entry.at for entry in entries if entry.at > steps]
@@ -93,10 +86,6 @@ def _new_session(item: RunObject, interaction: Interaction, arguments: argparse.
 
 def _known(interaction: Interaction, found: ForceSession, arguments: argparse.Namespace) -> ForceSession:
     """The session to replay, cut to the requested number of frames."""
-    from msgspec.structs import replace
-
-    from gausim.interaction.interaction import differences
-
     for text, allowed in differences(interaction, found):
         if not allowed:
             raise DataError(f"{arguments.session}: {text}. Replay it with what it was made with.")
@@ -109,8 +98,6 @@ def _known(interaction: Interaction, found: ForceSession, arguments: argparse.Na
 
 def write_trajectory(run: LoadedRun, item: RunObject, sequence: str, trajectory: Trajectory, folder: Path) -> None:
     """Writes ``trajectory.safetensors`` of an object that started from a sequence's initial state."""
-    from gausim.io.trajectory import save_trajectory
-
     facts = {"object": item.data.name, "sequence": sequence, "run": run.run_dir.name}
     save_trajectory(folder / "trajectory.safetensors", trajectory, facts=facts)
 
@@ -125,14 +112,6 @@ def write_film(
     folder: Path,
 ) -> None:
     """Writes the video and the contact sheet of a motion and its forces in one view, named after the camera."""
-    import numpy as np
-
-    from gausim.interaction.arrows import draw_arrows
-    from gausim.io.video import write_gif, write_video
-    from gausim.render.draw import film
-    from gausim.report.pictures.figures import picture_grid
-    from gausim.report.pictures.frames import brighten, label_bar
-
     (view,), background = cameras.names, parse_background(arguments.background)
     drawn = film(renderer, scene, trajectory, cameras, background=background, mask=scene.foreground)
     images = brighten(drawn[:, 0].cpu().numpy(), arguments.brighten)
@@ -157,9 +136,6 @@ def write_film(
 
 def _sharp(cameras: Cameras) -> Cameras:
     """The same views, enlarged to the size of a video panel if they are smaller."""
-    from gausim.core import Cameras
-    from gausim.report.pictures.frames import PANEL_HEIGHT
-
     zoom = max(1.0, PANEL_HEIGHT / cameras.height)
     Ks = cameras.Ks.clone()
     Ks[:, :2] *= zoom

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from gausim.cli.arguments import opened_scene, pinned_by
+from gausim.cli.end import end
+from gausim.cli.simulate_forces import told, write_film
+from gausim.compose.config import compose, instantiate
 from gausim.core.errors import ConfigError
-
-if TYPE_CHECKING:
-    from gausim.interaction.arrows import Arrow
-    from gausim.interaction.interaction import Interaction
-    from gausim.interaction.session import ForceSession
+from gausim.interaction.arrows import Arrow, arrows_of
+from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction, replay
+from gausim.interaction.session import ForceSession, save_session
+from gausim.interaction.words import entries_of, has_forces
+from gausim.io.ply import load_scene
+from gausim.io.trajectory import save_trajectory
+from gausim.ops.orbit import orbit_cameras
 
 # Frames without --frames, and the initial motion without forces [diagonals per frame of the farthest kernel].
 FRAMES, SWAY = 120, 0.02
@@ -29,17 +33,6 @@ def simulate_scene(arguments: argparse.Namespace) -> int:
         SceneError: the scene is unusable, or nothing of it is pinned.
         DivergenceError: a simulated position is not finite.
     """
-    from gausim.cli.end import end
-    from gausim.cli.simulate_forces import told, write_film
-    from gausim.compose.config import compose, instantiate
-    from gausim.interaction.arrows import arrows_of
-    from gausim.interaction.interaction import STANDARD_GRAVITY, replay
-    from gausim.interaction.session import save_session
-    from gausim.interaction.words import has_forces
-    from gausim.io.ply import load_scene
-    from gausim.io.trajectory import save_trajectory
-    from gausim.ops.orbit import orbit_cameras
-
     if arguments.base is None:
         raise ConfigError("--scene: its motion needs a trained network, --from RUN (a run of model=gausim).")
     if arguments.session:
@@ -66,9 +59,6 @@ def simulate_scene(arguments: argparse.Namespace) -> int:
 
 
 def _session(interaction: Interaction, arguments: argparse.Namespace) -> ForceSession:
-    from gausim.interaction.session import ForceSession
-    from gausim.interaction.words import entries_of
-
     steps = (arguments.frames or FRAMES) - 1
     entries = tuple(entries_of(arguments, interaction.scene))
     late = [entry.at for entry in entries if entry.at > steps]

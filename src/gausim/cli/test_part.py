@@ -6,15 +6,17 @@ import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from omegaconf import DictConfig
+
+from gausim.compose.build import LoadedRun
+from gausim.compose.predict import run_objects, sequence_of
 from gausim.core.errors import ConfigError, DataError
-
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
-    from gausim.compose.build import LoadedRun
-    from gausim.data.datamodule import ReadyDataModule
+from gausim.data.datamodule import ReadyDataModule
+from gausim.results.looks import DEVELOPMENT, TEST_PART, record_look
+from gausim.runs.names import TEST
+from gausim.runs.provenance import code_provenance
 
 
 @dataclass(frozen=True)
@@ -32,9 +34,6 @@ def choose(run: LoadedRun, arguments: argparse.Namespace) -> Chosen:
         ConfigError: no sequence belongs to the part, or ``--test`` or ``--trials`` does not apply.
         DataError: an object or sequence does not exist, or a sequence belongs to the other part.
     """
-    from gausim.compose.predict import run_objects, sequence_of
-    from gausim.results.looks import DEVELOPMENT, TEST_PART
-
     items = run_objects(run, arguments.object)
     declared = any({r.name for r in item.data.sequences} & item.data.test_part for item in items)
     if not declared and (arguments.test or arguments.trials):
@@ -71,10 +70,6 @@ def look(run: LoadedRun, arguments: argparse.Namespace, chosen: Chosen, state: M
     Raises:
         ConfigError: the number of trials is not declared.
     """
-    from gausim.results.looks import record_look
-    from gausim.runs.names import TEST
-    from gausim.runs.provenance import code_provenance
-
     trials = arguments.trials or (run.config.get("protocol") or {}).get("trials")
     if not trials:
         raise ConfigError(
@@ -92,9 +87,6 @@ def look(run: LoadedRun, arguments: argparse.Namespace, chosen: Chosen, state: M
 
 def home(run_dir: Path, part: str | None) -> Path:
     """Folder of a whole evaluation: that of the development part makes room for the test part once it was looked at."""
-    from gausim.results.looks import DEVELOPMENT
-    from gausim.runs.names import TEST
-
     folder = run_dir / "evaluation"
     return folder / DEVELOPMENT if part == DEVELOPMENT and (run_dir / TEST).is_file() else folder
 
@@ -109,8 +101,6 @@ def _move(folder: Path, target: Path) -> None:
 
 def check_protocol(cfg: DictConfig, datamodule: ReadyDataModule) -> None:
     """Raises ConfigError where the evaluation after training could not be made as the protocol demands."""
-    from gausim.results.looks import DEVELOPMENT, TEST_PART
-
     protocol = cfg.get("protocol") or {}  # configurations of earlier versions have none
     part, trials = protocol.get("part"), protocol.get("trials")
     if part not in (None, DEVELOPMENT, TEST_PART):

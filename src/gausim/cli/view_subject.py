@@ -6,18 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from gausim.compose.build import LoadedRun
 from gausim.compose.live import REST, open_interaction
+from gausim.compose.predict import RunObject, TrainedPrediction, run_objects
 from gausim.core import Trajectory
-
-if TYPE_CHECKING:
-    from gausim.compose.build import LoadedRun
-    from gausim.compose.predict import RunObject
-    from gausim.interaction.interaction import Interaction
-    from gausim.models.template.template import Property
-    from gausim.viewer.shown import Take
-    from gausim.viewer.subject import Subject
+from gausim.interaction.interaction import Interaction
+from gausim.models.step.scene_model import SceneModel
+from gausim.models.template.template import Property
+from gausim.viewer.companion import Companion
+from gausim.viewer.films import Films
+from gausim.viewer.shown import Take
+from gausim.viewer.subject import Subject
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,8 +30,6 @@ class Playable:
 
     def predictions(self) -> dict[str, Callable[[], Trajectory]]:
         """Functions that predict the recorded sequences, by name."""
-        from gausim.compose.predict import TrainedPrediction
-
         if self.item is None or self.run is None:
             return {}
         predict = TrainedPrediction(self.run, self.item)
@@ -47,27 +45,18 @@ def playable_run(
     keep: int | None = 0,
 ) -> Playable:
     """An object of a run, by default its first; the options are those of :func:`open_interaction`."""
-    from gausim.compose.predict import run_objects
-
     item = run_objects(run, [name] if name is not None else None)[0]
     return Playable(open_interaction(run, name=name, sequence=sequence, gravity=gravity, keep=keep), item, run)
 
 
 def takes_of(made: Playable, beside: Playable | None) -> list[Take]:
     """Predictions of the recorded sequences by the method, and by the method beside it."""
-    from gausim.viewer.shown import Take
-
     other = {} if beside is None else beside.predictions()
     return [Take(f"Predicted: {name}", load, name, other.get(name)) for name, load in made.predictions().items()]
 
 
 def subject_of(made: Playable, *, title: str, beside: Playable | None, up: str, sessions: Path) -> Subject:
     """The complete content of the viewer."""
-    from gausim.models.step.scene_model import SceneModel
-    from gausim.viewer.companion import Companion
-    from gausim.viewer.films import Films
-    from gausim.viewer.subject import Subject
-
     films = cameras = companion = None
     material: dict[str, Property] = {}
     if made.run is not None and made.item is not None:

@@ -5,15 +5,25 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
+import torch
+from omegaconf import OmegaConf
+
+from gausim.compose.config import compose, instantiate
 from gausim.compose.live import energy_ceiling
+from gausim.core import GaussianScene
 from gausim.core.errors import ConfigError
-
-if TYPE_CHECKING:
-    from gausim.core import GaussianScene
-    from gausim.interaction.interaction import Interaction
-    from gausim.models.step.simulator import GausSim
+from gausim.core.state import initial_sway
+from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
+from gausim.interaction.session import MadeWith
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.step.simulator import GausSim
+from gausim.models.template.material import MaterialTemplate
+from gausim.ops.selection import require_pinned
+from gausim.runs.directory import RunDirectory
+from gausim.training.pretraining import give_even_material
+from gausim.training.transfer import load_shared
 
 # The model without a trained run: its untrained network outputs zero, so that only the template acts.
 UNTRAINED = "gausim"
@@ -66,14 +76,6 @@ def open_scene(
         SceneError: no kernel is pinned.
         ConfigError: the frame rate is not positive and finite, or ``base`` is a run of another model.
     """
-    import torch
-
-    from gausim.core.state import initial_sway
-    from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
-    from gausim.interaction.session import MadeWith
-    from gausim.models.rollout.dynamics import SceneDynamics
-    from gausim.ops.selection import require_pinned
-
     if not (math.isfinite(fps) and fps > 0):
         raise ConfigError(f"--fps {fps}: expected frames per second > 0.")
     require_pinned(scene)
@@ -91,20 +93,11 @@ def open_scene(
 
 
 def _untrained(scene: GaussianScene, fps: float) -> GausSim:
-    from gausim.compose.config import compose
-
     return _built(compose(f"model/{UNTRAINED}").model.simulator, scene, fps)
 
 
 def _of_base(scene: GaussianScene, fps: float, base: Path, material: EvenMaterial) -> GausSim:
     """The simulator of a run's configuration with its shared weights, and an even material."""
-    from omegaconf import OmegaConf
-
-    from gausim.models.template.material import MaterialTemplate
-    from gausim.runs.directory import RunDirectory
-    from gausim.training.pretraining import give_even_material
-    from gausim.training.transfer import load_shared
-
     config = RunDirectory(base).config().get("model", {})
     node = OmegaConf.create(config).get("simulator")
     model = None if node is None else _built(node, scene, fps)
@@ -121,6 +114,4 @@ def _of_base(scene: GaussianScene, fps: float, base: Path, material: EvenMateria
 
 
 def _built(node: Any, scene: GaussianScene, fps: float) -> GausSim:
-    from gausim.compose.config import instantiate
-
     return cast("GausSim", instantiate(node, scenes=[scene], fps=[fps])())

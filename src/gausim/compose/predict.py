@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
+from torch import Tensor
+
+from gausim.compose.build import LoadedRun
+from gausim.core import ConfigError, GaussianScene, SimState, Trajectory
 from gausim.core.errors import DataError
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from gausim.compose.build import LoadedRun
-    from gausim.core import GaussianScene, Trajectory
-    from gausim.data.objects import ObjectData
-    from gausim.data.records import SequenceRecord
+from gausim.data.objects import ObjectData
+from gausim.data.records import SequenceRecord
+from gausim.evaluation.endurance import RandomPushes, endure
+from gausim.evaluation.stability import largest_eigenvalue
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.step.simulator import GausSim
+from gausim.runs.checkpoint import read_checkpoint
+from gausim.runs.directory import RunDirectory
 
 # Duration of the random pushes of `gausim evaluate --endurance` [frames].
 PUSHED_FRAMES = 240
@@ -68,9 +72,6 @@ def state_of(run: LoadedRun) -> dict[str, Any]:
 
     Prints a warning to the standard error if the run is unfinished.
     """
-    from gausim.runs.checkpoint import read_checkpoint
-    from gausim.runs.directory import RunDirectory
-
     directory = RunDirectory(run.run_dir)
     if not directory.is_finished:
         print(f"warning: {run.run_dir} is not finished; its latest checkpoint is used.", file=sys.stderr)
@@ -113,9 +114,6 @@ class TrainedPrediction:
     @property
     def footnotes(self) -> dict[str, Any] | None:
         """Remarks on the method (see :attr:`GausSimModule.footnotes`), with the largest eigenvalue of the step."""
-        from gausim.evaluation.stability import largest_eigenvalue
-        from gausim.models.step.simulator import GausSim
-
         footnotes, model = self._run.module.footnotes, self._run.module.model
         if not isinstance(model, GausSim):
             return footnotes
@@ -140,11 +138,6 @@ class TrainedPrediction:
 
 def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
     """Long rollouts of an object: its first sequence without forces, and random pushes from rest."""
-    from gausim.core import ConfigError, SimState
-    from gausim.evaluation.endurance import RandomPushes, endure
-    from gausim.models.rollout.dynamics import SceneDynamics
-    from gausim.models.step.simulator import GausSim
-
     if not isinstance(run.module.model, GausSim):
         raise ConfigError(
             f"--endurance: {run.module.method_name} takes no forces. Leave the option out, or evaluate a simulator."
