@@ -137,13 +137,7 @@ def _of_trajectory(name: str, scene: GaussianScene, trajectory: Trajectory) -> M
 def _thinned(motion: Motion, every: int) -> Motion:
     trajectory = motion.trajectory
     if trajectory is not None:
-        trajectory = replace(
-            trajectory,
-            positions=trajectory.positions[::every],
-            deformation_gradients=trajectory.deformation_gradients[::every],
-            rotations=trajectory.rotations[::every],
-            fps=trajectory.fps / every,
-        )
+        trajectory = trajectory.part(slice(None, None, every))
     return replace(
         motion,
         fps=motion.fps / every,
@@ -212,21 +206,13 @@ def _write_pictures(motion: Motion, path: Path, arguments: argparse.Namespace) -
 
 
 def _pictures(motion: Motion, arguments: argparse.Namespace) -> Iterator[np.ndarray]:
-    import torch
-
     from gausim.compose.config import compose, instantiate
-    from gausim.render.draw import draw, to_bytes
+    from gausim.render.draw import draw_still, to_bytes
 
     background, camera = parse_background(arguments.background), _camera(motion, arguments)
     renderer = motion.renderer or instantiate(compose("render/cpu").render)
-    identity = torch.eye(3)[None, None]
     for scene in motion.scenes():
-        units = torch.zeros(scene.count, dtype=torch.long)
-        with torch.no_grad():
-            made = draw(
-                renderer, scene, scene.means[None], identity, identity, units, camera, background=background,
-                mask=motion.first.foreground,
-            )  # fmt: skip
+        made = draw_still(renderer, scene, camera, background=background, mask=motion.first.foreground)
         yield to_bytes(made.rgb[0, 0]).cpu().numpy()
 
 

@@ -18,7 +18,7 @@ from gausim.models.step.scene_model import SceneModel
 from gausim.models.template.template import Property
 from gausim.ops.orbit import orbit_cameras
 from gausim.ops.spherical_harmonics import C0
-from gausim.render.draw import draw
+from gausim.render.draw import draw_still
 from gausim.report.pictures.material import draw_property, property_colors, property_scale
 
 PIXELS = 480
@@ -61,10 +61,5 @@ def _learned(run: LoadedRun, scene_id: int, name: str, path: Path) -> Property:
 def _images(run: LoadedRun, scene: GaussianScene, azimuths: list[float], up: str) -> torch.Tensor:
     """The scene from these sides on white, (V, H, W, 3) in [0, 1]."""
     cameras = orbit_cameras(scene.means[scene.foreground], azimuths=azimuths, up=up, size=(PIXELS, PIXELS))
-    identity, units = torch.eye(3)[None, None], torch.zeros(scene.count, dtype=torch.long)
-    with torch.no_grad():
-        made = draw(
-            run.renderer, scene, scene.means[None], identity, identity, units, cameras, background=torch.ones(3),
-            mask=scene.foreground,
-        )  # fmt: skip
+    made = draw_still(run.renderer, scene, cameras, background=torch.ones(3), mask=scene.foreground)
     return made.rgb[0].clamp(0, 1).cpu()

@@ -36,7 +36,7 @@ def main(argv: list[str]) -> int:
     if (arguments.run is None) == (arguments.scene is None):
         raise ConfigError("expected a RUN, or --scene SCENE.ply and the run whose network moves it, --from RUN.")
     if arguments.scene is not None:
-        from gausim.cli.simulate_scene import simulate_scene
+        from gausim.cli.simulate_forces import simulate_scene
 
         return simulate_scene(arguments)
     from gausim.cli.end import end, push

@@ -1,4 +1,4 @@
-"""`gausim simulate RUN --force ...` and `--session FILE`: simulation of an object under forces."""
+"""`gausim simulate RUN --force ...`, `--session FILE`, and `--scene SCENE --from RUN`: an object under forces."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from gausim.cli.arguments import parse_background
+from gausim.cli.arguments import opened_scene, parse_background, pinned_by
 from gausim.cli.end import end
 from gausim.compose.build import LoadedRun
+from gausim.compose.config import compose, instantiate
 from gausim.compose.live import REST, open_interaction
 from gausim.compose.predict import RunObject, run_objects
 from gausim.core import Cameras, GaussianScene, Renderer, Trajectory
@@ -21,11 +22,17 @@ from gausim.interaction.arrows import Arrow, arrows_of, draw_arrows
 from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction, differences, replay
 from gausim.interaction.session import ForceSession, load_session, save_session
 from gausim.interaction.words import entries_of, has_forces
+from gausim.io.ply import load_scene
 from gausim.io.trajectory import save_trajectory
 from gausim.io.video import write_gif, write_video
+from gausim.ops.orbit import orbit_cameras
 from gausim.render.draw import film
 from gausim.report.pictures.figures import picture_grid
 from gausim.report.pictures.frames import PANEL_HEIGHT, brighten, label_bar
+
+# Frames of a scene without --frames; its first motion without forces [diagonals per frame of the farthest kernel].
+FRAMES, SWAY = 120, 0.02
+SIZE = (480, 480)
 
 
 def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -> int:
@@ -44,7 +51,8 @@ def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) ->
         raise ConfigError(f"--metre {arguments.metre}: expected more than 0 scene units.")
     found = load_session(arguments.session) if arguments.session else None
     item, interaction = _opened(run, arguments, found)
-    session = _new_session(item, interaction, arguments) if found is None else _known(interaction, found, arguments)
+    frames = arguments.frames or item.data.sequences[0].count
+    session = _known(interaction, found, arguments) if found else _new_session(interaction, arguments, frames)
     views = arguments.view or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
     item.data.sequences[0].camera_indices(views)  # raises on an unknown view before the simulation
     arrows: list[list[Arrow]] = []
@@ -62,6 +70,41 @@ def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) ->
     return 0
 
 
+def simulate_scene(arguments: argparse.Namespace) -> int:
+    """Simulates a scene without a run; writes trajectory, session, video and pictures; returns the exit status.
+
+    Without forces the scene begins with a sway along x.
+
+    Raises:
+        ConfigError: an option is missing or wrong.
+        SceneError: the scene is unusable, or nothing of it is pinned.
+        DivergenceError: a simulated position is not finite.
+    """
+    if arguments.base is None:
+        raise ConfigError("--scene: its motion needs a trained network, --from RUN (a run of model=gausim).")
+    if arguments.session:
+        raise ConfigError("--session replays what was done to a run's object. With --scene give --force and the like.")
+    scene = pinned_by(load_scene(arguments.scene), arguments)
+    interaction = opened_scene(
+        scene, arguments, sway=0.0 if has_forces(arguments) else SWAY, gravity=STANDARD_GRAVITY * arguments.metre,
+        most_force=arguments.most_force,
+    )  # fmt: skip
+    session, arrows = _new_session(interaction, arguments, arguments.frames or FRAMES), list[list[Arrow]]()
+    trajectory = replay(interaction, session, watch=lambda live: arrows.append(arrows_of(live)))
+    folder = arguments.out or Path(f"{arguments.scene.stem}_simulation")
+    save_trajectory(
+        folder / "trajectory.safetensors", trajectory, facts={"object": scene.name, "run": arguments.base.name}
+    )
+    save_session(session, folder / "session.json")
+    cameras = orbit_cameras(
+        scene.means[scene.foreground], azimuths=[arguments.azimuth], up=arguments.up, size=SIZE
+    )  # fmt: skip
+    renderer = instantiate(compose("render/auto").render)
+    write_film(renderer, scene, trajectory, arrows, cameras, arguments, folder)
+    end(told(interaction, trajectory), "videos", folder)
+    return 0
+
+
 def _opened(run: LoadedRun, arguments: argparse.Namespace, found: ForceSession | None) -> tuple[RunObject, Interaction]:
     """The named object and its interaction; by default the object of the session, or the first."""
     names = arguments.object
@@ -75,8 +118,8 @@ def _opened(run: LoadedRun, arguments: argparse.Namespace, found: ForceSession |
     )  # fmt: skip
 
 
-def _new_session(item: RunObject, interaction: Interaction, arguments: argparse.Namespace) -> ForceSession:
-    steps = (arguments.frames or item.data.sequences[0].count) - 1
+def _new_session(interaction: Interaction, arguments: argparse.Namespace, frames: int) -> ForceSession:
+    steps = frames - 1
     entries = tuple(entries_of(arguments, interaction.scene))
     late = [entry.at for entry in entries if entry.at > steps]
     if late:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 from torch import Tensor
@@ -128,12 +128,7 @@ class TrainedPrediction:
         if known is None or known.frames < count:
             steps = max(record.count, self._frames, count) - 1
             known = self._known[record.name] = self._run.module.predict(self._ids[record.name], steps)
-        return replace(
-            known,
-            positions=known.positions[:count],
-            deformation_gradients=known.deformation_gradients[:count],
-            rotations=known.rotations[:count],
-        )
+        return known.part(slice(count))
 
 
 def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:

@@ -55,6 +55,11 @@ class Trajectory:
         """Number of frames F, the initial state included."""
         return self.positions.shape[0]
 
+    def part(self, frames: slice) -> Trajectory:
+        """The chosen frames."""
+        states = self.positions[frames], self.deformation_gradients[frames], self.rotations[frames]
+        return Trajectory(*states, self.unit_of_kernel, self.fps / (frames.step or 1))
+
     def carry(self, points: Float[Tensor, "P 3"], kernel: Int[Tensor, " P"], rest: Float[Tensor, "K 3"]) -> Tensor:
         """Moves rest-space points with the unit of the kernel they are attached to, (F, P, 3).
 

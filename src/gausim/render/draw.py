@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -119,37 +120,30 @@ def deformed_appearance(
     return deformed, (torch.einsum("bnvs,nsc->bvnc", basis, sh) + 0.5).clamp_min(0.0)
 
 
+@torch.no_grad()
+def draw_still(renderer: Renderer, scene: GaussianScene, cameras: Cameras, **options: Any) -> Rendered:
+    """Draws a scene as it stands (B = 1), without loss gradients; the options are those of :func:`draw`."""
+    identity, units = torch.eye(3)[None, None], torch.zeros(scene.count, dtype=torch.long)
+    return draw(renderer, scene, scene.means[None], identity, identity, units, cameras, **options)
+
+
 def draw_trajectory(
     renderer: Renderer,
     scene: GaussianScene | SceneAppearance,
     trajectory: Trajectory,
     cameras: Cameras,
     *,
-    background: Float[Tensor, " 3"] | None = None,
     mask: Bool[Tensor, " K"] | None = None,
+    background: Float[Tensor, " 3"] | None = None,
     chunk: int = 16,
 ) -> Iterator[Rendered]:
-    """Draws a trajectory for evaluation, ``chunk`` frames at a time, without loss gradients.
-
-    Yields:
-        The images of the next frames, (frames, V, ...), in order.
-    """
-    if isinstance(scene, GaussianScene):
-        scene, mask = SceneAppearance.of(scene, mask), None
+    """Draws a trajectory for evaluation, ``chunk`` frames (frames, V, ...) at a time, without loss gradients."""
+    look = SceneAppearance.of(scene, mask) if isinstance(scene, GaussianScene) else scene
     for start in range(0, trajectory.frames, chunk):
-        frames = slice(start, start + chunk)
+        now, unit = trajectory.part(slice(start, start + chunk)), trajectory.unit_of_kernel
+        state = now.positions, now.deformation_gradients, now.rotations
         with torch.no_grad():
-            images = draw(
-                renderer,
-                scene,
-                trajectory.positions[frames],
-                trajectory.deformation_gradients[frames],
-                trajectory.rotations[frames],
-                trajectory.unit_of_kernel,
-                cameras,
-                background=background,
-                mask=mask,
-            )
+            images = draw(renderer, look, *state, unit, cameras, background=background)
         yield images
 
 
@@ -159,13 +153,14 @@ def film(
     trajectory: Trajectory,
     cameras: Cameras,
     *,
-    background: Float[Tensor, " 3"] | None = None,
-    mask: Bool[Tensor, " K"] | None = None,
-    chunk: int = 16,
     as_bytes: bool = True,
+    **options: Any,
 ) -> Tensor:
-    """All frames of a trajectory, (F, V, H, W, 3): uint8, or float in linear input colours (not clamped)."""
-    parts = draw_trajectory(renderer, scene, trajectory, cameras, background=background, mask=mask, chunk=chunk)
+    """All frames of a trajectory, (F, V, H, W, 3): uint8, or float in linear input colours (not clamped).
+
+    The options are those of :func:`draw_trajectory`.
+    """
+    parts = draw_trajectory(renderer, scene, trajectory, cameras, **options)
     return torch.cat([to_bytes(part.rgb) if as_bytes else part.rgb for part in parts])
 
 
