@@ -39,7 +39,7 @@ from gausim.metrics import (
     point_error,
     track_error,
 )
-from gausim.metrics.flip import NO_PACKAGE, flip_is_installed
+from gausim.metrics.image import NO_PACKAGE, flip_is_installed
 from gausim.metrics.lpips import NO_WEIGHTS, SMALLEST, TOO_SMALL, weights_path
 from gausim.render.draw import SceneAppearance, draw
 from gausim.results.curves import (

@@ -15,8 +15,7 @@ from gausim.core import Cameras, DataError, GaussianScene, Renderer
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.data.records import STILLS_PER_HELDOUT, Stills, read_stills
-from gausim.metrics.psnr import PSNR, ForegroundPSNR
-from gausim.metrics.ssim import SSIM
+from gausim.metrics.image import PSNR, SSIM, ForegroundPSNR
 from gausim.render.draw import draw
 
 # Number of images drawn and compared together, limited because photos have several megapixels.

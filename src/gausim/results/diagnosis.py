@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gausim.metrics.level_error import level_error
+from gausim.metrics.motion import level_error
 from gausim.metrics.oscillation import (
     coordinates,
     oscillation,
