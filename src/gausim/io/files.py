@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 _LEFTOVER = re.compile(r"\..+\.\d+\.tmp(\.\w+)?")
 
 
@@ -57,6 +59,21 @@ def write_json(path: Path, data: Any) -> None:
         ValueError: a number is NaN or infinite, which JSON cannot represent.
     """
     write_durably(path, json.dumps(data, indent=1, allow_nan=False).encode() + b"\n")
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A mapping from a YAML file, with the safe loader: no tag builds an object.
+
+    Raises:
+        ValueError: the file is missing, not YAML or not a mapping.
+    """
+    try:
+        loaded = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+        raise ValueError(f"{path}: cannot be read as YAML ({error}).") from error
+    if not isinstance(loaded, dict):
+        raise ValueError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
+    return loaded
 
 
 def sha256(path: Path) -> str:

@@ -79,7 +79,7 @@ class UnitMotion:
             DataError: the trajectory is of another scene.
             DivergenceError: a frame is not finite.
         """
-        _check_trajectory(scene, trajectory)
+        check_trajectory(scene, trajectory)
         positions, gradients = trajectory.positions.float(), trajectory.deformation_gradients.float()
         made = _averaged(scene.means, positions, gradients, trajectory.unit_of_kernel)
         leaves = torch.zeros(scene.count)
@@ -244,7 +244,13 @@ def _averaged(rest: Tensor, positions: Tensor, gradients: Tensor, unit: Tensor) 
     return UnitMotion(centres.float(), (moved / members).float(), gradients, unit)
 
 
-def _check_trajectory(scene: GaussianScene, trajectory: Trajectory) -> None:
+def check_trajectory(scene: GaussianScene, trajectory: Trajectory) -> None:
+    """Checks that a trajectory can be exported with a scene.
+
+    Raises:
+        DataError: it is of another scene.
+        DivergenceError: a frame is not finite.
+    """
     if trajectory.positions.shape[1] != scene.count:
         raise DataError(
             f"{scene.name}: has {scene.count} kernels, the trajectory {trajectory.positions.shape[1]}. Give the scene "

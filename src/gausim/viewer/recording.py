@@ -8,8 +8,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from gausim.core import DataError, DivergenceError, GaussianScene, SteppedFrame, Trajectory
+from gausim.core import DataError, GaussianScene, SteppedFrame, Trajectory
 from gausim.io.files import write_durably
+from gausim.io.motion import check_trajectory
 from gausim.viewer.access import Access
 from gausim.viewer.coloring import BASE, VIEW, Painter
 from gausim.viewer.server import GuardedServer
@@ -53,11 +54,6 @@ def record(
 def _frames(scene: GaussianScene, trajectory: Trajectory, every: int) -> range:
     if every < 1:
         raise DataError(f"every: expected at least 1, got {every}.")
-    if trajectory.positions.shape[1] != scene.count:
-        raise DataError(
-            f"{scene.name}: has {scene.count} kernels, the trajectory {trajectory.positions.shape[1]}. Give the scene "
-            "that it was made with."
-        )
     numbers = range(0, trajectory.frames, every)
     size = len(numbers) * scene.count * 32
     if size > _LARGEST:
@@ -65,10 +61,7 @@ def _frames(scene: GaussianScene, trajectory: Trajectory, every: int) -> range:
             f"{scene.name}: {len(numbers)} frames of {scene.count} kernels take {size / 2**30:.1f} GiB, expected "
             f"at most {_LARGEST >> 30}. Take every {-(-size * every // _LARGEST)}th frame, or export PLY files."
         )
-    for values in (trajectory.positions, trajectory.deformation_gradients):
-        bad = ~torch.isfinite(values).reshape(trajectory.frames, -1).all(-1)
-        if bool(bad.any()):
-            raise DivergenceError(f"{scene.name}: frame {int(bad.nonzero()[0])} is not finite; it cannot be shown.")
+    check_trajectory(scene, trajectory)
     return numbers
 
 
