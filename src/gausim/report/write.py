@@ -12,8 +12,7 @@ from gausim.report.gather.study import Study, make_study
 from gausim.report.numbers import csv_numbers
 from gausim.report.opening import Opening, make_openings
 from gausim.report.pictures.media import Exhibit, object_figures
-from gausim.report.render import Content, html_page, latex_tables, markdown_report
-from gausim.report.sources import Sources
+from gausim.report.render import Content, Sources, html_page, latex_tables, markdown_report
 from gausim.report.tables.overview import make_sheets
 
 PAGE, MARKDOWN, LATEX, NUMBERS = "report.html", "report.md", "tables.tex", "numbers.csv"

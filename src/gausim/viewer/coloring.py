@@ -121,13 +121,12 @@ def highlighted(rgb: Float[Tensor, "K 3"], selected: Bool[Tensor, " K"], held: B
 
 def hues(units: Int[Tensor, " K"]) -> Float[Tensor, "K 3"]:
     """Distinct colours of neighbouring indices, hues by the golden ratio; grey for -1."""
-    number = units.clamp_min(0).double()
+    from matplotlib.colors import hsv_to_rgb
+
+    number = units.clamp_min(0).double().numpy()
     hue, light = (number * 0.61803398875) % 1, 0.75 + 0.25 * ((number * 0.41421356) % 1)
-    offset = torch.tensor([5.0, 3.0, 1.0], dtype=torch.float64)
-    k = (offset + 6 * hue[:, None]) % 6
-    rgb = light[:, None] * (1 - 0.7 * torch.minimum(k, 4 - k).clamp(0, 1))
-    rgb[units < 0] = 0.5
-    return rgb.float()
+    rgb = torch.from_numpy(hsv_to_rgb(np.stack((hue, np.full_like(hue, 0.7), light), -1))).float()
+    return torch.where(units[:, None] < 0, 0.5, rgb)
 
 
 def _ramp(fraction: Float[Tensor, " K"]) -> Float[Tensor, "K 3"]:

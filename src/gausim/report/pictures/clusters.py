@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from matplotlib.figure import Figure
+from matplotlib.colors import hsv_to_rgb
 
-from gausim.io.files import replacing
+from gausim.report.pictures.figures import made_figure, save_figure
 
 # Distance of successive units' hues on the colour circle: multiples of the golden ratio never repeat.
 GOLDEN = 0.6180339887498949
@@ -34,9 +34,8 @@ def draw_clusters(
     ``labels`` has the unit of every kernel at each level; pinned kernels are dark grey. ``sides`` are the
     horizontal and the vertical axis of each row (0, 1, 2 for x, y, z); ``flip`` draws the vertical one downwards.
     """
-    figure = Figure(figsize=(4.2 * len(labels), 8.4), layout="constrained")
-    figure.suptitle(title)
-    panels = figure.subplots(2, len(labels), squeeze=False)
+    figure, places = made_figure(2, len(labels), (4.2 * len(labels), 8.4), title)
+    panels = places.reshape(2, len(labels))
     area = min(POINT_AREA, max(0.3, POINT_AREA * 1e3 / len(means)))
     for column, (unit, name) in enumerate(zip(labels, names, strict=True)):
         colors = unit_colors(unit)
@@ -53,13 +52,10 @@ def draw_clusters(
                 panel.invert_yaxis()
             if row == 0:
                 panel.set_title(name)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="png", dpi=110)
+    save_figure(figure, path)
 
 
 def unit_colors(unit: Int[np.ndarray, " K"]) -> Float[np.ndarray, "K 3"]:
     """One RGB colour per unit: hues by the golden ratio, three brightnesses."""
     hue = (unit * GOLDEN) % 1.0
-    value = np.array([1.0, 0.8, 0.6])[unit % 3]
-    channels = [np.clip(np.abs((hue * 6 + shift) % 6 - 3) - 1, 0, 1) for shift in (0.0, 4.0, 2.0)]
-    return np.stack([value * (0.25 + 0.75 * c) for c in channels], axis=-1)
+    return hsv_to_rgb(np.stack((hue, np.full(len(unit), 0.75), np.array([1.0, 0.8, 0.6])[unit % 3]), -1))

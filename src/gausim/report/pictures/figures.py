@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
+from gausim.io.files import replacing
 from gausim.report.pictures.frames import error_colors, moving_line, space_time_slice
 from gausim.results.curves import ERROR_3D, ObjectCurves
 
@@ -194,7 +196,15 @@ def made_figure(rows: int, columns: int, size: tuple[float, float], title: str =
     return figure, figure.subplots(rows, columns, squeeze=False).ravel()
 
 
+def literal(figure: Figure) -> Figure:
+    """The figure with its texts as they stand: a dollar sign in a name would start a formula."""
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        text.set_parse_math(False)
+    return figure
+
+
 def save_figure(figure: Figure, path: Path) -> None:
-    """Writes a figure, and creates its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    """Writes a figure atomically, and creates its folder."""
+    with replacing(path, typed=True) as temporary:
+        figure.savefig(temporary)

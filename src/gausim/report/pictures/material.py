@@ -10,10 +10,9 @@ from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
 from torch import Tensor
 
-from gausim.io.files import replacing
+from gausim.report.pictures.figures import made_figure, save_figure
 
 # The scale leaves out as many kernels at each end; single extreme units would hide all differences of the others.
 _LEFT_OUT = 0.01
@@ -39,9 +38,7 @@ def property_colors(values: Float[Tensor, " K"], scale: LogNorm) -> Float[Tensor
 
 def draw_property(path: Path, images: Float[np.ndarray, "V H W 3"], scale: LogNorm, *, title: str, text: str) -> None:
     """Writes images of the coloured scene, in [0, 1], side by side with a colour bar labelled ``text``."""
-    figure = Figure(figsize=(4.0 * len(images) + 1.2, 4.4), layout="constrained")
-    figure.suptitle(title)
-    panels = figure.subplots(1, len(images), squeeze=False)[0]
+    figure, panels = made_figure(1, len(images), (4.0 * len(images) + 1.2, 4.4), title)
     for panel, image in zip(panels, images, strict=True):
         panel.imshow(image)
         panel.set_axis_off()
@@ -50,5 +47,4 @@ def draw_property(path: Path, images: Float[np.ndarray, "V H W 3"], scale: LogNo
     bar.set_ticks(ticks.tolist(), labels=[f"{tick:.3g}" for tick in ticks], minor=False)
     bar.set_ticks([], minor=True)
     bar.set_label(text)
-    with replacing(path, typed=True) as temporary:
-        figure.savefig(temporary, dpi=110)
+    save_figure(figure, path)
