@@ -227,11 +227,11 @@ def linear_scene(
     """A scene of linear scales, quaternions x y z w and opacities in [0, 1], as glTF and USD hold them."""
     inside = np.clip(opacities.astype(np.float64), _EDGE, 1 - _EDGE)
     return GaussianScene.create(
-        means=torch.fromcontiguous(means.copy()),
-        log_scales=torch.fromcontiguous(scales.copy()).log(),
-        quats=torch.fromcontiguous(np.ascontiguousarray(quats[:, [3, 0, 1, 2]])),
-        opacity_logits=torch.fromcontiguous(np.log(inside / (1 - inside)).astype(np.float32)),
-        sh=torch.fromcontiguous(sh),
+        means=torch.from_numpy(means.copy()),
+        log_scales=torch.from_numpy(scales.copy()).log(),
+        quats=torch.from_numpy(np.ascontiguousarray(quats[:, [3, 0, 1, 2]])),
+        opacity_logits=torch.from_numpy(np.log(inside / (1 - inside)).astype(np.float32)),
+        sh=torch.from_numpy(sh),
         name=name,
     )
 
