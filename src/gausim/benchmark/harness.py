@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -20,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gausim.kernels.operations import plain_forms
+from gausim.runs.memory import process_memory
 
 
 @dataclass(frozen=True)
@@ -139,12 +139,6 @@ def peak_resident() -> int:
     known = process_memory("VmHWM")  # getrusage includes the parent's memory at the start of this process
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return known or (peak if sys.platform == "darwin" else 1024 * peak)
-
-
-def process_memory(field: str, file: str = "/proc/self/status") -> int:
-    """A field of a file in Linux' /proc [bytes]; 0 on other systems."""
-    lines = Path(file).read_text().splitlines() if Path(file).is_file() else []
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{field}:")), 0)
 
 
 @contextmanager

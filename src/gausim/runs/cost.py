@@ -11,11 +11,11 @@ from typing import Any, TypeVar
 
 import torch
 
-from gausim.runs.memory import give_back_freed_memory
+from gausim.runs.memory import give_back_freed_memory, process_memory
 
 T = TypeVar("T")
 CUDA, RESIDENT = "CUDA allocated", "process, resident"
-_STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_RESET = Path("/proc/self/clear_refs")
 
 
 class CostMeter:
@@ -128,7 +128,7 @@ class TrainingCost:
 
 def peak_bytes() -> int | None:
     """Peak memory allocated by CUDA, or resident in the process, since the last reset; None where unknown."""
-    return torch.cuda.max_memory_allocated() if torch.cuda.is_initialized() else _resident("VmHWM")
+    return torch.cuda.max_memory_allocated() if torch.cuda.is_initialized() else process_memory("VmHWM")
 
 
 def _begin(cuda: bool) -> int | None:
@@ -143,13 +143,4 @@ def _begin(cuda: bool) -> int | None:
         _RESET.write_text("5")  # proc(5): resets the peak resident size
     except OSError:
         return None
-    return _resident("VmRSS")
-
-
-def _resident(field: str) -> int | None:
-    try:
-        lines = _STATUS.read_text().splitlines()
-    except OSError:
-        return None
-    found = [line.split()[1] for line in lines if line.startswith(f"{field}:")]
-    return int(found[0]) * 1024 if found else None
+    return process_memory("VmRSS")
