@@ -5,22 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-import torch
-from torch import Tensor
-
-from gausim.compose.build import LoadedRun
-from gausim.compose.predict import RunObject, TrainedPrediction, run_objects, scene_of
-from gausim.core import FittedDynamics, GaussianScene, SimState, Steppable
 from gausim.core.errors import ConfigError, DataError
-from gausim.core.state import initial_sway
-from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
-from gausim.interaction.session import MadeWith
-from gausim.models.rollout.dynamics import SceneDynamics
-from gausim.models.step.simulator import GausSim
-from gausim.ops.covariance import kernel_volumes
-from gausim.training.fitted.fitting import StagedFit
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gausim.compose.build import LoadedRun
+    from gausim.compose.predict import RunObject
+    from gausim.core import GaussianScene, SimState, Steppable
+    from gausim.interaction.interaction import Interaction
 
 REST = "rest"
 # Limit of the energy from forces, as a multiple of the initial energy of recorded motions; training covers little more.
@@ -54,6 +49,10 @@ def open_interaction(
         DataError: the object or sequence does not exist.
         ConfigError: the model does not support simulation.
     """
+    from gausim.compose.predict import TrainedPrediction, run_objects, scene_of
+    from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
+    from gausim.interaction.session import MadeWith
+
     item = run_objects(run, None if name is None else [name])[0]
     scene = scene_of(run, item)
     initial, dynamics, masses, ceiling = _method(run, item, scene, sequence)
@@ -86,6 +85,11 @@ def energy_ceiling(model: object, scene_id: int, previous: Sequence[Tensor]) -> 
     Returns:
         The energy; None for models without an energy.
     """
+    import torch
+
+    from gausim.core import SimState
+    from gausim.core.state import initial_sway
+
     if not getattr(model, "knows_energy", False):
         return None
     simulator = cast(Any, model)
@@ -101,6 +105,12 @@ def _method(
     run: LoadedRun, item: RunObject, scene: GaussianScene, sequence: str
 ) -> tuple[SimState, Steppable, Tensor, float | None]:
     """Initial state, dynamics, masses and the limit of the energy."""
+    from gausim.core import FittedDynamics, SimState
+    from gausim.models.rollout.dynamics import SceneDynamics
+    from gausim.models.step.simulator import GausSim
+    from gausim.ops.covariance import kernel_volumes
+    from gausim.training.fitted.fitting import StagedFit
+
     module, names = run.module, [record.name for record in item.data.sequences]
     if sequence != REST and sequence not in names:
         raise DataError(f"{item.data.root}: has no sequence '{sequence}'; expected '{REST}' or one of {names}.")
