@@ -15,9 +15,8 @@ from gausim.interaction.interaction import Interaction
 from gausim.models.step.scene_model import SceneModel
 from gausim.models.template.template import Property
 from gausim.viewer.companion import Companion
-from gausim.viewer.films import Films
 from gausim.viewer.shown import Take
-from gausim.viewer.subject import Subject
+from gausim.viewer.subject import Films, Subject
 
 
 @dataclass(frozen=True, eq=False)

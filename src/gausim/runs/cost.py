@@ -38,11 +38,8 @@ class CostMeter:
         """Runs ``make``, which predicts ``frames`` frames beyond the first, and records its cost."""
         cuda = torch.cuda.is_initialized()
         before = _begin(cuda)
-        start = time.perf_counter()
-        result = make()
-        if cuda:
-            torch.cuda.synchronize()
-        self._seconds.append((time.perf_counter() - start) / max(1, frames))
+        result, seconds = _timed(make)
+        self._seconds.append(seconds / max(1, frames))
         self._frames += frames
         peak = peak_bytes()
         if before is not None and peak is not None:
@@ -53,11 +50,8 @@ class CostMeter:
 
     def draw(self, make: Callable[[], T], images: int) -> T:
         """Runs ``make``, which renders ``images`` images, and records its time."""
-        start = time.perf_counter()
-        result = make()
-        if torch.cuda.is_initialized():
-            torch.cuda.synchronize()
-        self._drawing += time.perf_counter() - start
+        result, seconds = _timed(make)
+        self._drawing += seconds
         self._images += images
         return result
 
@@ -124,6 +118,15 @@ class TrainingCost:
             f"Trained in {self.seconds / 60:.1f} minutes, {self.cpu_seconds / 60:.1f} of processor time; it held "
             f"{self.peak_bytes / 1e9:.1f} GB at most."
         ]
+
+
+def _timed(make: Callable[[], T]) -> tuple[T, float]:
+    """The result of a function, and its wall time with the work of the GPU [s]."""
+    start = time.perf_counter()
+    result = make()
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    return result, time.perf_counter() - start
 
 
 def peak_bytes() -> int | None:
