@@ -69,11 +69,8 @@ def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[
         method: SharedSimulator | StagedFit = _shared_simulator(config, model, datamodule)
         smooth, learns = model.smooth_motions, objective
     else:
-        scene_of_sequence, seen = (
-            [scene_id for scene_id, _ in datamodule.index.entries],
-            int(config.data.curriculum.t_max),
-        )
-        fitted = instantiate(config.model.method, **given, scene_of_sequence=scene_of_sequence, seen=seen)()
+        given |= {"scene_of_sequence": [scene_id for scene_id, _ in datamodule.index.entries]}
+        fitted = instantiate(config.model.method, **given, seen=int(config.data.curriculum.t_max))()
         method = StagedFit(fitted, plan, datamodule.curriculum, objective.explosion)
         smooth, learns = (lambda scene_id: None), Objective(explosion=objective.explosion)
     sources = Sources(scenes, datamodule.index.ground_truth, smooth, renderer, objective.image)
