@@ -24,19 +24,12 @@ def moved(value: T, device: torch.device) -> T:
 
 
 class Recorded(TypedDict):
-    """Inputs of every fitted method: the options of :class:`Fitted`, which its subclasses pass on.
+    """Inputs of every fitted method: the options of :class:`Fitted`, which its subclasses pass on."""
 
-    Attributes:
-        scenes: the rest scenes.
-        fps: frames per second of each.
-        scene_of_sequence: the scene of each sequence.
-        seen: predicted frames that training may see.
-    """
-
-    scenes: Sequence[GaussianScene]
-    fps: Sequence[float]
-    scene_of_sequence: Sequence[int]
-    seen: int
+    scenes: Sequence[GaussianScene]  # the rest scenes
+    fps: Sequence[float]  # frames per second of each
+    scene_of_sequence: Sequence[int]  # the scene of each sequence
+    seen: int  # predicted frames that training may see
 
 
 class Fitted(nn.Module):

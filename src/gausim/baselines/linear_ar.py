@@ -18,17 +18,11 @@ from gausim.core import DataError
 
 @dataclass(frozen=True, eq=False)
 class LinearAR2:
-    """q_{t+1} = A q_t + B q_{t-1} with q the coordinates of the displacement in M orthonormal modes.
+    """q_{t+1} = A q_t + B q_{t-1} with q the coordinates of the displacement in M orthonormal modes."""
 
-    Attributes:
-        modes: orthonormal modes of the displacement of P points.
-        first: A.
-        second: B.
-    """
-
-    modes: Float[Tensor, "M P 3"]
-    first: Float[Tensor, "M M"]
-    second: Float[Tensor, "M M"]
+    modes: Float[Tensor, "M P 3"]  # orthonormal modes of the displacement of P points
+    first: Float[Tensor, "M M"]  # A
+    second: Float[Tensor, "M M"]  # B
 
     def rollout(self, displacement: Float[Tensor, "2 P 3"], steps: int) -> Float[Tensor, "F P 3"]:
         """Predicts from two true frames.

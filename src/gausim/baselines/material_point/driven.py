@@ -22,23 +22,14 @@ LEAST_VOLUME = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """P particles of one scene and its K kernels, all in scene units.
+    """P particles of one scene and its K kernels, all in scene units."""
 
-    Attributes:
-        rest: particles at rest.
-        pinned: particles that never move.
-        followed: indices of the n particles that every kernel follows.
-        weights: weights of those particles, with sum 1 for every kernel.
-        means: positions of the kernels at rest.
-        held: kernels that never move: pinned ones and those that are not simulated.
-    """
-
-    rest: Float[Tensor, "P 3"]
-    pinned: Bool[Tensor, " P"]
-    followed: Int[Tensor, "K n"]
-    weights: Float[Tensor, "K n"]
-    means: Float[Tensor, "K 3"]
-    held: Bool[Tensor, " K"]
+    rest: Float[Tensor, "P 3"]  # particles at rest
+    pinned: Bool[Tensor, " P"]  # particles that never move
+    followed: Int[Tensor, "K n"]  # indices of the n particles that every kernel follows
+    weights: Float[Tensor, "K n"]  # weights of those particles, with sum 1 for every kernel
+    means: Float[Tensor, "K 3"]  # positions of the kernels at rest
+    held: Bool[Tensor, " K"]  # kernels that never move: pinned ones and those that are not simulated
 
     def carried(
         self, x: Float[Tensor, "P 3"], deformation_gradients: Float[Tensor, "P 3 3"]

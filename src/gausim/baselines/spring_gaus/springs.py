@@ -31,23 +31,14 @@ FIRM = 16
 
 @dataclass(frozen=True, eq=False)
 class Net:
-    """E springs between A anchors, sorted by their first end.
+    """E springs between A anchors, sorted by their first end."""
 
-    Attributes:
-        first: one end.
-        second: the other end, of a higher number.
-        starts: first spring of every anchor, then E.
-        length: rest length L_0 [diagonals].
-        rank: number of nearer neighbours at an end, 0 for its nearest; the smaller of both ends.
-        reach: neighbours per anchor.
-    """
-
-    first: Int[Tensor, " E"]
-    second: Int[Tensor, " E"]
-    starts: Int[Tensor, " A_and_end"]
-    length: Float[Tensor, " E"]
-    rank: Int[Tensor, " E"]
-    reach: int
+    first: Int[Tensor, " E"]  # one end
+    second: Int[Tensor, " E"]  # the other end, of a higher number
+    starts: Int[Tensor, " A_and_end"]  # first spring of every anchor, then E
+    length: Float[Tensor, " E"]  # rest length L_0 [diagonals]
+    rank: Int[Tensor, " E"]  # number of nearer neighbours at an end, 0 for its nearest; the smaller of both ends
+    reach: int  # neighbours per anchor
 
     @staticmethod
     def of(rest: Float[Tensor, "A 3"], pinned: Tensor, neighbours: int) -> Net:
