@@ -64,9 +64,7 @@ class Trajectory:
 def initial_sway(scene: GaussianScene, fraction: float) -> SimState:
     """The rest state with an initial sway: every free kernel moves along x, faster when farther from the roots.
 
-    Args:
-        scene: with at least one pinned kernel.
-        fraction: displacement per frame of the kernel farthest from the roots [bounding-box diagonals].
+    ``fraction`` is the displacement per frame of the kernel farthest from the pins [diagonals].
     """
     free = scene.simulated & ~scene.pinned
     root = scene.means[scene.pinned].mean(0)

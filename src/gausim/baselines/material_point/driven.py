@@ -34,13 +34,9 @@ class Driven:
     def carried(
         self, x: Float[Tensor, "P 3"], deformation_gradients: Float[Tensor, "P 3 3"]
     ) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3 3"], Float[Tensor, "K 3 3"]]:
-        """Positions, deformation gradients and rotations of the kernels.
+        """Positions, deformation gradients and rotations of the kernels, from positions and F of the particles.
 
         Particle p maps X to x_p + F_p (X - X_p); a kernel follows the weighted mean of its particles' maps.
-
-        Args:
-            x: positions of the particles.
-            deformation_gradients: F of the particles.
         """
         middle = self.rest.mean(0)  # maps about a nearby point have less rounding error
         offset = x - middle - (deformation_gradients @ (self.rest - middle)[..., None])[..., 0]

@@ -110,10 +110,7 @@ def particle_volumes(positions: Float[Tensor, "N 3"], grid: Grid) -> Float[Tenso
 def require_inside(positions: Float[Tensor, "N 3"], grid: Grid, when: str) -> None:
     """Raises :class:`DivergenceError` naming the first particle whose 27 nodes are not all on the grid.
 
-    Args:
-        positions: positions [simulation units].
-        grid: the grid; the allowed region is half a cell less than the domain on each side.
-        when: the time, for the message, e.g. 'frame 12'.
+    The allowed region is half a cell less than the domain on each side; ``when`` is the time, e.g. 'frame 12'.
     """
     low, high = 0.5 * grid.dx, grid.size - 0.5 * grid.dx
     outside = ~((positions >= low) & (positions < high)).all(-1)

@@ -104,16 +104,10 @@ def move(
     free: Float[Tensor, "A 1"],
     substeps: int,
 ) -> tuple[Float[Tensor, "A 3"], Float[Tensor, "A 3"]]:
-    """Positions and velocities one frame later, by semi-implicit Euler; differentiable in all but the net.
+    """Positions [diagonals] and velocities [diagonals / frame] one frame later, by semi-implicit Euler.
 
-    Args:
-        net: the springs.
-        x: positions [diagonals].
-        v: velocities [diagonals / frame]; 0 where an anchor is pinned.
-        stiffness: kappa [1 / frames^2].
-        drag: c [1 / frames].
-        free: 1 where an anchor moves, else 0.
-        substeps: within the frame.
+    Stiffness kappa is in 1 / frames^2, drag c in 1 / frames; ``free`` is 1 where an anchor moves, else 0, as its
+    velocity. Differentiable in all but the net.
     """
     if x.device.type != "cpu":
         return move_plain(net, x, v, stiffness, drag, free, substeps)
