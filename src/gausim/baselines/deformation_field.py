@@ -63,12 +63,7 @@ class DeformationField(Fitted):
     extrapolates = False
 
     def __init__(
-        self,
-        *,
-        resolution: int = 32,
-        features: int = 32,
-        hidden: int = 64,
-        **recorded: Unpack[Recorded],
+        self, *, resolution: int = 32, features: int = 32, hidden: int = 64, **recorded: Unpack[Recorded]
     ) -> None:
         """Makes the fields.
 

@@ -7,14 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.cli.arguments import (
-    UPS,
-    add_data_option,
-    add_scene_options,
-    command_parser,
-    parse_background,
-    positive,
-)
+from gausim.cli.arguments import UPS, add_data_option, add_scene_options, command_parser, parse_background, positive
 from gausim.core.errors import ConfigError
 
 if TYPE_CHECKING:

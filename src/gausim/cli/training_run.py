@@ -127,11 +127,7 @@ def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataM
 
 
 def _fit(
-    cfg: DictConfig,
-    run: RunDirectory,
-    resume: Path | None,
-    parts: tuple[GausSimModule, ReadyDataModule],
-    crew: Crew,
+    cfg: DictConfig, run: RunDirectory, resume: Path | None, parts: tuple[GausSimModule, ReadyDataModule], crew: Crew
 ) -> float | None:
     module, datamodule = parts
     plan = module.method.plan if isinstance(module.method, StagedFit) else None

@@ -36,12 +36,7 @@ class Playable:
 
 
 def playable_run(
-    run: LoadedRun,
-    *,
-    name: str | None = None,
-    sequence: str = REST,
-    gravity: float | None = None,
-    keep: int | None = 0,
+    run: LoadedRun, *, name: str | None = None, sequence: str = REST, gravity: float | None = None, keep: int | None = 0
 ) -> Playable:
     """An object of a run, by default its first; the options are those of :func:`open_interaction`."""
     item = run_objects(run, [name] if name is not None else None)[0]

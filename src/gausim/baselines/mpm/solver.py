@@ -35,11 +35,7 @@ class MPMSolver:
         return self.step.count(self.grid.dx, young_modulus, density, self.material.poisson_ratio)
 
     def advance(
-        self,
-        state: ParticleState,
-        frame: int,
-        *,
-        young_modulus: Float[Tensor, " N"] | None = None,
+        self, state: ParticleState, frame: int, *, young_modulus: Float[Tensor, " N"] | None = None
     ) -> ParticleState:
         """The state at the end of a frame.
 

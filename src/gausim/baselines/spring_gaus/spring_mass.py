@@ -37,12 +37,7 @@ class AnchoredMotion(Fitted):
     anchors; in the original they keep their shape.
     """
 
-    def __init__(
-        self,
-        *,
-        anchors: int,
-        **recorded: Unpack[Recorded],
-    ) -> None:
+    def __init__(self, *, anchors: int, **recorded: Unpack[Recorded]) -> None:
         """Places the anchors.
 
         Args:
