@@ -17,7 +17,7 @@ from gausim.compose.config import compose
 from gausim.compose.places import more_settings
 from gausim.core.scene import GaussianScene
 from gausim.io.ply import load_scene, save_scene
-from gausim.report.pictures import clusters, material
+from gausim.report.pictures import material
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_figures_picture_and_masks(scene_file: Path, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize(("more", "down"), [([], True), (["--up=-z"], True), (["--up=z"], False)])
 def test_up_points_away_from_the_pins_unless_given(scene_file: Path, monkeypatch, more: list[str], down: bool) -> None:
     drawn: list[bool] = []
-    monkeypatch.setattr(clusters, "draw_clusters", lambda *_, flip, **__: drawn.append(flip))
+    monkeypatch.setattr(kernels, "draw_clusters", lambda *_, flip, **__: drawn.append(flip))
     assert main(["inspect", str(scene_file), "--pin-above", "z=1.9", *more]) == 0
     assert drawn == [down]
 
@@ -122,9 +122,9 @@ def test_a_trained_run_tells_what_it_has_learned_and_no_more(toy_run: Path, tmp_
 
 def test_scales_leave_out_extremes_and_unknown_kernels_are_grey() -> None:
     values = torch.cat((torch.linspace(1, 2, 1000), torch.tensor([1e6, torch.nan])))
-    scale = material.property_scale(values)
+    scale = kernels.property_scale(values)
     assert 1 <= scale.vmin < 1.05 and 1.95 < scale.vmax <= 2
-    colors = material.property_colors(values, scale)
+    colors = kernels.property_colors(values, scale)
     assert torch.equal(colors[-2], colors[999]) and float(colors[-1].std()) < 1e-6 and float(colors[0].std()) > 0.05
-    same = material.property_scale(torch.ones(5))
+    same = kernels.property_scale(torch.ones(5))
     assert same.vmin < 1 < same.vmax

@@ -19,7 +19,7 @@ from gausim.models.template.template import Property
 from gausim.ops.orbit import orbit_cameras
 from gausim.ops.spherical_harmonics import C0
 from gausim.render.draw import draw_still
-from gausim.report.pictures.material import draw_property, property_colors, property_scale
+from gausim.report.pictures.kernels import draw_property, property_colors, property_scale
 
 PIXELS = 480
 

@@ -43,8 +43,9 @@ class AutoRenderer:
         if chosen(means.device.type) == "gsplat":
             return self.gsplat(means, *inputs, background=background, depth=depth)
         *tensors, size = inputs
-        behind = None if background is None else background.cpu()
-        images = self.cpu(means.cpu(), *(value.cpu() for value in tensors), size, background=behind, depth=depth)
+        copies: list[Any] = [value.cpu() for value in (means, *tensors)]
+        options: dict[str, Any] = {"background": None if background is None else background.cpu(), "depth": depth}
+        images = self.cpu(*copies, size, **options)
         planes = None if images.depth is None else images.depth.to(means.device)
         return Rendered(images.rgb.to(means.device), images.alpha.to(means.device), planes)
 

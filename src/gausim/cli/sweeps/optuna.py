@@ -201,8 +201,8 @@ class Search:
         choose = min if self._settings.direction == "minimize" else max
         best = choose(done, key=lambda trial: trial.values[0], default=None)
         known, study_name = _row(best) if best else {}, self._settings.study_name
-        facts = {"name": "optuna", "study": study_name, "objective": OBJECTIVE, "direction": self._settings.direction}
-        facts |= {"best_trial": known.get("number")}
+        facts: dict[str, Any] = {"name": "optuna", "study": study_name, "objective": OBJECTIVE}
+        facts |= {"direction": self._settings.direction, "best_trial": known.get("number")}
         facts |= {f"best_{key}": known.get(key) for key in ("value", "params", "directory")}
         facts |= {"trials": [_row(t) for t in trials]}
         write_durably(self._folder / RESULTS, yaml.safe_dump(facts, sort_keys=False).encode())
