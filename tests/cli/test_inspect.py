@@ -17,7 +17,7 @@ from gausim.compose.config import compose
 from gausim.compose.places import more_settings
 from gausim.core.scene import GaussianScene
 from gausim.io.ply import load_scene, save_scene
-from gausim.report.pictures import material
+from gausim.report.pictures import kernels
 
 
 @pytest.fixture
