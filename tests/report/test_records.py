@@ -90,6 +90,30 @@ def test_a_metric_that_is_new_is_a_column(sweep: Path) -> None:
     assert cells["gausim w/o mass"] == Figure(0.5, std=0.1) and cells["static"] is None
 
 
+def test_errors_by_frames_ahead_are_a_table(sweep: Path) -> None:
+    table = measured_record(make_study(find_runs([sweep])), "Sweep").table("toy_bunny_ahead")
+    assert [column.label for column in table.columns] == ["+1", "+2", "+5", "+10", "+20", "+30"]
+    rows = {row.label[0]: row.cells[0] for row in table.rows}
+    # l2 of 1e-3 and 3e-3, five times that in unseen frames, of the two seeds 1 and 1.2 times that.
+    assert rows["gausim"] == Figure(1.1, [1.0, 1.2], pytest.approx(0.2 / 2**0.5, rel=1e-5))
+    assert rows["static"] == Figure(4.0)
+
+
+def test_several_objects_have_a_summary(sweep: Path) -> None:
+    assert all(table.key != "summary" for table in measured_record(make_study(find_runs([sweep])), "Sweep").tables)
+    run = report_runs.write_run(
+        sweep / "other", report_runs.config() | {"data": {"root": "/data/toy", "names": ["toy_cube"], "seed": 0}}
+    )
+    report_runs.evaluate(run, report_runs.make_curves(2.0, name="toy_cube"))
+    table = measured_record(make_study(find_runs([sweep])), "Sweep").tables[0]
+    names = ("toy_bunny", "toy_cube")
+    assert table.key == "summary" and [column.label for column in table.columns] == [
+        f"{name}: {what}" for name in names for what in ("l2 [1e-3]", "3D ÷ static", "motion energy")
+    ]
+    rows = {tuple(c is None for c in row.cells): row.cells for row in table.rows}
+    assert rows[False, False, False, False, False, False][3] == Figure(20.0)
+
+
 def test_rows_of_different_sequences_are_told_apart(sweep: Path) -> None:
     runs = find_runs([sweep])
     entry = next(run for run in runs if "no_mass" in run.name).objects["toy_bunny"]
