@@ -13,6 +13,7 @@ from gausim.cli import main as cli
 from gausim.core import RunError
 from gausim.report.gather.runs import find_runs
 from gausim.report.gather.study import make_study
+from gausim.report.records.commands import joined
 from gausim.report.records.measure import measured_record
 from gausim.report.records.print import markdown_table, page, results_latex, results_page
 from gausim.report.records.record import (
@@ -153,6 +154,23 @@ def test_results_come_with_commit_command_and_hardware(sweep: Path, capsys: pyte
     assert "no run here is evaluated" in capsys.readouterr().err
     assert cli.main(["report", "--results", str(out)]) == 2
     assert "DIR: expected run directories" in capsys.readouterr().err
+
+
+def test_commands_that_differ_by_one_key_are_joined_to_the_same_runs() -> None:
+    start = "gausim train experiment=tables/comparison"
+    jobs = [f"{start} method={m} seed={s} ++trainer.clock=cpu paths.output_root=/x" for m in "ab" for s in (0, 1)]
+    jobs += [f"{start} method=c seed=0 ++trainer.clock=cpu paths.output_root=/x", "gausim train model=m init_from=o/r"]
+    assert joined(jobs) == [
+        f"gausim train -m {start[13:]} method=a,b seed=0,1 trainer.clock=cpu",
+        f"gausim train {start[13:]} method=c seed=0 trainer.clock=cpu",
+        "gausim train model=m init_from=o/r",
+    ]
+    assert joined(
+        ["gausim train -m 'data.sequences=[a,b]' seed=0,1", "gausim train 'data.sequences=[a,b]' seed=2"]
+    ) == ["gausim train -m 'data.sequences=[a,b]' seed=0,1,2"]
+    assert joined(["gausim train paths.output_root=/x/y init_from=/x/y/run", "not recorded"]) == [
+        "gausim train init_from=outputs/run", "not recorded",
+    ]  # fmt: skip
 
 
 def record(*rows: Row, columns: list[Column], **options: object) -> Record:

@@ -11,6 +11,7 @@ import msgspec
 
 from gausim.report.gather.runs import RunRecord, dig
 from gausim.report.gather.study import FULL, Group, Study, cell, deviation, number, pooled
+from gausim.report.records.commands import joined
 from gausim.report.records.print import SEEDS_APART
 from gausim.report.records.record import SCHEMA, Cell, Column, Figure, Made, Record, RecordTable, Row
 from gausim.results.curves import ERROR_3D, FOLLOW_HANDS, STATIC
@@ -50,7 +51,7 @@ def measured_record(study: Study, title: str) -> Record:
     made = Made(
         recorded=datetime.now(UTC).date().isoformat(),
         commits=_distinct(run.commit for run in runs),
-        commands=_distinct(run.command for run in runs),
+        commands=joined(run.command for run in runs),
         hardware=_distinct(machine(run) for run in runs),
         test=study.test,
         missing=[f"{run.name} ({run.status})" for run in study.runs if run.summary is None],
