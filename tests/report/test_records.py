@@ -208,6 +208,9 @@ def test_pages_name_records(tmp_path: Path) -> None:
     text = page(tmp_path)
     assert "## A {#a}\n.5 of 6\n" in text and "| a | 1.0 |" in text and "Made by (abc; recorded 2026-01-01)" in text
     assert "\n    gausim train\n" in text
+    made.made.test = "Looked at once."
+    save_record(tmp_path / "mine.json", made)
+    assert page(tmp_path) == (text := text.replace("Made by (", "Looked at once.\n\nMade by ("))
     made.tables[0].rows[0].cells[0] = 1.1
     save_record(tmp_path / "mine.json", made)
     assert page(tmp_path) == text.replace("| a | 1.0 |", "| a | 1.1 |")
@@ -246,10 +249,13 @@ def test_the_page_of_results_is_what_its_records_give() -> None:
     assert (ROOT / "docs" / "results.md").read_text() == page(ROOT / "docs" / "results"), "run `make results`"
 
 
-def test_the_table_of_the_readme_is_that_of_the_record() -> None:
+def test_the_table_of_the_readme_is_of_the_record() -> None:
+    """Its rows are some of the record's, in the record's order."""
     found = re.search(r"\[start:results\] -->\n(\|.*?)\n\n", (ROOT / "README.md").read_text(), re.DOTALL)
     table = load_record(ROOT / "docs" / "results" / "comparison.json").table("summary")
-    assert found is not None and found[1] == markdown_table(table)
+    assert found is not None
+    shown, whole = found[1].splitlines(), markdown_table(table).splitlines()
+    assert shown[:2] == whole[:2] and len(shown) > 4 and shown == [line for line in whole if line in shown]
 
 
 def test_no_figure_is_typed_into_the_template() -> None:
