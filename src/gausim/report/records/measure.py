@@ -7,13 +7,11 @@ from datetime import UTC, datetime
 from statistics import fmean
 from typing import Any
 
-import msgspec
-
 from gausim.report.gather.runs import RunRecord, dig
 from gausim.report.gather.study import FULL, Group, Study, cell, deviation, number, pooled
 from gausim.report.records.commands import joined
 from gausim.report.records.print import SEEDS_APART
-from gausim.report.records.record import SCHEMA, Cell, Column, Figure, Made, Record, RecordTable, Row
+from gausim.report.records.record import SCHEMA, Cell, Column, Figure, Made, Record, RecordTable, Row, value_of
 from gausim.results.curves import ERROR_3D, FOLLOW_HANDS, STATIC
 from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import GROUP_TITLES, SPLIT_TITLES, footnotes_of, reference_row
@@ -24,7 +22,7 @@ _FIRST = (
     ("chamfer", "points"), (ERROR_3D, "points"), (MOTION_ENERGY, "points"),
 )  # fmt: skip
 # The same of every object in the summary of several objects.
-_SUMMARY = (("l2", "train"), (ERROR_3D, "points"), (MOTION_ENERGY, "points"))
+_SUMMARY = (("l2", "train"), (ERROR_3D, "points"))
 
 # Costs beside them. Memory: the most that the training process held; what a prediction adds, on a GPU the peak.
 _COSTS = (
@@ -73,17 +71,12 @@ def _summary(study: Study) -> Iterator[RecordTable]:
         return
     keys = [(name, *key) for name in names for key in _SUMMARY if study.info(key[0]) is not None]
     rows = [
-        Row([g.label], [_without_sequences(_figure(g, n, "unseen", m, v, row=None)) for n, m, v in keys])
-        for g in study.groups
+        Row([g.label], [value_of(_figure(g, n, "unseen", m, v, row=None)) for n, m, v in keys]) for g in study.groups
     ]
     columns = [_column(study, n, m) for n, m, _ in keys]
     for (name, _, _), column in zip(keys, columns, strict=True):
         column.label = f"{name}: {column.label}"
-    yield RecordTable("summary", columns, rows, title="Unseen frames", caption="± deviation over seeds.")
-
-
-def _without_sequences(cell: Cell) -> Cell:
-    return msgspec.structs.replace(cell, std=None) if isinstance(cell, Figure) else cell
+    yield RecordTable("summary", columns, rows, title="Unseen frames", caption="Means over seeds and sequences.")
 
 
 def _ahead(study: Study, name: str) -> Iterator[RecordTable]:
