@@ -168,6 +168,9 @@ def test_commands_that_differ_by_one_key_are_joined_to_the_same_runs() -> None:
     assert joined(
         ["gausim train -m 'data.sequences=[a,b]' seed=0,1", "gausim train 'data.sequences=[a,b]' seed=2"]
     ) == ["gausim train -m 'data.sequences=[a,b]' seed=0,1,2"]
+    assert joined(
+        ["gausim train -m method=b,a seed=0", "gausim train method=a seed=1", "gausim train method=b seed=1"]
+    ) == ["gausim train -m method=a,b seed=0,1"]
     assert joined(["gausim train paths.output_root=/x/y init_from=/x/y/run", "not recorded"]) == [
         "gausim train init_from=outputs/run", "not recorded",
     ]  # fmt: skip

@@ -35,10 +35,15 @@ def _parsed(command: str) -> Words:
     pairs = [word.lstrip("+").partition("=") for word in shlex.split(command)[2:]]
     root = next((value for key, _, value in pairs if key == _ROOT), _DEFAULT_ROOT).rstrip("/")
     return {
-        key: [value.replace(f"{root}/", f"{_DEFAULT_ROOT}/")] if equals else []
+        key: _choices(value.replace(f"{root}/", f"{_DEFAULT_ROOT}/")) if equals else []
         for key, equals, value in pairs
         if key not in _WITHOUT_EFFECT
     }
+
+
+def _choices(value: str) -> list[str]:
+    """The choices of a sweep: commas within brackets or quotes do not divide them."""
+    return [value] if set(value) & set("[{(\"'") else sorted(value.split(","))
 
 
 def _over(commands: list[Words], key: str) -> list[Words]:
@@ -48,7 +53,7 @@ def _over(commands: list[Words], key: str) -> list[Words]:
         others = repr((key in words, sorted(pair for pair in words.items() if pair[0] not in (key, _SWEEP))))
         before = same.get(others, {})
         values = [*before.get(key, []), *(v for v in words.get(key, []) if v not in before.get(key, []))]
-        same[others] = before | words | ({key: values} if key in words else {})
+        same[others] = before | words | ({key: sorted(values)} if key in words else {})
     return list(same.values())
 
 
