@@ -17,7 +17,6 @@ from gausim.models.step.recursion import Solved, Units
 from gausim.nn.mlp import zero_output as initialise_zero
 from gausim.nn.normaliser import RunningNormaliser
 
-
 # Ending of the name of the weights that read the node features.
 READS_NODES = "node_encoder.0.weight"
 
