@@ -99,6 +99,20 @@ def write_object(toy: ToyObject) -> ToyObject:
     return toy
 
 
+def surround(root: Path, **facts: object) -> None:
+    """States surroundings of a written object."""
+    path = root / "dataset.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | facts))
+
+
+def hold(root: Path, points: Tensor, way: Tensor, *, grip: float = 0.5) -> None:
+    """Has a hand hold a written object near points (C, 3) and go along a way (F, 3), in every sequence."""
+    surround(root, grip=grip)
+    for sequence in (root / "sequences").iterdir():
+        moved = (points + way[:, None]).numpy()
+        np.savez(sequence / "hands.npz", points=moved, hand=np.zeros(len(points), np.int64))
+
+
 def _write_sequence(toy: ToyObject, name: str) -> None:
     folder, images, entries = toy.root / "sequences" / name, toy.images(name), []
     for v, view in enumerate(toy.views.names):

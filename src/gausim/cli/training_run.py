@@ -121,7 +121,7 @@ def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataM
     module, datamodule = build(cfg)
     check_protocol(cfg, datamodule)
     _take_over(cfg, module, resumed=resumed)
-    if module.initial_states is not None and not resumed:
+    if module.initial_states is not None:
         begin_free_bodies(module, datamodule)
     return module, datamodule
 

@@ -20,7 +20,7 @@ from msgspec import Meta
 from torch import Tensor
 from torch.nn import Module
 
-from gausim.core import ConfigError, DataError, GaussianScene, SimState
+from gausim.core import ConfigError, DataError, GaussianScene, HandPath, SimState
 from gausim.interaction.checked import Checked, Natural, Vector, made
 from gausim.interaction.selections import Selected, Whole, selection_from_json, selection_to_json
 from gausim.io.files import write_durably
@@ -168,20 +168,22 @@ class MadeWith(Checked, frozen=True):
         settings: str = "",
         name: str = "rest",
         run: str = "",
+        path: HandPath | None = None,
     ) -> MadeWith:
         """Hashes the inputs of a simulation: the rest scene, the method and the initial state called ``name``.
 
         A method is identified by its type, by its state dict if it is a torch module, and by ``settings``, a text of
-        its other parameters.
+        its other parameters. A recorded ``path`` of hands counts as part of the initial state.
         """
         masks = (scene.simulated, scene.pinned)
         gaussians = (scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh)
+        moved = () if path is None else (path.rotations, path.centres)
         numbers = dict(sorted(model.state_dict().items())) if isinstance(model, Module) else {}
         return MadeWith(
             scene.name,
             digest("scene", *gaussians, *masks),
             digest(type(model).__name__, settings, *numbers, *(v for v in numbers.values() if isinstance(v, Tensor))),
-            digest("initial", initial.positions, initial.previous),
+            digest("initial", initial.positions, initial.previous, *moved),
             name,
             run,
         )

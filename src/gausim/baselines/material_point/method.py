@@ -168,6 +168,9 @@ class MaterialPoints(Fitted):
     fitting all velocities are 0.
     """
 
+    # Particles keep their pins in place, and gravity is not identified.
+    unknown = frozenset({"hands", "trained_gravity"})
+
     def __init__(
         self,
         *,
@@ -186,16 +189,10 @@ class MaterialPoints(Fitted):
             velocity_scale: factor on the velocity fields' outputs [longest sides / s].
 
         Raises:
-            ConfigError: Warp is not installed, a number is out of range, or hands move a scene's pins.
+            ConfigError: Warp is not installed, a number is out of range, or a scene has unknown surroundings.
             SceneError: too few kernels.
         """
         super().__init__(**recorded)
-        handled = [scene.name for scene in self.scenes if scene.hand is not None]
-        if handled:
-            raise ConfigError(
-                f"{self.name}: hands move {', '.join(handled)}, but particles keep their pins in place here. Take "
-                "another model, or objects without hands (data.names)."
-            )
         if velocity_resolution < 2 or not velocity_scale > 0:
             raise ConfigError(
                 "model.method: expected velocity_resolution >= 2 and velocity_scale > 0, got "

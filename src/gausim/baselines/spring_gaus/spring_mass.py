@@ -37,6 +37,9 @@ class AnchoredMotion(Fitted):
     anchors; in the original they keep their shape.
     """
 
+    # The body begins at rest in its pins.
+    unknown = frozenset({"free", "hands"})
+
     def __init__(self, *, anchors: int, **recorded: Unpack[Recorded]) -> None:
         """Places the anchors.
 
@@ -101,6 +104,7 @@ class SpringMass(AnchoredMotion):
     """
 
     name = "spring_mass"
+    unknown = frozenset({"free", "gravity", "trained_gravity", "floor", "hands"})
 
     def __init__(
         self,

@@ -84,7 +84,9 @@ class ImageSupervision:
         self.appearances = Appearances(scenes)
         self._keys: dict[tuple[int, tuple[str, ...]], Hashable] = {}
         self._rest: dict[Hashable, Rendered] = {}
-        # Positions at frame 0 of a sequence whose body does not begin at rest; set by the learner.
+        # Positions at frame 0 of sequences whose bodies do not begin at rest: those with which training began, which
+        # do not depend on when it was resumed, else the present ones; set by the start of training and the learner.
+        self.begun: dict[int, Float[Tensor, "K 3"]] = {}
         self.begins: Callable[[SequenceSample], Float[Tensor, "K 3"] | None] = lambda sample: None
 
     def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Comparison:
@@ -122,7 +124,8 @@ class ImageSupervision:
 
         Of a body that begins elsewhere it is an image of where it begins, rendered once per sequence.
         """
-        key, first = self._key(sample), self.begins(sample)
+        key, first = self._key(sample), self.begun.get(sample.sequence_id)
+        first = self.begins(sample) if first is None else first.to(rest)
         if first is not None:
             key, rest = (key, sample.sequence_id), first
         if key not in self._rest:
