@@ -15,12 +15,15 @@ from gausim.cli import evaluate, simulate, train
 from gausim.compose.bare import EvenMaterial, open_scene
 from gausim.compose.build import build
 from gausim.compose.config import compose
-from gausim.core import ConfigError, GausSimError
+from gausim.core import ConfigError, GausSimError, SimState
 from gausim.data.dataset import SampleKey
 from gausim.evaluation.corpus import BodyFigures, summary
 from gausim.io.ply import save_scene
 from gausim.io.trajectory import load_trajectory
+from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.template.material import MaterialTemplate
+from gausim.training.material_scan import find_materials
+from gausim.training.pretraining import give_even_material
 
 SMALL = (
     "model.simulator.hierarchy.levels=[{diameter: 0.5, edge_length: 2.0}]", "model.simulator.template.modes=12",
@@ -153,3 +156,21 @@ def test_a_fit_to_the_truth_has_no_error_and_keeps_the_order_of_stiffness() -> N
     assert whole.error == (1.0, 1.0, 1.0) and whole.energy == 0.5 and whole.stiffness == pytest.approx(1.0)
     assert whole.within == 1.0 and whole.within_smooth == 0.5
     assert summary([replace(x, fitted_period=-x.period) for x in found]).stiffness == pytest.approx(-1.0)
+
+
+def test_a_scan_finds_the_even_material_of_a_motion_from_its_seen_frames(corpus: Path) -> None:
+    root = [f"data.root={corpus}", *SMALL]
+    module, data = build(compose("train", ["experiment=pretrain_fit", "init_from=RUN", "data.seen=8", *root]))
+    model, body = module.model, data.objects[0].body
+    give_even_material(model, 0, period=6 / body.fps, damping=4.0)
+    wanted = model.attributes[0][0, :2].tolist()
+    moved = SceneDynamics(model, 0).rollout(SimState(body.positions[0, 1], body.positions[0, 0]), FRAMES - 2).positions
+    body.positions[:] = torch.cat((body.positions[0, :1], moved))
+    body.positions[:, 10:] = torch.nan  # beyond the seen frames
+    find_materials(model, data)
+    found = model.attributes[0]
+    assert (found == found[0]).all() and not found[:, 2:].any()
+    assert found[0, :2].tolist() == pytest.approx(wanted, abs=0.5)
+    for epoch in range(3):
+        assert max(key.start + key.steps for batch in _batches(data, epoch) for key in batch) <= 7
+    assert len(data.index.ground_truth(0).positions) == 8

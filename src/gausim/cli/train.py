@@ -165,7 +165,9 @@ def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataM
 
     from gausim.cli.test_part import check_protocol
     from gausim.compose.build import build
+    from gausim.data.pretraining import CorpusDataModule
     from gausim.training.first_frames import begin_free_bodies
+    from gausim.training.material_scan import find_materials
 
     seed_everything(cfg.seed, workers=True, verbose=False)
     module, datamodule = build(cfg)
@@ -173,6 +175,8 @@ def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataM
     _take_over(cfg, module, resumed=resumed)
     if module.initial_states is not None and not resumed:
         begin_free_bodies(module, datamodule)
+    if isinstance(datamodule, CorpusDataModule) and not datamodule.knows_material and not resumed:
+        find_materials(cast("GausSim", module.model), datamodule)
     return module, datamodule
 
 
