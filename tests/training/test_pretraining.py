@@ -18,6 +18,9 @@ from gausim.compose.config import compose
 from gausim.core import ConfigError, GausSimError, SimState
 from gausim.data.dataset import SampleKey
 from gausim.evaluation.corpus import BodyFigures, summary
+from gausim.interaction.interaction import replay as replay_session
+from gausim.interaction.selections import Whole
+from gausim.interaction.session import Force, Material
 from gausim.io.ply import save_scene
 from gausim.io.trajectory import load_trajectory
 from gausim.models.rollout.dynamics import SceneDynamics
@@ -104,6 +107,22 @@ def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(corpus: Path
         tip = [float(live.step().positions[8, 0]) for _ in range(25 // int(stiffness**0.5))]
         periods[stiffness] = 4 * (1 + tip.index(max(tip)))  # frames to the first turn
     assert periods[1.0] == pytest.approx(24, abs=6) and periods[4.0] == pytest.approx(12, abs=3)
+
+    live = open_scene(body, fps=24.0, base=base, sway=0.02)
+    live.act(Force(Whole(), (1.0, 0.0, 0.0), 0.02))
+    amplitudes = {}
+    for stiffness in (1.0, 0.25, 4.0):
+        live.act(Material(stiffness, damping=10.0))
+        amplitudes[stiffness] = float([live.step() for _ in range(60)][-1].positions[8, 0] - body.means[8, 0])
+    assert amplitudes[0.25] == pytest.approx(4 * amplitudes[1.0], rel=0.2)  # bends as a spring does
+    assert amplitudes[4.0] == pytest.approx(amplitudes[1.0] / 4, rel=0.2)
+    last = live.frame.positions
+    assert torch.equal(
+        replay_session(open_scene(body, fps=24.0, base=base, sway=0.02), live.session()).positions[-1], last
+    )
+    assert torch.equal(replay_session(live, live.session()).positions[-1], last)  # which begins with the first material
+    with pytest.raises(ConfigError, match="learned and cannot be set"):
+        open_scene(body, fps=24.0).act(Material())
 
     scene, out = tmp_path / "beam.ply", tmp_path / "out"
     save_scene(body, scene)
