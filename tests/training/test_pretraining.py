@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ import torch
 from helpers.corpus import FRAMES, SEQUENCES, write_corpus
 from msgspec.structs import replace
 
-from gausim.cli import evaluate, simulate, train
+from gausim.cli import evaluate, report, simulate, train
 from gausim.compose.bare import EvenMaterial, open_scene
 from gausim.compose.build import build
 from gausim.compose.config import compose
@@ -160,6 +161,11 @@ def test_a_pretrained_network_is_fitted_to_bodies_held_out(corpus: Path, base: P
     assert "Rank correlation of fitted and true stiffness: " in capsys.readouterr().out
     (body,) = json.loads((fit / "evaluation" / "corpus.json").read_text())["bodies"]
     assert body["name"] == "beam2" and body["period"] == pytest.approx(14 / 24) and abs(body["within"]) <= 1
+    assert report.main([str(tmp_path), "--bodies", str(tmp_path / "curve.png")]) == 0
+    assert re.search(r"6 frames seen: \S+ with 2 bodies\n", capsys.readouterr().out)
+    assert (tmp_path / "curve.png").stat().st_size > 1000
+    with pytest.raises(GausSimError, match="no fit to bodies of a corpus"):
+        report.main([str(corpus), "--bodies", str(tmp_path / "curve.png")])
     with pytest.raises(GausSimError, match="measured as a whole"):
         evaluate.main([str(fit), "--sequences", "seq_000"])
 

@@ -126,6 +126,8 @@ class CorpusDataModule(ReadyDataModule):
 
     Attributes:
         watched: indices of the objects whose motion is measured during training.
+        trainable: number of bodies of the corpus that are not held out; set when the objects are first read.
+        seen: frames that count as seen.
         knows_material: whether the material is given.
     """
 
@@ -166,7 +168,7 @@ class CorpusDataModule(ReadyDataModule):
             raise ConfigError(
                 f"data.part, data.held_out: expected train or held_out and a number >= 1, got {part}, {held_out}."
             )
-        self._part, self._bodies, self._held_out, self._seen = part, bodies, held_out, seen
+        self._part, self._bodies, self._held_out, self.seen = part, bodies, held_out, seen
         self.knows_material = part == "train"
 
     @cached_property
@@ -178,6 +180,7 @@ class CorpusDataModule(ReadyDataModule):
             )
         corpus = Corpus(Path(str(self._root)))
         first = len(corpus) - self._held_out
+        self.trainable = first
         wanted = first if self._bodies is None else self._bodies
         if not 1 <= wanted <= first:
             raise ConfigError(
@@ -186,12 +189,12 @@ class CorpusDataModule(ReadyDataModule):
             )
         chosen = [*(range(wanted) if self.knows_material else ()), *range(first, len(corpus))]
         read = lru_cache(BODIES_IN_MEMORY)(corpus.body)
-        return [_body_data(corpus, read, i, self._seen) for i in chosen]
+        return [_body_data(corpus, read, i, self.seen) for i in chosen]
 
     @cached_property
     def index(self) -> CorpusIndex:
         """All sequences of all bodies, numbered."""
-        return CorpusIndex(self.objects, None if self.knows_material else self._seen)
+        return CorpusIndex(self.objects, None if self.knows_material else self.seen)
 
     @property
     def watched(self) -> range:
@@ -201,7 +204,7 @@ class CorpusDataModule(ReadyDataModule):
     def trained(self) -> tuple[int, list[int] | None]:
         """The number of sequences to train on, and the numbers of their frames at which samples may start and end."""
         if not self.knows_material:
-            return len(self.index), [self._seen] * len(self.index)
+            return len(self.index), [self.seen] * len(self.index)
         frames = [record.count for scene_id, record in self.index.entries if scene_id not in self.watched]
         return len(frames), frames
 
