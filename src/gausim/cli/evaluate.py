@@ -84,12 +84,28 @@ def _evaluate_bodies(arguments: argparse.Namespace) -> int:
             "--sequences, --views, --test and --endurance."
         )
     folder = arguments.out or arguments.run / "evaluation"
-    whole = write_figures(folder, body_figures(*load_corpus_run(arguments.run, data=data_option(arguments.data))))
+    module, data = load_corpus_run(arguments.run, data=data_option(arguments.data))
+    pretrained = _pretrained(arguments.run, data.trainable)
+    whole = write_figures(folder, body_figures(module, data), seen=data.seen, pretrained=pretrained)
     if arguments.json:
         print((folder / FILE).read_text(), end="")
         return 0
     end(sentences(whole), "figures", folder / FILE)
     return 0
+
+
+def _pretrained(run: Path, trainable: int) -> int | None:
+    """Number of bodies that the network of a run on a corpus was trained on; None where its base is gone."""
+    from gausim.runs.directory import RunDirectory
+
+    config = RunDirectory(run).config()
+    if config["data"]["part"] != "train":
+        base = config.get("init_from")
+        if base is None or not Path(base).is_dir():
+            return 0 if base is None else None
+        config = RunDirectory(base).config()
+    bodies = config["data"].get("bodies")
+    return trainable if bodies is None else int(bodies)
 
 
 def _parser() -> argparse.ArgumentParser:

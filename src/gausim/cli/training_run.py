@@ -21,6 +21,7 @@ from gausim.compose.build import build, load_run
 from gausim.compose.config import in_sweep, instantiate, run_dir
 from gausim.core import ConfigError, FittedMethod, RunError, TakesOver
 from gausim.data.datamodule import ReadyDataModule
+from gausim.data.pretraining import CorpusDataModule
 from gausim.doctor.examine import examine
 from gausim.doctor.page import findings_text
 from gausim.models.step.simulator import GausSim
@@ -30,6 +31,7 @@ from gausim.training.callbacks.convergence import Convergence
 from gausim.training.callbacks.judge import EpochJudge
 from gausim.training.first_frames import begin_free_bodies
 from gausim.training.fitted.fitting import StagedFit
+from gausim.training.material_scan import find_materials
 from gausim.training.module import GausSimModule
 from gausim.training.ranks.launch import Crew
 from gausim.training.trainer import make_trainer
@@ -123,6 +125,8 @@ def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataM
     _take_over(cfg, module, resumed=resumed)
     if module.initial_states is not None:
         begin_free_bodies(module, datamodule)
+    if isinstance(datamodule, CorpusDataModule) and not datamodule.knows_material and not resumed:
+        find_materials(cast("GausSim", module.model), datamodule)
     return module, datamodule
 
 

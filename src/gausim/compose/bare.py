@@ -17,7 +17,7 @@ from gausim.core.errors import ConfigError
 from gausim.core.state import initial_sway
 from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
 from gausim.interaction.session import MadeWith
-from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.rollout.dynamics import MaterialDynamics, SceneDynamics
 from gausim.models.step.simulator import GausSim
 from gausim.models.template.material import MaterialTemplate
 from gausim.ops.selection import require_pinned
@@ -82,7 +82,8 @@ def open_scene(
     torch.manual_seed(seed)
     model = _untrained(scene, fps) if base is None else _of_base(scene, fps, base, material or EvenMaterial())
     initial = initial_sway(scene, sway)
-    dynamics = SceneDynamics(model, energy_ceiling=energy_ceiling(model, 0, [initial.previous]))
+    kind = SceneDynamics if base is None else MaterialDynamics
+    dynamics = kind(model, energy_ceiling=energy_ceiling(model, 0, [initial.previous]))
     run = "untrained" if base is None else base.resolve().name
     made_with = MadeWith.of(scene, model, initial, settings=UNTRAINED, run=run)
     return Interaction(

@@ -107,6 +107,14 @@ class Handled(Steppable, Protocol):
         """Stepper at a state; ``hands`` are the poses of the hands by frame, counted from that state."""
 
 
+@runtime_checkable
+class Adjustable(Steppable, Protocol):
+    """Dynamics whose material can be changed; it shows in steppers made afterwards."""
+
+    def adjust(self, stiffness: float, damping: float) -> None:
+        """Multiplies the material's stiffness and damping, as they were at the beginning, by factors > 0."""
+
+
 def roll_out(stepper: Stepper, steps: int, forces: Forces | None = None) -> Trajectory:
     """Takes ``steps`` steps; the result has steps + 1 frames, the stepper's current one first."""
     frames = [stepper.frame]

@@ -141,11 +141,19 @@ def summary(found: Sequence[BodyFigures]) -> CorpusFigures:
     )  # fmt: skip
 
 
-def write_figures(folder: Path, found: Sequence[BodyFigures]) -> CorpusFigures:
-    """Writes ``corpus.json`` and returns the summary."""
+def write_figures(folder: Path, found: Sequence[BodyFigures], *, seen: int, pretrained: int | None) -> CorpusFigures:
+    """Writes ``corpus.json`` and returns the summary.
+
+    Args:
+        folder: where to.
+        found: figures of the bodies.
+        seen: number of seen frames.
+        pretrained: number of bodies that the network was trained on; None where it is unknown.
+    """
     whole = summary(found)
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / FILE, msgspec.to_builtins({"all": whole, "bodies": list(found)}))
+    facts = {"seen": seen, "pretrained": pretrained, "all": whole, "bodies": list(found)}
+    write_json(folder / FILE, msgspec.to_builtins(facts))
     return whole
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import (
+    Adjustable,
     ConfigError,
     DataError,
     DivergenceError,
@@ -39,6 +40,7 @@ from gausim.interaction.session import (
     Hand,
     Impulse,
     MadeWith,
+    Material,
     Pin,
     Release,
     Reset,
@@ -125,6 +127,8 @@ class Interaction:
         """Begins a new session from the initial state and discards the recorded events."""
         self.tick, self._entries = 0, list[Entry]()
         phases = random.Random(self.seed)
+        if isinstance(self._dynamics, Adjustable):
+            self._dynamics.adjust(1.0, 1.0)
         self._phases = [phases.uniform(0, 2 * math.pi) for _ in _GUSTS]
         self._rest_all()
         self._frames.clear()
@@ -282,6 +286,8 @@ class Interaction:
                 self.held = self.held & ~event.on.mask(self.scene, self.units).to(self.held.device)
             case Hand():
                 self._move_hand(event)
+            case Material():
+                self._adjust(event)
             case Reset():
                 self._rest_all()
 
@@ -298,6 +304,26 @@ class Interaction:
             self._limited_before += self._stepper.limited
             self._stepper = self._dynamics.stepper(self.state, lambda frame: hands.pose(frame + begin))
         cast(MovedHands, self._hands).move(event, self.frame_number)
+
+    @property
+    def adjustable(self) -> bool:
+        """Whether the material can be changed."""
+        return isinstance(self._dynamics, Adjustable)
+
+    def _adjust(self, event: Material) -> None:
+        """Changes the material; a new stepper goes on from the current state."""
+        if not isinstance(self._dynamics, Adjustable):
+            raise ConfigError(
+                f"{self.made_with.run or 'this method'}: its material was learned and cannot be set. Take a scene that "
+                "a pretrained network moves (--from BASE)."
+            )
+        self._dynamics.adjust(event.stiffness, event.damping)
+        self._limited_before += self._stepper.limited
+        hands, begin = self._hands, self.frame_number
+        if hands is not None and isinstance(self._dynamics, Handled):
+            self._stepper = self._dynamics.stepper(self.state, lambda frame: hands.pose(frame + begin))
+        else:
+            self._stepper = self._dynamics.stepper(self.state)
 
     def _allowed(self, name: str, amount: float, *, per: float = 1.0) -> float:
         """``amount * per``, a force in weights, or an error if it exceeds the largest force."""

@@ -29,6 +29,7 @@ FORMAT = "gausim.session/1"
 MOST_BYTES, MOST_EVENTS, MOST_STEPS = 64 << 20, 200_000, 100_000
 _Amount = Annotated[float, Meta(ge=0, lt=1e9)]
 _Positive = Annotated[float, Meta(gt=0, lt=1e9)]
+_Factor = Annotated[float, Meta(ge=1e-3, le=1e3)]
 _Name = Annotated[str, Meta(min_length=1, max_length=200)]
 _Text = Annotated[str, Meta(max_length=200)]
 
@@ -118,13 +119,25 @@ class Hand(_EventBase, frozen=True):
     hand: Annotated[int, Meta(ge=0, lt=1000)] = 0
 
 
+class Material(_EventBase, frozen=True):
+    """Changes the material of the whole object, which goes on from where it is.
+
+    Attributes:
+        stiffness: over that at the beginning of the session.
+        damping: over that at the beginning of the session.
+    """
+
+    stiffness: _Factor = 1.0
+    damping: _Factor = 1.0
+
+
 class Reset(_EventBase, frozen=True):
-    """Returns to the initial state without forces, wind, gravity or pins."""
+    """Returns to the initial state without forces, wind, gravity or pins; the material stays."""
 
 
-Event = Force | Release | Impulse | Gravity | Wind | Pin | Unpin | Hand | Reset
+Event = Force | Release | Impulse | Gravity | Wind | Pin | Unpin | Hand | Material | Reset
 KINDS: dict[str, type] = {
-    t.__name__.lower(): t for t in (Force, Release, Impulse, Gravity, Wind, Pin, Unpin, Hand, Reset)
+    t.__name__.lower(): t for t in (Force, Release, Impulse, Gravity, Wind, Pin, Unpin, Hand, Material, Reset)
 }
 
 

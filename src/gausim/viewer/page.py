@@ -15,6 +15,7 @@ from gausim.interaction.session import (
     Gravity,
     Hand,
     Impulse,
+    Material,
     Pin,
     Release,
     Unpin,
@@ -111,6 +112,24 @@ class Page:
         if self._live.interaction.hand is not None:
             self._strengths += self._hand(gui)
 
+        self._factors = self._material(gui) if self._live.interaction.adjustable else []
+
+    def _material(self, gui: Any) -> list[Any]:
+        """Sliders of factors on the stiffness and damping that the scene began with."""
+        with gui.add_folder("Material", expand_by_default=False):
+            factors = [
+                gui.add_slider(f"{name} times", 0.1, 10.0, 0.1, 1.0, hint="1: as given on the command line")
+                for name in ("Stiffness", "Damping")
+            ]
+
+        def change(_: object) -> None:
+            event = Material(*(float(factor.value) for factor in factors))
+            self._live.do(lambda: self._live.act(event))
+
+        for factor in factors:
+            self._on_change(factor, (0.1, 10.0), change)
+        return factors
+
     def _hand(self, gui: Any) -> list[Any]:
         """Sliders of where the pins are held, relative to rest."""
         scene, fps = self._live.interaction.scene, self._live.interaction.fps
@@ -201,7 +220,13 @@ class Page:
 
     def _begin(self) -> None:
         self._live.begin()
+        self._start_over()
+
+    def _start_over(self) -> None:
+        """Shows the beginning of a session on the controls."""
         self._source.value = LIVE
+        for factor in self._factors:
+            factor.value = 1.0
         self._calm()
 
     def _let_go(self) -> None:
@@ -262,8 +287,7 @@ class Page:
 
     def _play_file(self, content: bytes) -> None:
         self._live.replay(parse_session(content, "the file"))
-        self._source.value = LIVE
-        self._calm()
+        self._start_over()
 
     def refresh(self, shown: Shown, legend: Legend, displayed: float, *, now: bool = False) -> None:
         """Updates rates, frame, messages and legend, at most :data:`_REFRESHES` times a second unless ``now``."""
