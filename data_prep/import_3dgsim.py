@@ -10,7 +10,6 @@ hold out whole samples, so all frames are trained on unless --train-frames says 
 from __future__ import annotations
 
 import string
-import sys
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -196,7 +195,3 @@ def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     folder = "a sample with metadata.json, or a folder of samples"
     return import_command(STAGE, __doc__, folder, GenesisOptions, import_3dgsim, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

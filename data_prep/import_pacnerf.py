@@ -10,7 +10,6 @@ have no unseen frames: all are trained on unless --train-frames says otherwise.
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -192,7 +191,3 @@ def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     folder = "data/OBJECT, with all_data.json and data/"
     return import_command(STAGE, __doc__, folder, PacNerfOptions, import_pacnerf, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

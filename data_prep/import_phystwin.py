@@ -10,7 +10,6 @@ ours has no gaps. Depth is not read. Pickles go through a reader that executes n
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -269,7 +268,3 @@ def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     folder = "data/different_types/CASE"
     return import_command(STAGE, __doc__, folder, PhysTwinOptions, import_phystwin, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

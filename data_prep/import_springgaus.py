@@ -11,7 +11,6 @@ moved and scaled until it covers the masks of the first sequence's first frame. 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -309,7 +308,3 @@ def main(argv: list[str] | None = None) -> int:
     """Command line; returns the exit code."""
     folder = "data/mpm_synthetic/render/OBJECT, or data/real_capture"
     return import_command(STAGE, __doc__, folder, SpringGausOptions, import_springgaus, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
