@@ -14,21 +14,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from data_prep.common.command import option
-from data_prep.common.progress import Tick, silent
 from data_prep.public.fields import field, inside, lens, numbered, read_any_json, viewmat
-from data_prep.public.importing import ImportOptions, import_command, run_import
+from data_prep.public.importing import Importer, ImportOptions, rate_option
 from data_prep.public.pictures import CutOut, before_white, read_sized, size_of, with_alpha, without_pixels
 from data_prep.public.scene import GRAVITY, Motion, Picture, PublicObject, View, floor
 from gausim.core.errors import DataError
 
-# Raise when the same inputs and settings give another result than before.
-REVISION = 1
-STAGE = "import_pacnerf"
 DATA = "all_data.json"
 _NAME = re.compile(r"r_([0-9]{1,4})_(-?[0-9]{1,6})\.png")
 # Frames of the empty scene and of the pixels to ignore, and the alpha above which these are ignored.
@@ -43,7 +37,7 @@ _UNEVEN = 0.01
 class PacNerfOptions(ImportOptions):
     """Facts that the folder does not contain."""
 
-    fps: float | None = option(None, "frames per second (by the times of all_data.json)", least=1e-3, most=1e4)
+    fps: float | None = rate_option("by the times of all_data.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,18 +51,6 @@ class _Image:
     time: float
     viewmat: np.ndarray
     k: np.ndarray
-
-
-def import_pacnerf(
-    root: Path, out: Path, options: PacNerfOptions, *, force: bool = False, tick: Tick = silent
-) -> dict[str, Any]:
-    """Runs the stage.
-
-    Raises:
-        DataError: ``all_data.json`` or a picture is missing or malformed, or a camera moves.
-        ConfigError: an option does not suit the object.
-    """
-    return run_import(STAGE, REVISION, [read_pacnerf(root, options)], out, options, force=force, tick=tick)
 
 
 def read_pacnerf(root: Path, options: PacNerfOptions) -> PublicObject:
@@ -187,7 +169,9 @@ def _rate(path: Path, times: dict[str, list[float]]) -> float:
     return float(1 / np.diff(first).mean())
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    folder = "data/OBJECT, with all_data.json and data/"
-    return import_command(STAGE, __doc__, folder, PacNerfOptions, import_pacnerf, argv)
+# The number rises when the same inputs and settings give another result than before.
+import_pacnerf = Importer(
+    "import_pacnerf", 1, PacNerfOptions, lambda root, options: [read_pacnerf(root, options)],
+    "data/OBJECT, with all_data.json and data/", __doc__,
+)  # fmt: skip
+main = import_pacnerf.main

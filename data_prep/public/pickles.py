@@ -13,7 +13,7 @@ import struct
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -74,6 +74,9 @@ def _refusal(name: str) -> Callable[[Any], None]:
 class _Reader(pickle._Unpickler):
     """Python's reader, the one in Python: damage cannot do more to it than raise an exception."""
 
+    stack: list[Any]
+    metastack: list[Any]
+
     def __init__(self, data: bytes) -> None:
         self._file, self._left = io.BytesIO(data), _MOST_COPIES * len(data)
         super().__init__(self._file, encoding="latin1")  # as Python 2 wrote the content of arrays
@@ -127,7 +130,7 @@ class _Reader(pickle._Unpickler):
         else:
             raise ValueError(f"sets the state of a {type(target).__name__}")
 
-    dispatch = {
+    dispatch: ClassVar[dict[int, Callable[[Any], None]]] = {
         **pickle._Unpickler.dispatch,
         **{getattr(pickle, name)[0]: _refusal(name) for name in _REFUSED},
         pickle.BUILD[0]: load_build,

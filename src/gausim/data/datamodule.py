@@ -157,11 +157,11 @@ class ReadyDataModule(LightningDataModule):
         """
         if self._prefetch < 0:
             raise ConfigError(f"data.prefetch: expected 0 or more batches read ahead, got {self._prefetch}.")
-        ahead = {"num_workers": 1, "prefetch_factor": self._prefetch, "persistent_workers": True}
+        ahead = self._prefetch > 0
         # The loader draws one number per epoch; from the global generator, a resumed run would draw a different count.
         return DataLoader(
             self.index, batch_sampler=self._ready_sampler(), collate_fn=collate, generator=torch.Generator(),
-            **(ahead if self._prefetch else {}),
+            num_workers=int(ahead), prefetch_factor=self._prefetch or None, persistent_workers=ahead,
         )  # fmt: skip
 
     def state_dict(self) -> dict[str, Any]:
