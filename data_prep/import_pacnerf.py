@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_prep.public.fields import field, inside, lens, numbered, read_any_json, viewmat
+from data_prep.public.fields import field, inside, lens, numbered, rate_of, read_list, viewmat
 from data_prep.public.importing import Importer, ImportOptions, rate_option
 from data_prep.public.pictures import CutOut, before_white, read_sized, size_of, with_alpha, without_pixels
 from data_prep.public.scene import GRAVITY, Motion, Picture, PublicObject, View, floor
@@ -29,8 +29,8 @@ _NAME = re.compile(r"r_([0-9]{1,4})_(-?[0-9]{1,6})\.png")
 PLATE, IGNORED, IGNORED_ALPHA = -1, -2, 50
 # Every image repeats its camera, with all digits.
 _SAME = 1e-6
-# Steps of time may differ by this fraction of a frame.
-_UNEVEN = 0.01
+# Times of cameras may differ by this fraction of a frame.
+_APART = 0.01
 
 
 @dataclass(frozen=True)
@@ -84,11 +84,8 @@ def read_pacnerf(root: Path, options: PacNerfOptions) -> PublicObject:
 
 
 def _images(root: Path, path: Path) -> list[_Image]:
-    entries = read_any_json(path)
-    if not isinstance(entries, list) or not entries:
-        raise DataError(f"{path}: expected a list of images, got {str(entries)[:60]}.")
     images = []
-    for i, entry in enumerate(entries):
+    for i, entry in enumerate(read_list(path, "images")):
         where = f"{path}: [{i}]"
         name = field(entry, "file_path", str, where)
         place = inside(root, name.removeprefix("./"), f"{where}: field 'file_path'")
@@ -156,17 +153,15 @@ def _cleared(read: Callable[[], np.ndarray], ignored: Path | None = None) -> np.
 
 
 def _rate(path: Path, times: dict[str, list[float]]) -> float:
-    """Frames per second by the times of the images [s]."""
-    first = next(iter(times.values()))
-    for name, row in times.items():
-        steps, common = np.diff(row), min(len(row), len(first))
-        even = len(steps) > 0 and steps.min() > 0 and np.ptp(steps) <= _UNEVEN * steps.mean()
-        if not even or np.abs(np.array(row[:common]) - first[:common]).max() > _UNEVEN * steps.mean():
-            raise DataError(
-                f"{path}: field 'time' of {name}: expected times [s] that rise by equal steps and are the same in all "
-                f"cameras, got {row[:4]}. State --fps."
-            )
-    return float(1 / np.diff(first).mean())
+    """Frames per second by the times of the images [s], which all cameras must share."""
+    first, *_ = rates = [rate_of(row, f"{path}: field 'time' of {name}") for name, row in times.items()]
+    starts = [row[0] for row in times.values()]
+    if max(np.ptp(starts), np.ptp(1 / np.array(rates))) * first > _APART:
+        raise DataError(
+            f"{path}: field 'time': expected the same times [s] in all cameras, got rates {rates} and starts {starts}. "
+            "State --fps."
+        )
+    return first
 
 
 # The number rises when the same inputs and settings give another result than before.

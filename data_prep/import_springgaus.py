@@ -22,7 +22,18 @@ from data_prep.capture.cameras.sources import fitted
 from data_prep.common.command import option
 from data_prep.common.photos import list_images, natural, open_photo
 from data_prep.common.progress import Tick
-from data_prep.public.fields import check_name, field, inside, lens, numbered, numbers, read_any_json, viewmat
+from data_prep.public.fields import (
+    check_name,
+    field,
+    inside,
+    lens,
+    numbered,
+    numbers,
+    rate_of,
+    read_any_json,
+    read_list,
+    viewmat,
+)
 from data_prep.public.importing import Importer, ImportOptions, rate_option
 from data_prep.public.pictures import masked, size_of, with_alpha
 from data_prep.public.registration import register
@@ -85,11 +96,8 @@ def read_synthetic(root: Path, options: SpringGausOptions) -> PublicObject:
         DataError: ``camera.json``, ``frame.json`` or a folder of frames is missing or malformed.
     """
     path = root / CAMERAS
-    entries = read_any_json(path)
-    if not isinstance(entries, list) or not entries:
-        raise DataError(f"{path}: expected a list of cameras, got {str(entries)[:60]}.")
     views, pictures = [], {}
-    for i, entry in enumerate(entries):
+    for i, entry in enumerate(read_list(path, "cameras")):
         where = f"{path}: [{i}]"
         name = check_name(field(entry, "camera", str, where), f"{where}: field 'camera'")
         if name in pictures:
@@ -130,13 +138,7 @@ def _rate(path: Path, count: int) -> float:
         raise DataError(
             f"{path}: has times of {len(entries)} frames, the folders have {count}. Restore what is missing."
         )
-    times = numbers([next(iter(entry.values())) for entry in entries], (-1,), str(path))
-    steps = np.diff(times)
-    if len(steps) == 0 or steps.min() <= 0 or np.ptp(steps) > 0.01 * steps.mean():
-        raise DataError(
-            f"{path}: expected times [s] that rise by equal steps, got steps {steps[:4].tolist()}. State --fps."
-        )
-    return float(1 / steps.mean())
+    return rate_of([next(iter(entry.values())) for entry in entries], str(path))
 
 
 def read_real(root: Path, options: SpringGausOptions) -> PublicObject:
@@ -288,9 +290,9 @@ def _registered(found: PublicObject, options: SpringGausOptions, tick: Tick) -> 
             "Check static/masks and dynamic/videos_masks, try more --turns, or leave the stills out (--no-stills): "
             "frame 0 of the cameras takes their place."
         )
-    stills = tuple((replace(view, viewmat=fit.moved(view.viewmat)), picture) for view, picture in found.stills)
+    stills = tuple((replace(view, viewmat=fit.move.viewmat(view.viewmat)), picture) for view, picture in found.stills)
     reached = f"overlap of silhouettes {fit.overlap:.3f} ({views}), agreement of colours {fit.colour:.2f}"
-    notes = {"registered": f"{reached}, scale {fit.scale:.4g}"}
+    notes = {"registered": f"{reached}, scale {fit.move.scale:.4g}"}
     if fit.ambiguous:
         notes["look at"] = "another turn of the object fits as well: compare the stills with frame 0"
     return replace(found, stills=stills, told={"registration": fit.told(), "notes": notes})
