@@ -149,7 +149,3 @@ def _text(value: Any, made: Mapping[str, Path], base: Path, where: str) -> str:
         ) from error
     beside = base / filled
     return str(beside) if filled == text and isinstance(value, str) and text and beside.exists() else filled
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.plain import plain_scene
 from plyfile import PlyData
 
 from gausim.cli import inspect as command
 from gausim.cli.main import main
 from gausim.compose.config import compose
 from gausim.compose.places import more_settings
-from gausim.core.scene import GaussianScene
 from gausim.io.ply import load_scene, save_scene
 from gausim.report.pictures import kernels
 
@@ -24,15 +24,7 @@ from gausim.report.pictures import kernels
 def scene_file(tmp_path: Path) -> Path:
     axis = [torch.linspace(0, 1, 4), torch.linspace(0, 1, 3), torch.linspace(0, 2, 5)]
     means = torch.stack(torch.meshgrid(*axis, indexing="ij"), -1).reshape(-1, 3)
-    count = len(means)
-    scene = GaussianScene.create(
-        means=means,
-        log_scales=torch.full((count, 3), -2.0),
-        quats=torch.tensor([1.0, 0, 0, 0]).expand(count, 4),
-        opacity_logits=torch.zeros(count),
-        sh=torch.zeros(count, 4, 3),
-    )
-    save_scene(scene, tmp_path / "block.ply")
+    save_scene(plain_scene(means, log_scale=-2.0, sh=torch.zeros(len(means), 4, 3)), tmp_path / "block.ply")
     return tmp_path / "block.ply"
 
 

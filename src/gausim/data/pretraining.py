@@ -145,7 +145,7 @@ class CorpusDataModule(ReadyDataModule):
         repeats: int = 1,
         curriculum: Curriculum | None = None,
         seed: int = 0,
-        prefetch: int = 1,
+        prefetch: int = 0,
     ) -> None:
         """Stores the settings; the corpus is first read by :attr:`objects`.
 
@@ -159,7 +159,7 @@ class CorpusDataModule(ReadyDataModule):
             repeats: how many times each sequence is shown per epoch.
             curriculum: predicted steps per epoch.
             seed: seed of the training order.
-            prefetch: number of batches read ahead.
+            prefetch: number of batches that a process of its own reads ahead.
         """
         super().__init__(
             root, batch_size=batch_size, repeats=repeats, curriculum=curriculum, seed=seed, prefetch=prefetch
