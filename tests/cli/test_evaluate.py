@@ -7,8 +7,7 @@ import pytest
 from helpers import toy_object
 from helpers.played import stand_in
 
-from gausim.cli import evaluate
-from gausim.compose import build as _run
+from gausim.cli import evaluate, evaluate_run
 from gausim.core import DataError, SimState
 
 
@@ -28,7 +27,7 @@ def run(toy, tmp_path, monkeypatch):
         return rollout(SimState(toy.scene.means, initial.state(sequence).previous), steps)
 
     loaded = stand_in(tmp_path / "run", toy.root, model=model, initial_states=initial, predict=predict)
-    monkeypatch.setattr(_run, "load_run", lambda path, data=None: loaded)
+    monkeypatch.setattr(evaluate_run, "load_run", lambda path, data=None: loaded)
     return loaded
 
 
