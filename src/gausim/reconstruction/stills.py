@@ -24,20 +24,13 @@ MEASURED_AT_ONCE = 4
 
 @dataclass(frozen=True, eq=False)
 class ImageSet:
-    """N posed images of one size.
+    """N posed images of one size."""
 
-    Attributes:
-        name: name of the set in tables.
-        images: straight-alpha RGBA.
-        cameras: one per image.
-        weight: probability of the set when training draws images, up to a factor.
-        span: first and last step in which training draws from the set [fractions of all steps].
-    """
-
-    name: str
-    images: UInt8[Tensor, "N H W 4"]
-    cameras: Cameras
-    weight: float = 1.0
+    name: str  # name of the set in tables
+    images: UInt8[Tensor, "N H W 4"]  # straight-alpha RGBA
+    cameras: Cameras  # one per image
+    weight: float = 1.0  # probability of the set when training draws images, up to a factor
+    # first and last step in which training draws from the set [fractions of all steps]
     span: tuple[float, float] = (0.0, 1.0)
 
     def select(self, index: Sequence[int]) -> ImageSet:
