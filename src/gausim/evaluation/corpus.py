@@ -125,13 +125,9 @@ def summary(found: Sequence[BodyFigures]) -> CorpusFigures:
 
 
 def write_figures(folder: Path, found: Sequence[BodyFigures], *, seen: int, pretrained: int | None) -> CorpusFigures:
-    """Writes ``corpus.json`` and returns the summary.
+    """Writes ``corpus.json`` with the number of seen frames, and returns the summary.
 
-    Args:
-        folder: where to.
-        found: figures of the bodies.
-        seen: number of seen frames.
-        pretrained: number of bodies that the network was trained on; None where it is unknown.
+    ``pretrained`` is the number of bodies that the network was trained on; None where it is unknown.
     """
     whole = summary(found)
     folder.mkdir(parents=True, exist_ok=True)

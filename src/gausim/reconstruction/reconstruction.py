@@ -94,18 +94,11 @@ def reconstruct(
 ) -> GaussianScene:
     """Fits Gaussians to images by L1 + D-SSIM + mask loss (3DGS, with the mask against floaters).
 
-    Kernels of an object start on the surface of its visual hull (or on the points in it), those of an open scene on
-    the points. They are split where the images' error is largest and pruned where they are transparent, never seen or
-    out of bounds, because the dynamics moves every kernel.
-
-    Args:
-        sets: training images; the hull is carved from the first set.
-        renderer: draws the Gaussians.
-        options: sizes, steps and rates.
-        cloud: points at which kernels start; an open scene needs them.
-        name: name of the scene, whose kernels are all simulated and foreground, none pinned.
-        progress: called after every step.
-        begun: :meth:`Reconstruction.state` of an interrupted reconstruction with the same arguments, to continue.
+    Kernels of an object start on the surface of the visual hull of the first set (or on the points of ``cloud`` in
+    it), those of an open scene on the points. They are split where the images' error is largest and pruned where
+    they are transparent, never seen or out of bounds, because the dynamics moves every kernel. All are simulated
+    and foreground, none pinned. ``progress`` is called after every step; ``begun`` is :meth:`Reconstruction.state`
+    of an interrupted reconstruction with the same arguments.
 
     Raises:
         ConfigError: an open scene has no points.

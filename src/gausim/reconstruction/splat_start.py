@@ -91,13 +91,8 @@ def start_object(
 ) -> Start:
     """``count`` balls evenly over the surface of the visual hull of the masks, or over the points that lie in it.
 
-    Args:
-        images: posed images; alpha > 0 is the object.
-        count: number of balls.
-        resolution: voxels along the longest side of the hull.
-        missing: fraction of the views whose masks may lack a part that all others show.
-        cloud: points instead of the surface.
-        name: name of the scene, for errors.
+    The object is where alpha > 0. The hull has ``resolution`` voxels along its longest side; ``missing`` is the
+    fraction of the views whose masks may lack a part that all others show.
 
     Raises:
         DataError: no body projects into all masks, or no point lies in it.

@@ -54,14 +54,10 @@ def gather_stills(
     longest: int | None = None,
     coarse: float = 0.0,
 ) -> Material:
-    """The stills of the ``transforms.json`` at ``path``; some are not used in training but only measured.
+    """The stills of the ``transforms.json`` at ``path``; one in ``every`` is not used in training but only measured.
 
-    Args:
-        path: the file.
-        every: one of this number of stills is left out of training.
-        opaque: every pixel is foreground, whatever its alpha.
-        longest: maximum length of the longer side, to which larger stills are reduced [pixels].
-        coarse: fraction of the steps, from the first, on stills of half that size, which cost a quarter.
+    ``opaque``: every pixel is foreground, whatever its alpha. Larger stills are reduced to ``longest`` [pixels].
+    ``coarse`` is the fraction of the steps, from the first, on stills of half that size, which cost a quarter.
 
     Raises:
         DataError: fewer than two stills, or an image or pose is unusable.
@@ -90,13 +86,9 @@ def gather_object(data: ObjectData, *, video_fraction: float = 0.5) -> Material:
     """The stills of an object and the first frames of its training views, which show the same rest state.
 
     Training compares renderings with the video frames, which are often smaller than the stills, and splats are not
-    scale-free (their pixel filter is 0.3 pixels^2 at every size). So the fraction ``video_fraction`` of the
-    steps is at the size of the video: a quarter of it on the first frames, the others on the stills reduced to that
-    size. Views that are held out are only measured.
-
-    Args:
-        data: the object.
-        video_fraction: fraction of the steps at the video's size, 0 for stills only.
+    scale-free (their pixel filter is 0.3 pixels^2 at every size). So the fraction ``video_fraction`` of the steps
+    (0: stills only) is at the size of the video: a quarter of it on the first frames, the others on the stills
+    reduced to that size. Views that are held out are only measured.
     """
     stills = data.stills()
     train = _part(stills, stills.train, "stills", weight=1 - video_fraction)
