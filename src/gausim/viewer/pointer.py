@@ -274,8 +274,8 @@ def invisible_handle() -> bytes:
 def first_hit(
     points: Float[Tensor, "K 3"],
     reach: Float[Tensor, " K"],
-    origin: Sequence[float],
-    direction: Sequence[float],
+    origin: Sequence[float] | Tensor,
+    direction: Sequence[float] | Tensor,
     among: Bool[Tensor, " K"],
 ) -> int | None:
     """The first kernel of the mask ``among`` whose centre is within its ``reach`` of a ray, or None."""
