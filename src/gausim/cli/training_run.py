@@ -16,7 +16,6 @@ from omegaconf import DictConfig, OmegaConf
 
 from gausim.cli.end import end
 from gausim.cli.sweeps.jobs import do_job
-from gausim.cli.test_part import check_protocol
 from gausim.compose.build import build, load_run
 from gausim.compose.config import in_sweep, instantiate, run_dir
 from gausim.core import ConfigError, FittedMethod, RunError, TakesOver
@@ -25,6 +24,7 @@ from gausim.data.pretraining import CorpusDataModule
 from gausim.doctor.examine import examine
 from gausim.doctor.page import findings_text
 from gausim.models.step.simulator import GausSim
+from gausim.results.looks import DEVELOPMENT, TEST_PART
 from gausim.runs.defaults import with_defaults
 from gausim.runs.directory import RunDirectory
 from gausim.training.callbacks.convergence import Convergence
@@ -128,6 +128,28 @@ def _parts(cfg: DictConfig, *, resumed: bool) -> tuple[GausSimModule, ReadyDataM
     if isinstance(datamodule, CorpusDataModule) and not datamodule.knows_material and not resumed:
         find_materials(cast("GausSim", module.model), datamodule)
     return module, datamodule
+
+
+def check_protocol(cfg: DictConfig, datamodule: ReadyDataModule) -> None:
+    """Raises ConfigError where the evaluation after training could not be made as the protocol demands."""
+    protocol = cfg.get("protocol") or {}  # configurations of earlier versions have none
+    part, trials = protocol.get("part"), protocol.get("trials")
+    if part not in (None, DEVELOPMENT, TEST_PART):
+        raise ConfigError(f"protocol.part: expected null, {DEVELOPMENT} or {TEST_PART}, got '{part}'.")
+    if not cfg.evaluate or not datamodule.has_videos:
+        return
+    names = [(item.test_part, record.name) for item in datamodule.objects for record in item.sequences]
+    reserved = [name in part_of for part_of, name in names]
+    if part == TEST_PART and (not trials or not any(reserved)):
+        raise ConfigError(
+            f"protocol.part: expected protocol.trials for a look at the test part, got {trials}, and sequences of a "
+            f"test part in the data, got {sum(reserved)} of {len(reserved)}."
+        )
+    if part != TEST_PART and all(reserved):
+        raise ConfigError(
+            "evaluate: every sequence of the data belongs to the test part. Set protocol.part=test and "
+            "protocol.trials=N (trials made on the development part), or evaluate=false."
+        )
 
 
 def _fit(

@@ -79,16 +79,11 @@ class Gravity(_EventBase, frozen=True):
 
 
 class Wind(_EventBase, frozen=True):
-    """A wind, until the next such event: a force on every kernel in proportion to its cross-section.
-
-    Attributes:
-        weights: force on the whole object, averaged over time [weights of the object]; 0 for none.
-        gusts: relative amplitude of gusts, in 0..1.
-    """
+    """A wind, until the next such event: a force on every kernel in proportion to its cross-section."""
 
     direction: Vector
-    weights: _Amount
-    gusts: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    weights: _Amount  # force on the whole object, averaged over time [weights of the object]; 0 for none
+    gusts: Annotated[float, Meta(ge=0, le=1)] = 0.0  # relative amplitude of gusts, in 0..1
 
 
 class Pin(_EventBase, frozen=True):
@@ -104,18 +99,12 @@ class Unpin(_EventBase, frozen=True):
 
 
 class Hand(_EventBase, frozen=True):
-    """Moves the pins of a hand smoothly to a place relative to rest, and holds them there.
+    """Moves the pins of a hand smoothly to a place relative to rest, and holds them there."""
 
-    Attributes:
-        to: displacement from rest [scene units].
-        frames: duration of the motion.
-        turn: rotation about the middle of the hand's pins, axis times angle [radian].
-        hand: number of the hand; an object without recorded hands has one, which holds all pins.
-    """
-
-    to: Vector
-    frames: Annotated[int, Meta(ge=1, le=MOST_STEPS)] = 1
-    turn: Vector = (0.0, 0.0, 0.0)
+    to: Vector  # displacement from rest [scene units]
+    frames: Annotated[int, Meta(ge=1, le=MOST_STEPS)] = 1  # duration of the motion
+    turn: Vector = (0.0, 0.0, 0.0)  # rotation about the middle of the hand's pins, axis times angle [radian]
+    # number of the hand; an object without recorded hands has one, which holds all pins
     hand: Annotated[int, Meta(ge=0, lt=1000)] = 0
 
 
@@ -142,35 +131,21 @@ KINDS: dict[str, type] = {
 
 
 class Entry(Checked, frozen=True):
-    """An event and its time.
+    """An event and its time."""
 
-    Attributes:
-        at: number of steps before it.
-        event: the event.
-    """
-
-    at: Natural
-    event: Event
+    at: Natural  # number of steps before it
+    event: Event  # the event
 
 
 class MadeWith(Checked, frozen=True):
-    """Provenance of a session; a replay with equal hashes is bit-identical.
+    """Provenance of a session; a replay with equal hashes is bit-identical."""
 
-    Attributes:
-        scene: name of the scene.
-        scene_hash: hash of its Gaussians and masks.
-        model_hash: hash of the method's weights and settings.
-        initial_hash: hash of the initial state.
-        initial: name of the initial state: a sequence, or ``rest``.
-        run: name of the run.
-    """
-
-    scene: _Text
-    scene_hash: _Text
-    model_hash: _Text
-    initial_hash: _Text
-    initial: _Text = "rest"
-    run: _Text = ""
+    scene: _Text  # name of the scene
+    scene_hash: _Text  # hash of its Gaussians and masks
+    model_hash: _Text  # hash of the method's weights and settings
+    initial_hash: _Text  # hash of the initial state
+    initial: _Text = "rest"  # name of the initial state: a sequence, or ``rest``
+    run: _Text = ""  # name of the run
 
     @staticmethod
     def of(
@@ -203,23 +178,14 @@ class MadeWith(Checked, frozen=True):
 
 
 class ForceSession(Checked, frozen=True):
-    """The events on an object and the number of frames.
+    """The events on an object and the number of frames."""
 
-    Attributes:
-        made_with: provenance.
-        fps: frames per second.
-        steps: frames after the initial one.
-        entries: the events, in order of time.
-        gravity: ratio of weight to mass [scene units / s^2].
-        seed: seed of the gusts of wind.
-    """
-
-    made_with: MadeWith
-    fps: _Positive
-    steps: Annotated[int, Meta(ge=0, le=MOST_STEPS)]
-    entries: tuple[Any, ...]
-    gravity: _Positive
-    seed: Natural = 0
+    made_with: MadeWith  # provenance
+    fps: _Positive  # frames per second
+    steps: Annotated[int, Meta(ge=0, le=MOST_STEPS)]  # frames after the initial one
+    entries: tuple[Any, ...]  # the events, in order of time
+    gravity: _Positive  # ratio of weight to mass [scene units / s^2]
+    seed: Natural = 0  # seed of the gusts of wind
 
     def __post_init__(self) -> None:
         Checked.__post_init__(self)

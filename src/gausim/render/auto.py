@@ -43,9 +43,9 @@ class AutoRenderer:
         if chosen(means.device.type) == "gsplat":
             return self.gsplat(means, *inputs, background=background, depth=depth)
         *tensors, size = inputs
-        copies: list[Any] = [value.cpu() for value in (means, *tensors)]
+        kernels, covars, colors, opacities, viewmats, Ks = (value.cpu() for value in (means, *tensors))
         options: dict[str, Any] = {"background": None if background is None else background.cpu(), "depth": depth}
-        images = self.cpu(*copies, size, **options)
+        images = self.cpu(kernels, covars, colors, opacities, viewmats, Ks, size, **options)
         planes = None if images.depth is None else images.depth.to(means.device)
         return Rendered(images.rgb.to(means.device), images.alpha.to(means.device), planes)
 

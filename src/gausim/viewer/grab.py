@@ -18,18 +18,12 @@ HAND_SECONDS = 0.15
 
 @dataclass
 class Grab:
-    """A hand that a pointer drags, from the beginning of the drag.
+    """A hand that a pointer drags, from the beginning of the drag."""
 
-    Attributes:
-        hand: its number.
-        point: where the drag began (3,) [page units].
-        scale: page units per scene unit.
-        moved: called with the hand and its displacement from rest [scene units].
-    """
-
-    hand: int
-    point: Tensor
-    scale: float
+    hand: int  # its number
+    point: Tensor  # where the drag began (3,) [page units]
+    scale: float  # page units per scene unit
+    # called with the hand and its displacement from rest [scene units]
     moved: Callable[[int, tuple[float, float, float]], None]
     # Displacement and turn of the hand when the drag began; asked for by the simulation's thread at the first motion.
     _place: tuple[Tensor, tuple[float, float, float]] | None = None

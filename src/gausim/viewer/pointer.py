@@ -274,8 +274,8 @@ def invisible_handle() -> bytes:
 def first_hit(
     points: Float[Tensor, "K 3"],
     reach: Float[Tensor, " K"],
-    origin: Sequence[float],
-    direction: Sequence[float],
+    origin: Sequence[float] | Tensor,
+    direction: Sequence[float] | Tensor,
     among: Bool[Tensor, " K"],
 ) -> int | None:
     """The first kernel of the mask ``among`` whose centre is within its ``reach`` of a ray, or None."""
@@ -290,13 +290,10 @@ def first_hit(
 def in_rectangle(
     points: Float[Tensor, "K 3"], camera: Any, low: Sequence[float], high: Sequence[float]
 ) -> Bool[Tensor, " K"]:
-    """Points within a rectangle of a viser camera's picture.
+    """Points of the page within a rectangle of a viser camera's picture, from its upper left to its lower right corner.
 
-    Args:
-        points: positions on the page.
-        camera: a viser camera: world pose (wxyz, position), vertical field of view [rad], aspect (width / height).
-        low: upper left corner of the rectangle, in 0..1 of the picture.
-        high: its lower right corner.
+    Corners are in 0..1 of the picture. The camera has a world pose (wxyz, position), the vertical field of view
+    [rad] and the aspect (width / height).
     """
     rotation = torch.from_numpy(SO3(np.asarray(camera.wxyz, float)).as_matrix()).to(points)
     seen = (points - points.new_tensor([float(v) for v in camera.position])) @ rotation

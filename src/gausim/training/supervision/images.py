@@ -34,19 +34,14 @@ class StaticFigures(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """Parts of a run from which supervision is built.
-
-    Attributes:
-        truth: true motion of a sequence by its number, None where it is unknown.
-        motions: smooth motions of the model's template, of a scene by its number; None where it has no such basis.
-        loss: image loss.
-    """
+    """Parts of a run from which supervision is built."""
 
     scenes: Sequence[GaussianScene]
-    truth: Callable[[int], GroundTruth | None]
+    truth: Callable[[int], GroundTruth | None]  # true motion of a sequence by its number, None where it is unknown
+    # smooth motions of the model's template, of a scene by its number; None where it has no such basis
     motions: Callable[[int], SmoothMotions | None]
     renderer: Renderer
-    loss: ImageLoss
+    loss: ImageLoss  # image loss
 
 
 @runtime_checkable

@@ -1,4 +1,4 @@
-"""`gausim simulate RUN --force ...`, `--session FILE`, and `--scene SCENE --from RUN`: an object under forces."""
+"""What `gausim simulate` does: predictions beside the truth, and objects or bare scenes under forces."""
 
 from __future__ import annotations
 
@@ -9,15 +9,21 @@ from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
+from torch import Tensor
 
 from gausim.cli.arguments import opened_scene, parse_background, pinned_by
-from gausim.cli.end import end
-from gausim.compose.build import LoadedRun
+from gausim.cli.bars import named_bar
+from gausim.cli.end import end, error_sentences, push
+from gausim.compose.build import LoadedRun, load_run
 from gausim.compose.config import compose, instantiate
+from gausim.compose.data_paths import data_option
 from gausim.compose.live import REST, open_interaction
-from gausim.compose.predict import RunObject, run_objects
+from gausim.compose.predict import RunObject, TrainedPrediction, run_objects, scene_of, sequence_of, state_of
 from gausim.core import Cameras, GaussianScene, Renderer, Trajectory
 from gausim.core.errors import ConfigError, DataError
+from gausim.data.images import composite
+from gausim.data.records import SequenceRecord
+from gausim.evaluation.evaluation import evaluate_object
 from gausim.interaction.arrows import Arrow, arrows_of, draw_arrows
 from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction, differences, replay
 from gausim.interaction.session import ForceSession, load_session, save_session
@@ -26,13 +32,93 @@ from gausim.io.ply import load_scene
 from gausim.io.trajectory import save_trajectory
 from gausim.io.video import write_gif, write_video
 from gausim.ops.orbit import orbit_cameras
-from gausim.render.draw import film
-from gausim.report.pictures.figures import picture_grid
-from gausim.report.pictures.frames import PANEL_HEIGHT, brighten, label_bar
+from gausim.render.draw import film, to_bytes
+from gausim.report.pictures.figures import contact_sheet, error_figure, picture_grid, slice_figure
+from gausim.report.pictures.frames import PANEL_HEIGHT, Timeline, brighten, label_bar, video_frame
+from gausim.results.summary import summarise
 
 # Frames of a scene without --frames; its first motion without forces [diagonals per frame of the farthest kernel].
 FRAMES, SWAY = 120, 0.02
 SIZE = (480, 480)
+
+
+def simulate_run(arguments: argparse.Namespace) -> int:
+    """Simulates objects of a run, under forces if there are any; returns the exit status."""
+    run = load_run(arguments.run, data=data_option(arguments.data))
+    state_of(run)
+    folder = arguments.out or run.run_dir / "simulation"
+    if arguments.session or has_forces(arguments):
+        return simulate_forces(run, arguments, folder)
+    items = run_objects(run, arguments.object)
+    sentences = [_simulate_object(run, item, arguments, folder / item.data.name) for item in items]
+    first = items[0].data.name
+    push_it = push(arguments.run, first if len(run.objects) > 1 else None)
+    end(sentences, "videos", folder if len(items) > 1 else folder / first, ["view", arguments.run], push_it)
+    return 0
+
+
+def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namespace, folder: Path) -> str:
+    """Writes all results on an object's sequences; returns a sentence on their errors."""
+    names = arguments.sequence or [item.data.sequences[0].name]
+    names = [record.name for record in item.data.sequences] if names == ["all"] else names
+    views = arguments.view or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
+    for name in names:
+        sequence_of(item, name).camera_indices(views)  # raises on an unknown sequence or view before the simulation
+    predict = TrainedPrediction(run, item, frames=arguments.frames or 0)
+    with named_bar(len(names) * (1 + len(views)), f"simulate {item.data.name}") as advance:
+        curves = evaluate_object(
+            item.data, scene_of(run, item), {run.module.method_name: predict}, run.renderer, sequences=names,
+            advance=advance,
+        )  # fmt: skip
+        for name in names:
+            record = item.data.record(sequence_of(item, name).name)
+            trajectory = predict(record, arguments.frames)
+            error_figure(curves, folder / name / "errors.png", sequence=name)
+            write_trajectory(run, item, name, trajectory, folder / name)
+            for view in views:
+                _write_view(run, item, record, trajectory, view, arguments, folder / name)
+                advance(f"{name} {view}")
+    if arguments.verbose:
+        for name in names:
+            print("\n".join(f"wrote {path}" for path in sorted((folder / name).iterdir())))
+    of = names[0] if len(names) == 1 else f"{len(names)} sequences"
+    return error_sentences({f"{item.data.name} {of}": summarise(curves)})[0]
+
+
+def _write_view(
+    run: LoadedRun,
+    item: RunObject,
+    record: SequenceRecord,
+    trajectory: Trajectory,
+    view: str,
+    arguments: argparse.Namespace,
+    folder: Path,
+) -> None:
+    background, scene = parse_background(arguments.background), scene_of(run, item)
+    drawn = film(
+        run.renderer, scene, trajectory, record.cameras_of([view]), background=background, mask=scene.foreground
+    )
+    prediction = brighten(drawn[:, 0].cpu().numpy(), arguments.brighten)
+    truth = brighten(_truth(record, view, min(trajectory.frames, record.count), background), arguments.brighten)
+    unseen, title = item.data.train_frames.stop, f"{item.data.name} {record.name} {view}"
+    fps, timeline = item.data.fps / arguments.slow, Timeline(trajectory.frames, unseen)
+
+    def compared() -> Iterator[np.ndarray]:
+        for number, image in enumerate(prediction):
+            yield video_frame(truth[number] if number < len(truth) else None, image, number, timeline, title)
+
+    write_video(folder / f"{view}.mp4", compared(), fps)
+    if arguments.gif:
+        write_gif(folder / f"{view}.gif", compared(), fps)
+    slice_figure(truth, prediction, folder / f"{view}_slices.png", title=title, first_unseen=unseen)
+    contact_sheet(truth, prediction, folder / f"{view}_sheet.png", title=title, first_unseen=unseen)
+
+
+def _truth(record: SequenceRecord, view: str, frames: int, background: Tensor | None) -> np.ndarray:
+    # In chunks: as floats a whole sequence takes sixteen times its memory in bytes.
+    pieces = [range(start, min(start + 16, frames)) for start in range(0, frames, 16)]
+    parts = [to_bytes(composite(record.frames(piece, [view])[:, 0], background)[0]).numpy() for piece in pieces]
+    return np.concatenate(parts)
 
 
 def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -> int:
