@@ -9,7 +9,6 @@ with the scene of `select` it is complete, and is checked as `gausim verify` doe
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -198,7 +197,3 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
     if results["scene"]:
         return "\n".join([*lines, f"train       gausim train data=object data.root={out} name={facts['name']}"])
     return "\n".join([*lines, f"scene       none yet: gausim prepare reconstruct {out} --out DIR"])
-
-
-if __name__ == "__main__":
-    sys.exit(main())

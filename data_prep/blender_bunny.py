@@ -89,7 +89,3 @@ def _run(arguments: argparse.Namespace, tick: Tick) -> str:
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

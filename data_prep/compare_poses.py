@@ -6,7 +6,6 @@ Photos are told apart by their names without ending; for results of the stage po
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -90,7 +89,3 @@ def comparison(poses: Path, reference: Path, images: Path | None) -> str:
         f"orientation  mean {facts['rotation_error_mean_degree']:.4f}, largest "
         f"{facts['rotation_error_max_degree']:.4f} degrees"
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -11,7 +11,6 @@ import argparse
 import importlib.util
 import json
 import shutil
-import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -113,7 +112,3 @@ def _run(arguments: argparse.Namespace, tick: Tick) -> str:
         f"{headline(arguments.out, manifest)}: {told['bodies']} bodies, {told['sequences']} sequences; "
         f"{told['redrawn']} bodies and pushes drawn again"
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -28,20 +28,10 @@ from gausim.core.errors import ConfigError, GausSimError
 
 # Stages in the order in which they make sense, with the arguments that have no option's name.
 STAGES = {
-    "ingest": ("films",),
-    "poses": (),
-    "segment": ("pictures",),
-    "reconstruct": ("root",),
-    "select": ("scene",),
-    "assemble": ("pictures",),
-    "pack": ("root",),
-    "import_ready": ("root",),
-    "import_springgaus": ("root",),
-    "import_pacnerf": ("root",),
-    "import_phystwin": ("root",),
-    "import_3dgsim": ("root",),
-    "import_physdreamer": ("root",),
-}
+    "ingest": ("films",), "poses": (), "segment": ("pictures",), "reconstruct": ("root",), "select": ("scene",),
+    "assemble": ("pictures",), "pack": ("root",),
+    **{f"import_{name}": ("root",) for name in ("ready", "springgaus", "pacnerf", "phystwin", "3dgsim", "physdreamer")},
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -149,7 +139,3 @@ def _text(value: Any, made: Mapping[str, Path], base: Path, where: str) -> str:
         ) from error
     beside = base / filled
     return str(beside) if filled == text and isinstance(value, str) and text and beside.exists() else filled
-
-
-if __name__ == "__main__":
-    sys.exit(main())

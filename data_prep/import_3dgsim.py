@@ -10,7 +10,6 @@ hold out whole samples, so all frames are trained on unless --train-frames says 
 from __future__ import annotations
 
 import string
-import sys
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -21,17 +20,13 @@ from msgspec import Meta
 
 from data_prep.common.command import option
 from data_prep.common.photos import natural
-from data_prep.common.progress import Tick, silent
 from data_prep.public.fields import check_name, field, inside, lens, read_any_json, viewmat
-from data_prep.public.importing import ImportOptions, import_command, run_import
+from data_prep.public.importing import Importer, ImportOptions, rate_option
 from data_prep.public.pictures import read_sized, straight
 from data_prep.public.scene import Motion, Picture, PublicObject, View, floor
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.pixels import decode
 
-# Raise when the same inputs and settings give another result than before.
-REVISION = 1
-STAGE = "import_3dgsim"
 DATA = "metadata.json"
 # Genesis' default [m/s^2].
 GENESIS_GRAVITY = 9.81
@@ -50,7 +45,7 @@ def identities(text: str) -> tuple[int, ...]:
 class GenesisOptions(ImportOptions):
     """Facts that the folders do not contain."""
 
-    fps: float | None = option(None, "frames per second (has to be stated)", least=1e-3, most=1e4)
+    fps: float | None = rate_option("has to be stated")
     segments: tuple[int, ...] = option(
         (),
         "numbers of the segments that are the object (all but 0 and 3)",
@@ -59,18 +54,6 @@ class GenesisOptions(ImportOptions):
         least=1,
         most=65535,
     )
-
-
-def import_3dgsim(
-    root: Path, out: Path, options: GenesisOptions, *, force: bool = False, tick: Tick = silent
-) -> dict[str, Any]:
-    """Runs the stage.
-
-    Raises:
-        DataError: ``metadata.json`` or a picture is missing or malformed.
-        ConfigError: --fps is not stated, or an option does not suit the samples.
-    """
-    return run_import(STAGE, REVISION, read_3dgsim(root, options), out, options, force=force, tick=tick)
 
 
 def read_3dgsim(root: Path, options: GenesisOptions) -> list[PublicObject]:
@@ -192,11 +175,9 @@ def _segments(path: Path, size: tuple[int, int]) -> np.ndarray:
     return numbers
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    folder = "a sample with metadata.json, or a folder of samples"
-    return import_command(STAGE, __doc__, folder, GenesisOptions, import_3dgsim, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+# The number rises when the same inputs and settings give another result than before.
+import_3dgsim = Importer(
+    "import_3dgsim", 1, GenesisOptions, read_3dgsim,
+    "a sample with metadata.json, or a folder of samples", __doc__,
+)  # fmt: skip
+main = import_3dgsim.main

@@ -10,41 +10,34 @@ have no unseen frames: all are trained on unless --train-frames says otherwise.
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from data_prep.common.command import option
-from data_prep.common.progress import Tick, silent
-from data_prep.public.fields import field, inside, lens, numbered, read_any_json, viewmat
-from data_prep.public.importing import ImportOptions, import_command, run_import
+from data_prep.public.fields import field, inside, lens, numbered, rate_of, read_list, viewmat
+from data_prep.public.importing import Importer, ImportOptions, rate_option
 from data_prep.public.pictures import CutOut, before_white, read_sized, size_of, with_alpha, without_pixels
 from data_prep.public.scene import GRAVITY, Motion, Picture, PublicObject, View, floor
 from gausim.core.errors import DataError
 
-# Raise when the same inputs and settings give another result than before.
-REVISION = 1
-STAGE = "import_pacnerf"
 DATA = "all_data.json"
 _NAME = re.compile(r"r_([0-9]{1,4})_(-?[0-9]{1,6})\.png")
 # Frames of the empty scene and of the pixels to ignore, and the alpha above which these are ignored.
 PLATE, IGNORED, IGNORED_ALPHA = -1, -2, 50
 # Every image repeats its camera, with all digits.
 _SAME = 1e-6
-# Steps of time may differ by this fraction of a frame.
-_UNEVEN = 0.01
+# Times of cameras may differ by this fraction of a frame.
+_APART = 0.01
 
 
 @dataclass(frozen=True)
 class PacNerfOptions(ImportOptions):
     """Facts that the folder does not contain."""
 
-    fps: float | None = option(None, "frames per second (by the times of all_data.json)", least=1e-3, most=1e4)
+    fps: float | None = rate_option("by the times of all_data.json")
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,18 +51,6 @@ class _Image:
     time: float
     viewmat: np.ndarray
     k: np.ndarray
-
-
-def import_pacnerf(
-    root: Path, out: Path, options: PacNerfOptions, *, force: bool = False, tick: Tick = silent
-) -> dict[str, Any]:
-    """Runs the stage.
-
-    Raises:
-        DataError: ``all_data.json`` or a picture is missing or malformed, or a camera moves.
-        ConfigError: an option does not suit the object.
-    """
-    return run_import(STAGE, REVISION, [read_pacnerf(root, options)], out, options, force=force, tick=tick)
 
 
 def read_pacnerf(root: Path, options: PacNerfOptions) -> PublicObject:
@@ -103,11 +84,8 @@ def read_pacnerf(root: Path, options: PacNerfOptions) -> PublicObject:
 
 
 def _images(root: Path, path: Path) -> list[_Image]:
-    entries = read_any_json(path)
-    if not isinstance(entries, list) or not entries:
-        raise DataError(f"{path}: expected a list of images, got {str(entries)[:60]}.")
     images = []
-    for i, entry in enumerate(entries):
+    for i, entry in enumerate(read_list(path, "images")):
         where = f"{path}: [{i}]"
         name = field(entry, "file_path", str, where)
         place = inside(root, name.removeprefix("./"), f"{where}: field 'file_path'")
@@ -175,24 +153,20 @@ def _cleared(read: Callable[[], np.ndarray], ignored: Path | None = None) -> np.
 
 
 def _rate(path: Path, times: dict[str, list[float]]) -> float:
-    """Frames per second by the times of the images [s]."""
-    first = next(iter(times.values()))
-    for name, row in times.items():
-        steps, common = np.diff(row), min(len(row), len(first))
-        even = len(steps) > 0 and steps.min() > 0 and np.ptp(steps) <= _UNEVEN * steps.mean()
-        if not even or np.abs(np.array(row[:common]) - first[:common]).max() > _UNEVEN * steps.mean():
-            raise DataError(
-                f"{path}: field 'time' of {name}: expected times [s] that rise by equal steps and are the same in all "
-                f"cameras, got {row[:4]}. State --fps."
-            )
-    return float(1 / np.diff(first).mean())
+    """Frames per second by the times of the images [s], which all cameras must share."""
+    first, *_ = rates = [rate_of(row, f"{path}: field 'time' of {name}") for name, row in times.items()]
+    starts = [row[0] for row in times.values()]
+    if max(np.ptp(starts), np.ptp(1 / np.array(rates))) * first > _APART:
+        raise DataError(
+            f"{path}: field 'time': expected the same times [s] in all cameras, got rates {rates} and starts {starts}. "
+            "State --fps."
+        )
+    return first
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    folder = "data/OBJECT, with all_data.json and data/"
-    return import_command(STAGE, __doc__, folder, PacNerfOptions, import_pacnerf, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+# The number rises when the same inputs and settings give another result than before.
+import_pacnerf = Importer(
+    "import_pacnerf", 1, PacNerfOptions, lambda root, options: [read_pacnerf(root, options)],
+    "data/OBJECT, with all_data.json and data/", __doc__,
+)  # fmt: skip
+main = import_pacnerf.main

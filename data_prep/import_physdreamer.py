@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -274,7 +273,3 @@ def summary(results: Mapping[str, Any], out: Path) -> str:
     else:
         lines.append(f"next        {train_command(facts, out)}")
     return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -10,7 +10,6 @@ ours has no gaps. Depth is not read. Pickles go through a reader that executes n
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -21,17 +20,13 @@ import numpy as np
 from msgspec import Meta
 
 from data_prep.common.command import option
-from data_prep.common.progress import Tick, silent
 from data_prep.public.fields import REMEDY, field, lens, numbers, read_any_json, viewmat
-from data_prep.public.importing import ImportOptions, import_command, run_import
+from data_prep.public.importing import Importer, ImportOptions, rate_option
 from data_prep.public.pickles import read_pickle
 from data_prep.public.pictures import masked, size_of
 from data_prep.public.scene import GRAVITY, Hands, Motion, Picture, PublicObject, View, floor
 from gausim.core.errors import ConfigError, DataError
 
-# Raise when the same inputs and settings give another result than before.
-REVISION = 1
-STAGE = "import_phystwin"
 META, POSES, FINAL, TRACKS, SPLIT = "metadata.json", "calibrate.pkl", "final_data.pkl", "gt_track_3d.pkl", "split.json"
 HUMAN = "different_types_human_mask"
 HAND = "hand"
@@ -45,7 +40,7 @@ _MOST_CONTROLLERS = 1000
 class PhysTwinOptions(ImportOptions):
     """Facts that the folder does not contain."""
 
-    fps: float | None = option(None, "frames per second (metadata.json's)", least=1e-3, most=1e4)
+    fps: float | None = rate_option("metadata.json's")
     grip: float = option(
         GRIP, "distance to the hands' points within which kernels are pinned [m] (%(default)s)", least=1e-9
     )
@@ -59,18 +54,6 @@ class PhysTwinOptions(ImportOptions):
     human_masks: Path | None = option(
         None, f"masks of the human, mask/CAMERA/0/FRAME.png (../../{HUMAN}/CASE)", type=Path
     )
-
-
-def import_phystwin(
-    root: Path, out: Path, options: PhysTwinOptions, *, force: bool = False, tick: Tick = silent
-) -> dict[str, Any]:
-    """Runs the stage.
-
-    Raises:
-        DataError: a file is missing or malformed, or files do not go together.
-        ConfigError: an option does not suit the case.
-    """
-    return run_import(STAGE, REVISION, [read_phystwin(root, options)], out, options, force=force, tick=tick)
 
 
 def read_phystwin(root: Path, options: PhysTwinOptions) -> PublicObject:
@@ -265,11 +248,9 @@ def _split(path: Path, count: int) -> int:
     return end
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    folder = "data/different_types/CASE"
-    return import_command(STAGE, __doc__, folder, PhysTwinOptions, import_phystwin, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+# The number rises when the same inputs and settings give another result than before.
+import_phystwin = Importer(
+    "import_phystwin", 1, PhysTwinOptions, lambda root, options: [read_phystwin(root, options)],
+    "data/different_types/CASE", __doc__,
+)  # fmt: skip
+main = import_phystwin.main

@@ -10,7 +10,6 @@ that pin_mask.json lists are pinned. Pickles are never read.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -140,7 +139,3 @@ def summary(results: Mapping[str, Any]) -> str:
     if results["without_alpha"]:
         lines.append(f"no alpha    in {', '.join(results['without_alpha'])}: segment them next")
     return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

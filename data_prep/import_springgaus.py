@@ -11,30 +11,36 @@ moved and scaled until it covers the masks of the first sequence's first frame. 
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from data_prep.capture.cameras.sources import fitted
 from data_prep.common.command import option
 from data_prep.common.photos import list_images, natural, open_photo
-from data_prep.common.progress import Tick, silent
-from data_prep.public.fields import check_name, field, inside, lens, numbered, numbers, read_any_json, viewmat
-from data_prep.public.importing import ImportOptions, import_command, run_import
+from data_prep.common.progress import Tick
+from data_prep.public.fields import (
+    check_name,
+    field,
+    inside,
+    lens,
+    numbered,
+    numbers,
+    rate_of,
+    read_any_json,
+    read_list,
+    viewmat,
+)
+from data_prep.public.importing import Importer, ImportOptions, rate_option
 from data_prep.public.pictures import masked, size_of, with_alpha
 from data_prep.public.registration import register
 from data_prep.public.scene import GRAVITY, Motion, Picture, PublicObject, View, floor
 from gausim.core.errors import ConfigError, DataError
 from gausim.io.colmap import ColmapModel, colmap_files, read_colmap
 
-# Raise when the same inputs and settings give another result than before.
-REVISION = 1
-STAGE = "import_springgaus"
 CAMERAS, CALIBRATION = "camera.json", "dynamic/cameras_calib.json"
 # Their renderer's world: frames every 0.03 s, a floor at this height, the first 20 of 30 frames seen.
 SYNTHETIC_FPS, SYNTHETIC_FLOOR, SYNTHETIC_SEEN = 1 / 0.03, 0.3, 20
@@ -47,9 +53,7 @@ SUFFIXES = (".JPG", ".jpg", ".jpeg", ".png", ".PNG")
 class SpringGausOptions(ImportOptions):
     """Facts that the folders do not contain."""
 
-    fps: float | None = option(
-        None, "frames per second (synthetic: frame.json, or 33.3; real: 120)", least=1e-3, most=1e4
-    )
+    fps: float | None = rate_option("synthetic: frame.json, or 33.3; real: 120")
     object: str | None = option(None, "of a real capture: name of the object (folder of dynamic/sequences)")
     real_floor: float = option(
         -0.02, "of a real capture: the table's z [scene units] (%(default)s)", least=-1e3, most=1e3
@@ -66,27 +70,23 @@ class SpringGausOptions(ImportOptions):
     )
 
 
-def import_springgaus(
-    root: Path, out: Path, options: SpringGausOptions, *, force: bool = False, tick: Tick = silent
-) -> dict[str, Any]:
-    """Runs the stage.
+def read_springgaus(root: Path, options: SpringGausOptions) -> list[PublicObject]:
+    """One synthetic object or one real capture.
 
     Raises:
-        DataError: a file is missing or malformed, or the stills do not fit the films.
+        DataError: a file is missing or malformed.
         ConfigError: an option does not suit the folder.
     """
     if (root / CAMERAS).is_file():
         if options.object is not None:
             raise ConfigError(f"--object: {root} is one synthetic object ({CAMERAS}); leave the option out.")
-        return run_import(STAGE, REVISION, [read_synthetic(root, options)], out, options, force=force, tick=tick)
+        return [read_synthetic(root, options)]
     if not (root / CALIBRATION).is_file():
         raise DataError(
             f"{root}: neither {CAMERAS} (a synthetic object) nor {CALIBRATION} (real captures) is here. Give the "
             "folder data/mpm_synthetic/render/OBJECT, or data/real_capture."
         )
-    found = read_real(root, options)
-    finish = None if options.no_stills else partial(_registered, options=options)
-    return run_import(STAGE, REVISION, [found], out, options, force=force, tick=tick, finish=finish)
+    return [read_real(root, options)]
 
 
 def read_synthetic(root: Path, options: SpringGausOptions) -> PublicObject:
@@ -96,11 +96,8 @@ def read_synthetic(root: Path, options: SpringGausOptions) -> PublicObject:
         DataError: ``camera.json``, ``frame.json`` or a folder of frames is missing or malformed.
     """
     path = root / CAMERAS
-    entries = read_any_json(path)
-    if not isinstance(entries, list) or not entries:
-        raise DataError(f"{path}: expected a list of cameras, got {str(entries)[:60]}.")
     views, pictures = [], {}
-    for i, entry in enumerate(entries):
+    for i, entry in enumerate(read_list(path, "cameras")):
         where = f"{path}: [{i}]"
         name = check_name(field(entry, "camera", str, where), f"{where}: field 'camera'")
         if name in pictures:
@@ -141,13 +138,7 @@ def _rate(path: Path, count: int) -> float:
         raise DataError(
             f"{path}: has times of {len(entries)} frames, the folders have {count}. Restore what is missing."
         )
-    times = numbers([next(iter(entry.values())) for entry in entries], (-1,), str(path))
-    steps = np.diff(times)
-    if len(steps) == 0 or steps.min() <= 0 or np.ptp(steps) > 0.01 * steps.mean():
-        raise DataError(
-            f"{path}: expected times [s] that rise by equal steps, got steps {steps[:4].tolist()}. State --fps."
-        )
-    return float(1 / steps.mean())
+    return rate_of([next(iter(entry.values())) for entry in entries], str(path))
 
 
 def read_real(root: Path, options: SpringGausOptions) -> PublicObject:
@@ -281,12 +272,14 @@ def _still(photo: Path, mask: Path, size: tuple[int, int]) -> np.ndarray:
     return straight(rgb, brightness(read_sized(mask, size, f"the mask of {photo.name}")))
 
 
-def _registered(found: PublicObject, tick: Tick, *, options: SpringGausOptions) -> PublicObject:
-    """The same object with its stills in the world of the films.
+def _registered(found: PublicObject, options: SpringGausOptions, tick: Tick) -> PublicObject:
+    """The same object with its stills, where it has some, in the world of the films.
 
     Raises:
         DataError: the silhouettes overlap too little.
     """
+    if not found.stills:
+        return found
     first = [(view, motion.pictures[view.name][0]) for motion in found.motions[:1] for view in motion.views]
     fit = register(found.stills, first, turns=options.turns, tick=tick)
     views = ", ".join(f"{name} {value:.3f}" for name, value in fit.by_view.items())
@@ -297,19 +290,17 @@ def _registered(found: PublicObject, tick: Tick, *, options: SpringGausOptions) 
             "Check static/masks and dynamic/videos_masks, try more --turns, or leave the stills out (--no-stills): "
             "frame 0 of the cameras takes their place."
         )
-    stills = tuple((replace(view, viewmat=fit.moved(view.viewmat)), picture) for view, picture in found.stills)
+    stills = tuple((replace(view, viewmat=fit.move.viewmat(view.viewmat)), picture) for view, picture in found.stills)
     reached = f"overlap of silhouettes {fit.overlap:.3f} ({views}), agreement of colours {fit.colour:.2f}"
-    notes = {"registered": f"{reached}, scale {fit.scale:.4g}"}
+    notes = {"registered": f"{reached}, scale {fit.move.scale:.4g}"}
     if fit.ambiguous:
         notes["look at"] = "another turn of the object fits as well: compare the stills with frame 0"
     return replace(found, stills=stills, told={"registration": fit.told(), "notes": notes})
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Command line; returns the exit code."""
-    folder = "data/mpm_synthetic/render/OBJECT, or data/real_capture"
-    return import_command(STAGE, __doc__, folder, SpringGausOptions, import_springgaus, argv)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+# The number rises when the same inputs and settings give another result than before.
+import_springgaus = Importer(
+    "import_springgaus", 1, SpringGausOptions, read_springgaus,
+    "data/mpm_synthetic/render/OBJECT, or data/real_capture", __doc__, _registered,
+)  # fmt: skip
+main = import_springgaus.main

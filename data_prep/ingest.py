@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from fractions import Fraction
@@ -243,7 +242,3 @@ def summary(results: Mapping[str, Any]) -> str:
             )
         lines += [f"  note: {note}" for note in found["notes"]]
     return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

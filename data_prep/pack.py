@@ -7,7 +7,6 @@ read from it where they lie, so that training never holds it in memory. ``gausim
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,7 +100,3 @@ def _sequence(data: ObjectData, name: str, folder: Path, margin: int) -> tuple[i
         write_packed(folder, source.cameras, (view[:, 0].numpy() for view in views), data.fps, margin=margin)
     images = source.count * len(data.views)
     return images, read_packed(folder).size, 4 * images * source.cameras.width * source.cameras.height
-
-
-if __name__ == "__main__":
-    sys.exit(main())

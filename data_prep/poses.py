@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import shutil
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -195,7 +194,3 @@ def _summary(out: Path, manifest: dict[str, Any]) -> str:
     for name, missing in results["sequences_without_poses"].items():
         lines.append(f"left out       {name}: no pose of {', '.join(missing)}")
     return "\n".join([*lines, f"look at        {out / 'cameras.png'}"])
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,7 +9,6 @@ and OUT/scene.png: look at it. `gausim reconstruct` does the same without a mani
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -88,7 +87,3 @@ def main(argv: list[str] | None = None) -> int:
         return "\n".join([headline(given.out, manifest), kernels, *lines, f"look at {given.out / 'scene.png'}"])
 
     return run_command(parser, argv, run)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -11,7 +11,6 @@ import argparse
 import json
 import math
 import shutil
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -260,7 +259,3 @@ def summary(results: Mapping[str, Any]) -> str:
 def _some(what: str, names: list[str]) -> str:
     more = f" and {len(names) - 4} more" if len(names) > 4 else ""
     return f", {what}: {', '.join(names[:4])}{more}" if names else ""
-
-
-if __name__ == "__main__":
-    sys.exit(main())

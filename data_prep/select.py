@@ -14,7 +14,6 @@ marked kernels from four sides.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -157,7 +156,3 @@ def main(argv: list[str] | None = None) -> int:
         return "\n".join([headline(given.out, manifest), *lines, f"look at     {given.out / 'masks.png'}"])
 
     return run_command(parser, argv, run)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

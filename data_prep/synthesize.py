@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import sys
 from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
@@ -80,7 +79,3 @@ def _run(arguments: argparse.Namespace, tick: Tick) -> str:
     plan = replace(QUICK if arguments.quick else Plan(), **given(Plan, arguments))
     manifest = synthesize(arguments.out, plan, workers=max(1, arguments.workers), force=arguments.force, tick=tick)
     return f"{headline(arguments.out, manifest)}: {', '.join(plan.objects)}"
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -89,8 +89,10 @@ def _played(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
 @pytest.fixture
 def played(_played: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     """A run that was never trained, which is what loading any run gives; not to be changed."""
-    for home in ("gausim.compose.build", "gausim.api"):
-        monkeypatch.setattr(f"{home}.load_run", lambda path, data=None: _played)
+    # All who name it at their top are imported before it is replaced at home.
+    names = ("cli.inspect_material", "cli.simulate_run", "cli.evaluate_run", "cli.training_run", "api", "compose.build")
+    for home in names:
+        monkeypatch.setattr(f"gausim.{home}.load_run", lambda path, data=None: _played)
     return _played
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from helpers.plain import Call
 from helpers.toy_object import toy_scene
 
 from data_prep.public.pickles import read_pickle
@@ -53,18 +54,13 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
 }
 
 
-class Payload:
+def payload(canary: Path) -> Call:
     """Makes a file when it is unpickled."""
-
-    def __init__(self, canary: Path) -> None:
-        self.command = f"touch '{canary}'"
-
-    def __reduce__(self) -> tuple:
-        return os.system, (self.command,)
+    return Call(os.system, f"touch '{canary}'")
 
 
 def object_array(canary: Path) -> np.ndarray:
-    return np.array([Payload(canary)], dtype=object)
+    return np.array([payload(canary)], dtype=object)
 
 
 def saved(save: Callable[[io.BytesIO], object]) -> bytes:
@@ -74,10 +70,10 @@ def saved(save: Callable[[io.BytesIO], object]) -> bytes:
 
 
 CONTENTS: dict[str, Callable[[Path], bytes]] = {
-    "pickle": lambda canary: pickle.dumps({"payload": Payload(canary)}, protocol=2),
-    "torch archive": lambda canary: saved(lambda f: torch.save({"payload": Payload(canary)}, f)),
+    "pickle": lambda canary: pickle.dumps({"payload": payload(canary)}, protocol=2),
+    "torch archive": lambda canary: saved(lambda f: torch.save({"payload": payload(canary)}, f)),
     "old torch file": lambda canary: saved(
-        lambda f: torch.save({"payload": Payload(canary)}, f, _use_new_zipfile_serialization=False)
+        lambda f: torch.save({"payload": payload(canary)}, f, _use_new_zipfile_serialization=False)
     ),
     "npz of objects": lambda canary: saved(lambda f: np.savez(f, payload=object_array(canary))),
     "npy of objects": lambda canary: saved(lambda f: np.save(f, object_array(canary))),
@@ -136,7 +132,7 @@ def test_a_run_of_other_people_builds_nothing_else(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("evil.py").write_text("open('canary', 'w')")
-    torch.save(Payload(Path("canary")), "evil.ckpt")
+    torch.save(payload(Path("canary")), "evil.ckpt")
     parts = {name: {} for name in ("model", "loss", "optimizer", "render", "trainer", "paths")}
     parts["model"] = {"simulator": node, "initial_states": {}}
     config = {**parts, "seed": 0, "name": "evil", "data": node, "callbacks": {"evil": node}}

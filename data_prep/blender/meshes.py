@@ -128,7 +128,7 @@ class _Element:
 def _read_ply(path: Path) -> tuple[Array, Indices]:
     data = path.read_bytes()
     encoding, elements, start = _header(path, data)
-    body = _Text(path, data[start:]) if encoding == "ascii" else _Binary(path, memoryview(data)[start:])
+    body = _Body(path, memoryview(data)[start:] if encoding != "ascii" else memoryview(_numbers(path, data[start:])))
     vertices, triangles = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     for element in elements:
         columns = body.take(element)
@@ -137,6 +137,14 @@ def _read_ply(path: Path) -> tuple[Array, Indices]:
         elif element.name == "face":
             triangles = _faces(path, element, columns)
     return vertices, triangles
+
+
+def _numbers(path: Path, text: bytes) -> bytes:
+    """The words of a text as float64, whatever the header calls them."""
+    try:
+        return np.array(text.split(), np.float64).tobytes()
+    except ValueError as error:
+        raise DataError(f"{path}: expected numbers after the header ({error!s:.80}). Export it again.") from None
 
 
 def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
@@ -153,7 +161,7 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
             elif words[:1] == ["element"]:
                 elements.append(_Element(words[1], int(words[2]), []))
             elif words[:1] == ["property"]:
-                elements[-1].fields.append(_field(words[1:], PLY_ORDER[encoding]))
+                elements[-1].fields.append(_field(words[1:], encoding))
         except (IndexError, KeyError, ValueError) as error:
             raise DataError(f"{path}: the header's line '{line[:60]}' is not of a PLY file ({error}).") from None
     if encoding not in PLY_ORDER:
@@ -165,13 +173,14 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
     return encoding, elements, end.end()
 
 
-def _field(words: Sequence[str], order: str) -> tuple[str, str, str | None]:
-    if words[0] == "list":
-        counter = PLY_TYPES[words[1]]
-        if counter.startswith("f") or (words[3] in FACE_FIELDS and PLY_TYPES[words[2]].startswith("f")):
-            raise ValueError("lengths and indices are whole numbers")
-        return words[3], order + PLY_TYPES[words[2]], order + counter
-    return words[1], order + PLY_TYPES[words[0]], None
+def _field(words: Sequence[str], encoding: str) -> tuple[str, str, str | None]:
+    kinds = [PLY_TYPES[word] for word in (words[1:3] if words[0] == "list" else words[:1])]
+    stored = ["<f8" if encoding == "ascii" else PLY_ORDER[encoding] + kind for kind in kinds]
+    if words[0] != "list":
+        return words[1], stored[0], None
+    if kinds[0].startswith("f") or (words[3] in FACE_FIELDS and kinds[1].startswith("f")):
+        raise ValueError("lengths and indices are whole numbers")
+    return words[3], stored[1], stored[0]
 
 
 def _positions(path: Path, element: _Element, columns: list[Iterable[object]]) -> Array:
@@ -189,19 +198,23 @@ def _faces(path: Path, element: _Element, columns: list[Iterable[object]]) -> In
         raise DataError(f"{path}: faces have lists {names}, expected '{FACE_FIELDS[0]}'.")
     column = columns[[field[0] for field in element.fields].index(chosen[0])]
     if isinstance(column, np.ndarray) and column.ndim == 2 and column.shape[1] == 3:
-        return column.astype(np.int64)
+        return _whole(path, column)
     triangles: list[tuple[int, int, int]] = []
     for i, corners in enumerate(column):
         try:
-            triangles += _fan([int(corner) for corner in corners])  # type: ignore[attr-defined]
-        except (ValueError, OverflowError) as error:
+            triangles += _fan(_whole(path, np.asarray(corners)).tolist())
+        except ValueError as error:
             raise DataError(f"{path}: face {i}: {error}.") from None
-    if triangles and max(abs(corner) for triangle in triangles for corner in triangle) > LARGEST_INDEX:
-        raise DataError(f"{path}: a face uses a vertex beyond {LARGEST_INDEX}. Export the mesh again.")
     return np.array(triangles, np.int64).reshape(-1, 3)
 
 
-class _Binary:
+def _whole(path: Path, indices: np.ndarray) -> Indices:
+    if not ((np.abs(indices.astype(np.float64)) <= LARGEST_INDEX) & (indices == np.trunc(indices))).all():
+        raise DataError(f"{path}: a face uses a vertex that is no whole number up to {LARGEST_INDEX}. Export it again.")
+    return indices.astype(np.int64)
+
+
+class _Body:
     """Elements one after another in memory."""
 
     def __init__(self, path: Path, data: memoryview) -> None:
@@ -235,11 +248,12 @@ class _Binary:
             size = np.dtype(kind).itemsize
             if counter is not None:
                 self._need(at + np.dtype(counter).itemsize, element)
-                lengths.append(int(np.frombuffer(self.data, counter, 1, at)[0]))
+                length = float(np.frombuffer(self.data, counter, 1, at)[0])
+                if not (length.is_integer() and 0 <= length <= len(self.data)):
+                    raise DataError(f"{self.path}: a list of '{element.name}' has length {length:g}.")
+                lengths.append(int(length))
                 at += np.dtype(counter).itemsize
                 size *= lengths[-1]
-            if size < 0:
-                raise DataError(f"{self.path}: a list of '{element.name}' has length {lengths[-1]}.")
             at += size
             self._need(at, element)
         return lengths
@@ -247,35 +261,3 @@ class _Binary:
     def _need(self, end: int, element: _Element) -> None:
         if end > len(self.data):
             raise DataError(f"{self.path}: is cut off within '{element.name}'. Copy or export it again.")
-
-
-class _Text:
-    """Elements as words."""
-
-    def __init__(self, path: Path, data: bytes) -> None:
-        self.path, self.words, self.at = path, data.split(), 0
-
-    def take(self, element: _Element) -> list[Iterable[object]]:
-        """The fields of the next ``element.count`` things."""
-        try:
-            if not element.lists():
-                width = len(element.fields)
-                table = np.array(self._next(width * element.count), np.float64).reshape(element.count, width)
-                return [table[:, i] for i in range(width)]
-            found: list[list[object]] = [[] for _ in element.fields]
-            for _ in range(element.count):
-                for values, (_, _, counter) in zip(found, element.fields, strict=True):
-                    values.append(
-                        float(self._next(1)[0])
-                        if counter is None
-                        else [int(word) for word in self._next(int(self._next(1)[0]))]
-                    )
-        except ValueError as error:
-            raise DataError(f"{self.path}: '{element.name}' cannot be read ({error}). Export it again.") from None
-        return list(found)
-
-    def _next(self, count: int) -> list[bytes]:
-        if not 0 <= count <= len(self.words) - self.at:
-            raise ValueError(f"{count} values expected, {len(self.words) - self.at} are left")
-        self.at += count
-        return self.words[self.at - count : self.at]

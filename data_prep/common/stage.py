@@ -30,8 +30,6 @@ from gausim.io.plain_json import parse_json
 
 MANIFEST = "stage.json"
 PLAN = "plan.json"
-# Records of sets that were made before every stage wrote a manifest; --force replaces such a set.
-EARLIER_MANIFESTS = ("synthetic.json",)
 
 
 @dataclass(frozen=True)
@@ -167,10 +165,6 @@ def _known(out: Path, key: Mapping[str, Any], *, force: bool) -> dict[str, Any] 
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return None
     if not (out / MANIFEST).is_file():
-        if any((out / name).is_file() for name in EARLIER_MANIFESTS):
-            if force:
-                return None
-            raise DataError(f"{out}: was made by an earlier version. Choose another --out, or replace it with --force.")
         raise DataError(
             f"{out}: exists and is not the result of a stage ({MANIFEST} is missing). Choose another --out."
         )

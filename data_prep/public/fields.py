@@ -17,6 +17,8 @@ _LARGEST = 1e9
 _ROTATION_TOLERANCE = 1e-3
 # Columns of pixels may stand askew by this fraction of the focal length before it shows.
 _SKEW = 1e-3
+# Steps of time may differ by this fraction of a frame.
+_UNEVEN = 0.01
 _NESTED: dict[int, Any] = {1: list[float], 2: list[list[float]], 3: list[list[list[float]]]}
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 REMEDY = "Take the file that the set's authors publish."
@@ -34,6 +36,30 @@ def read_any_json(path: Path) -> Any:
         return parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: cannot be read as JSON ({error}). {REMEDY}") from error
+
+
+def read_list(path: Path, what: str) -> list[Any]:
+    """The content of a JSON file that holds a list.
+
+    Raises:
+        DataError: it is missing, no JSON, or no list with something in it.
+    """
+    entries = read_any_json(path)
+    if not isinstance(entries, list) or not entries:
+        raise DataError(f"{path}: expected a list of {what}, got {str(entries)[:60]}.")
+    return entries
+
+
+def rate_of(times: list[float], where: str) -> float:
+    """Frames per second by the times of the frames [s].
+
+    Raises:
+        DataError: the times do not rise by equal steps.
+    """
+    steps = np.diff(numbers(times, (-1,), where))
+    if len(steps) == 0 or steps.min() <= 0 or np.ptp(steps) > _UNEVEN * steps.mean():
+        raise DataError(f"{where}: expected times [s] that rise by equal steps, got {times[:4]}. State --fps.")
+    return float(1 / steps.mean())
 
 
 def field(data: Any, key: str, kind: Any, where: str) -> Any:

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 from data_prep.common.command import Options, add_options, chosen, headline, names, option, run_command, stage_parser
 from data_prep.common.progress import Tick, silent
@@ -31,59 +31,63 @@ class ImportOptions(Options):
     )
 
 
+def rate_option(usual: str) -> Any:
+    """The option that states the frames per second; ``usual`` says what they are otherwise."""
+    return option(None, f"frames per second ({usual})", least=1e-3, most=1e4)
+
+
 T = TypeVar("T", bound=ImportOptions)
-Given = TypeVar("Given", bound=ImportOptions, contravariant=True)
-# Completes an object where that takes long: it is called only where there is something to make.
-Finish = Callable[[PublicObject, Tick], PublicObject]
 
 
-class Importer(Protocol[Given]):
-    """The function of an importer: a stage of data preparation."""
+@dataclass(frozen=True)
+class Importer(Generic[T]):
+    """A stage that brings a folder of a public set to our layout; a call makes it, ``main`` is its command line."""
+
+    stage: str  # name
+    revision: int  # raised when the same inputs and settings give another result than before
+    kind: type[T]  # of its options
+    read: Callable[[Path, T], Sequence[PublicObject]]  # the objects in a folder; decodes no picture
+    folder: str  # the folder, for the help
+    text: str | None  # what the command does, for the help
+    # completes an object where that takes long: called only where there is something to make
+    finish: Callable[[PublicObject, T, Tick], PublicObject] = lambda found, options, tick: found
 
     def __call__(
-        self, root: Path, out: Path, options: Given, *, force: bool = False, tick: Tick = silent
+        self, root: Path, out: Path, options: T, *, force: bool = False, tick: Tick = silent
     ) -> dict[str, Any]:
-        """Reads ROOT, writes our layout to ``out`` and returns the stage's manifest."""
+        """Reads ROOT and returns the manifest: one object becomes ``out``, several become folders of it by their names.
 
+        Raises:
+            DataError: a file is missing or malformed, parts do not go together, or an object would have faults.
+            ConfigError: an option does not suit the folder.
+        """
+        objects = self.read(root, options)
+        inputs = {name: path for found in objects for name, path in found.checked().inputs().items()}
 
-def run_import(
-    stage: str, revision: int, objects: Sequence[PublicObject], out: Path, options: ImportOptions, *,
-    force: bool, tick: Tick, finish: Finish | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """Runs the stage: one object becomes ``out``, several become folders of it by their names.
+        def make(work: Path) -> Mapping[str, Any]:
+            made = {}
+            for found in objects:
+                place = Path(found.name) if len(objects) > 1 else Path()
+                whole = self.finish(found, options, tick)
+                writer = ObjectWriter(work / place, whole, longest=options.longest, tick=tick)
+                made[found.name] = writer.write(out / place)
+            return {"objects": made, "files": files_in(work)}
 
-    Raises:
-        DataError: the objects' parts do not go together, a picture is unusable, or an object would have faults.
-    """
-    inputs = {name: path for found in objects for name, path in found.checked().inputs().items()}
+        # Folders count by the files in them.
+        settings = {name: value for name, value in asdict(options).items() if not isinstance(value, Path)}
+        return run_stage(Stage(self.stage, self.revision, inputs, settings, PACKAGES), out, make, force=force)
 
-    def make(work: Path) -> Mapping[str, Any]:
-        made = {}
-        for found in objects:
-            place = Path(found.name) if len(objects) > 1 else Path()
-            whole = finish(found, tick) if finish is not None else found
-            writer = ObjectWriter(work / place, whole, longest=options.longest, tick=tick)
-            made[found.name] = writer.write(out / place)
-        return {"objects": made, "files": files_in(work)}
+    def main(self, argv: list[str] | None = None) -> int:
+        """Command line; returns the exit code."""
+        parser = stage_parser(self.stage, self.text or "")
+        parser.add_argument("root", type=Path, metavar="ROOT", help=self.folder)
+        add_options(parser.add_argument_group("what the set does not say, or may say otherwise"), self.kind)
 
-    # Folders count by the files in them.
-    settings = {name: value for name, value in asdict(options).items() if not isinstance(value, Path)}
-    return run_stage(Stage(stage, revision, inputs, settings, PACKAGES), out, make, force=force)
+        def run(given: argparse.Namespace, tick: Tick) -> str:
+            manifest = self(given.root, given.out, chosen(self.kind, given), force=given.force, tick=tick)
+            return "\n".join([headline(given.out, manifest), *summaries(manifest["results"], given.out)])
 
-
-def import_command(
-    stage: str, text: str | None, folder: str, kind: type[T], importer: Importer[T], argv: list[str] | None
-) -> int:
-    """The command line of an importer; returns the exit code."""
-    parser = stage_parser(stage, text or "")
-    parser.add_argument("root", type=Path, metavar="ROOT", help=folder)
-    add_options(parser.add_argument_group("what the set does not say, or may say otherwise"), kind)
-
-    def run(given: argparse.Namespace, tick: Tick) -> str:
-        manifest = importer(given.root, given.out, chosen(kind, given), force=given.force, tick=tick)
-        return "\n".join([headline(given.out, manifest), *summaries(manifest["results"], given.out)])
-
-    return run_command(parser, argv, run)
+        return run_command(parser, argv, run)
 
 
 def summaries(results: Mapping[str, Any], out: Path) -> list[str]:

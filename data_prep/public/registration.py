@@ -18,6 +18,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from data_prep.capture.cameras.world import Similarity, centers, nearest_to_lines
 from data_prep.common.progress import Tick
 from data_prep.public.pictures import HALF, resized
 from data_prep.public.scene import Picture, View
@@ -40,12 +41,10 @@ _Fit = tuple[float, np.ndarray, float, np.ndarray]  # overlap, rotation, scale, 
 
 
 @dataclass(frozen=True, eq=False)
-class Similarity:
-    """x' = scale · rotation x + shift, with how well it fits."""
+class Registration:
+    """A similarity, with how well it fits."""
 
-    scale: float
-    rotation: np.ndarray  # (3, 3)
-    shift: np.ndarray  # (3,)
+    move: Similarity  # from the stills' world to the frames'
     overlap: float  # mean intersection over union of the silhouettes
     by_view: dict[str, float]  # the same by camera
     colour: float  # correlation of colours, -1 to 1
@@ -56,19 +55,10 @@ class Similarity:
         """Whether another turn covers the masks as well and has colours that agree nearly as well."""
         return self.second > self.colour - UNDECIDED
 
-    def moved(self, viewmat: np.ndarray) -> np.ndarray:
-        """World to camera (4, 4) of a camera of the first world, in the second; camera units are scaled too."""
-        out = np.eye(4)
-        out[:3, :3] = viewmat[:3, :3] @ self.rotation.T
-        out[:3, 3] = self.scale * viewmat[:3, 3] - out[:3, :3] @ self.shift
-        return out
-
     def told(self) -> dict[str, Any]:
         """As plain data."""
-        return {
-            "scale": self.scale, "rotation": self.rotation.tolist(), "shift": self.shift.tolist(),
-            "overlap": self.overlap, "by_view": self.by_view, "colour": self.colour, "second": self.second,
-        }  # fmt: skip
+        move = {"scale": self.move.scale, "rotation": self.move.rotation.tolist(), "shift": self.move.shift.tolist()}
+        return move | {name: value for name, value in vars(self).items() if name != "move"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +87,7 @@ class _Body:
 
 def register(
     stills: Sequence[tuple[View, Picture]], frames: Sequence[tuple[View, Picture]], *, turns: int, tick: Tick
-) -> Similarity:
+) -> Registration:
     """The similarity from the stills' world to that of the frames, which show the object in one moment.
 
     Args:
@@ -285,15 +275,11 @@ def _principal(window: _Window, place: np.ndarray) -> np.ndarray:
 
 def _crossing(windows: Sequence[_Window]) -> np.ndarray:
     """The point nearest to the rays through the middles of the masks."""
-    normal, right = 1e-9 * np.eye(3), np.zeros(3)
-    for window in windows:
-        r, t = window.view.viewmat[:3, :3], window.view.viewmat[:3, 3]
-        ray = r.T @ np.linalg.solve(window.view.k, np.array([*window.middle, 1.0]))
-        ray /= np.linalg.norm(ray)
-        across = np.eye(3) - np.outer(ray, ray)
-        normal += across
-        right += across @ (-r.T @ t)
-    return np.asarray(np.linalg.solve(normal, right))
+    viewmats = np.stack([window.view.viewmat for window in windows])
+    rays = np.stack([np.linalg.solve(window.view.k, [*window.middle, 1.0]) for window in windows])
+    rays = np.einsum("nji,nj->ni", viewmats[:, :3, :3], rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    point = nearest_to_lines(centers(viewmats), rays)
+    return centers(viewmats).mean(0) if point is None else point
 
 
 def _refined(body: _Body, windows: Sequence[_Window], start: _Fit, step: float) -> _Fit:
@@ -315,7 +301,7 @@ def _refined(body: _Body, windows: Sequence[_Window], start: _Fit, step: float) 
     return (-loss(values), *parts(values))
 
 
-def _best(body: _Body, windows: Sequence[_Window], found: list[_Fit]) -> Similarity:
+def _best(body: _Body, windows: Sequence[_Window], found: list[_Fit]) -> Registration:
     """Of the fits that cover the masks alike, the one whose colours agree best."""
     top = max(fit[0] for fit in found)
     alike = [fit for fit in found if fit[0] > top - CLOSE]
@@ -324,8 +310,8 @@ def _best(body: _Body, windows: Sequence[_Window], found: list[_Fit]) -> Similar
     overlap, rotation, scale, shift = alike[best]
     others = [a for fit, a in zip(alike, agreement, strict=True) if _angle(fit[1], rotation) > APART]
     views = _overlap(body.points @ rotation.T * scale + shift, windows)
-    return Similarity(
-        scale, rotation, shift - scale * rotation @ body.middle, float(overlap),
+    return Registration(
+        Similarity(scale, rotation, shift - scale * rotation @ body.middle), float(overlap),
         {window.view.name: float(value) for window, value in zip(windows, views, strict=True)},
         agreement[best], max(others, default=-1.0),
     )  # fmt: skip

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from data_prep.capture.cameras.output import write_cameras
 from data_prep.capture.masks.clips import write_picture
 from data_prep.common.faults import refuse_faults
 from data_prep.common.progress import Tick
@@ -15,7 +16,7 @@ from data_prep.common.stage import copy_missing, write_npz
 from data_prep.public.pictures import resized
 from data_prep.public.scene import Motion, Picture, PublicObject, View
 from gausim.core.errors import DataError
-from gausim.io.files import replacing, write_json
+from gausim.io.files import write_json
 
 POINTS = "points.npz"
 
@@ -135,22 +136,11 @@ def write_poses(path: Path, posed: Sequence[View], entries: list[dict[str, Any]]
     Raises:
         DataError: the cameras differ in size.
     """
-    import torch
-
-    from gausim.core import Cameras
-    from gausim.io.transforms import write_transforms
-
     for view in posed:
         if view.size != posed[0].size:
             raise DataError(
                 f"{path}: '{view.name}' is {view.size[0]}x{view.size[1]}, '{posed[0].name}' is "
                 f"{posed[0].size[0]}x{posed[0].size[1]}. All pictures of a set need one size."
             )
-    cameras = Cameras(
-        torch.from_numpy(np.stack([view.viewmat for view in posed])).float(),
-        torch.from_numpy(np.stack([view.k for view in posed])).float(),
-        *posed[0].size,
-        tuple(view.name for view in posed),
-    )
-    with replacing(path, typed=True) as temporary:
-        write_transforms(temporary, cameras.validated(str(path)), entries, fps=fps)
+    viewmats, ks = [view.viewmat for view in posed], [view.k for view in posed]
+    write_cameras(path, viewmats, ks, posed[0].size, tuple(view.name for view in posed), entries, fps)

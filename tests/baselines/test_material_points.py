@@ -310,5 +310,8 @@ def test_loss_gradients_reach_the_place_where_a_free_body_begins() -> None:
 def test_bodies_in_hands_are_refused() -> None:
     scene = toy_scene()
     held = replace(scene, hand=torch.where(scene.pinned, 0, -1))
-    with pytest.raises(ConfigError, match=r"hands move .* keep their pins in place"):
+    with pytest.raises(ConfigError, match=r"'toy' has a 'grip' of hands in its dataset.json.*model=gausim"):
         gaussian(held)
+    trained = replace(scene, surroundings=Surroundings(trains_gravity=True))
+    with pytest.raises(ConfigError, match=r"'toy' has 'gravity' that is trained"):
+        gaussian(trained)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from helpers.plain import plain_scene
 from scipy.spatial.transform import Rotation
 
 from gausim.baselines.ballistic import BallisticDynamics, rigid_fit
@@ -14,20 +15,11 @@ from gausim.core import Floor, GaussianScene, HandPath, SimState, Surroundings
 FPS = 24.0
 
 
-def scene(means: torch.Tensor, **fields: object) -> GaussianScene:
-    count = len(means)
-    made = GaussianScene.create(
-        means=means, log_scales=torch.full((count, 3), -3.0), quats=torch.tensor([1.0, 0, 0, 0]).expand(count, 4),
-        opacity_logits=torch.zeros(count), sh=torch.zeros(count, 1, 3),
-    )  # fmt: skip
-    return replace(made, **fields)
-
-
 def cube(*, floor: float | None = None, gravity: float | None = None) -> GaussianScene:
     corners = torch.cartesian_prod(*[torch.tensor([0.0, 0.3])] * 3) * torch.tensor([1.0, 1.2, 0.8])
     plane = None if floor is None else Floor((0.0, 0.0, floor), (0.0, 0.0, 1.0))
     pull = None if gravity is None else (0.0, 0.0, -gravity)
-    return scene(corners + 2.0, surroundings=Surroundings(free=True, gravity=pull, floor=plane))
+    return plain_scene(corners + 2.0, surroundings=Surroundings(free=True, gravity=pull, floor=plane))
 
 
 def placed(body: GaussianScene, shift: list[float], turn: list[float]) -> torch.Tensor:
@@ -79,7 +71,7 @@ def beam(turn: float = 0.0) -> tuple[GaussianScene, HandPath]:
     means = torch.cat([torch.stack((x, torch.full_like(x, y), torch.full_like(x, z)), 1)
                        for y in (-0.01, 0.01) for z in (-0.01, 0.01)])  # fmt: skip
     hand = torch.where(means[:, 0] < 0.05, 0, torch.where(means[:, 0] > 0.95, 1, -1))
-    body = scene(means, pinned=hand >= 0, hand=hand)
+    body = plain_scene(means, pinned=hand >= 0, hand=hand)
     frames = []
     for part in (0.0, 1.0):
         moved = means[hand >= 0].clone()

@@ -10,9 +10,20 @@ import pytest
 import torch
 from helpers.toy_object import toy_scene
 
+from gausim.baselines.deformation_field import DeformationField
+from gausim.baselines.linear_tracks import LinearTracks
 from gausim.baselines.spring_gaus.anchors import Anchors
 from gausim.baselines.spring_gaus.spring_mass import ConstantVelocity, SpringMass, slowest_vibration
-from gausim.core import ConfigError, DivergenceError, FittedMethod, FittedState, SceneError, SimState
+from gausim.core import (
+    ConfigError,
+    DivergenceError,
+    FittedMethod,
+    FittedState,
+    Floor,
+    SceneError,
+    SimState,
+    Surroundings,
+)
 from gausim.core.fitted import FittedDynamics
 from gausim.ops.quaternion import quaternion_to_matrix
 
@@ -34,6 +45,34 @@ def rolled(method: FittedMethod, frames: int) -> list[FittedState]:
     for _ in range(frames):
         states.append(method.advance(states[-1]))
     return states
+
+
+@pytest.mark.parametrize(
+    ("around", "text"),
+    [
+        ({"gravity": (0.0, 0.0, -9.8)}, "'gravity'"),
+        ({"trains_gravity": True}, "'gravity' that is trained"),
+        ({"free": True, "floor": Floor((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))}, "'free', a 'floor'"),
+    ],
+)
+def test_surroundings_that_springs_do_not_know_are_refused(around: dict[str, Any], text: str) -> None:
+    scene = replace(toy_scene(), surroundings=Surroundings(**around))
+    recorded: Any = {"scenes": [toy_scene(), scene], "fps": [24.0] * 2, "scene_of_sequence": [0, 1], "seen": 7}
+    with pytest.raises(ConfigError, match=rf"spring_mass: 'toy' has {text} in its dataset.json, .*model=gausim"):
+        SpringMass(anchors=40, **recorded)
+    if "free" not in around:
+        ConstantVelocity(anchors=40, **recorded)
+
+
+def test_no_baseline_keeps_pins_in_place_that_hands_move() -> None:
+    scene = toy_scene()
+    recorded: Any = {"fps": [24.0], "scene_of_sequence": [0], "seen": 7}
+    recorded["scenes"] = [replace(scene, hand=torch.where(scene.pinned, 0, -1))]
+    for method in (SpringMass, ConstantVelocity, LinearTracks):
+        with pytest.raises(ConfigError, match="'toy' has a 'grip' of hands"):
+            method(anchors=40, **recorded)
+    with pytest.raises(ConfigError, match="'toy' has a 'grip' of hands"):
+        DeformationField(**recorded)
 
 
 def test_kernels_follow_an_affine_motion_with_its_gradient() -> None:

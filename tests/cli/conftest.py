@@ -11,7 +11,7 @@ from helpers.shared import Shared
 from helpers.sweeps import Sweeps
 from helpers.toy_runs import Trainings
 
-from gausim.cli import evaluate
+from gausim.cli import evaluate, training_run
 from gausim.cli import train as command
 from gausim.runs.directory import RunDirectory
 
@@ -50,4 +50,4 @@ def evaluated_here(monkeypatch: pytest.MonkeyPatch) -> None:
     def evaluate_run(run: RunDirectory) -> None:
         assert evaluate.main([str(run.path)]) == 0
 
-    monkeypatch.setattr(command, "_evaluate", evaluate_run)
+    monkeypatch.setattr(training_run, "_evaluate", evaluate_run)

@@ -7,8 +7,8 @@ import pytest
 from helpers import toy_object
 from helpers.played import stand_in
 
-from gausim.cli import evaluate
-from gausim.compose import build as _run
+from gausim.cli import evaluate, evaluate_run, simulate_run
+from gausim.compose import build
 from gausim.core import DataError, SimState
 
 
@@ -28,7 +28,8 @@ def run(toy, tmp_path, monkeypatch):
         return rollout(SimState(toy.scene.means, initial.state(sequence).previous), steps)
 
     loaded = stand_in(tmp_path / "run", toy.root, model=model, initial_states=initial, predict=predict)
-    monkeypatch.setattr(_run, "load_run", lambda path, data=None: loaded)
+    for home in (evaluate_run, simulate_run, build):
+        monkeypatch.setattr(home, "load_run", lambda path, data=None: loaded)
     return loaded
 
 

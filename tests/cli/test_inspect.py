@@ -9,30 +9,22 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.plain import plain_scene
 from plyfile import PlyData
 
 from gausim.cli import inspect as command
 from gausim.cli.main import main
 from gausim.compose.config import compose
 from gausim.compose.places import more_settings
-from gausim.core.scene import GaussianScene
 from gausim.io.ply import load_scene, save_scene
-from gausim.report.pictures import clusters, material
+from gausim.report.pictures import kernels
 
 
 @pytest.fixture
 def scene_file(tmp_path: Path) -> Path:
     axis = [torch.linspace(0, 1, 4), torch.linspace(0, 1, 3), torch.linspace(0, 2, 5)]
     means = torch.stack(torch.meshgrid(*axis, indexing="ij"), -1).reshape(-1, 3)
-    count = len(means)
-    scene = GaussianScene.create(
-        means=means,
-        log_scales=torch.full((count, 3), -2.0),
-        quats=torch.tensor([1.0, 0, 0, 0]).expand(count, 4),
-        opacity_logits=torch.zeros(count),
-        sh=torch.zeros(count, 4, 3),
-    )
-    save_scene(scene, tmp_path / "block.ply")
+    save_scene(plain_scene(means, log_scale=-2.0, sh=torch.zeros(len(means), 4, 3)), tmp_path / "block.ply")
     return tmp_path / "block.ply"
 
 
@@ -61,7 +53,7 @@ def test_figures_picture_and_masks(scene_file: Path, capsys: pytest.CaptureFixtu
 @pytest.mark.parametrize(("more", "down"), [([], True), (["--up=-z"], True), (["--up=z"], False)])
 def test_up_points_away_from_the_pins_unless_given(scene_file: Path, monkeypatch, more: list[str], down: bool) -> None:
     drawn: list[bool] = []
-    monkeypatch.setattr(clusters, "draw_clusters", lambda *_, flip, **__: drawn.append(flip))
+    monkeypatch.setattr(kernels, "draw_clusters", lambda *_, flip, **__: drawn.append(flip))
     assert main(["inspect", str(scene_file), "--pin-above", "z=1.9", *more]) == 0
     assert drawn == [down]
 
@@ -122,9 +114,9 @@ def test_a_trained_run_tells_what_it_has_learned_and_no_more(toy_run: Path, tmp_
 
 def test_scales_leave_out_extremes_and_unknown_kernels_are_grey() -> None:
     values = torch.cat((torch.linspace(1, 2, 1000), torch.tensor([1e6, torch.nan])))
-    scale = material.property_scale(values)
+    scale = kernels.property_scale(values)
     assert 1 <= scale.vmin < 1.05 and 1.95 < scale.vmax <= 2
-    colors = material.property_colors(values, scale)
+    colors = kernels.property_colors(values, scale)
     assert torch.equal(colors[-2], colors[999]) and float(colors[-1].std()) < 1e-6 and float(colors[0].std()) > 0.05
-    same = material.property_scale(torch.ones(5))
+    same = kernels.property_scale(torch.ones(5))
     assert same.vmin < 1 < same.vmax

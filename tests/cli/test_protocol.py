@@ -13,7 +13,7 @@ from helpers.evaluations import make_quick
 from omegaconf import OmegaConf
 
 from gausim.cli import evaluate, report, simulate, train
-from gausim.cli.test_part import check_protocol
+from gausim.cli.training_run import check_protocol
 from gausim.core import ConfigError, DataError, RunError
 from gausim.data import frames as frames_of_files
 from gausim.data import records
@@ -66,8 +66,8 @@ def trained(toy: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamesp
 @pytest.fixture
 def run(trained: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     make_quick(monkeypatch)
-    monkeypatch.setattr("gausim.report.pictures.figures.error_figure", lambda *unused, **options: None)
-    monkeypatch.setattr("gausim.report.pictures.motion.diagnosis_figure", lambda *unused: False)
+    monkeypatch.setattr("gausim.cli.evaluate_run.error_figure", lambda *unused, **options: None)
+    monkeypatch.setattr("gausim.cli.evaluate_run.diagnosis_figure", lambda *unused: False)
     return Path(shutil.copytree(trained.run, tmp_path / "run"))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,8 +11,9 @@ import numpy as np
 import pytest
 import torch
 from helpers import toy_object
+from helpers.plain import edit_json, plain_scene
 
-from gausim.core import Cameras, GaussianScene
+from gausim.core import Cameras
 from gausim.io.transforms import write_transforms
 
 VIEWS = ("cam_0", "cam_1", "cam_2")
@@ -59,15 +59,8 @@ class Blob(toy_object.ToyObject):
 
 def make_object(root: Path, *, name: str = "blob", sequences: int = SEQUENCES) -> Path:
     """Writes the whole directory."""
-    scene = GaussianScene.create(
-        means=torch.rand(POINTS, 3, generator=torch.Generator().manual_seed(0)),
-        log_scales=torch.full((POINTS, 3), -3.0),
-        quats=torch.tensor([1.0, 0, 0, 0]).repeat(POINTS, 1),
-        opacity_logits=torch.zeros(POINTS),
-        sh=torch.zeros(POINTS, 1, 3),
-        pinned=torch.arange(POINTS) == 0,
-        name=name,
-    )
+    means = torch.rand(POINTS, 3, generator=torch.Generator().manual_seed(0))
+    scene = plain_scene(means, pinned=torch.arange(POINTS) == 0, name=name)
     names = dict.fromkeys((f"seq_{s:03d}" for s in range(sequences)), 0.0)
     cameras = ring_of_cameras(VIEWS)
     toy_object.write_object(Blob(root, scene, FRAMES, first_unseen=16, amplitudes=names, cameras=cameras))
@@ -90,13 +83,6 @@ def blob(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def spoilt(tmp_path: Path) -> Path:
     """One object of one sequence, to be spoilt."""
     return make_object(tmp_path / "blob", sequences=1)
-
-
-def edit_json(path: Path, edit) -> None:
-    """Applies ``edit`` to the JSON object in a file."""
-    data = json.loads(path.read_text())
-    edit(data)
-    path.write_text(json.dumps(data))
 
 
 @pytest.fixture(scope="session")

@@ -1,11 +1,8 @@
-"""Training streams: read ahead within bounds, each rank its share, every frame once."""
+"""Training streams: a few batches in memory, each rank its share, every frame once."""
 
 from __future__ import annotations
 
-import threading
-import time
 import tracemalloc
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,11 +10,10 @@ import numpy as np
 import pytest
 
 from data_prep.pack import pack
-from gausim.core import Cameras, DataError
+from gausim.core import Cameras
 from gausim.data import frames as frames_module
 from gausim.data.curriculum import Curriculum
 from gausim.data.datamodule import ReadyDataModule
-from gausim.data.prefetch import read_ahead
 from gausim.data.records import SequenceRecord
 from gausim.io.packed import HEADER, PIXELS, Crop, header
 
@@ -57,9 +53,8 @@ def epoch(data: ReadyDataModule, number: int) -> list[list[tuple[int, int]]]:
     return [[(s.sequence_id, int(s.frames[-1, 0, -1, -1, 2]) - 3) for s in batch] for batch in loader]
 
 
-@pytest.mark.parametrize("prefetch", [1, 7])
-def test_reading_ahead_changes_nothing(mixed: Path, prefetch: int) -> None:
-    plain, ahead = stream(mixed, prefetch=0, repeats=3), stream(mixed, prefetch=prefetch, repeats=3)
+def test_reading_ahead_changes_nothing(mixed: Path) -> None:
+    plain, ahead = stream(mixed, repeats=3), stream(mixed, prefetch=2, repeats=3)
     for number in (0, 2):
         found = epoch(ahead, number)
         assert found == epoch(plain, number) and len(found) == 8
@@ -67,46 +62,8 @@ def test_reading_ahead_changes_nothing(mixed: Path, prefetch: int) -> None:
         assert {last for batch in found for _, last in batch} == {number + 1}
 
 
-def test_at_most_so_many_items_are_read_ahead() -> None:
-    made = 0
-
-    def source() -> Iterator[int]:
-        nonlocal made
-        for item in range(12):
-            made += 1
-            yield item
-
-    ahead = read_ahead(source(), 3)
-    for asked in range(1, 10):
-        assert next(ahead) == asked - 1
-        limit = time.monotonic() + 5
-        while made < min(12, asked + 3) and time.monotonic() < limit:
-            time.sleep(0.001)
-        time.sleep(0.005)  # long enough for a reader without bounds to run away
-        assert made == min(12, asked + 3)
-    assert list(ahead) == [9, 10, 11]
-
-
-def test_an_error_comes_where_it_happened_and_threads_end() -> None:
-    before = threading.active_count()
-
-    def broken() -> Iterator[int]:
-        yield from (0, 1)
-        raise DataError("cam_0/0002.png: torn")
-
-    ahead, seen = read_ahead(broken(), 4), []
-    with pytest.raises(DataError, match="torn"):
-        seen += [next(ahead), next(ahead)]
-        next(ahead)
-    assert seen == [0, 1]
-    left = read_ahead(iter(range(100)), 2)
-    next(left)
-    left.close()
-    assert threading.active_count() == before
-
-
-def test_memory_is_bounded_by_the_batches_in_flight(tmp_path: Path, tiny: SimpleNamespace) -> None:
-    """A packed set of ten batches: over three epochs no more than the batches in flight are in memory."""
+def test_memory_does_not_grow_with_the_set(tmp_path: Path, tiny: SimpleNamespace) -> None:
+    """A packed set of ten batches: over three epochs no more than two of them are in memory."""
     root = tiny.object(tmp_path / "large", sequences=1)
     sequences, frames, views, side = 10, 16, ("cam_0", "cam_1", "cam_2"), 160
     (root / "sequences" / "seq_000").rename(tmp_path / "small")
@@ -114,7 +71,7 @@ def test_memory_is_bounded_by_the_batches_in_flight(tmp_path: Path, tiny: Simple
     block = frames * 4 * side * side
     for number in range(sequences):
         _sparse_sequence(root / "sequences" / f"seq_{number:03d}", cameras, frames, side, block)
-    data = stream(root, batch_size=1, prefetch=1, curriculum=Curriculum(t_start=15))
+    data = stream(root, batch_size=1, curriculum=Curriculum(t_start=15))
     loader = data.train_dataloader()
     batch = frames * 2 * 4 * side * side  # two training views
     tracemalloc.start()
@@ -128,8 +85,8 @@ def test_memory_is_bounded_by_the_batches_in_flight(tmp_path: Path, tiny: Simple
             assert shown == sequences
     finally:
         tracemalloc.stop()
-    # In use, and one read ahead; a batch more while the consumer drops the old one for the new one.
-    assert max(peaks) < 3.5 * batch < sequences * batch / 2
+    # The old one while the new one is read.
+    assert max(peaks) < 2.5 * batch < sequences * batch / 2
 
 
 def _sparse_sequence(folder: Path, cameras: Cameras, frames: int, side: int, block: int) -> None:
@@ -151,7 +108,7 @@ def test_a_rank_reads_only_its_share(mixed: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(SequenceRecord, "frames", noted)
     shares = []
     for rank in range(2):
-        data = ReadyDataModule(mixed, batch_size=3, repeats=1, curriculum=Curriculum(t_max=5), prefetch=2)
+        data = ReadyDataModule(mixed, batch_size=3, repeats=1, curriculum=Curriculum(t_max=5))
         data.trainer = SimpleNamespace(global_rank=rank, world_size=2)  # type: ignore[assignment]
         data.setup("fit")
         read.clear()

@@ -17,6 +17,7 @@ import pytest
 import torch
 import yaml
 from helpers import toy_object
+from helpers.plain import edit_json
 
 from data_prep.assemble import AssembleOptions, assemble, main
 from data_prep.dataset import main as prepare_main
@@ -104,12 +105,6 @@ def test_facts_beside_the_pictures_are_kept_and_options_win(toy: Any, tmp_path: 
     assert (found["name"], found["heldout_views"], found["train_frames"]) == ("rose", [], [0, 4])
 
 
-def _edit(path: Path, change: Any) -> None:
-    data = json.loads(path.read_text())
-    change(data)
-    path.write_text(json.dumps(data))
-
-
 def _opaque(toy: Any) -> None:
     path = toy.root / "sequences" / "seq_001" / "cam_1" / "0000.png"
     import cv2
@@ -132,15 +127,15 @@ FAULTS = {
     "nothing": (lambda toy: [shutil.rmtree(toy.root), toy.root.mkdir()], DataError, "no posed pictures.*--every"),
     "gone": (lambda toy: shutil.rmtree(toy.root), DataError, "no such folder"),
     "rates": (
-        lambda toy: _edit(toy.root / "sequences/seq_001/transforms.json", lambda d: d.update(fps=25)),
+        lambda toy: edit_json(toy.root / "sequences/seq_001/transforms.json", lambda d: d.update(fps=25)),
         DataError, "different rates.*seq_000.*24",
     ),
     "no rate": (
-        lambda toy: [_edit(p, lambda d: d.pop("fps")) for p in toy.root.glob("sequences/*/transforms.json")],
+        lambda toy: [edit_json(p, lambda d: d.pop("fps")) for p in toy.root.glob("sequences/*/transforms.json")],
         ConfigError, "--fps",
     ),
     "cameras": (
-        lambda toy: _edit(toy.root / "sequences/seq_001/transforms.json",
+        lambda toy: edit_json(toy.root / "sequences/seq_001/transforms.json",
                           lambda d: d.update(frames=[f for f in d["frames"] if f["camera"] != "cam_2"])),
         DataError, r"seq_001.*has the cameras \['cam_0', 'cam_1'\], seq_000 has",
     ),
@@ -148,7 +143,7 @@ FAULTS = {
         lambda toy: (toy.root / "sequences/seq_000/cam_0/0005.png").unlink(), DataError, r"cam_0/0005\.png: not found",
     ),
     "outside": (
-        lambda toy: _edit(toy.root / "transforms.json",
+        lambda toy: edit_json(toy.root / "transforms.json",
                           lambda d: d["frames"][0].update(file_path="../cut/../cut2/x.png")
                           or shutil.copytree(toy.root / "images", toy.root.parent / "cut2")
                           and shutil.copyfile(toy.root / "images/cam_0.png", toy.root.parent / "cut2/x.png")),

@@ -308,9 +308,9 @@ def real_command(mesh: Path, out: Path) -> list[str]:
     if not python:
         pytest.skip("GAUSIM_BLENDER_PYTHON names no Python with bpy")
     return [
-        sys.executable, "-m", "data_prep.blender_bunny", "--mesh", str(mesh), "--out", str(out), "--up", "z", "--quick",
-        "--sequences", "2", "--frames", "4", "--stills", "3", "--views", "2", "--blender-python", python,
-        "--workers", "1",
+        sys.executable, "-m", "gausim.cli.main", "prepare", "blender_bunny", "--mesh", str(mesh), "--out", str(out),
+        "--up", "z", "--quick", "--sequences", "2", "--frames", "4", "--stills", "3", "--views", "2",
+        "--blender-python", python, "--workers", "1",
     ]  # fmt: skip
 
 

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 import pytest
 from helpers import colmap_files
+from helpers.plain import Call
+from helpers.public_sets import write_cloud
 from helpers.toy_object import toy_scene
 
 from data_prep.import_ready import ReadyOptions, import_ready, main
@@ -27,16 +29,6 @@ FRAMES = 3
 OPTIONS = ReadyOptions(train_frames=2)
 # Sequence 2 has no cameras of its own in the model, it shares those of its twin 1; 3 has one camera more; 4 is invalid.
 VIDEOS = {"seq_00001": (0, 1), "seq_00002": (0, 1), "seq_00003": (0, 1, 2), "seq_00004": (0, 1)}
-
-
-class Canary:
-    """Leaves a file behind when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple:
-        return os.mkdir, (str(self.path),)
 
 
 def image(path: Path, value: int, channels: int = 3) -> None:
@@ -74,14 +66,8 @@ def ready(tmp_path: Path) -> Path:
     for name, chosen in (("moving_part_points", means[:, 2] > 0.3), ("clean_object_points", means[:, 0] > -0.1)):
         write_cloud(root / f"{name}.ply", means[chosen] + 0.004)
     (root / "pin_mask.json").write_text(json.dumps({"indices": np.flatnonzero(means[:, 2] < 0.4).tolist()}))
-    (root / "sim_mask.pkl").write_bytes(pickle.dumps(Canary(tmp_path / "canary")))
+    (root / "sim_mask.pkl").write_bytes(pickle.dumps(Call(os.mkdir, str(tmp_path / "canary"))))
     return root
-
-
-def write_cloud(path: Path, points: np.ndarray) -> None:
-    header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
-    header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
-    path.write_text(header + "\n".join(" ".join(map(repr, map(float, p))) for p in points) + "\n")
 
 
 def test_the_layout_becomes_ours(ready: Path, tmp_path: Path) -> None:

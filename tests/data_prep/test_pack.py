@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from helpers import toy_object
+from helpers.plain import edit_json
 
 from data_prep.pack import pack
 from gausim.data.dataset import SampleKey, SequenceIndex
@@ -80,14 +81,8 @@ def store(toy: Path, tmp_path: Path) -> Path:
     return tmp_path / "store"
 
 
-def _edit(path: Path, change: Callable[[dict], object]) -> None:
-    data = json.loads(path.read_text())
-    change(data)
-    path.write_text(json.dumps(data))
-
-
 def _header(change: Callable[[dict], object]) -> Callable[[Path], object]:
-    return lambda store: _edit(store / "sequences/seq_000" / HEADER, change)
+    return lambda store: edit_json(store / "sequences/seq_000" / HEADER, change)
 
 
 FAULTS: dict[str, tuple[Callable[[Path], object], str, str]] = {
@@ -100,7 +95,7 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str, str]] = {
     "focal": (_header(lambda d: d["views"][0]["K"][0].__setitem__(0, -1.0)), "seq_000", "focal"),
     "fps": (_header(lambda d: d.update(fps=25)), "seq_000", "fps"),
     "view": (_header(lambda d: d["views"][0].update(name="cam_9")), "seq_000", "cam_9"),
-    "facts": (lambda s: _edit(s / "dataset.json", lambda d: d.update(fps=-1)), "dataset.json", "fps"),
+    "facts": (lambda s: edit_json(s / "dataset.json", lambda d: d.update(fps=-1)), "dataset.json", "fps"),
     "stranger": (lambda s: (s / "notes.txt").write_text("x"), "notes.txt", "not in stage.json"),
     "no sequences": (lambda s: shutil.rmtree(s / "sequences"), "sequences", "holds no sequence"),
 }

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers import colmap_files
+from helpers import colmap_files, public_sets
 
 from data_prep import poses as command
 from data_prep.capture.cameras.lenses import rays_of, straighten
@@ -32,14 +32,7 @@ OPTIONS = MappingOptions(camera_model="SIMPLE_PINHOLE", features=1500, feature_s
 def room_viewmat(azimuth: float) -> np.ndarray:
     """(4, 4) of a camera that looks into the corner x = y = z = 0 of a room from its middle."""
     eye = 3.2 * np.array([np.cos(azimuth), np.sin(azimuth), 0.45 + 0.1 * np.sin(9 * azimuth)])
-    forward = np.array([0.3, 0.3, 0.35]) - eye
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack((right, np.cross(forward, right), forward))
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    return viewmat
+    return public_sets.look(eye, np.array([0.3, 0.3, 0.35]), np.array([0.0, 0.0, 1.0]))
 
 
 def photograph_room(viewmat: np.ndarray, walls: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.plain import Call
 from helpers.public_sets import Sample
 
 from data_prep import import_3dgsim, import_pacnerf, import_physdreamer, import_phystwin, import_springgaus
@@ -37,13 +38,16 @@ class Damage:
     named: str | None = None  # the file in the message, where it is not this one
 
 
+def at(data: Any, keys: tuple[Any, ...]) -> Any:
+    for key in keys:
+        data = data[key]
+    return data
+
+
 def put(*keys: Any, to: Any) -> Callable[[Any], Any]:
     def change(data: Any) -> Any:
-        *above, last = keys
-        place = data
-        for key in above:
-            place = place[key]
-        place[last] = to(place[last]) if callable(to) else to
+        place = at(data, keys[:-1])
+        place[keys[-1]] = to(place[keys[-1]]) if callable(to) else to
         return data
 
     return change
@@ -51,11 +55,7 @@ def put(*keys: Any, to: Any) -> Callable[[Any], Any]:
 
 def drop(*keys: Any) -> Callable[[Any], Any]:
     def change(data: Any) -> Any:
-        *above, last = keys
-        place = data
-        for key in above:
-            place = place[key]
-        del place[last]
+        del at(data, keys[:-1])[keys[-1]]
         return data
 
     return change
@@ -67,16 +67,6 @@ def narrow(pixels: np.ndarray) -> np.ndarray:
 
 def black(pixels: np.ndarray) -> np.ndarray:
     return 0 * pixels
-
-
-class Canary:
-    """Would leave a folder behind if it were unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple:
-        return os.mkdir, (str(self.path),)
 
 
 def times(factor: float) -> Callable[[list], list]:
@@ -154,7 +144,7 @@ PHYSTWIN = (
     Damage("calibrate.pkl", lambda data: data[:2], "list of 3 poses"),
     Damage("calibrate.pkl", put(1, slice(0, 3), to=lambda m: m * 1.5), "[1]: expected a rotation"),
     Damage("calibrate.pkl", put(1, to="x"), "[1]: expected"),
-    Damage("calibrate.pkl", put(0, to=Canary(Path("canary"))), "posix.mkdir"),
+    Damage("calibrate.pkl", put(0, to=Call(os.mkdir, "canary")), "posix.mkdir"),
     Damage("final_data.pkl", lambda data: np.array([{}], dtype=object), "elements of type 'O8'"),
     Damage("final_data.pkl", lambda data: [1], "expected a dict"),
     Damage("final_data.pkl", drop("controller_points"), "field 'controller_points' is missing"),

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 import torch
+from helpers.plain import cameras_at
 
 from data_prep import reconstruct
-from gausim.core import Cameras
 from gausim.data.images import write_rgba
 from gausim.io.ply import load_scene
 from gausim.io.transforms import write_transforms
@@ -22,19 +22,11 @@ OPTIONS = ["--iterations", "40", "--kernels", "60", "--coarse", "0"]
 @pytest.fixture
 def ball(tmp_path: Path) -> Path:
     """A ball, red above and blue below, seen by twelve cameras all around: transforms.json with RGBA pictures."""
-    viewmats = []
-    for i in range(12):
-        angle = torch.tensor(2 * torch.pi * i / 12)
-        away = torch.stack((angle.cos(), angle.sin(), torch.tensor(0.4 * (-1) ** i)))
-        away = away / away.norm()
-        right = torch.nn.functional.normalize(torch.linalg.cross(-away, torch.tensor([0.0, 0.0, 1.0])), dim=0)
-        viewmat = torch.eye(4)
-        viewmat[:3, :3] = torch.stack((right, torch.linalg.cross(-away, right), -away))
-        viewmat[2, 3] = 2.5
-        viewmats.append(viewmat)
-    K = torch.tensor([[50.0, 0, SIZE / 2], [0, 50.0, SIZE / 2], [0, 0, 1]])
+    angle = 2 * torch.pi * torch.arange(12) / 12
+    away = torch.stack((angle.cos(), angle.sin(), 0.4 * (-1.0) ** torch.arange(12)), -1)
     names = [f"images/{i:02d}.png" for i in range(12)]
-    cameras = Cameras(torch.stack(viewmats), K.repeat(12, 1, 1), SIZE, SIZE, tuple(names))
+    eyes = 2.5 * torch.nn.functional.normalize(away, dim=-1)
+    cameras = cameras_at(eyes, (0.0, 0.0, 0.0), focal=50.0, size=SIZE, names=names)
     (tmp_path / "ball" / "images").mkdir(parents=True)
     y, x = torch.meshgrid(torch.arange(SIZE) + 0.5 - SIZE / 2, torch.arange(SIZE) + 0.5 - SIZE / 2, indexing="ij")
     inside = (x**2 + y**2).sqrt() < 50 * RADIUS / 2.5

@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.plain import plain_scene
 
 from data_prep.common.stage import read_manifest
 from data_prep.ready.selections import parse_selection, read_points
 from data_prep.select import main, select
-from gausim.core import ConfigError, DataError, GaussianScene, SceneError
+from gausim.core import ConfigError, DataError, SceneError
 from gausim.io.ply import load_scene, save_scene
 
 
@@ -22,14 +23,7 @@ def scene(tmp_path: Path) -> Path:
     rng = np.random.default_rng(1)
     means = rng.uniform(-0.5, 0.5, (60, 3))
     means[40:] = 0.4 * means[40:] + (5, 0, 0)
-    made = GaussianScene.create(
-        means=torch.from_numpy(means).float(),
-        log_scales=torch.full((60, 3), -2.5),
-        quats=torch.tensor([[1.0, 0, 0, 0]]).expand(60, 4).contiguous(),
-        opacity_logits=torch.full((60,), 3.0),
-        sh=torch.zeros(60, 1, 3),
-    )
-    save_scene(made, tmp_path / "scene.ply")
+    save_scene(plain_scene(torch.from_numpy(means).float(), log_scale=-2.5, opacity=3.0), tmp_path / "scene.ply")
     (tmp_path / "scene.masks.npz").unlink()
     return tmp_path / "scene.ply"
 
@@ -105,15 +99,4 @@ def test_selections_that_hold_nothing_are_refused(
     with pytest.raises(ConfigError, match="no mask"):
         select(scene, tmp_path / "out", {})
     with pytest.raises(SceneError, match="component radius"):
-        parse_selection("component 1e9")[0](wide_scene())
-
-
-def wide_scene() -> GaussianScene:
-    """So many kernels that all pairs of them would not fit into memory."""
-    return GaussianScene.create(
-        means=torch.zeros(6000, 3),
-        log_scales=torch.zeros(6000, 3),
-        quats=torch.ones(6000, 4),
-        opacity_logits=torch.zeros(6000),
-        sh=torch.zeros(6000, 1, 3),
-    )
+        parse_selection("component 1e9")[0](plain_scene(torch.zeros(6000, 3)))  # all pairs fill no memory

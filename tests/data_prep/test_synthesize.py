@@ -56,16 +56,6 @@ def test_same_seed_same_bytes_other_seed_others(made: Path, tmp_path: Path) -> N
     assert first[motion] != other[motion] and first["scene.ply"] != other["scene.ply"]
 
 
-def test_set_of_an_earlier_version_is_replaced_by_force_alone(tmp_path: Path, capsys) -> None:
-    out = tmp_path / "set"
-    out.mkdir()
-    (out / "synthetic.json").write_text('{"generator": 2}')
-    command = [*TINY, "--out", str(out), "--objects", "pudding_soft", "--sequences", "1"]
-    assert main(command) == 2 and "--force" in capsys.readouterr().err
-    assert main([*command, "--force"]) == 0
-    assert (out / "stage.json").is_file() and not (out / "synthetic.json").exists()
-
-
 def test_set_is_read_by_the_data_module(made: Path) -> None:
     data = ReadyDataModule(made, batch_size=4, repeats=1)
     data.setup("fit")

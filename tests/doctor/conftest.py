@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from helpers import toy_object
+from helpers.plain import cameras_at, plain_scene
 
 from gausim.core import Cameras, GaussianScene, Trajectory
 
@@ -41,29 +42,16 @@ def body() -> GaussianScene:
     arm = torch.stack((torch.linspace(0.3, 0.9, 6), torch.linspace(0.1, 0.5, 6), torch.linspace(0.7, 1.1, 6)), 1)
     means = torch.cat((trunk, arm))
     generator = torch.Generator().manual_seed(0)
-    return GaussianScene.create(
-        means=means,
-        log_scales=torch.full((len(means), 3), math.log(0.08)),
-        quats=torch.tensor([1.0, 0, 0, 0]).expand(len(means), 4).clone(),
-        opacity_logits=torch.full((len(means),), 4.0),
-        sh=2 * torch.rand(len(means), 1, 3, generator=generator) - 1,
-        pinned=means[:, 2] < 0.1,
-        name="swaying",
-    )
+    return plain_scene(
+        means, log_scale=math.log(0.08), opacity=4.0, sh=2 * torch.rand(len(means), 1, 3, generator=generator) - 1,
+        pinned=means[:, 2] < 0.1, name="swaying",
+    )  # fmt: skip
 
 
 def ring() -> Cameras:
-    viewmats = []
-    for angle, height in ((0.0, 1.4), (1.5, 1.9), (-0.9, 0.8), (2.6, 1.2)):
-        eye = torch.tensor([4 * math.sin(angle), -4 * math.cos(angle), height])
-        forward = torch.nn.functional.normalize(torch.tensor([0.1, 0.1, 0.6]) - eye, dim=0)
-        right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
-        viewmat = torch.eye(4)
-        viewmat[:3, :3] = torch.stack((right, torch.linalg.cross(forward, right), forward))
-        viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-        viewmats.append(viewmat)
-    k = torch.tensor([[110.0, 0, SIZE / 2], [0, 110.0, SIZE / 2], [0, 0, 1]])
-    return Cameras(torch.stack(viewmats), k.expand(4, 3, 3).clone(), SIZE, SIZE, VIEWS)
+    places = ((0.0, 1.4), (1.5, 1.9), (-0.9, 0.8), (2.6, 1.2))
+    eyes = torch.tensor([[4 * math.sin(angle), -4 * math.cos(angle), height] for angle, height in places])
+    return cameras_at(eyes, (0.1, 0.1, 0.6), focal=110.0, size=SIZE, names=VIEWS)
 
 
 @pytest.fixture(scope="session")

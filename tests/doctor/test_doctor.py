@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers import mistakes
+from helpers.plain import edit_json
 
 from gausim.cli.main import main
 
@@ -146,7 +147,7 @@ def late_without_scene(root: Path) -> None:
 
 
 def short(root: Path) -> None:
-    mistakes.edit(root / "dataset.json", lambda data: data.update(train_frames=[0, 4]))
+    edit_json(root / "dataset.json", lambda data: data.update(train_frames=[0, 4]))
     for name in ("seq_001", "seq_002", "seq_003"):
         shutil.rmtree(root / "sequences" / name)
 
@@ -225,7 +226,7 @@ def test_a_folder_within_an_object_is_sent_to_the_object(swaying: Path, capsys: 
 def test_a_free_body_needs_no_pin_and_may_begin_elsewhere(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     MISTAKES["no pin"](spoilt)
     MISTAKES["not at rest"](spoilt)
-    mistakes.edit(spoilt / "dataset.json", lambda data: data.update(free=True))
+    edit_json(spoilt / "dataset.json", lambda data: data.update(free=True))
     _, entry = told(spoilt, capsys)
     assert "pins" not in found(entry)
     assert not any("not at rest" in f["what"] for f in entry["findings"])
@@ -241,7 +242,7 @@ def test_pins_may_be_given(spoilt: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 @pytest.mark.slow
 def test_the_page_shows_findings_and_escapes_names(spoilt: Path, tmp_path: Path) -> None:
-    mistakes.edit(spoilt / "dataset.json", lambda data: data.update(name="<b>$x$"))
+    edit_json(spoilt / "dataset.json", lambda data: data.update(name="<b>$x$"))
     MISTAKES["one camera moved"](spoilt)
     assert main(["doctor", str(spoilt), "--out", str(tmp_path / "seen")]) == 1
     page = (tmp_path / "seen" / "index.html").read_text()

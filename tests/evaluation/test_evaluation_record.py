@@ -19,7 +19,7 @@ from gausim.data.objects import ObjectData
 from gausim.evaluation import evaluation
 from gausim.evaluation.evaluation import absent_metrics, default_metrics, evaluate_object, write_evaluation
 from gausim.evaluation.recorder import PictureRecorder
-from gausim.metrics import flip
+from gausim.metrics import image as flip
 from gausim.metrics.lpips import expected_shapes
 from gausim.render.reference import ReferenceRenderer
 from gausim.results.pictures import load_pictures

@@ -155,13 +155,9 @@ def _object(folder: Path) -> Iterator[Reader]:
 
 def _surroundings(folder: Path) -> Iterator[Reader]:
     root = toy_object.write_toy_object(folder / "held", frames=8).root
-    facts = json.loads((root / "dataset.json").read_text())
     floor = {"point": [0.0, 0.0, -1.0], "normal": [0.0, 0.0, 1.0], "friction": 0.3, "restitution": 0.1}
-    facts |= {"gravity": [0.0, 0.0, -9.8], "floor": floor, "free": False, "grip": 0.5}
-    (root / "dataset.json").write_text(json.dumps(facts))
-    points = np.repeat(SCENE.means[SCENE.pinned][:4].numpy()[None], 8, 0)
-    for sequence in (root / "sequences").iterdir():
-        np.savez(sequence / "hands.npz", points=points, hand=np.zeros(4, np.int64))
+    toy_object.surround(root, gravity=[0.0, 0.0, -9.8], floor=floor, free=False)
+    toy_object.hold(root, SCENE.means[SCENE.pinned][:4], torch.zeros(8, 3))
 
     def held(_: Path) -> Any:
         data = ObjectData(root)

@@ -7,9 +7,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gausim.core import Cameras, GaussianScene
+from gausim.core import Cameras
 from gausim.runs.checkpoint import averaged_weights, read_checkpoint
 from helpers import toy_object
+from helpers.plain import plain_scene
 from helpers.simulators import SMALLEST
 
 TINY = (
@@ -27,15 +28,11 @@ PAPER = (
 def other_object(root: Path) -> Path:
     """An object of other kernels, frame rate, image size, cameras, frames and sequences than the toy's."""
     means = toy_object.toy_scene().means
-    scene = GaussianScene.create(
-        means=torch.cat((means * 2, means[9:] * 2 + 0.1)),
-        log_scales=torch.full((63, 3), -1.6),
-        quats=torch.tensor([1.0, 0, 0, 0]).expand(63, 4).clone(),
-        opacity_logits=torch.full((63,), 2.0),
+    scene = plain_scene(
+        torch.cat((means * 2, means[9:] * 2 + 0.1)), log_scale=-1.6, opacity=2.0,
         sh=torch.rand(63, 1, 3, generator=torch.Generator().manual_seed(1)),
-        pinned=torch.cat((means, means[9:]))[:, 2] < 0.1,
-        name="other",
-    )
+        pinned=torch.cat((means, means[9:]))[:, 2] < 0.1, name="other",
+    )  # fmt: skip
     seen = toy_object.cameras().select([0, 1])
     smaller = seen.Ks * torch.tensor([[0.75], [0.75], [1.0]])
     cameras = Cameras(seen.viewmats, smaller, 24, 20, ("left", "right"))

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-import gausim.cli.train
+import gausim.cli.training_run
 import gausim.compose.build
 import gausim.training.callbacks.panels
 import gausim.training.loggers.files

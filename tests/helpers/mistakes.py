@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from gausim.io.ply import masks_path
+from helpers.plain import edit_json
 
 Json = dict
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -30,15 +31,9 @@ def copy_object(source: Path, root: Path, *, scene: Path | None = None, sequence
     return root
 
 
-def edit(path: Path, change: Callable[[Json], None]) -> None:
-    data = json.loads(path.read_text())
-    change(data)
-    path.write_text(json.dumps(data))
-
-
 def every_transforms(root: Path, change: Callable[[Json], None]) -> None:
     for path in sorted(root.glob("sequences/*/transforms.json")):
-        edit(path, change)
+        edit_json(path, change)
 
 
 def every_pose(root: Path, change: Callable[[np.ndarray, str], np.ndarray]) -> None:
@@ -85,7 +80,7 @@ def every_alpha(root: Path, change: Callable[[np.ndarray], np.ndarray | int]) ->
 
 def wrong_rate(root: Path, factor: float) -> None:
     for path in (root / "dataset.json", *root.glob("sequences/*/transforms.json")):
-        edit(path, lambda data: data.update(fps=data["fps"] * factor))
+        edit_json(path, lambda data: data.update(fps=data["fps"] * factor))
 
 
 def missing_images(root: Path, *, listed: bool = True) -> None:
@@ -98,7 +93,7 @@ def missing_images(root: Path, *, listed: bool = True) -> None:
         data["frames"] = [e for e in data["frames"] if e["camera"] != view or e["frame"] not in (5, 6, 7)]
 
     if not listed:
-        edit(sequence / "transforms.json", change)
+        edit_json(sequence / "transforms.json", change)
 
 
 def moved_camera(root: Path, view: int = 1, degrees: float = 2.0) -> None:
@@ -158,7 +153,7 @@ def film_for_frames(root: Path) -> None:
             if entry["file_path"] == f"{path.parent.name}/{path.name}":
                 entry["file_path"] = f"{path.parent.name}/{film.name}"
 
-    edit(path.parent.parent / "transforms.json", change)
+    edit_json(path.parent.parent / "transforms.json", change)
 
 
 def films_for_folders(root: Path) -> None:
@@ -182,7 +177,7 @@ def darker(root: Path, factor: float, every: int = 1) -> None:
 
 
 def one_view(root: Path) -> None:
-    edit(root / "dataset.json", lambda d: d.update(train_views=d["views"][:1], heldout_views=d["views"][1:]))
+    edit_json(root / "dataset.json", lambda d: d.update(train_views=d["views"][:1], heldout_views=d["views"][1:]))
 
 
 MISTAKES: dict[str, Callable[[Path], None]] = {
@@ -195,7 +190,7 @@ MISTAKES: dict[str, Callable[[Path], None]] = {
     "nothing cut out": lambda root: every_alpha(root, lambda alpha: 255),
     "rate times 4": lambda root: wrong_rate(root, 4),
     "rate over 4": lambda root: wrong_rate(root, 0.25),
-    "rate in one file": lambda root: edit(root / "dataset.json", lambda data: data.update(fps=data["fps"] * 4)),
+    "rate in one file": lambda root: edit_json(root / "dataset.json", lambda data: data.update(fps=data["fps"] * 4)),
     "missing images": missing_images,
     "missing frames": lambda root: missing_images(root, listed=False),
     "one camera moved": moved_camera,

@@ -19,7 +19,7 @@ from torch import distributed as dist
 from gausim.core import DivergenceError
 from gausim.data.dataset import SequenceSample
 from gausim.losses import Objective
-from gausim.metrics.psnr import PSNR
+from gausim.metrics.image import PSNR
 from gausim.models.initial_state import FreeInitialStates
 from gausim.render.reference import ReferenceRenderer
 from gausim.runs.checkpoint import digest

@@ -21,7 +21,16 @@ from gausim.nn.meshgraphnet import MeshGraphNet
 
 PARTS: dict[str, tuple[str, ...]] = {
     "hierarchy": ("clustering", "max_neighbours", "edges", "share_network", "body_frame"),
-    "features": ("angle", "rest_inputs", "coarse_inputs", "velocities", "attributes", "gravity", "normaliser_floor"),
+    "features": (
+        "angle",
+        "rest_inputs",
+        "coarse_inputs",
+        "velocities",
+        "attributes",
+        "gravity",
+        "normaliser_floor",
+        "floor",
+    ),
     "network": ("hidden", "layers", "norm", "activation", "precision", "checkpoint", "compile"),
     "head": ("output_scale", "zero_output", "lever", "anchor"),
     "rollout": ("cuda_graph", "energy_guard_frames"),

@@ -17,6 +17,7 @@ from gausim.io.ply import save_scene
 from gausim.io.transforms import write_transforms
 from gausim.render.draw import draw
 from gausim.render.reference import ReferenceRenderer
+from helpers.plain import cameras_at, plain_scene
 
 AMPLITUDES = {"seq_000": 0.4, "seq_001": -0.25}
 OMEGA, SIZE, VIEWS = 0.45, 32, ("cam_0", "cam_1", "cam_2")
@@ -57,29 +58,15 @@ def toy_scene() -> GaussianScene:
     axis = torch.tensor([-0.3, 0.0, 0.3])
     means = torch.cartesian_prod(axis, axis, torch.tensor([0.0, 0.35, 0.7, 1.05]))
     generator = torch.Generator().manual_seed(0)
-    return GaussianScene.create(
-        means=means,
-        log_scales=torch.full((len(means), 3), math.log(0.12)),
-        quats=torch.tensor([1.0, 0, 0, 0]).expand(len(means), 4).clone(),
-        opacity_logits=torch.full((len(means),), 2.0),
-        sh=torch.rand(len(means), 1, 3, generator=generator),
-        pinned=means[:, 2] < 0.1,
-        name="toy",
-    )
+    return plain_scene(
+        means, log_scale=math.log(0.12), opacity=2.0, sh=torch.rand(len(means), 1, 3, generator=generator),
+        pinned=means[:, 2] < 0.1, name="toy",
+    )  # fmt: skip
 
 
 def cameras() -> Cameras:
-    viewmats = []
-    for angle in (0.0, 1.2, -0.9):
-        eye = torch.tensor([4 * math.sin(angle), -4 * math.cos(angle), 0.9])
-        forward = torch.nn.functional.normalize(torch.tensor([0.0, 0.0, 0.5]) - eye, dim=0)
-        right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
-        rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
-        viewmat = torch.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
-        viewmats.append(viewmat)
-    k = torch.tensor([[56.0, 0, SIZE / 2], [0, 56.0, SIZE / 2], [0, 0, 1]])
-    return Cameras(torch.stack(viewmats), k.expand(3, 3, 3), SIZE, SIZE, VIEWS)
+    eyes = torch.tensor([[4 * math.sin(angle), -4 * math.cos(angle), 0.9] for angle in (0.0, 1.2, -0.9)])
+    return cameras_at(eyes, (0.0, 0.0, 0.5), focal=56.0, size=SIZE, names=VIEWS)
 
 
 def write_toy_object(root: Path, *, frames: int = 20) -> ToyObject:
@@ -97,6 +84,20 @@ def write_object(toy: ToyObject) -> ToyObject:
     for name in toy.amplitudes:
         _write_sequence(toy, name)
     return toy
+
+
+def surround(root: Path, **facts: object) -> None:
+    """States surroundings of a written object."""
+    path = root / "dataset.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | facts))
+
+
+def hold(root: Path, points: Tensor, way: Tensor, *, grip: float = 0.5) -> None:
+    """Has a hand hold a written object near points (C, 3) and go along a way (F, 3), in every sequence."""
+    surround(root, grip=grip)
+    for sequence in (root / "sequences").iterdir():
+        moved = (points + way[:, None]).numpy()
+        np.savez(sequence / "hands.npz", points=moved, hand=np.zeros(len(points), np.int64))
 
 
 def _write_sequence(toy: ToyObject, name: str) -> None:

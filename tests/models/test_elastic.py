@@ -217,6 +217,9 @@ def test_trained_inertia_is_the_equation_of_motion_with_another_mass() -> None:
     heavy = torch.eye(9, dtype=torch.float64) + 0.3 * scene.inertia_mixing
     mass, inner = heavy.mT @ heavy, root[:, None] * mixing
     stiffness, damping = heavy.mT @ inner @ inner.mT @ heavy, heavy.mT @ scene.dissipation() @ heavy
+    prepared = PreparedElastic(scene)
+    # What loads and the floor act against.
+    torch.testing.assert_close((prepared.inertia, prepared.stiffness, prepared.damping), (mass, stiffness, damping))
     z, before = 0.01 * torch.randn(2, 1, 9, generator=generator, dtype=torch.float64)
     size = torch.tensor(scene.initial_log_stiffness).exp() * scene.gain
     force = size * scene.springs(z)

@@ -8,7 +8,7 @@ import torch
 from helpers.bodies import make_model, make_scene, make_state
 
 from gausim.core import SimState
-from gausim.models.step.features import FeatureOptions, UnitState, edge_features, network_inputs
+from gausim.models.step.features import FLOOR_FEATURES, FeatureOptions, UnitState, edge_features, network_inputs
 from gausim.models.step.recursion import Solved, Units
 
 DT = 0.25
@@ -30,6 +30,7 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
         (FeatureOptions(), True),
         (FeatureOptions(rest_inputs=True), False),
         (FeatureOptions(rest_inputs=True, velocities=False), False),
+        (FeatureOptions(floor=True), False),
     ],
 )
 def test_node_features_by_hand(options: FeatureOptions, coarse: bool) -> None:
@@ -37,7 +38,8 @@ def test_node_features_by_hand(options: FeatureOptions, coarse: bool) -> None:
     unit, parent, template = _unit_state(0), _unit_state(1, 2), _unit_state(2)
     gradient = torch.eye(3) + 0.3 * torch.randn(2, 3, 3, dtype=torch.float64)
     density, attributes = torch.linspace(-1, 1, 4).double(), torch.rand(4, 2).double()
-    units = Units(unit.rest, unit.now, unit.before, density.exp(), density, attributes)
+    floor = torch.rand(4, FLOOR_FEATURES).double()
+    units = Units(unit.rest, unit.now, unit.before, density.exp(), density, attributes, floor)
     above = Solved(
         parent.rest, parent.now, parent.before, parent.after, template.rest[:2], gradient, gradient, index
     )  # fmt: skip
@@ -58,8 +60,9 @@ def test_node_features_by_hand(options: FeatureOptions, coarse: bool) -> None:
         elif options.rest_inputs:
             expected += [now - rest, (after - now) / DT]
         columns = [np.concatenate(expected) / size, density[i : i + 1].numpy(), attributes[i].numpy()]
+        columns += [floor[i].numpy()] if options.floor else []
         np.testing.assert_allclose(out[i].numpy(), np.concatenate(columns), rtol=1e-9)
-    assert out.shape[1] == options.node_normalised + 1 + 2
+    assert out.shape[1] == options.node_size - options.attributes + 2
 
 
 @pytest.mark.parametrize("coarse", [False, True])

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gausim.benchmark.naive_network import naive_network
+from gausim.benchmark.network import naive_network
 from gausim.nn.meshgraphnet import MeshGraphNet
 from gausim.nn.mlp import mlp, zero_output
 

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gausim.ops.deformation import bounded_deformation, deformation_gradient_from_output, determinant, polar_rotation
@@ -26,6 +28,16 @@ def test_without_mass_conservation_leaves_the_product_of_the_clamped_stretches()
     expected = output[:, 8:].clamp(-5, 5).sum(-1)
     assert torch.allclose(torch.linalg.det(gradient).log(), expected, atol=1e-6)
     assert (torch.linalg.det(gradient) - 1).abs().median() > 0.5
+
+
+def test_it_is_u_times_stretches_times_v_transposed() -> None:
+    output = _outputs(1.0)
+    gradient, rotation = deformation_gradient_from_output(output, conserve_mass=False)
+    first = np.array([1.0, 0, 0, 0])
+    u, v = (Rotation.from_quat(q.numpy() + first, scalar_first=True).as_matrix() for q in output[:, :8].split(4, 1))
+    stretches = output[:, 8:].clamp(-5, 5).exp().numpy()
+    np.testing.assert_allclose(gradient, np.einsum("nij,nj,nkj->nik", u, stretches, v), atol=1e-10)
+    np.testing.assert_allclose(rotation, u @ v.transpose(0, 2, 1), atol=1e-12)
 
 
 def test_zero_output_is_the_identity() -> None:

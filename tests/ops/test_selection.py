@@ -7,6 +7,7 @@ import re
 
 import pytest
 import torch
+from helpers.plain import plain_scene
 
 from gausim.core.errors import SceneError
 from gausim.core.scene import GaussianScene
@@ -18,13 +19,7 @@ def scene() -> GaussianScene:
     means = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.2], [0.0, 2.0, 0.4], [1.0, 2.0, 0.6]])
     sh = torch.zeros(4, 1, 3)
     sh[2, 0, 1] = 1.0  # one greenish kernel
-    return GaussianScene.create(
-        means=means,
-        log_scales=torch.full((4, 3), -3.0),
-        quats=torch.tensor([1.0, 0, 0, 0]).expand(4, 4),
-        opacity_logits=torch.zeros(4),
-        sh=sh,
-    )
+    return plain_scene(means, sh=sh)
 
 
 def selected(mask: torch.Tensor) -> list[int]:

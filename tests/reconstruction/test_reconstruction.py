@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from helpers.plain import cameras_at, plain_scene
 
 from gausim.cli.main import main
 from gausim.core import Cameras, ConfigError, DataError, GaussianScene
@@ -31,20 +32,10 @@ TINY = ReconstructionOptions(kernels=160, iterations=400, hull_resolution=24, ra
 
 
 def cameras_around(count: int) -> Cameras:
-    viewmats = []
-    for i in range(count):
-        z = torch.tensor(0.9 - 1.6 * i / count)
-        angle = torch.tensor(2.39996 * i)
-        ring = (1 - z * z).sqrt()
-        away = torch.stack((angle.cos() * ring, angle.sin() * ring, z))
-        right = torch.nn.functional.normalize(torch.linalg.cross(-away, torch.tensor([0.0, 0.0, 1.0])), dim=0)
-        viewmat = torch.eye(4)
-        viewmat[:3, :3] = torch.stack((right, torch.linalg.cross(-away, right), -away))
-        viewmat[2, 3] = 3.0
-        viewmats.append(viewmat)
-    K = torch.tensor([[50.0, 0, SIZE / 2], [0, 50.0, SIZE / 2], [0, 0, 1]])
-    names = tuple(f"still/{i}.png" for i in range(count))
-    return Cameras(torch.stack(viewmats), K.repeat(count, 1, 1), SIZE, SIZE, names)
+    z, angle = 0.9 - 1.6 * torch.arange(count) / count, 2.39996 * torch.arange(count)
+    ring = (1 - z * z).sqrt()
+    eyes = 3.0 * torch.stack((angle.cos() * ring, angle.sin() * ring, z), -1)
+    return cameras_at(eyes, (0.0, 0.0, 0.0), focal=50.0, size=SIZE, names=[f"still/{i}.png" for i in range(count)])
 
 
 def true_scene() -> GaussianScene:
@@ -55,13 +46,7 @@ def true_scene() -> GaussianScene:
     means = torch.where(upper[:, None], 0.3 * direction + torch.tensor([0.1, 0, 0.5]), 0.5 * direction)
     colors = torch.where(upper[:, None], torch.tensor([0.9, 0.3, 0.2]), torch.tensor([0.2, 0.5, 0.8]))
     colors = (colors + 0.15 * means).clamp(0, 1)
-    return GaussianScene.create(
-        means=means,
-        log_scales=torch.full((150, 3), -2.7),
-        quats=torch.tensor([1.0, 0, 0, 0]).expand(150, 4),
-        opacity_logits=torch.full((150,), 4.0),
-        sh=((colors - 0.5) / 0.28209479)[:, None],
-    )
+    return plain_scene(means, log_scale=-2.7, opacity=4.0, sh=((colors - 0.5) / 0.28209479)[:, None])
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from helpers.report_runs import config, evaluate, make_curves, write_run
 from gausim.report.gather.runs import find_runs
 from gausim.report.gather.study import Study, make_study
 from gausim.report.opening import first_table
-from gausim.report.tables.further import bounce_sheets, horizon_sheets
+from gausim.report.tables.motion import bounce_sheets, horizon_sheets
 from gausim.report.tables.verdict import outcome, sentences
 
 BOUNCE = {"height": 0.5, "rise": 0.2, "height_error": 0.1, "rise_error": 0.25, "depth": 0.3}

@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -11,16 +12,22 @@ import torch
 from helpers.corpus import FRAMES, SEQUENCES, write_corpus
 from msgspec.structs import replace
 
-from gausim.cli import evaluate, simulate, train
+from gausim.cli import evaluate, report, simulate, train
 from gausim.compose.bare import EvenMaterial, open_scene
 from gausim.compose.build import build
 from gausim.compose.config import compose
-from gausim.core import ConfigError, GausSimError
+from gausim.core import ConfigError, GausSimError, SimState
 from gausim.data.dataset import SampleKey
 from gausim.evaluation.corpus import BodyFigures, summary
+from gausim.interaction.interaction import replay as replay_session
+from gausim.interaction.selections import Whole
+from gausim.interaction.session import Force, Material
 from gausim.io.ply import save_scene
 from gausim.io.trajectory import load_trajectory
+from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.models.template.material import MaterialTemplate
+from gausim.training.material_scan import find_materials
+from gausim.training.pretraining import give_even_material
 
 SMALL = (
     "model.simulator.hierarchy.levels=[{diameter: 0.5, edge_length: 2.0}]", "model.simulator.template.modes=12",
@@ -102,6 +109,22 @@ def test_a_scene_that_was_never_filmed_swings_as_its_stiffness_says(corpus: Path
         periods[stiffness] = 4 * (1 + tip.index(max(tip)))  # frames to the first turn
     assert periods[1.0] == pytest.approx(24, abs=6) and periods[4.0] == pytest.approx(12, abs=3)
 
+    live = open_scene(body, fps=24.0, base=base, sway=0.02)
+    live.act(Force(Whole(), (1.0, 0.0, 0.0), 0.02))
+    amplitudes = {}
+    for stiffness in (1.0, 0.25, 4.0):
+        live.act(Material(stiffness, damping=10.0))
+        amplitudes[stiffness] = float([live.step() for _ in range(60)][-1].positions[8, 0] - body.means[8, 0])
+    assert amplitudes[0.25] == pytest.approx(4 * amplitudes[1.0], rel=0.2)  # bends as a spring does
+    assert amplitudes[4.0] == pytest.approx(amplitudes[1.0] / 4, rel=0.2)
+    last = live.frame.positions
+    assert torch.equal(
+        replay_session(open_scene(body, fps=24.0, base=base, sway=0.02), live.session()).positions[-1], last
+    )
+    assert torch.equal(replay_session(live, live.session()).positions[-1], last)  # which begins with the first material
+    with pytest.raises(ConfigError, match="learned and cannot be set"):
+        open_scene(body, fps=24.0).act(Material())
+
     scene, out = tmp_path / "beam.ply", tmp_path / "out"
     save_scene(body, scene)
     common = ["--scene", str(scene), "--from", str(base), "--pin-below", "z=0.01", "--out", str(out), "--frames", "5"]
@@ -138,6 +161,11 @@ def test_a_pretrained_network_is_fitted_to_bodies_held_out(corpus: Path, base: P
     assert "Rank correlation of fitted and true stiffness: " in capsys.readouterr().out
     (body,) = json.loads((fit / "evaluation" / "corpus.json").read_text())["bodies"]
     assert body["name"] == "beam2" and body["period"] == pytest.approx(14 / 24) and abs(body["within"]) <= 1
+    assert report.main([str(tmp_path), "--bodies", str(tmp_path / "curve.png")]) == 0
+    assert re.search(r"6 frames seen: \S+ with 2 bodies\n", capsys.readouterr().out)
+    assert (tmp_path / "curve.png").stat().st_size > 1000
+    with pytest.raises(GausSimError, match="no fit to bodies of a corpus"):
+        report.main([str(corpus), "--bodies", str(tmp_path / "curve.png")])
     with pytest.raises(GausSimError, match="measured as a whole"):
         evaluate.main([str(fit), "--sequences", "seq_000"])
 
@@ -153,3 +181,21 @@ def test_a_fit_to_the_truth_has_no_error_and_keeps_the_order_of_stiffness() -> N
     assert whole.error == (1.0, 1.0, 1.0) and whole.energy == 0.5 and whole.stiffness == pytest.approx(1.0)
     assert whole.within == 1.0 and whole.within_smooth == 0.5
     assert summary([replace(x, fitted_period=-x.period) for x in found]).stiffness == pytest.approx(-1.0)
+
+
+def test_a_scan_finds_the_even_material_of_a_motion_from_its_seen_frames(corpus: Path) -> None:
+    root = [f"data.root={corpus}", *SMALL]
+    module, data = build(compose("train", ["experiment=pretrain_fit", "init_from=RUN", "data.seen=8", *root]))
+    model, body = module.model, data.objects[0].body
+    give_even_material(model, 0, period=6 / body.fps, damping=4.0)
+    wanted = model.attributes[0][0, :2].tolist()
+    moved = SceneDynamics(model, 0).rollout(SimState(body.positions[0, 1], body.positions[0, 0]), FRAMES - 2).positions
+    body.positions[:] = torch.cat((body.positions[0, :1], moved))
+    body.positions[:, 10:] = torch.nan  # beyond the seen frames
+    find_materials(model, data)
+    found = model.attributes[0]
+    assert (found == found[0]).all() and not found[:, 2:].any()
+    assert found[0, :2].tolist() == pytest.approx(wanted, abs=0.5)
+    for epoch in range(3):
+        assert max(key.start + key.steps for batch in _batches(data, epoch) for key in batch) <= 7
+    assert len(data.index.ground_truth(0).positions) == 8

@@ -63,6 +63,24 @@ def test_a_run_killed_again_and_again_equals_an_uninterrupted_one(trainings: Tra
     assert_same_run(run, toy_run)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["falling", "held"])
+def test_a_moving_body_killed_again_and_again_equals_an_uninterrupted_one(trainings: Trainings, kind: str) -> None:
+    template = "model.simulator.template"
+    settings = (*THREE, "model=gausim", trainings.moving(kind), f"{template}.modes=6", f"{template}.spacing=0.3",
+                "callbacks.checkpoint.every_steps=2")  # fmt: skip
+    whole, run = trainings.whole(f"whole_{kind}", *settings), trainings.run(kind)
+    for deaths, death in enumerate((killed(STEP, 2), killed(SAVED, 2), killed(STEP, 3, when="after"), killed(STEP, 4))):
+        status, output = trainings(kind, *settings, **death)
+        assert status == -9, output
+        assert (run / "last.ckpt").exists() == (deaths > 0)
+    status, output = trainings(kind, *settings)
+    assert status == 0 and "resuming" in output, output
+    assert_same_run(run, whole)
+    trained = {name for name in read_checkpoint(run / "last.ckpt")["state_dict"] if "surroundings" in name}
+    assert len(trained) == (3 if kind == "falling" else 0)
+
+
 def test_a_run_created_again_from_its_saved_config_is_equal(trainings: Trainings, toy_run: Path) -> None:
     folder = trainings.run("again")
     config = ["--config-dir", str(toy_run), "--config-name", "config", f"hydra.run.dir={folder}"]

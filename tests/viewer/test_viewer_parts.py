@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -30,10 +32,10 @@ from gausim.viewer.companion import Companion
 from gausim.viewer.live import Live
 from gausim.viewer.messages import MessageChecker, MessageError
 from gausim.viewer.pipeline import Worker
-from gausim.viewer.pointer import first_hit, in_rectangle
+from gausim.viewer.pointer import Pointer, first_hit, in_rectangle
 from gausim.viewer.recording import record
 from gausim.viewer.shown import LIVE, Shown, Take
-from gausim.viewer.splats import Placing, half_covariances, pack
+from gausim.viewer.splats import SIZE, Placing, half_covariances, pack
 
 
 @pytest.mark.parametrize(("size", "spread"), [(1e-3, 0.0), (1.0, 0.5), (1.0, 4.0), (1e3, 4.0)])
@@ -199,6 +201,44 @@ def test_messages_of_the_page_pass_and_others_do_not() -> None:
 def live(make_interaction: Callable[..., Interaction]) -> tuple[Live, list[Shown]]:
     shown: list[Shown] = []
     return Live(make_interaction(keep=None), shown.append), shown
+
+
+def test_a_dragged_pin_takes_its_hand_along(live: tuple[Live, list[Shown]]) -> None:
+    one, _ = live
+    interaction = one.interaction
+    scene, placing = interaction.scene, Placing.of(interaction.scene)
+    pointer = Pointer(MagicMock(), one, placing, interaction.units, interaction.masses)
+    pointer.follow(one.shown())
+    followed: list[tuple[float, float, float]] = []
+    pointer.hand_moved = lambda hand, to: followed.append(to)
+
+    def drag(kernel: int, *way: tuple[str, tuple[float, float, float]]) -> None:
+        begun = placing.to_page(interaction.frame.positions[kernel]).double().numpy()
+        for phase, moved in way:
+            start = placing.to_page(interaction.frame.positions[kernel]).double().numpy()
+            camera = SimpleNamespace(position=start - np.array([0.0, 0.0, SIZE]))  # looks up from below
+            end = begun + placing.scale * np.array(moved)
+            asyncio.run(
+                pointer._dragged(
+                    SimpleNamespace(
+                        client=SimpleNamespace(camera=camera), client_id=0, phase=phase, instance_index=0,
+                        start_position=start, end_position=end,
+                    )
+                )
+            )  # fmt: skip
+            one._take_commands(0.0)
+            one.advance()
+
+    low = int(scene.means[:, 2].masked_fill(~scene.pinned, torch.inf).argmin())
+    drag(low, ("start", (0.0, 0.0, 0.0)), ("update", (0.1, 0.0, 0.0)), ("end", (0.1, 0.0, 0.0)))
+    for _ in range(6):
+        one.advance()
+    assert not one.message and not interaction.acting
+    moved = interaction.frame.positions - scene.means
+    torch.testing.assert_close(moved[scene.pinned], torch.tensor([0.1, 0.0, 0.0]).expand(int(scene.pinned.sum()), 3))
+    assert followed and followed[-1] == pytest.approx((0.1, 0.0, 0.0), abs=1e-5)
+    drag(low, ("start", (0.0, 0.0, 0.0)), ("update", (0.0, 0.1, 0.0)), ("end", (0.0, 0.1, 0.0)))
+    assert interaction.session().entries[-1].event.to == pytest.approx((0.1, 0.1, 0.0), abs=1e-5)  # goes on from there
 
 
 def test_what_was_done_is_played_back_bit_for_bit(live: tuple[Live, list[Shown]]) -> None:

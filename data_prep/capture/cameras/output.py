@@ -104,20 +104,24 @@ class PosedWriter:
             self.bare.add(what)
 
     def _transforms(self, path: Path, posed: Sequence[Posed], entries: list, fps: float | None) -> None:
-        import torch
+        photo, ks = posed[0].photo, [self._straight(shot).intrinsics for shot in posed]
+        names = tuple(shot.photo.name for shot in posed)
+        write_cameras(path, [shot.viewmat for shot in posed], ks, (photo.width, photo.height), names, entries, fps)
 
-        from gausim.core import Cameras
-        from gausim.io.transforms import write_transforms
 
-        cameras = Cameras(
-            torch.from_numpy(np.stack([shot.viewmat for shot in posed])).float(),
-            torch.from_numpy(np.stack([self._straight(shot).intrinsics for shot in posed])).float(),
-            posed[0].photo.width,
-            posed[0].photo.height,
-            tuple(shot.photo.name for shot in posed),
-        )
-        with replacing(path, typed=True) as temporary:
-            write_transforms(temporary, cameras.validated(str(path)), entries, fps=fps)
+def write_cameras(
+    path: Path, viewmats: Sequence[np.ndarray], ks: Sequence[np.ndarray], size: tuple[int, int],
+    names: tuple[str, ...], entries: list, fps: float | None,
+) -> None:  # fmt: skip
+    """Writes a ``transforms.json`` of pinhole cameras (4, 4), (3, 3) of one size, all of it or nothing."""
+    import torch
+
+    from gausim.core import Cameras
+    from gausim.io.transforms import write_transforms
+
+    viewmat, k = (torch.from_numpy(np.stack(parts)).float() for parts in (viewmats, ks))
+    with replacing(path, typed=True) as temporary:
+        write_transforms(temporary, Cameras(viewmat, k, *size, names).validated(str(path)), entries, fps=fps)
 
 
 def _read_mask(path: Path, photo: Photo) -> np.ndarray:

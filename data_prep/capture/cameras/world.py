@@ -122,17 +122,22 @@ def upright(up: np.ndarray) -> np.ndarray:
     return rotation
 
 
-def looked_at(viewmats: np.ndarray) -> np.ndarray:
-    """The point (3,) nearest to all optical axes of cameras (n, 4, 4), in the mean square.
+def nearest_to_lines(points: np.ndarray, directions: np.ndarray) -> np.ndarray | None:
+    """The point (3,) nearest, in the mean square, to lines through points (n, 3) along unit directions (n, 3).
 
-    Parallel axes have none; there it is the middle of the cameras.
+    None where the lines are parallel.
     """
-    x, axes = centers(viewmats), viewmats[:, 2, :3]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None]
+    across = np.eye(3) - directions[:, :, None] * directions[:, None]
     total = across.sum(0)
     if np.linalg.cond(total) > 1e6:
-        return x.mean(0)
-    return np.linalg.solve(total, np.einsum("nij,nj->i", across, x))
+        return None
+    return np.asarray(np.linalg.solve(total, np.einsum("nij,nj->i", across, points)))
+
+
+def looked_at(viewmats: np.ndarray) -> np.ndarray:
+    """The point (3,) nearest to all optical axes of cameras (n, 4, 4); their middle where the axes are parallel."""
+    point = nearest_to_lines(centers(viewmats), viewmats[:, 2, :3])
+    return centers(viewmats).mean(0) if point is None else point
 
 
 def triangulate(picks: Sequence[tuple[ColmapCamera, np.ndarray, tuple[float, float]]], what: str) -> np.ndarray:
@@ -143,15 +148,10 @@ def triangulate(picks: Sequence[tuple[ColmapCamera, np.ndarray, tuple[float, flo
     """
     if len(picks) < 2:
         raise DataError(f"{what}: expected picks in at least 2 photos, got {len(picks)}.")
-    across, goal = np.zeros((3, 3)), np.zeros(3)
-    for camera, viewmat, pixel in picks:
-        ray = viewmat[:3, :3].T @ rays_of(camera, np.array([pixel]))[0]
-        part = np.eye(3) - np.outer(ray, ray)
-        across += part
-        goal += part @ centers(viewmat[None])[0]
-    if np.linalg.cond(across) > 1e6:
+    rays = np.stack([rays_of(camera, np.array([pixel]))[0] @ viewmat[:3, :3] for camera, viewmat, pixel in picks])
+    point = nearest_to_lines(centers(np.stack([viewmat for _, viewmat, _ in picks])), rays)
+    if point is None:
         raise DataError(f"{what}: the photos see it from nearly the same direction; pick it in others.")
-    point = np.linalg.solve(across, goal)
     for camera, viewmat, pixel in picks:
         missed = float(np.linalg.norm(project(camera, viewmat, point[None])[0] - pixel))
         if not missed <= _PICK_TOLERANCE * max(camera.width, camera.height) / 1000:

@@ -7,30 +7,30 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from jsonschema import Draft202012Validator
-from jsonschema.exceptions import best_match
+from msgspec import Meta, Struct
 
 from data_prep.common.photos import natural
 from gausim.core import DataError
+from gausim.io.plain_json import checked
 
-# JSON schema of a list file; times are in seconds.
-_TIME = {"type": "number", "minimum": 0, "maximum": 1e6}
-_TAKE = {
-    "type": "object",
-    "required": ["cameras"],
-    "additionalProperties": False,
-    "properties": {
-        "name": {"type": ["string", "number"]},
-        "cameras": {"type": "object", "minProperties": 1, "additionalProperties": {"type": "string", "minLength": 1}},
-        "offsets": {"type": "object", "additionalProperties": {"type": ["string", "number"]}},
-        "start": _TIME,
-        "duration": _TIME,
-    },
-}
-_SEQUENCES = {"type": "array", "minItems": 1, "items": _TAKE}
-_LIST = {"type": "object", "required": ["sequences"], "properties": {"sequences": _SEQUENCES}}
+_Seconds = Annotated[float, Meta(ge=0, le=1e6)]
+
+
+class _Listed(Struct, forbid_unknown_fields=True):
+    """One sequence of a list file."""
+
+    cameras: Annotated[dict[str, Annotated[str, Meta(min_length=1)]], Meta(min_length=1)]
+    name: str | int | float | None = None
+    offsets: dict[str, str | int | float] = {}
+    start: _Seconds | None = None
+    duration: _Seconds | None = None
+
+
+class _List(Struct):
+    sequences: Annotated[list[_Listed], Meta(min_length=1)]
+
 
 FILMS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".mxf")
 
@@ -128,14 +128,10 @@ def _by_stem(folder: Path) -> dict[str, Path]:
 def _listed(path: Path) -> list[tuple[str, dict[str, Path], dict[str, Any]]]:
     from gausim.io.transforms import read_json  # loads torch
 
-    data = read_json(path)
-    fault = best_match(Draft202012Validator(_LIST).iter_errors(data))
-    if fault is not None:
-        raise DataError(f"{path}: {fault.json_path.removeprefix('$.')}: {fault.message:.200}. See --help for the form.")
     found = []
-    for i, entry in enumerate(data["sequences"]):
-        offsets = {name: str(value) for name, value in entry.get("offsets", {}).items()}
-        extra = {"offsets": offsets, "start": entry.get("start"), "duration": entry.get("duration")}
-        films = {name: path.parent / value for name, value in entry["cameras"].items()}
-        found.append((str(entry.get("name", i)), films, extra))
+    for i, entry in enumerate(checked(read_json(path), _List, str(path), "See --help for the form.").sequences):
+        offsets = {name: str(value) for name, value in entry.offsets.items()}
+        extra = {"offsets": offsets, "start": entry.start, "duration": entry.duration}
+        films = {name: path.parent / value for name, value in entry.cameras.items()}
+        found.append((str(i if entry.name is None else entry.name), films, extra))
     return found

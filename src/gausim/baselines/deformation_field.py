@@ -61,14 +61,10 @@ class DeformationField(Fitted):
 
     name = "deformation_field (no diffusion prior)"
     extrapolates = False
+    unknown = frozenset({"hands"})
 
     def __init__(
-        self,
-        *,
-        resolution: int = 32,
-        features: int = 32,
-        hidden: int = 64,
-        **recorded: Unpack[Recorded],
+        self, *, resolution: int = 32, features: int = 32, hidden: int = 64, **recorded: Unpack[Recorded]
     ) -> None:
         """Makes the fields.
 

@@ -11,7 +11,7 @@ from jaxtyping import Int
 from torch import Tensor, nn
 from torch.nn import Parameter
 
-from gausim.core import FittedState, GaussianScene
+from gausim.core import ConfigError, FittedState, GaussianScene
 
 T = TypeVar("T")
 
@@ -23,20 +23,26 @@ def moved(value: T, device: torch.device) -> T:
     return found
 
 
+def surroundings_of(scene: GaussianScene) -> dict[str, str]:
+    """Surroundings of a scene with their text for messages: free, gravity, trained_gravity, floor, hands."""
+    around = scene.surroundings
+    present = {
+        "free": (around.free, "'free'"),
+        "gravity": (around.gravity is not None, "'gravity'"),
+        "trained_gravity": (around.trains_gravity, "'gravity' that is trained"),
+        "floor": (around.floor is not None, "a 'floor'"),
+        "hands": (scene.hand is not None, "a 'grip' of hands"),
+    }
+    return {key: text for key, (there, text) in present.items() if there}
+
+
 class Recorded(TypedDict):
-    """Inputs of every fitted method: the options of :class:`Fitted`, which its subclasses pass on.
+    """Inputs of every fitted method: the options of :class:`Fitted`, which its subclasses pass on."""
 
-    Attributes:
-        scenes: the rest scenes.
-        fps: frames per second of each.
-        scene_of_sequence: the scene of each sequence.
-        seen: predicted frames that training may see.
-    """
-
-    scenes: Sequence[GaussianScene]
-    fps: Sequence[float]
-    scene_of_sequence: Sequence[int]
-    seen: int
+    scenes: Sequence[GaussianScene]  # the rest scenes
+    fps: Sequence[float]  # frames per second of each
+    scene_of_sequence: Sequence[int]  # the scene of each sequence
+    seen: int  # predicted frames that training may see
 
 
 class Fitted(nn.Module):
@@ -47,15 +53,23 @@ class Fitted(nn.Module):
     Attributes:
         name: name of the method in tables.
         extrapolates: whether the method predicts frames beyond the seen ones.
+        unknown: surroundings that the method cannot predict, of :func:`surroundings_of`.
     """
 
     name = "static"
     extrapolates = True
+    unknown: frozenset[str] = frozenset()
 
     def __init__(
         self, *, scenes: Sequence[GaussianScene], fps: Sequence[float], scene_of_sequence: Sequence[int], seen: int
     ) -> None:
         super().__init__()
+        for scene in scenes:
+            if found := [text for key, text in surroundings_of(scene).items() if key in self.unknown]:
+                raise ConfigError(
+                    f"{self.name}: '{scene.name}' has {', '.join(found)} in its dataset.json, of which this method "
+                    "knows nothing. Take model=gausim, or objects without them (data.names)."
+                )
         self.scenes, self.fps = tuple(scenes), tuple(fps)
         self.scene_of_sequence, self.seen = tuple(scene_of_sequence), seen
 

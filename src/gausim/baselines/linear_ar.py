@@ -18,25 +18,14 @@ from gausim.core import DataError
 
 @dataclass(frozen=True, eq=False)
 class LinearAR2:
-    """q_{t+1} = A q_t + B q_{t-1} with q the coordinates of the displacement in M orthonormal modes.
+    """q_{t+1} = A q_t + B q_{t-1} with q the coordinates of the displacement in M orthonormal modes."""
 
-    Attributes:
-        modes: orthonormal modes of the displacement of P points.
-        first: A.
-        second: B.
-    """
-
-    modes: Float[Tensor, "M P 3"]
-    first: Float[Tensor, "M M"]
-    second: Float[Tensor, "M M"]
+    modes: Float[Tensor, "M P 3"]  # orthonormal modes of the displacement of P points
+    first: Float[Tensor, "M M"]  # A
+    second: Float[Tensor, "M M"]  # B
 
     def rollout(self, displacement: Float[Tensor, "2 P 3"], steps: int) -> Float[Tensor, "F P 3"]:
-        """Predicts from two true frames.
-
-        Args:
-            displacement: displacements from the rest state in frames 0 and 1 [scene units].
-            steps: frames after frame 0; the result has ``steps`` + 1 frames, the given ones first.
-        """
+        """Predicts ``steps`` frames after frame 0 from the displacements in frames 0 and 1, which come first."""
         modes = self.modes.flatten(1)
         q = [x for x in displacement.to(modes).flatten(1) @ modes.T]
         for _ in range(steps - 1):
@@ -46,14 +35,11 @@ class LinearAR2:
 
 
 def fit_linear_ar2(displacements: Sequence[Float[Tensor, "F P 3"]], n_modes: int) -> LinearAR2:
-    """Fits modes and coefficients to the seen frames of all sequences by least squares, in float64.
+    """Fits at most ``n_modes`` modes and coefficients to the seen frames of all sequences by least squares, in float64.
 
-    The modes are those of the displacements themselves, not of their deviation from a mean: the rest state is the
-    equilibrium. Where the motion has fewer modes than requested, the others are 0 (least-norm solution).
-
-    Args:
-        displacements: displacement from the rest state per sequence, each with at least three frames [scene units].
-        n_modes: number of modes M, at most the total number of frames.
+    The modes are those of the displacements from rest [scene units] themselves, not of their deviation from a mean:
+    the rest state is the equilibrium. Where the motion has fewer modes than requested, the others are 0 (least-norm
+    solution).
 
     Raises:
         DataError: there is no sequence, or one has fewer than three frames.

@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -20,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gausim.kernels.operations import plain_forms
+from gausim.runs.memory import process_memory
 
 
 @dataclass(frozen=True)
@@ -66,17 +66,10 @@ def medians(
     warmup: int = 1,
     at_least: float = 0.0,
 ) -> dict[str, float]:
-    """Median wall time of each candidate [s].
+    """Median wall time of each candidate [s], over ``rounds`` (default ``options.rounds``) after ``warmup`` calls.
 
-    The candidates are called in turn, A B C A B C ..., so that a drift of the machine's speed affects all of them and
-    cancels in their ratios.
-
-    Args:
-        candidates: timed functions by name.
-        options: the device to synchronise with and the number of rounds.
-        rounds: timed calls of each; ``options.rounds`` when None.
-        warmup: calls of each that are not timed.
-        at_least: total time to which shorter calls are repeated, judged by the last call of the warm-up [s].
+    The candidates are called in turn, A B C A B C ..., so that a drift of the machine's speed affects all of them
+    and cancels in their ratios. Calls shorter than ``at_least`` [s] in the warm-up are repeated to that time.
     """
     times: dict[str, list[float]] = {name: [] for name in candidates}
     repeats = dict.fromkeys(candidates, 1)
@@ -148,20 +141,9 @@ def peak_resident() -> int:
     return known or (peak if sys.platform == "darwin" else 1024 * peak)
 
 
-def process_memory(field: str, file: str = "/proc/self/status") -> int:
-    """A field of a file in Linux' /proc [bytes]; 0 on other systems."""
-    lines = Path(file).read_text().splitlines() if Path(file).is_file() else []
-    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{field}:")), 0)
-
-
 @contextmanager
 def spent_in(parts: Mapping[str, Sequence[tuple[Any, str]]], device: torch.device) -> Iterator[dict[str, float]]:
-    """Context that measures the time spent in functions, by the name of their part [s].
-
-    Args:
-        parts: functions of each part, as module or class and attribute.
-        device: device to synchronise with before each reading of the clock.
-    """
+    """Context that measures the time spent in functions (owner and attribute), by the name of their part [s]."""
     seconds = dict.fromkeys(parts, 0.0)
 
     def timed(name: str, function: Callable[..., Any]) -> Callable[..., Any]:

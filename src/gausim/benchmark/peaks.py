@@ -5,10 +5,8 @@
 from __future__ import annotations
 
 import functools
-import os
 import platform
 from dataclasses import dataclass
-from pathlib import Path
 
 import numba
 import numpy as np
@@ -17,6 +15,7 @@ import torch
 from gausim import __version__
 from gausim.benchmark.harness import Options, medians, seconds_of, torch_threads
 from gausim.kernels.pool import WorkerPool
+from gausim.runs import provenance
 
 # Independent accumulators: enough vectors of any width to hide the latency of a fused multiply-add.
 LANES = 192
@@ -79,21 +78,13 @@ def peaks(options: Options) -> Peaks:
     return Peaks(fma, 2.0 * size**3 / times["gemm"], 2.0 * COPY_BYTES / times["copy"])
 
 
-def processor() -> str:
-    """The processor's name according to the system."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    named = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    return next(named, platform.processor() or platform.machine())
-
-
 def machine(options: Options) -> dict[str, str]:
     """Processor, device and software of the benchmark, with the peaks measured now."""
     best = peaks(options)
     rates = [f"fused multiply-add {best.fma / 1e9:.0f} GFLOP/s"] if best.fma else []
     rates += [f"matrix product {best.gemm / 1e9:.0f} GFLOP/s", f"copy {best.copy / 1e9:.1f} GB/s"]
     described = {
-        "processor": f"{processor()}, {os.cpu_count()} logical cores, {torch.backends.cpu.get_cpu_capability()}",
+        "processor": f"{provenance.machine()}, {torch.backends.cpu.get_cpu_capability()}",
         "system": f"{platform.system()} {platform.machine()}",
         "software": f"gausim {__version__}, Python {platform.python_version()}, torch {torch.__version__}, "
         f"numba {numba.__version__}",
@@ -101,6 +92,4 @@ def machine(options: Options) -> dict[str, str]:
         "peaks": ", ".join(rates),
         "sizes": "quick (not to be quoted)" if options.quick else "full",
     }
-    if options.device.type == "cuda":
-        described["device"] = torch.cuda.get_device_name(options.device)
     return described

@@ -72,13 +72,10 @@ class _Case:
 def run(
     options: Options, module: GausSimModule, datamodule: ReadyDataModule, others: Mapping[str, GausSimModule]
 ) -> list[Row]:
-    """Times of optimiser steps and their parts, and memory of the graph.
+    """Times of optimiser steps and their parts, and memory of the graph, at the curriculum's largest T.
 
-    Args:
-        options: options; a quick run predicts three frames, another one the curriculum's largest T.
-        module: trained module; its weights stay constant, its running statistics change.
-        datamodule: source of the sequences.
-        others: modules of the same data for comparison, by the setting that selects them.
+    The module's weights stay constant, its running statistics change. ``others`` are modules of the same data for
+    comparison, by the setting that selects them.
     """
     datamodule.setup("fit")
     t_max = datamodule.curriculum.t_max

@@ -33,7 +33,7 @@ def main(argv: list[str]) -> int:
     arguments = _parser().parse_args(argv)
     from omegaconf import OmegaConf
 
-    from gausim.cli.train import train_run
+    from gausim.cli.training_run import train_run
     from gausim.runs.directory import RunDirectory
 
     source = RunDirectory(arguments.run)

@@ -113,13 +113,7 @@ def _run(name: str, options: Options, overrides: list[str], *, optional: bool) -
 
 
 def simulator_of(preset: str, scene: GaussianScene, *settings: str) -> GausSim:
-    """The untrained simulator of ``conf/model/PRESET.yaml`` for a scene at 24 frames per second.
-
-    Args:
-        preset: name of the file.
-        scene: the scene to simulate.
-        settings: KEY=VALUE with keys of the simulator.
-    """
+    """The untrained simulator of ``conf/model/PRESET.yaml`` for a scene at 24 frames per second, with KEY=VALUE."""
     from gausim.compose.config import compose, instantiate
 
     config = compose(f"model/{preset}", [f"model.simulator.{setting}" for setting in settings])

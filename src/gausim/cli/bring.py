@@ -34,12 +34,8 @@ def default_folder(entry: Entry) -> Path:
 def fetch(entry: Entry, target: Path, addresses: Sequence[str]) -> bool:
     """Makes the directory ``target`` of an entry atomically; returns False if it was fetched before.
 
-    Downloads are kept in a hidden folder beside it, from which the same call continues after an interruption.
-
-    Args:
-        entry: the entry to fetch.
-        target: the directory, which must not exist.
-        addresses: addresses of the archive, in the order to try.
+    Addresses are tried in their order. Downloads are kept in a hidden folder beside the target, from which the same
+    call continues after an interruption.
 
     Raises:
         FetchError: the target has other content, no address has the file, its size or hash is wrong, the archive is

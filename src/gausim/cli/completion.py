@@ -17,11 +17,7 @@ OVERRIDES = "KEY=VALUE"
 
 
 def complete(words: Sequence[str]) -> list[str]:
-    """Returns the completions of the last word; none for files and free text.
-
-    Args:
-        words: the words after `gausim`; the last is the one at the cursor (empty after a space).
-    """
+    """Completions of the last of the words after `gausim` (empty after a space); none for files and free text."""
     *before, word = words or [""]
     if not before:
         offered = [*COMMANDS, *(("--help", "--version") if word.startswith("-") else ())]

@@ -16,13 +16,10 @@ OWN_OBJECT = ("train", "data=object", "data.root=ROOT", "name=mine")
 
 
 def end(sentences: Sequence[str], kind: str, address: Path, *commands: Sequence[object]) -> None:
-    """Prints the end of a command, at most three lines, one, and one per next command.
+    """Prints the result in at most three lines, its address, and the next commands, as arguments of gausim.
 
-    Args:
-        sentences: the result, one line each; beyond three only the number of the others is printed.
-        kind: kind of the address: ``page``, ``tables``, ``videos``, ``run``.
-        address: file or directory.
-        commands: the next commands, as arguments of gausim.
+    Of more than three sentences only the number of the others is printed. ``kind``: ``page``, ``tables``,
+    ``videos``, ``run``.
     """
     lines = list(sentences[:MOST_SENTENCES])
     left = len(sentences) - len(lines)

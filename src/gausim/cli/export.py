@@ -20,41 +20,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion to export.
+    """A motion to export."""
 
-    Attributes:
-        name: base name of the files.
-        fps: frames per second.
-        frames: number of frames.
-        scenes: generator function of the deformed scenes.
-        first: the first deformed scene, or the rest scene.
-        trajectory: the motion as a trajectory, if it was read as one.
-        cameras: cameras of the data set, if any.
-        renderer: renderer of the run, if any.
-    """
-
-    name: str
-    fps: float
-    frames: int
-    scenes: Callable[[], Iterator[GaussianScene]]
-    first: GaussianScene
-    trajectory: Trajectory | None = None
-    cameras: Cameras | None = None
-    renderer: Renderer | None = None
+    name: str  # base name of the files
+    fps: float  # frames per second
+    frames: int  # number of frames
+    scenes: Callable[[], Iterator[GaussianScene]]  # generator function of the deformed scenes
+    first: GaussianScene  # the first deformed scene, or the rest scene
+    trajectory: Trajectory | None = None  # the motion as a trajectory, if it was read as one
+    cameras: Cameras | None = None  # cameras of the data set, if any
+    renderer: Renderer | None = None  # renderer of the run, if any
 
 
 def main(argv: list[str]) -> int:
     """Runs the command; returns the exit status."""
     arguments = _parser().parse_args(argv)
     motion = _thinned(_opened(arguments), arguments.every)
-    form = FORMATS[arguments.format]
-    path = arguments.out or Path(f"{motion.name}{form.suffix}")
-    if form.write in (_write_safetensors, _write_motion, _write_page, _write_recording) and motion.trajectory is None:
-        raise ConfigError(
-            f"--format {arguments.format}: {arguments.source} holds frames without units, which make no trajectory. "
-            "Export from a run, a trajectory or a motion, or as ply, gltf, usd, mp4 or gif."
-        )
-    count = form.write(motion, path, arguments)
+    path = arguments.out or Path(f"{motion.name}{FORMATS[arguments.format].suffix}")
+    count = _write(motion, path, arguments)
     print(f"wrote {path}: {count} frames of {motion.first.count} kernels at {motion.fps:g} frames per second")
     return 0
 
@@ -148,13 +131,7 @@ def _of_trajectory(name: str, scene: GaussianScene, trajectory: Trajectory) -> M
 def _thinned(motion: Motion, every: int) -> Motion:
     trajectory = motion.trajectory
     if trajectory is not None:
-        trajectory = replace(
-            trajectory,
-            positions=trajectory.positions[::every],
-            deformation_gradients=trajectory.deformation_gradients[::every],
-            rotations=trajectory.rotations[::every],
-            fps=trajectory.fps / every,
-        )
+        trajectory = trajectory.part(slice(None, None, every))
     return replace(
         motion,
         fps=motion.fps / every,
@@ -164,80 +141,61 @@ def _thinned(motion: Motion, every: int) -> Motion:
     )
 
 
-def _write_safetensors(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
-    from gausim.io.trajectory import save_trajectory
+def _write(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
+    """Writes the motion; returns the number of frames."""
+    scene, trajectory, up = motion.first, motion.trajectory, arguments.up
+    match arguments.format:
+        case "ply":
+            from gausim.io.ply_sequence import save_ply_sequence
 
-    assert motion.trajectory is not None
-    save_trajectory(path, motion.trajectory, facts={"object": motion.first.name})
+            return len(save_ply_sequence(path, motion.name, motion.scenes(), motion.fps))
+        case "gltf":
+            from gausim.io.gltf import save_gltf_frames
+
+            return save_gltf_frames(path, motion.name, motion.scenes(), up=up)
+        case "usd":
+            from gausim.io.usd import save_usd
+
+            return save_usd(path, motion.scenes(), motion.fps, up=up)
+        case "mp4" | "gif":
+            from gausim.io.video import write_gif, write_video
+
+            write = write_gif if arguments.format == "gif" else write_video
+            return write(path, _pictures(motion, arguments), motion.fps)
+    if trajectory is None:
+        raise ConfigError(
+            f"--format {arguments.format}: {arguments.source} holds frames without units, which make no trajectory. "
+            "Export from a run, a trajectory or a motion, or as ply, gltf, usd, mp4 or gif."
+        )
+    match arguments.format:
+        case "safetensors":
+            from gausim.io.trajectory import save_trajectory
+
+            save_trajectory(path, trajectory, facts={"object": scene.name})
+        case "motion":
+            from gausim.io.motion import save_motion
+
+            save_motion(path, scene, trajectory, up=up)
+        case "html":
+            from gausim.io.player import save_player
+
+            background, camera = parse_background(arguments.background), _camera(motion, arguments)
+            save_player(path, scene, trajectory, camera, up=up, background=background)
+        case "viser":
+            from gausim.viewer.recording import record
+
+            record(scene, trajectory, path, up=up)
     return motion.frames
-
-
-def _write_ply(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
-    from gausim.io.ply_sequence import save_ply_sequence
-
-    return len(save_ply_sequence(path, motion.name, motion.scenes(), motion.fps))
-
-
-def _write_gltf(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
-    from gausim.io.gltf import save_gltf_frames
-
-    return save_gltf_frames(path, motion.name, motion.scenes(), up=arguments.up)
-
-
-def _write_motion(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
-    from gausim.io.motion import save_motion
-
-    assert motion.trajectory is not None
-    save_motion(path, motion.first, motion.trajectory, up=arguments.up)
-    return motion.frames
-
-
-def _write_page(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
-    from gausim.io.player import save_player
-
-    assert motion.trajectory is not None
-    background, camera = parse_background(arguments.background), _camera(motion, arguments)
-    save_player(path, motion.first, motion.trajectory, camera, up=arguments.up, background=background)
-    return motion.frames
-
-
-def _write_usd(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
-    from gausim.io.usd import save_usd
-
-    return save_usd(path, motion.scenes(), motion.fps, up=arguments.up)
-
-
-def _write_recording(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
-    from gausim.viewer.recording import record
-
-    assert motion.trajectory is not None
-    record(motion.first, motion.trajectory, path, up=arguments.up)
-    return motion.frames
-
-
-def _write_pictures(motion: Motion, path: Path, arguments: argparse.Namespace) -> int:
-    from gausim.io.video import write_gif, write_video
-
-    write = write_gif if arguments.format == "gif" else write_video
-    return write(path, _pictures(motion, arguments), motion.fps)
 
 
 def _pictures(motion: Motion, arguments: argparse.Namespace) -> Iterator[np.ndarray]:
-    import torch
-
     from gausim.compose.config import compose, instantiate
-    from gausim.render.draw import draw, to_bytes
+    from gausim.render.draw import draw_still, to_bytes
 
     background, camera = parse_background(arguments.background), _camera(motion, arguments)
     renderer = motion.renderer or instantiate(compose("render/cpu").render)
-    identity = torch.eye(3)[None, None]
     for scene in motion.scenes():
-        units = torch.zeros(scene.count, dtype=torch.long)
-        with torch.no_grad():
-            made = draw(
-                renderer, scene, scene.means[None], identity, identity, units, camera, background=background,
-                mask=motion.first.foreground,
-            )  # fmt: skip
+        made = draw_still(renderer, scene, camera, background=background, mask=motion.first.foreground)
         yield to_bytes(made.rgb[0, 0]).cpu().numpy()
 
 
@@ -257,10 +215,9 @@ def _camera(motion: Motion, arguments: argparse.Namespace) -> Cameras:
 
 
 class Format(NamedTuple):
-    """A file format: suffix (empty for a folder), writer, content that it keeps and loses, and readers."""
+    """A file format: suffix (empty for a folder), content that it keeps and loses, and readers."""
 
     suffix: str
-    write: Callable[[Motion, Path, argparse.Namespace], int]
     keeps: str
     loses: str
     reader: str = ""
@@ -269,14 +226,12 @@ class Format(NamedTuple):
 FORMATS = {
     "safetensors": Format(
         ".safetensors",
-        _write_safetensors,
         "every number of the trajectory, bit for bit: positions, deformation gradients and rotations per unit",
         "the rest scene (keep SCENE.ply beside it)",
         "gausim (--scene SCENE.ply), any safetensors reader",
     ),
     "ply": Format(
         "",
-        _write_ply,
         "one 3DGS PLY per frame, name_0001.ply as SuperSplat's timeline plays; covariances as axes and lengths, turned "
         "spherical harmonics, masks of the first frame",
         "units of the kernels, deformation gradients",
@@ -284,7 +239,6 @@ FORMATS = {
     ),
     "motion": Format(
         ".motion.glb",
-        _write_motion,
         "the rest scene and its masks; of every unit and frame centre and deformation gradient as 12 half floats, a "
         "hundredth of the size of PLY files",
         "digits (errors below a thousandth of the diagonal; spherical harmonics have 8 bits); rotations become those "
@@ -293,14 +247,12 @@ FORMATS = {
     ),
     "html": Format(
         ".html",
-        _write_page,
         "as motion, in one page that plays in a browser without a network: turned spherical harmonics, time bar, orbit",
         "as motion",
         "every browser with WebGL 2",
     ),
     "gltf": Format(
         "",
-        _write_gltf,
         "one glTF (GLB with KHR_gaussian_splatting) per frame, name_0001.glb: covariances as axes and lengths, turned "
         "spherical harmonics, float32",
         "masks, units, deformation gradients, frame rate",
@@ -308,7 +260,6 @@ FORMATS = {
     ),
     "usd": Format(
         ".usdc",
-        _write_usd,
         "one ParticleField3DGaussianSplat with time samples: positions, orientations, scales, opacities, turned "
         "spherical harmonics, float32",
         "masks, units, deformation gradients",
@@ -316,12 +267,9 @@ FORMATS = {
     ),
     "viser": Format(
         ".viser",
-        _write_recording,
         "positions, covariances (float16), one colour per kernel and frame",
         "spherical harmonics, masks, units",
     ),
-    "mp4": Format(".mp4", _write_pictures, "pictures of one camera", "everything else"),
-    "gif": Format(
-        ".gif", _write_pictures, "pictures of one camera, 256 colours, whole hundredths of a second", "everything else"
-    ),
+    "mp4": Format(".mp4", "pictures of one camera", "everything else"),
+    "gif": Format(".gif", "pictures of one camera, 256 colours, whole hundredths of a second", "everything else"),
 }

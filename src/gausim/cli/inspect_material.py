@@ -5,31 +5,27 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import torch
+
+from gausim.compose.build import LoadedRun, load_run
+from gausim.compose.data_paths import data_option
+from gausim.compose.predict import run_objects, scene_of, state_of
+from gausim.core import GaussianScene
 from gausim.core.errors import ConfigError
-
-if TYPE_CHECKING:
-    import torch
-
-    from gausim.compose.build import LoadedRun
-    from gausim.core import GaussianScene
-    from gausim.models.template.template import Property
+from gausim.io.ply import save_scene
+from gausim.models.step.scene_model import SceneModel
+from gausim.models.template.template import Property
+from gausim.ops.orbit import orbit_cameras
+from gausim.ops.spherical_harmonics import C0
+from gausim.render.draw import draw_still
+from gausim.report.pictures.kernels import draw_property, property_colors, property_scale
 
 PIXELS = 480
 
 
 def show_material(arguments: argparse.Namespace) -> int:
     """Writes picture and PLY of a property, and prints its range; returns the exit status."""
-    import torch
-
-    from gausim.compose.build import load_run
-    from gausim.compose.data_paths import data_option
-    from gausim.compose.predict import run_objects, scene_of, state_of
-    from gausim.io.ply import save_scene
-    from gausim.ops.spherical_harmonics import C0
-    from gausim.report.pictures.material import draw_property, property_colors, property_scale
-
     run, name = load_run(arguments.scene, data=data_option(arguments.data)), arguments.property
     state_of(run)
     item = run_objects(run, None if arguments.object is None else [arguments.object])[0]
@@ -51,8 +47,6 @@ def show_material(arguments: argparse.Namespace) -> int:
 
 
 def _learned(run: LoadedRun, scene_id: int, name: str, path: Path) -> Property:
-    from gausim.models.step.scene_model import SceneModel
-
     model = run.module.model
     known = model.material(scene_id) if isinstance(model, SceneModel) else {}
     if name not in known:
@@ -66,16 +60,6 @@ def _learned(run: LoadedRun, scene_id: int, name: str, path: Path) -> Property:
 
 def _images(run: LoadedRun, scene: GaussianScene, azimuths: list[float], up: str) -> torch.Tensor:
     """The scene from these sides on white, (V, H, W, 3) in [0, 1]."""
-    import torch
-
-    from gausim.ops.orbit import orbit_cameras
-    from gausim.render.draw import draw
-
     cameras = orbit_cameras(scene.means[scene.foreground], azimuths=azimuths, up=up, size=(PIXELS, PIXELS))
-    identity, units = torch.eye(3)[None, None], torch.zeros(scene.count, dtype=torch.long)
-    with torch.no_grad():
-        made = draw(
-            run.renderer, scene, scene.means[None], identity, identity, units, cameras, background=torch.ones(3),
-            mask=scene.foreground,
-        )  # fmt: skip
+    made = draw_still(run.renderer, scene, cameras, background=torch.ones(3), mask=scene.foreground)
     return made.rgb[0].clamp(0, 1).cpu()

@@ -82,14 +82,7 @@ def _run(name: str, argv: list[str]) -> int:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command line.
-
-    Args:
-        argv: arguments without the program's name; the process's own by default.
-
-    Returns:
-        The exit status: 0 done, 2 wrong usage or unusable input, 130 interrupted, else that of the command.
-    """
+    """Runs the command line; exit status: 0 done, 2 wrong usage or input, 130 interrupted, else the command's."""
     name, *rest = list(sys.argv[1:] if argv is None else argv) or [""]
     if name in ("-h", "--help", "help"):
         print(usage())

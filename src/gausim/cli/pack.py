@@ -27,18 +27,10 @@ _LICENCES = ("licence", "license")
 
 
 def pack_published(source: Path, out: Path, *, name: str, title: str | None, licence: str | None, data: str) -> str:
-    """Packs a finished run or a data set into ``out/NAME.tar``, its card beside it.
+    """Packs a finished run or a data set into ``out/NAME.tar``, its card beside it; returns its entry in TOML.
 
-    Args:
-        source: a run directory, or a directory of an object or of several.
-        out: directory of the archive.
-        name: name of the entry.
-        title: title of the entry; made from the names of the objects when None.
-        licence: licence of the content; that of ``dataset.json`` when None.
-        data: of a run, the entry of its data set, or empty.
-
-    Returns:
-        The TOML entry for a registry, without addresses.
+    The title is made from the names of the objects when None, the licence is that of ``dataset.json``; ``data`` is
+    the entry of a run's data set, or empty.
 
     Raises:
         FetchError: the name is invalid, or the licence is unknown.

@@ -59,15 +59,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def fit_scene(source: Path, out: Path, arguments: argparse.Namespace) -> tuple[dict[str, Any], str]:
-    """Reconstructs a scene and writes it, with figures (JSON) and a picture (PNG) beside it.
+    """Reconstructs a scene and writes it to ``out``, with figures (JSON) and a picture (PNG) beside it.
 
-    Args:
-        source: ``dataset.json`` of an object or ``transforms.json`` of stills.
-        out: the scene file to write.
-        arguments: arguments of :func:`add_fit_options` and :func:`gausim.cli.arguments.add_pin_options`.
-
-    Returns:
-        Number of kernels, figures per set of images and options as plain data; a text of the same content.
+    ``source`` is ``dataset.json`` of an object or ``transforms.json`` of stills; ``arguments`` are those of
+    :func:`add_fit_options` and :func:`gausim.cli.arguments.add_pin_options`. Returns the figures as plain data and
+    as text.
 
     Raises:
         DataError: images, poses or masks are unusable.

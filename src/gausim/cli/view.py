@@ -9,14 +9,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gausim.cli.arguments import (
-    UPS,
-    add_data_option,
-    add_scene_options,
-    command_parser,
-    opened_scene,
-    pinned_by,
-)
+from gausim.cli.arguments import UPS, add_data_option, add_scene_options, command_parser, opened_scene, pinned_by
 
 if TYPE_CHECKING:
     from gausim.cli.view_subject import Playable

@@ -6,38 +6,29 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from gausim.compose.build import LoadedRun
 from gausim.compose.live import REST, open_interaction
+from gausim.compose.predict import RunObject, TrainedPrediction, run_objects
 from gausim.core import Trajectory
-
-if TYPE_CHECKING:
-    from gausim.compose.build import LoadedRun
-    from gausim.compose.predict import RunObject
-    from gausim.interaction.interaction import Interaction
-    from gausim.models.template.template import Property
-    from gausim.viewer.shown import Take
-    from gausim.viewer.subject import Subject
+from gausim.interaction.interaction import Interaction
+from gausim.models.step.scene_model import SceneModel
+from gausim.models.template.template import Property
+from gausim.viewer.companion import Companion
+from gausim.viewer.shown import Take
+from gausim.viewer.subject import Films, Subject
 
 
 @dataclass(frozen=True, eq=False)
 class Playable:
-    """A method for one object.
+    """A method for one object."""
 
-    Attributes:
-        interaction: the interactive simulation of the object.
-        item: the object of the run; None for a bare scene.
-        run: the run; None for a bare scene.
-    """
-
-    interaction: Interaction
-    item: RunObject | None = None
-    run: LoadedRun | None = None
+    interaction: Interaction  # the interactive simulation of the object
+    item: RunObject | None = None  # the object of the run; None for a bare scene
+    run: LoadedRun | None = None  # the run; None for a bare scene
 
     def predictions(self) -> dict[str, Callable[[], Trajectory]]:
         """Functions that predict the recorded sequences, by name."""
-        from gausim.compose.predict import TrainedPrediction
-
         if self.item is None or self.run is None:
             return {}
         predict = TrainedPrediction(self.run, self.item)
@@ -45,35 +36,21 @@ class Playable:
 
 
 def playable_run(
-    run: LoadedRun,
-    *,
-    name: str | None = None,
-    sequence: str = REST,
-    gravity: float | None = None,
-    keep: int | None = 0,
+    run: LoadedRun, *, name: str | None = None, sequence: str = REST, gravity: float | None = None, keep: int | None = 0
 ) -> Playable:
     """An object of a run, by default its first; the options are those of :func:`open_interaction`."""
-    from gausim.compose.predict import run_objects
-
     item = run_objects(run, [name] if name is not None else None)[0]
     return Playable(open_interaction(run, name=name, sequence=sequence, gravity=gravity, keep=keep), item, run)
 
 
 def takes_of(made: Playable, beside: Playable | None) -> list[Take]:
     """Predictions of the recorded sequences by the method, and by the method beside it."""
-    from gausim.viewer.shown import Take
-
     other = {} if beside is None else beside.predictions()
     return [Take(f"Predicted: {name}", load, name, other.get(name)) for name, load in made.predictions().items()]
 
 
 def subject_of(made: Playable, *, title: str, beside: Playable | None, up: str, sessions: Path) -> Subject:
     """The complete content of the viewer."""
-    from gausim.models.step.scene_model import SceneModel
-    from gausim.viewer.companion import Companion
-    from gausim.viewer.films import Films
-    from gausim.viewer.subject import Subject
-
     films = cameras = companion = None
     material: dict[str, Property] = {}
     if made.run is not None and made.item is not None:

@@ -5,15 +5,25 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
+import torch
+from omegaconf import OmegaConf
+
+from gausim.compose.config import compose, instantiate
 from gausim.compose.live import energy_ceiling
+from gausim.core import GaussianScene
 from gausim.core.errors import ConfigError
-
-if TYPE_CHECKING:
-    from gausim.core import GaussianScene
-    from gausim.interaction.interaction import Interaction
-    from gausim.models.step.simulator import GausSim
+from gausim.core.state import initial_sway
+from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
+from gausim.interaction.session import MadeWith
+from gausim.models.rollout.dynamics import MaterialDynamics, SceneDynamics
+from gausim.models.step.simulator import GausSim
+from gausim.models.template.material import MaterialTemplate
+from gausim.ops.selection import require_pinned
+from gausim.runs.directory import RunDirectory
+from gausim.training.pretraining import give_even_material
+from gausim.training.transfer import load_shared
 
 # The model without a trained run: its untrained network outputs zero, so that only the template acts.
 UNTRAINED = "gausim"
@@ -23,16 +33,13 @@ UNTRAINED = "gausim"
 class EvenMaterial:
     """The material of a body that was never filmed, the same everywhere.
 
-    Attributes:
-        stiffness: over that of the material whose slowest swing takes one second; the period is stiffness^(-1/2) [s].
-        damping: amplitudes fall as exp(-damping t / 2) [1 / s].
-
     Raises:
         ConfigError: a number is not positive and finite.
     """
 
+    # over that of the material whose slowest swing takes one second; the period is stiffness^(-1/2) [s]
     stiffness: float = 1.0
-    damping: float = 0.5
+    damping: float = 0.5  # amplitudes fall as exp(-damping t / 2) [1 / s]
 
     def __post_init__(self) -> None:
         """Checks the numbers."""
@@ -58,38 +65,25 @@ def open_scene(
     most_force: float | None = None,
     keep: int | None = 0,
 ) -> Interaction:
-    """Opens a scene without videos for interaction.
+    """Opens a scene without videos, some of its kernels pinned, for interaction.
 
-    Args:
-        scene: the rest scene, some of its kernels pinned.
-        fps: frames per second.
-        base: trained run of the neural simulator whose network and decoders are used; None: an untrained model.
-        material: the material with ``base``; the default one when None.
-        seed: seed of an untrained model.
-        sway: initial displacement per frame of the kernel farthest from the pins [diagonals].
-        gravity: acceleration that defines the unit of weight [scene units / s^2]; 9.81 when None.
-        most_force: the largest force [weights]; the default of interactions when None.
-        keep: number of latest frames to keep; None keeps all.
+    ``base`` is a trained run of the neural simulator whose network and decoders move it, with an even ``material``;
+    None: an untrained model of this ``seed``. ``sway`` is the initial displacement per frame of the kernel farthest
+    from the pins [diagonals], ``gravity`` the unit of weight [scene units / s^2] (9.81), ``most_force`` the largest
+    force [weights], ``keep`` the number of latest frames that are kept (None: all).
 
     Raises:
         SceneError: no kernel is pinned.
         ConfigError: the frame rate is not positive and finite, or ``base`` is a run of another model.
     """
-    import torch
-
-    from gausim.core.state import initial_sway
-    from gausim.interaction.interaction import MOST_FORCE, STANDARD_GRAVITY, Interaction
-    from gausim.interaction.session import MadeWith
-    from gausim.models.rollout.dynamics import SceneDynamics
-    from gausim.ops.selection import require_pinned
-
     if not (math.isfinite(fps) and fps > 0):
         raise ConfigError(f"--fps {fps}: expected frames per second > 0.")
     require_pinned(scene)
     torch.manual_seed(seed)
     model = _untrained(scene, fps) if base is None else _of_base(scene, fps, base, material or EvenMaterial())
     initial = initial_sway(scene, sway)
-    dynamics = SceneDynamics(model, energy_ceiling=energy_ceiling(model, 0, [initial.previous]))
+    kind = SceneDynamics if base is None else MaterialDynamics
+    dynamics = kind(model, energy_ceiling=energy_ceiling(model, 0, [initial.previous]))
     run = "untrained" if base is None else base.resolve().name
     made_with = MadeWith.of(scene, model, initial, settings=UNTRAINED, run=run)
     return Interaction(
@@ -100,20 +94,11 @@ def open_scene(
 
 
 def _untrained(scene: GaussianScene, fps: float) -> GausSim:
-    from gausim.compose.config import compose
-
     return _built(compose(f"model/{UNTRAINED}").model.simulator, scene, fps)
 
 
 def _of_base(scene: GaussianScene, fps: float, base: Path, material: EvenMaterial) -> GausSim:
     """The simulator of a run's configuration with its shared weights, and an even material."""
-    from omegaconf import OmegaConf
-
-    from gausim.models.template.material import MaterialTemplate
-    from gausim.runs.directory import RunDirectory
-    from gausim.training.pretraining import give_even_material
-    from gausim.training.transfer import load_shared
-
     config = RunDirectory(base).config().get("model", {})
     node = OmegaConf.create(config).get("simulator")
     model = None if node is None else _built(node, scene, fps)
@@ -130,6 +115,4 @@ def _of_base(scene: GaussianScene, fps: float, base: Path, material: EvenMateria
 
 
 def _built(node: Any, scene: GaussianScene, fps: float) -> GausSim:
-    from gausim.compose.config import instantiate
-
     return cast("GausSim", instantiate(node, scenes=[scene], fps=[fps])())

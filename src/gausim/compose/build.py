@@ -24,7 +24,7 @@ from gausim.training.fitted.stages import StagedCurriculum
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.pretraining import KnownStates
-from gausim.training.supervision.images import Sources, Supervision
+from gausim.training.supervision.images import Sources
 
 # Target of the data of pretraining.
 PRETRAINING = "gausim.data.pretraining.CorpusDataModule"
@@ -32,111 +32,80 @@ PRETRAINING = "gausim.data.pretraining.CorpusDataModule"
 
 @dataclass(frozen=True, eq=False)
 class LoadedRun:
-    """A trained run, loaded for evaluation or simulation.
+    """A trained run, loaded for evaluation or simulation."""
 
-    Attributes:
-        config: the resolved configuration.
-        module: the module in evaluation mode, with the run's weights (averaged ones if there are any).
-        objects: the objects; their index is the ``scene_id`` of the module's scenes.
-        datamodule: the data.
-        renderer: the renderer of the training.
-        run_dir: the run directory.
-    """
-
-    config: dict[str, Any]
-    module: GausSimModule
-    objects: list[ObjectData]
-    datamodule: ReadyDataModule
-    renderer: Renderer
-    run_dir: Path
+    config: dict[str, Any]  # the resolved configuration
+    module: GausSimModule  # the module in evaluation mode, with the run's weights (averaged ones if there are any)
+    objects: list[ObjectData]  # the objects; their index is the ``scene_id`` of the module's scenes
+    datamodule: ReadyDataModule  # the data
+    renderer: Renderer  # the renderer of the training
+    run_dir: Path  # the run directory
 
 
 def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[GausSimModule, ReadyDataModule]:
     """Builds the module and the data of a training configuration.
 
-    Args:
-        cfg: the configuration.
-        sealed: refuse unseen frames and the true motion of the test part.
+    ``sealed`` refuses unseen frames and the true motion of the test part.
 
     Raises:
         GausSimError: a node is wrong, the model cannot be trained, or the data or a rest scene is missing or damaged.
     """
     config = cfg if isinstance(cfg, DictConfig) else OmegaConf.create(dict(cfg))
-    if "method" in config.model:
-        return _build_fit(config, sealed)
-    if "simulator" not in config.model or "initial_states" not in config.model:
+    fits = "method" in config.model
+    if not fits and ("simulator" not in config.model or "initial_states" not in config.model):
         raise ConfigError(
             "model: expected the entries 'simulator' and 'initial_states' of a model that learns (gausim, "
             "gausim_paper), or 'method' and 'plan' of one that is fitted (spring_mass, ...), got "
             f"{sorted(str(k) for k in config.model)}."
         )
-    datamodule = instantiate(config.data)
+    plan = instantiate(config.model.plan) if fits else None
+    datamodule = instantiate(config.data, **({} if plan is None else _staged(config, plan)))
     datamodule.sealed = sealed
-    objects = datamodule.objects
-    scenes = [item.scene() for item in objects]
-    model = instantiate(config.model.simulator, scenes=scenes, fps=[item.fps for item in objects])()
-    scene_of_sequence = [scene_id for scene_id, _ in datamodule.index.entries]
+    scenes = [item.scene() for item in datamodule.objects]
+    given = {"scenes": scenes, "fps": [item.fps for item in datamodule.objects]}
     renderer, objective = instantiate(config.render), instantiate(config.loss)
-    sources = Sources(scenes, datamodule.index.ground_truth, model.smooth_motions, renderer, objective.image)
-    if isinstance(datamodule, CorpusDataModule):
-        method: SharedSimulator = KnownStates(model, datamodule, scene_of_sequence)
+    if plan is None:
+        model = instantiate(config.model.simulator, **given)()
+        method: SharedSimulator | StagedFit = _shared_simulator(config, model, datamodule)
+        smooth, learns = model.smooth_motions, objective
     else:
-        states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
-        hands = [record.hands for _, record in datamodule.index.entries]
-        method = SharedSimulator(model, states, scene_of_sequence, hands)
+        given |= {"scene_of_sequence": [scene_id for scene_id, _ in datamodule.index.entries]}
+        fitted = instantiate(config.model.method, **given, seen=int(config.data.curriculum.t_max))()
+        method = StagedFit(fitted, plan, datamodule.curriculum, objective.explosion)
+        smooth, learns = (lambda scene_id: None), Objective(explosion=objective.explosion)
+    sources = Sources(scenes, datamodule.index.ground_truth, smooth, renderer, objective.image)
+    node = config.get("supervision")
     module = GausSimModule(
         method=method,
         renderer=renderer,
-        objective=objective,
-        optimizer=instantiate(config.optimizer),
-        supervision=_supervision(config, sources),
+        objective=learns,
+        optimizer=None if fits else instantiate(config.optimizer),
+        supervision=instantiate(node)(sources) if node else None,
         seed=int(config.seed),
     )
     return module, datamodule
 
 
-def _supervision(config: DictConfig, sources: Sources) -> Supervision | None:
-    node = config.get("supervision")
-    made: Supervision | None = instantiate(node)(sources) if node else None
-    return made
-
-
-def _build_fit(config: DictConfig, sealed: bool) -> tuple[GausSimModule, ReadyDataModule]:
-    """The module and data of a method that is fitted in stages; its plan sets T and the shows per epoch."""
-    plan = instantiate(config.model.plan)
-    seen = int(config.data.curriculum.t_max)
-    curriculum = StagedCurriculum(t_start=1, t_max=seen, plan=plan)
+def _staged(config: DictConfig, plan: Any) -> dict[str, Any]:
+    """Settings of the data of a method that is fitted in stages; its plan sets T and the shows per epoch."""
+    curriculum = StagedCurriculum(t_start=1, t_max=int(config.data.curriculum.t_max), plan=plan)
     alone = config.data.batch_size or 1  # sequences are fitted independently
-    datamodule = instantiate(config.data, curriculum=curriculum, repeats=plan.shows, batch_size=alone)
-    datamodule.sealed = sealed
-    objects = datamodule.objects
-    scenes = [item.scene() for item in objects]
-    fitted = instantiate(
-        config.model.method,
-        scenes=scenes,
-        fps=[item.fps for item in objects],
-        scene_of_sequence=[scene_id for scene_id, _ in datamodule.index.entries],
-        seen=seen,
-    )()
-    renderer, objective = instantiate(config.render), instantiate(config.loss)
-    sources = Sources(scenes, datamodule.index.ground_truth, lambda scene_id: None, renderer, objective.image)
-    module = GausSimModule(
-        method=StagedFit(fitted, plan, datamodule.curriculum, objective.explosion),
-        renderer=renderer,
-        objective=Objective(explosion=objective.explosion),
-        supervision=_supervision(config, sources),
-        seed=int(config.seed),
-    )
-    return module, datamodule
+    return {"curriculum": curriculum, "repeats": plan.shows, "batch_size": alone}
+
+
+def _shared_simulator(config: DictConfig, model: Any, datamodule: ReadyDataModule) -> SharedSimulator:
+    entries = datamodule.index.entries
+    scene_of_sequence = [scene_id for scene_id, _ in entries]
+    if isinstance(datamodule, CorpusDataModule):
+        return KnownStates(model, datamodule, scene_of_sequence)
+    states = instantiate(config.model.initial_states, model=model, scene_of_sequence=scene_of_sequence)()
+    return SharedSimulator(model, states, scene_of_sequence, [record.hands for _, record in entries])
 
 
 def load_run(run_dir: Path | str, *, checkpoint: str = "last.ckpt", data: Mapping[str, Any] | None = None) -> LoadedRun:
     """Loads a run; its test part is sealed until `gausim evaluate --test` has looked at it.
 
-    Args:
-        run_dir: the run directory.
-        checkpoint: file in this directory.
-        data: keys of the data configuration to replace, e.g. ``{"root": "/elsewhere"}``.
+    ``data`` replaces keys of the data configuration, e.g. ``{"root": "/elsewhere"}``.
 
     Raises:
         RunError: the run or checkpoint is missing, or the scene differs from the one it was trained on.

@@ -30,14 +30,7 @@ _UNKNOWN_KEY = r"Could not override '([^']+)'|Key '([^']+)' (?:is )?not in"
 
 
 def compose(config_name: str, overrides: Sequence[str] = ()) -> DictConfig:
-    """Composes a configuration without running anything.
-
-    Args:
-        config_name: file in conf/, without its suffix.
-        overrides: as on the command line, e.g. `("model=gausim_paper", "seed=3")`.
-
-    Returns:
-        The composed configuration; unknown keys cannot be set on it.
+    """Composes a file of conf/ with overrides as on the command line; unknown keys cannot be set on the result.
 
     Raises:
         ConfigError: a key, group or option is unknown.
@@ -47,14 +40,7 @@ def compose(config_name: str, overrides: Sequence[str] = ()) -> DictConfig:
 
 
 def compose_leniently(config_name: str, overrides: Sequence[str]) -> tuple[DictConfig, list[str]]:
-    """Composes a configuration from the valid overrides, and reports the errors of the others.
-
-    Args:
-        config_name: file in conf/, without its suffix.
-        overrides: as on the command line.
-
-    Returns:
-        The configuration without the wrong overrides, and a sentence for each of these.
+    """The configuration of the valid overrides, and a sentence for each of the others.
 
     Raises:
         ConfigError: the file in conf/ is invalid without overrides.
@@ -124,13 +110,8 @@ class Job:
 def run_hydra(config_name: str, task: Callable[[DictConfig], float | None], argv: Sequence[str]) -> int:
     """Runs a task under Hydra: overrides, `-m`, `--cfg job`, `--help` and the rest of Hydra's own options.
 
-    Args:
-        config_name: file in conf/, without its suffix.
-        task: function of the composed configuration; its return value is a sweeper's objective.
-        argv: the arguments after the command's name.
-
-    Returns:
-        The exit status.
+    ``task`` is a function of the composed configuration; its value is a sweeper's objective. Returns the exit
+    status.
 
     Raises:
         ConfigError: a key, group or option is unknown, or a value is missing.
@@ -225,14 +206,8 @@ def _keys(node: DictConfig, prefix: str = "") -> Iterator[str]:
 def instantiate(node: DictConfig | ListConfig | Mapping[str, Any], **kwargs: Any) -> Any:
     """Builds the objects that a configuration names in `_target_`; the only place in gausim that does so.
 
-    Objects in `kwargs` are passed to the constructor without the copies that Hydra would make.
-
-    Args:
-        node: a node with `_target_`, or a dict or list of such nodes (then without `kwargs`).
-        **kwargs: further constructor arguments; they take precedence over the node's.
-
-    Returns:
-        The object; a `functools.partial` for `_partial_: true`; a dict or list for a dict or list.
+    A dict or list gives a dict or list, `_partial_: true` a `functools.partial`. Further arguments in `kwargs` take
+    precedence over the node's, and are passed without the copies that Hydra would make.
 
     Raises:
         ConfigError: a target is not in the allow-list, does not exist, or does not take its arguments.

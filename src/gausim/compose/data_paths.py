@@ -37,15 +37,10 @@ def data_option(words: Sequence[str]) -> dict[str, Any]:
 
 
 def located(run_dir: Path, data: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """The data configuration of a run with the paths on this machine.
+    """The data configuration of a run with the paths on this machine, after replacing the keys ``given``.
 
     A missing scene or masks file is searched in ``RUN/scenes``, a folder of packed runs. The checkpoint contains
     fingerprints of its scenes, so that a wrong file is refused later.
-
-    Args:
-        run_dir: the run directory.
-        data: the data configuration of the run.
-        given: keys to replace.
 
     Raises:
         DataError: a path does not exist; the message names the option to set it.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from gausim.compose.build import LoadedRun
     from gausim.compose.predict import RunObject
-    from gausim.core import GaussianScene, SimState, Steppable
+    from gausim.core import GaussianScene, HandPath, SimState, Steppable
     from gausim.interaction.interaction import Interaction
 
 REST = "rest"
@@ -55,10 +55,10 @@ def open_interaction(
 
     item = run_objects(run, None if name is None else [name])[0]
     scene = scene_of(run, item)
-    initial, dynamics, masses, ceiling = _method(run, item, scene, sequence)
+    initial, dynamics, masses, ceiling, path = _method(run, item, scene, sequence)
     settings = json.dumps([run.config.get("model"), ceiling], sort_keys=True, default=str)
     made_with = MadeWith.of(
-        scene, run.module.model, initial, settings=settings, name=sequence, run=_name(Path(run.run_dir))
+        scene, run.module.model, initial, settings=settings, name=sequence, run=_name(Path(run.run_dir)), path=path
     )
     return Interaction(
         scene,
@@ -71,6 +71,7 @@ def open_interaction(
         most_force=MOST_FORCE if most_force is None else most_force,
         seed=seed,
         keep=keep,
+        hands=None if path is None else path.pose,
     )
 
 
@@ -103,8 +104,8 @@ def energy_ceiling(model: object, scene_id: int, previous: Sequence[Tensor]) -> 
 
 def _method(
     run: LoadedRun, item: RunObject, scene: GaussianScene, sequence: str
-) -> tuple[SimState, Steppable, Tensor, float | None]:
-    """Initial state, dynamics, masses and the limit of the energy."""
+) -> tuple[SimState, Steppable, Tensor, float | None, HandPath | None]:
+    """Initial state, dynamics, masses, the limit of the energy, and the recorded path of the hands."""
     from gausim.core import FittedDynamics, SimState
     from gausim.models.rollout.dynamics import SceneDynamics
     from gausim.models.step.simulator import GausSim
@@ -117,7 +118,7 @@ def _method(
     number = item.first_sequence + (names.index(sequence) if sequence != REST else 0)
     if isinstance(module.method, StagedFit):
         volumes = kernel_volumes(scene.log_scales, scene.volume_scale) * scene.simulated
-        return SimState(scene.means, scene.means), FittedDynamics(module.method.fitted, number), volumes, None
+        return SimState(scene.means, scene.means), FittedDynamics(module.method.fitted, number), volumes, None, None
     if not isinstance(module.model, GausSim):
         raise ConfigError(f"{run.run_dir}: {module.method_name} cannot be simulated by itself. Take a run of gausim.")
     states = cast(Any, module.initial_states)
@@ -126,7 +127,8 @@ def _method(
     ceiling = energy_ceiling(module.model, item.scene_id, [start.previous.to(scene.means) for start in starts])
     dynamics = SceneDynamics(module.model, item.scene_id, energy_ceiling=ceiling)
     initial = SimState(scene.means, scene.means) if sequence == REST else starts[names.index(sequence)]
-    return initial, dynamics, dynamics.masses, ceiling
+    path = None if sequence == REST else item.data.sequences[names.index(sequence)].hands
+    return initial, dynamics, dynamics.masses, ceiling, path
 
 
 def _name(path: Path) -> str:

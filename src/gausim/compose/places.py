@@ -24,17 +24,11 @@ MORE = f"{BASE}/more.yaml"  # settings that no configuration lists, with the def
 
 @dataclass
 class Place:
-    """One key of the configuration, over all files that set it.
+    """One key of the configuration, over all files that set it."""
 
-    Attributes:
-        targets: the targets that any file builds there.
-        children: the keys below.
-        comment: comment behind the key, from the first file that has one.
-    """
-
-    targets: list[str] = field(default_factory=list)
-    children: dict[str, Place] = field(default_factory=dict)
-    comment: str = ""
+    targets: list[str] = field(default_factory=list)  # the targets that any file builds there
+    children: dict[str, Place] = field(default_factory=dict)  # the keys below
+    comment: str = ""  # comment behind the key, from the first file that has one
 
     def merged(self) -> Place:
         """All children merged to one, for mappings with arbitrary names."""

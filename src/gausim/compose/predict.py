@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from dataclasses import dataclass
+from typing import Any, cast
 
+from torch import Tensor
+
+from gausim.compose.build import LoadedRun
+from gausim.core import ConfigError, GaussianScene, SimState, Trajectory
 from gausim.core.errors import DataError
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from gausim.compose.build import LoadedRun
-    from gausim.core import GaussianScene, Trajectory
-    from gausim.data.objects import ObjectData
-    from gausim.data.records import SequenceRecord
+from gausim.data.objects import ObjectData
+from gausim.data.records import SequenceRecord
+from gausim.evaluation.endurance import RandomPushes, endure
+from gausim.evaluation.stability import largest_eigenvalue
+from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.step.simulator import GausSim
+from gausim.runs.checkpoint import read_checkpoint
+from gausim.runs.directory import RunDirectory
 
 # Duration of the random pushes of `gausim evaluate --endurance` [frames].
 PUSHED_FRAMES = 240
@@ -22,17 +26,11 @@ PUSHED_FRAMES = 240
 
 @dataclass(frozen=True)
 class RunObject:
-    """One object of a run.
+    """One object of a run."""
 
-    Attributes:
-        scene_id: index of the object in the run.
-        data: data of the object.
-        first_sequence: index of its first sequence over all objects.
-    """
-
-    scene_id: int
-    data: ObjectData
-    first_sequence: int
+    scene_id: int  # index of the object in the run
+    data: ObjectData  # data of the object
+    first_sequence: int  # index of its first sequence over all objects
 
 
 def run_objects(run: LoadedRun, names: list[str] | None = None) -> list[RunObject]:
@@ -74,9 +72,6 @@ def state_of(run: LoadedRun) -> dict[str, Any]:
 
     Prints a warning to the standard error if the run is unfinished.
     """
-    from gausim.runs.checkpoint import read_checkpoint
-    from gausim.runs.directory import RunDirectory
-
     directory = RunDirectory(run.run_dir)
     if not directory.is_finished:
         print(f"warning: {run.run_dir} is not finished; its latest checkpoint is used.", file=sys.stderr)
@@ -119,9 +114,6 @@ class TrainedPrediction:
     @property
     def footnotes(self) -> dict[str, Any] | None:
         """Remarks on the method (see :attr:`GausSimModule.footnotes`), with the largest eigenvalue of the step."""
-        from gausim.evaluation.stability import largest_eigenvalue
-        from gausim.models.step.simulator import GausSim
-
         footnotes, model = self._run.module.footnotes, self._run.module.model
         if not isinstance(model, GausSim):
             return footnotes
@@ -136,21 +128,11 @@ class TrainedPrediction:
         if known is None or known.frames < count:
             steps = max(record.count, self._frames, count) - 1
             known = self._known[record.name] = self._run.module.predict(self._ids[record.name], steps)
-        return replace(
-            known,
-            positions=known.positions[:count],
-            deformation_gradients=known.deformation_gradients[:count],
-            rotations=known.rotations[:count],
-        )
+        return known.part(slice(count))
 
 
 def endurance(run: LoadedRun, item: RunObject, frames: int) -> dict[str, Any]:
     """Long rollouts of an object: its first sequence without forces, and random pushes from rest."""
-    from gausim.core import ConfigError, SimState
-    from gausim.evaluation.endurance import RandomPushes, endure
-    from gausim.models.rollout.dynamics import SceneDynamics
-    from gausim.models.step.simulator import GausSim
-
     if not isinstance(run.module.model, GausSim):
         raise ConfigError(
             f"--endurance: {run.module.method_name} takes no forces. Leave the option out, or evaluate a simulator."

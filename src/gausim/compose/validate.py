@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import yaml
 from jsonschema import Draft7Validator, ValidationError
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -18,6 +17,7 @@ from gausim.compose.root import conf_dir
 from gausim.compose.schema import required_keys, training_schema
 from gausim.compose.targets import target_faults
 from gausim.core.errors import ConfigError, GausSimError
+from gausim.io.files import read_yaml
 
 RUN_CONFIG = "config.yaml"
 # Nodes that are built for the checks of their constructors; none of them reads data or writes files.
@@ -25,14 +25,10 @@ _BUILT = ("data", "supervision", "loss", "optimizer", "render")
 
 
 def faults(arguments: Sequence[str]) -> list[str]:
-    """Errors of a configuration, key by key.
+    """Errors of a configuration, key by key, a sentence each; data sets are not checked.
 
-    Args:
-        arguments: one saved configuration (a YAML file, or a run directory); or arguments of `gausim train`: overrides,
-            names of experiments, and files of conf/ or of a folder like it (`MINE/experiment/NAME.yaml`).
-
-    Returns:
-        A sentence per error; empty if the configuration is valid. Data sets are not checked.
+    The arguments are one saved configuration (a YAML file, or a run directory); or those of `gausim train`:
+    overrides, names of experiments, and files of conf/ or of a folder like it (`MINE/experiment/NAME.yaml`).
 
     Raises:
         ConfigError: an argument is not a configuration, or a saved one is combined with other arguments.
@@ -105,13 +101,10 @@ def _override(argument: str) -> str:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        text = path.read_text()
-        loaded = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: cannot be read as YAML ({error}).") from error
-    if not isinstance(loaded, dict):
-        raise ConfigError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
-    if "defaults" in loaded or GLOBAL_PACKAGE in text.splitlines():
+        loaded = read_yaml(path)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    if "defaults" in loaded or GLOBAL_PACKAGE in path.read_text().splitlines():
         raise ConfigError(f"{path}: is composed with others. Put it into a folder named experiment (or ablation, ...).")
     return loaded
 

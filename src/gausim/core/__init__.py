@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from gausim.core.camera import Cameras
     from gausim.core.fitted import FittedDynamics, FittedMethod, FittedState, TakesOver
     from gausim.core.protocols import (
+        Adjustable,
         Dynamics,
         Forces,
         Handled,
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from gausim.core.surroundings import Floor, HandPath, HandPose, Surroundings
 
 __all__ = [
-    "BusyError", "Cameras", "ConfigError", "DataError", "DivergenceError", "Dynamics", "FetchError",
+    "Adjustable", "BusyError", "Cameras", "ConfigError", "DataError", "DivergenceError", "Dynamics", "FetchError",
     "FittedDynamics", "FittedMethod", "FittedState", "Floor", "Forces", "GausSimError", "GaussianScene", "HandPath",
     "HandPose", "Handled", "Hands", "Rendered", "Renderer", "RunError", "SceneError", "SimState", "SmoothMotions",
     "Steppable", "SteppedFrame", "Stepper", "Surroundings", "TakesOver", "Trajectory", "roll_out", "trajectory_of",

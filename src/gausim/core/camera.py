@@ -16,21 +16,13 @@ ROTATION_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
-    """V cameras of one image size.
+    """V cameras of one image size."""
 
-    Attributes:
-        viewmats: world to camera, x right, y down, z forward (OpenCV).
-        Ks: intrinsics [pixels]; pixel (i, j) has its centre at (i + 0.5, j + 0.5).
-        width: image width [pixels].
-        height: image height [pixels].
-        names: one name per view, as in the data set.
-    """
-
-    viewmats: Float[Tensor, "V 4 4"]
-    Ks: Float[Tensor, "V 3 3"]
-    width: int
-    height: int
-    names: tuple[str, ...]
+    viewmats: Float[Tensor, "V 4 4"]  # world to camera, x right, y down, z forward (OpenCV)
+    Ks: Float[Tensor, "V 3 3"]  # intrinsics [pixels]; pixel (i, j) has its centre at (i + 0.5, j + 0.5)
+    width: int  # image width [pixels]
+    height: int  # image height [pixels]
+    names: tuple[str, ...]  # one name per view, as in the data set
 
     def validated(self, source: str) -> Cameras:
         """Returns itself, or raises :class:`DataError` naming ``source`` and the camera with an invalid pose."""

@@ -19,22 +19,14 @@ from gausim.core.state import SimState, Trajectory
 
 @dataclass(frozen=True, eq=False)
 class FittedState:
-    """State of a fitted method in one frame of one sequence.
+    """State of a fitted method in one frame of one sequence."""
 
-    Attributes:
-        sequence_id: the sequence, numbered over all objects.
-        frame: index of the frame, from 0.
-        positions: kernel means [scene units].
-        deformation_gradients: deformation gradients of the N units that carry kernels.
-        rotations: rotations of these units.
-        inner: further variables of the method that the next frame needs (anchors, particles, fields).
-    """
-
-    sequence_id: int
-    frame: int
-    positions: Float[Tensor, "K 3"]
-    deformation_gradients: Float[Tensor, "N 3 3"]
-    rotations: Float[Tensor, "N 3 3"]
+    sequence_id: int  # the sequence, numbered over all objects
+    frame: int  # index of the frame, from 0
+    positions: Float[Tensor, "K 3"]  # kernel means [scene units]
+    deformation_gradients: Float[Tensor, "N 3 3"]  # deformation gradients of the N units that carry kernels
+    rotations: Float[Tensor, "N 3 3"]  # rotations of these units
+    # further variables of the method that the next frame needs (anchors, particles, fields)
     inner: tuple[Tensor, ...] = ()
 
     def detach(self) -> FittedState:
@@ -54,20 +46,13 @@ class FittedMethod(Protocol):
 
     It is also a torch module. It uses neither images nor losses: the engine renders its states and compares them with
     the videos, in the stages that ``conf/model/NAME.yaml`` lists.
-
-    Attributes:
-        name: label of its row in tables.
-        scenes: the rest scenes; their index is the ``scene_id`` of samples.
-        fps: frames per second of each scene.
-        scene_of_sequence: the scene of each sequence.
-        extrapolates: whether frames beyond the trained ones are predicted; otherwise they repeat the fitted ones.
     """
 
-    name: str
-    scenes: Sequence[GaussianScene]
-    fps: Sequence[float]
-    scene_of_sequence: Sequence[int]
-    extrapolates: bool
+    name: str  # label of its row in tables
+    scenes: Sequence[GaussianScene]  # the rest scenes; their index is the ``scene_id`` of samples
+    fps: Sequence[float]  # frames per second of each scene
+    scene_of_sequence: Sequence[int]  # the scene of each sequence
+    extrapolates: bool  # whether frames beyond the trained ones are predicted; otherwise they repeat the fitted ones
 
     def notes(self) -> tuple[str, ...]:
         """Remarks on the method, one sentence each, printed under every table."""

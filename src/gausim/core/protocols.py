@@ -30,17 +30,11 @@ class Dynamics(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SteppedFrame:
-    """One frame of a :class:`gausim.core.Trajectory`.
+    """One frame of a :class:`gausim.core.Trajectory`."""
 
-    Attributes:
-        positions: kernel means [scene units].
-        deformation_gradients: accumulated deformation gradients of the N units that carry kernels.
-        rotations: rotations of these units.
-    """
-
-    positions: Float[Tensor, "K 3"]
-    deformation_gradients: Float[Tensor, "N 3 3"]
-    rotations: Float[Tensor, "N 3 3"]
+    positions: Float[Tensor, "K 3"]  # kernel means [scene units]
+    deformation_gradients: Float[Tensor, "N 3 3"]  # accumulated deformation gradients of the N units that carry kernels
+    rotations: Float[Tensor, "N 3 3"]  # rotations of these units
 
 
 @runtime_checkable
@@ -107,6 +101,14 @@ class Handled(Steppable, Protocol):
         """Stepper at a state; ``hands`` are the poses of the hands by frame, counted from that state."""
 
 
+@runtime_checkable
+class Adjustable(Steppable, Protocol):
+    """Dynamics whose material can be changed; it shows in steppers made afterwards."""
+
+    def adjust(self, stiffness: float, damping: float) -> None:
+        """Multiplies the material's stiffness and damping, as they were at the beginning, by factors > 0."""
+
+
 def roll_out(stepper: Stepper, steps: int, forces: Forces | None = None) -> Trajectory:
     """Takes ``steps`` steps; the result has steps + 1 frames, the stepper's current one first."""
     frames = [stepper.frame]
@@ -129,18 +131,13 @@ def trajectory_of(frames: Sequence[SteppedFrame], stepper: Stepper) -> Trajector
 
 @dataclass(frozen=True, eq=False)
 class Rendered:
-    """Images of B states seen by V cameras each.
+    """Images of B states seen by V cameras each."""
 
-    Attributes:
-        rgb: colour composited over the background, linear in the input colours, not clamped.
-        alpha: accumulated opacity in [0, 1].
-        depth: accumulated depth sum_i w_i z_i [scene units], where kernel i contributes w_i = alpha_i T_i to the pixel
-            and has depth z_i at its centre along the camera's axis (gsplat's mode "D"), not divided by ``alpha``,
-            without the background, 0 where no kernel contributes. None unless requested.
-    """
-
-    rgb: Float[Tensor, "B V H W 3"]
-    alpha: Float[Tensor, "B V H W"]
+    rgb: Float[Tensor, "B V H W 3"]  # colour composited over the background, linear in the input colours, not clamped
+    alpha: Float[Tensor, "B V H W"]  # accumulated opacity in [0, 1]
+    # accumulated depth sum_i w_i z_i [scene units], where kernel i contributes w_i = alpha_i T_i to the pixel and
+    # has depth z_i at its centre along the camera's axis (gsplat's mode "D"), not divided by ``alpha``, without
+    # the background, 0 where no kernel contributes. None unless requested
     depth: Float[Tensor, "B V H W"] | None = None
 
 

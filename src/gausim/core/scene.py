@@ -16,34 +16,21 @@ SH_COEFFICIENTS = {0: 1, 1: 4, 2: 9, 3: 16}
 
 @dataclass(frozen=True, eq=False)
 class GaussianScene:
-    """K Gaussians exactly as a 3DGS file stores them (raw parameters, neither activated nor normalised).
+    """K Gaussians exactly as a 3DGS file stores them (raw parameters, neither activated nor normalised)."""
 
-    Attributes:
-        means: rest positions X [scene units].
-        log_scales: natural logarithm of the standard deviations along the principal axes [log scene units].
-        quats: orientation, w x y z, any non-zero length.
-        opacity_logits: opacity before the sigmoid.
-        sh: spherical-harmonics colour coefficients, ((d+1)^2, RGB) per kernel, d = 0..3.
-        simulated: kernels that the dynamics may move; the others stay in place and are rendered.
-        pinned: simulated kernels that are held at their rest position (the roots).
-        foreground: kernels that are compared with segmented video.
-        volume_scale: c of V = prod(c s_i) (METHOD section 1), so that the mean kernel mass is of order 1.
-        name: name of the scene in messages, tables and checkpoints.
-        surroundings: what acts on the body besides its own elasticity.
-        hand: the hand that holds each pinned kernel, -1 for those that nobody moves; None: there are no hands.
-    """
-
-    means: Float[Tensor, "K 3"]
+    means: Float[Tensor, "K 3"]  # rest positions X [scene units]
+    # natural logarithm of the standard deviations along the principal axes [log scene units]
     log_scales: Float[Tensor, "K 3"]
-    quats: Float[Tensor, "K 4"]
-    opacity_logits: Float[Tensor, " K"]
-    sh: Float[Tensor, "K B 3"]
-    simulated: Bool[Tensor, " K"]
-    pinned: Bool[Tensor, " K"]
-    foreground: Bool[Tensor, " K"]
-    volume_scale: float = 1.0
-    name: str = "scene"
-    surroundings: Surroundings = field(default_factory=Surroundings)
+    quats: Float[Tensor, "K 4"]  # orientation, w x y z, any non-zero length
+    opacity_logits: Float[Tensor, " K"]  # opacity before the sigmoid
+    sh: Float[Tensor, "K B 3"]  # spherical-harmonics colour coefficients, ((d+1)^2, RGB) per kernel, d = 0..3
+    simulated: Bool[Tensor, " K"]  # kernels that the dynamics may move; the others stay in place and are rendered
+    pinned: Bool[Tensor, " K"]  # simulated kernels that are held at their rest position (the roots)
+    foreground: Bool[Tensor, " K"]  # kernels that are compared with segmented video
+    volume_scale: float = 1.0  # c of V = prod(c s_i) (METHOD section 1), so that the mean kernel mass is of order 1
+    name: str = "scene"  # name of the scene in messages, tables and checkpoints
+    surroundings: Surroundings = field(default_factory=Surroundings)  # what acts on the body besides its own elasticity
+    # the hand that holds each pinned kernel, -1 for those that nobody moves; None: there are no hands
     hand: Int[Tensor, " K"] | None = None
 
     @staticmethod

@@ -11,19 +11,13 @@ from torch import Tensor
 
 @dataclass(frozen=True, eq=False)
 class SmoothMotions:
-    """A basis of M motions of one scene, scaled to about equal elastic energy.
+    """A basis of M motions of one scene, scaled to about equal elastic energy."""
 
-    Attributes:
-        kernels: displacement of every kernel by each motion [scene units]; zero where pinned or never simulated.
-        displacement_gradients: one per unit; the last row belongs to kernels that never move.
-        unit_of_kernel: the unit of each kernel: its row in ``displacement_gradients``.
-        sizes: amplitudes of the motions [typical displacements of the template].
-    """
-
+    # displacement of every kernel by each motion [scene units]; zero where pinned or never simulated
     kernels: Float[Tensor, "K 3 M"]
-    displacement_gradients: Float[Tensor, "N 3 3 M"]
-    unit_of_kernel: Int[Tensor, " K"]
-    sizes: Float[Tensor, " M"]
+    displacement_gradients: Float[Tensor, "N 3 3 M"]  # one per unit; the last row belongs to kernels that never move
+    unit_of_kernel: Int[Tensor, " K"]  # the unit of each kernel: its row in ``displacement_gradients``
+    sizes: Float[Tensor, " M"]  # amplitudes of the motions [typical displacements of the template]
 
     @property
     def count(self) -> int:

@@ -13,15 +13,10 @@ from gausim.core.scene import GaussianScene
 
 @dataclass(frozen=True, eq=False)
 class SimState:
-    """The state of the dynamics is exactly the kernels' two latest positions.
+    """The state of the dynamics is exactly the kernels' two latest positions."""
 
-    Attributes:
-        positions: x_t of all K kernels of the scene [scene units].
-        previous: x_{t-1}, one frame earlier.
-    """
-
-    positions: Float[Tensor, "K 3"]
-    previous: Float[Tensor, "K 3"]
+    positions: Float[Tensor, "K 3"]  # x_t of all K kernels of the scene [scene units]
+    previous: Float[Tensor, "K 3"]  # x_{t-1}, one frame earlier
 
     def detach(self) -> SimState:
         """The same values, detached from the graph of loss gradients."""
@@ -35,25 +30,25 @@ class Trajectory:
     Kernel k of frame f has mean ``positions[f, k]``, covariance G S_k G^T with
     G = ``deformation_gradients[f, unit_of_kernel[k]]``, and its colour is looked up at Q^T d with Q the rotation of the
     same unit.
-
-    Attributes:
-        positions: kernel means [scene units].
-        deformation_gradients: accumulated deformation gradients of the N units that carry kernels.
-        rotations: accumulated rotations of these units.
-        unit_of_kernel: the unit of each kernel; pinned and never-simulated kernels point to an identity unit.
-        fps: frames per second.
     """
 
-    positions: Float[Tensor, "F K 3"]
+    positions: Float[Tensor, "F K 3"]  # kernel means [scene units]
+    # accumulated deformation gradients of the N units that carry kernels
     deformation_gradients: Float[Tensor, "F N 3 3"]
-    rotations: Float[Tensor, "F N 3 3"]
+    rotations: Float[Tensor, "F N 3 3"]  # accumulated rotations of these units
+    # the unit of each kernel; pinned and never-simulated kernels point to an identity unit
     unit_of_kernel: Int[Tensor, " K"]
-    fps: float
+    fps: float  # frames per second
 
     @property
     def frames(self) -> int:
         """Number of frames F, the initial state included."""
         return self.positions.shape[0]
+
+    def part(self, frames: slice) -> Trajectory:
+        """The chosen frames."""
+        states = self.positions[frames], self.deformation_gradients[frames], self.rotations[frames]
+        return Trajectory(*states, self.unit_of_kernel, self.fps / (frames.step or 1))
 
     def carry(self, points: Float[Tensor, "P 3"], kernel: Int[Tensor, " P"], rest: Float[Tensor, "K 3"]) -> Tensor:
         """Moves rest-space points with the unit of the kernel they are attached to, (F, P, 3).
@@ -69,9 +64,7 @@ class Trajectory:
 def initial_sway(scene: GaussianScene, fraction: float) -> SimState:
     """The rest state with an initial sway: every free kernel moves along x, faster when farther from the roots.
 
-    Args:
-        scene: with at least one pinned kernel.
-        fraction: displacement per frame of the kernel farthest from the roots [bounding-box diagonals].
+    ``fraction`` is the displacement per frame of the kernel farthest from the pins [diagonals].
     """
     free = scene.simulated & ~scene.pinned
     root = scene.means[scene.pinned].mean(0)

@@ -17,19 +17,12 @@ FLAT = 1e-3
 
 @dataclass(frozen=True)
 class Floor:
-    """A half space that the body cannot enter; the body is on the side of the normal.
+    """A half space that the body cannot enter; the body is on the side of the normal."""
 
-    Attributes:
-        point: a point of the plane [scene units].
-        normal: unit vector out of the floor.
-        friction: Coulomb's coefficient; None: trained.
-        restitution: speed after over speed before an impact of a contact point, 0..1; None: trained.
-    """
-
-    point: tuple[float, float, float]
-    normal: tuple[float, float, float]
-    friction: float | None = None
-    restitution: float | None = None
+    point: tuple[float, float, float]  # a point of the plane [scene units]
+    normal: tuple[float, float, float]  # unit vector out of the floor
+    friction: float | None = None  # Coulomb's coefficient; None: trained
+    restitution: float | None = None  # speed after over speed before an impact of a contact point, 0..1; None: trained
 
     def height(self, positions: Float[Tensor, "*N 3"]) -> Float[Tensor, " *N"]:
         """Signed distance from the plane [scene units], negative below it."""
@@ -38,19 +31,13 @@ class Floor:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Surroundings of a scene.
+    """Surroundings of a scene."""
 
-    Attributes:
-        free: nothing holds the body: it moves as a whole, and no kernel needs to be pinned.
-        gravity: acceleration [scene units / s^2]; None: none. A body at rest in its pins is in equilibrium with it.
-        trains_gravity: gravity is trained, beginning at ``gravity`` or zero.
-        floor: the floor, if there is one.
-    """
-
-    free: bool = False
+    free: bool = False  # nothing holds the body: it moves as a whole, and no kernel needs to be pinned
+    # acceleration [scene units / s^2]; None: none. A body at rest in its pins is in equilibrium with it
     gravity: tuple[float, float, float] | None = None
-    trains_gravity: bool = False
-    floor: Floor | None = None
+    trains_gravity: bool = False  # gravity is trained, beginning at ``gravity`` or zero
+    floor: Floor | None = None  # the floor, if there is one
 
     @property
     def still(self) -> bool:

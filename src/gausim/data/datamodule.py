@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import torch
 from lightning.pytorch import LightningDataModule
 from torch.utils.data import DataLoader
 
@@ -14,7 +15,6 @@ from gausim.core import ConfigError
 from gausim.data.curriculum import Curriculum
 from gausim.data.dataset import SampleKey, SequenceIndex, SequenceSample, collate
 from gausim.data.objects import ObjectData, find_objects
-from gausim.data.prefetch import PrefetchingLoader
 from gausim.data.sampler import SequenceBatchSampler
 from gausim.ops.selection import Selection
 
@@ -44,7 +44,7 @@ class ReadyDataModule(LightningDataModule):
         repeats: int = 4,
         curriculum: Curriculum | None = None,
         seed: int = 0,
-        prefetch: int = 1,
+        prefetch: int = 0,
         names: Sequence[str] | None = None,
         sequences: int | Sequence[str] | None = None,
         test: Mapping[str, Any] | None = None,
@@ -61,7 +61,7 @@ class ReadyDataModule(LightningDataModule):
             repeats: how many times each sequence is shown per epoch.
             curriculum: predicted steps per epoch; that of METHOD section 4 when None.
             seed: seed of the training order.
-            prefetch: number of batches read ahead, which stay in memory.
+            prefetch: number of batches that a process of its own reads ahead; 0 reads each when it is asked for.
             names: names of the objects to use; all when None.
             sequences: number of sequences per object to use, or their names; all when None.
             test: the test part of the objects (:class:`gausim.data.reserved.ReservedPart`), in addition to what their
@@ -147,13 +147,22 @@ class ReadyDataModule(LightningDataModule):
         return self.curriculum.steps(epoch)
 
     def train_dataloader(self) -> DataLoader:
-        """Batches of training samples, read ahead by a thread.
+        """Batches of training samples.
 
-        Image files are decoded once and cached, packed frames are read directly: no worker process is needed.
+        Image files are decoded once and cached, packed frames are read directly: a worker pays only where a batch is
+        large and a step short.
+
+        Raises:
+            ConfigError: ``prefetch`` is negative.
         """
-        return PrefetchingLoader(
-            self.index, batch_sampler=self._ready_sampler(), collate_fn=collate, prefetch=self._prefetch
-        )
+        if self._prefetch < 0:
+            raise ConfigError(f"data.prefetch: expected 0 or more batches read ahead, got {self._prefetch}.")
+        ahead = self._prefetch > 0
+        # The loader draws one number per epoch; from the global generator, a resumed run would draw a different count.
+        return DataLoader(
+            self.index, batch_sampler=self._ready_sampler(), collate_fn=collate, generator=torch.Generator(),
+            num_workers=int(ahead), prefetch_factor=self._prefetch or None, persistent_workers=ahead,
+        )  # fmt: skip
 
     def state_dict(self) -> dict[str, Any]:
         """Epoch and position in the training order, for an exact resume."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -84,7 +85,21 @@ class BodyData:
 
 
 class CorpusIndex(SequenceIndex):
-    """The motions of several bodies, numbered consecutively; a sample has no image."""
+    """The motions of several bodies, numbered consecutively; a sample has no image.
+
+    Of the true motion, training is given the first ``shown`` frames; all of them when None.
+    """
+
+    def __init__(self, objects: Sequence[Any], shown: int | None = None) -> None:
+        """Lists the motions of these bodies."""
+        super().__init__(objects)
+        self._shown = shown
+
+    def ground_truth(self, sequence: int) -> GroundTruth:
+        """The frames of a motion that training may use."""
+        scene_id, record = self.entries[sequence]
+        truth = cast(BodyData, self.objects[scene_id]).ground_truth(cast(Any, record))
+        return GroundTruth(truth.rest, truth.positions[: self._shown])
 
     def __getitem__(self, key: SampleKey) -> SequenceSample:
         """The sample of ``steps`` frames after frame ``start``, without views."""
@@ -106,11 +121,13 @@ class CorpusDataModule(ReadyDataModule):
 
     The last ``held_out`` bodies of the corpus are never trained on with ``part=train``. Then training samples start at
     any frame, the material of all bodies is known, and the motion watch measures predictions of the bodies held out.
-    With ``part=held_out`` these bodies are the objects: their material is unknown, samples start at frame 0, and only
-    the first ``seen`` frames are used.
+    With ``part=held_out`` these bodies are the objects: their material is unknown, and only the first ``seen`` frames
+    are used; samples start at any of them.
 
     Attributes:
         watched: indices of the objects whose motion is measured during training.
+        trainable: number of bodies of the corpus that are not held out; set when the objects are first read.
+        seen: frames that count as seen.
         knows_material: whether the material is given.
     """
 
@@ -128,7 +145,7 @@ class CorpusDataModule(ReadyDataModule):
         repeats: int = 1,
         curriculum: Curriculum | None = None,
         seed: int = 0,
-        prefetch: int = 1,
+        prefetch: int = 0,
     ) -> None:
         """Stores the settings; the corpus is first read by :attr:`objects`.
 
@@ -142,7 +159,7 @@ class CorpusDataModule(ReadyDataModule):
             repeats: how many times each sequence is shown per epoch.
             curriculum: predicted steps per epoch.
             seed: seed of the training order.
-            prefetch: number of batches read ahead.
+            prefetch: number of batches that a process of its own reads ahead.
         """
         super().__init__(
             root, batch_size=batch_size, repeats=repeats, curriculum=curriculum, seed=seed, prefetch=prefetch
@@ -151,7 +168,7 @@ class CorpusDataModule(ReadyDataModule):
             raise ConfigError(
                 f"data.part, data.held_out: expected train or held_out and a number >= 1, got {part}, {held_out}."
             )
-        self._part, self._bodies, self._held_out, self._seen = part, bodies, held_out, seen
+        self._part, self._bodies, self._held_out, self.seen = part, bodies, held_out, seen
         self.knows_material = part == "train"
 
     @cached_property
@@ -163,6 +180,7 @@ class CorpusDataModule(ReadyDataModule):
             )
         corpus = Corpus(Path(str(self._root)))
         first = len(corpus) - self._held_out
+        self.trainable = first
         wanted = first if self._bodies is None else self._bodies
         if not 1 <= wanted <= first:
             raise ConfigError(
@@ -171,12 +189,12 @@ class CorpusDataModule(ReadyDataModule):
             )
         chosen = [*(range(wanted) if self.knows_material else ()), *range(first, len(corpus))]
         read = lru_cache(BODIES_IN_MEMORY)(corpus.body)
-        return [_body_data(corpus, read, i, self._seen) for i in chosen]
+        return [_body_data(corpus, read, i, self.seen) for i in chosen]
 
     @cached_property
     def index(self) -> CorpusIndex:
         """All sequences of all bodies, numbered."""
-        return CorpusIndex(self.objects)
+        return CorpusIndex(self.objects, None if self.knows_material else self.seen)
 
     @property
     def watched(self) -> range:
@@ -184,9 +202,9 @@ class CorpusDataModule(ReadyDataModule):
         return range(len(self.objects) - self._held_out, len(self.objects))
 
     def trained(self) -> tuple[int, list[int] | None]:
-        """The number of sequences to train on and, where samples start at any frame, their numbers of frames."""
+        """The number of sequences to train on, and the numbers of their frames at which samples may start and end."""
         if not self.knows_material:
-            return len(self.index), None
+            return len(self.index), [self.seen] * len(self.index)
         frames = [record.count for scene_id, record in self.index.entries if scene_id not in self.watched]
         return len(frames), frames
 

@@ -12,15 +12,11 @@ from gausim.io.plain_json import checked
 
 
 class ReservedPart(Struct, frozen=True, forbid_unknown_fields=True):
-    """Sequences that training sees only the seen frames of, as images; nothing is tuned on the others.
+    """Sequences that training sees only the seen frames of, as images; nothing is tuned on the others."""
 
-    Attributes:
-        sequences: their names, or ``all``.
-        seeds: only objects made from one of these seeds (field ``seed`` of ``dataset.json``) have a test part; null:
-            every object.
-    """
-
-    sequences: tuple[str, ...] | Literal["all"] = "all"
+    sequences: tuple[str, ...] | Literal["all"] = "all"  # their names, or ``all``
+    # only objects made from one of these seeds (field ``seed`` of ``dataset.json``) have a test part; null: every
+    # object
     seeds: tuple[int, ...] | None = None
 
     def of(self, found: Sequence[str], seed: object, where: str) -> set[str]:

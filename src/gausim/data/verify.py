@@ -32,10 +32,8 @@ class Fault:
 def verify(root: Path, *, quick: bool = False, scene: bool = True) -> list[Fault]:
     """The faults of one object: facts, sequences with all their images, true motion, stills, scene, hashes of a store.
 
-    Args:
-        root: its directory.
-        quick: check headers and sizes only, without reading images or computing hashes.
-        scene: check ``scene.ply`` and its masks too.
+    ``quick`` checks headers and sizes only, without reading images or computing hashes; ``scene``: scene and masks
+    too.
     """
     faults = list(_manifest(root, quick=quick))
     try:

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 
 from gausim.doctor.clock import motion_energy
 from gausim.doctor.coverage import view_directions
 from gausim.doctor.evidence import Evidence, with_bar
 from gausim.doctor.motion import swing
-from gausim.report.pictures.figures import METHOD_COLORS, save_figure
+from gausim.report.pictures.figures import METHOD_COLORS, literal, save_figure
 
 _DPI = 110
 _COLUMNS = 3
@@ -34,11 +33,7 @@ def draw_pictures(evidence: Evidence, out: Path) -> list[tuple[str, str]]:
         ("coverage.png", "Cameras seen from above. Orange: training views, blue: held-out ones.", _coverage),
     ]  # fmt: skip
     for name, _, figure in with_bar(drawn, "pictures"):
-        finished = figure(evidence)
-        for text in finished.findobj(Text):  # a dollar sign in a name would start a formula
-            assert isinstance(text, Text)
-            text.set_parse_math(False)
-        save_figure(finished, out / name)
+        save_figure(literal(figure(evidence)), out / name)
     return [(name, caption) for name, caption, _ in drawn]
 
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from gausim.core import Cameras, GaussianScene
 from gausim.render.cpu import CpuRenderer
-from gausim.render.draw import draw
+from gausim.render.draw import draw_still
 
 # Smoothing [pixels], steps and precision of the alignment (cv2.findTransformECC).
 _SMOOTHING, _STEPS, _PRECISION = 5, 100, 1e-5
@@ -42,9 +41,7 @@ class Fit:
 def draw_silhouettes(scene: GaussianScene, cameras: Cameras) -> Silhouettes:
     """Renders the rest scene's foreground."""
     shown = scene.select(scene.foreground)
-    identity, unit = torch.eye(3)[None, None], torch.zeros(shown.count, dtype=torch.int64)
-    with torch.no_grad():
-        drawn = draw(CpuRenderer(), shown, shown.means[None], identity, identity, unit, cameras)
+    drawn = draw_still(CpuRenderer(), shown, cameras)
     return Silhouettes(drawn.alpha[0].clamp(0, 1).numpy(), drawn.rgb[0].clamp(0, 1).numpy())
 
 

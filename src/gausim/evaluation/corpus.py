@@ -30,50 +30,33 @@ FILE = "corpus.json"
 
 
 class BodyFigures(msgspec.Struct, frozen=True):
-    """Figures of one body; sums over its sequences and the frames of each range, in diagonals.
+    """Figures of one body; sums over its sequences and the frames of each range, in diagonals."""
 
-    Attributes:
-        name: of the body.
-        material: kind of its material: even, split or smooth.
-        error: distance of the predicted kernels from the true ones: seen frames, the ten after, all unseen ones.
-        static: the same of the rest state.
-        energy: predicted and true motion energy of the unseen frames.
-        period: true period of the slowest mode [s].
-        fitted_period: that of the fitted material [s]; None where the material was given.
-        within: rank correlation of fitted and true stiffness over the free units; None where it is even or given.
-    """
-
-    name: str
-    material: str
+    name: str  # of the body
+    material: str  # kind of its material: even, split or smooth
+    # distance of the predicted kernels from the true ones: seen frames, the ten after, all unseen ones
     error: tuple[float, float, float]
-    static: tuple[float, float, float]
-    energy: tuple[float, float]
-    period: float
-    fitted_period: float | None
+    static: tuple[float, float, float]  # the same of the rest state
+    energy: tuple[float, float]  # predicted and true motion energy of the unseen frames
+    period: float  # true period of the slowest mode [s]
+    fitted_period: float | None  # that of the fitted material [s]; None where the material was given
+    # rank correlation of fitted and true stiffness over the free units; None where it is even or given
     within: float | None
 
 
 class CorpusFigures(msgspec.Struct, frozen=True):
-    """Figures of all bodies together.
+    """Figures of all bodies together."""
 
-    Attributes:
-        bodies: number of bodies.
-        error: error over the static prediction's, of the sums over all bodies: seen, the ten frames after, unseen.
-        median: median over bodies of the unseen error over the static prediction's.
-        energy: predicted over true motion energy of the unseen frames.
-        stiffness: rank correlation over bodies of the fitted and true stiffness; motion shows it relative to density
-            and size, as (1 / period of the slowest mode)^2.
-        within: mean over bodies of two materials of the rank correlation of stiffness over the units.
-        within_smooth: the same over bodies whose stiffness varies smoothly.
-    """
-
-    bodies: int
+    bodies: int  # number of bodies
+    # error over the static prediction's, of the sums over all bodies: seen, the ten frames after, unseen
     error: tuple[float, float, float]
-    median: float
-    energy: float
+    median: float  # median over bodies of the unseen error over the static prediction's
+    energy: float  # predicted over true motion energy of the unseen frames
+    # rank correlation over bodies of the fitted and true stiffness; motion shows it relative to density and size,
+    # as (1 / period of the slowest mode)^2
     stiffness: float | None
-    within: float | None
-    within_smooth: float | None
+    within: float | None  # mean over bodies of two materials of the rank correlation of stiffness over the units
+    within_smooth: float | None  # the same over bodies whose stiffness varies smoothly
 
 
 @torch.no_grad()
@@ -141,11 +124,15 @@ def summary(found: Sequence[BodyFigures]) -> CorpusFigures:
     )  # fmt: skip
 
 
-def write_figures(folder: Path, found: Sequence[BodyFigures]) -> CorpusFigures:
-    """Writes ``corpus.json`` and returns the summary."""
+def write_figures(folder: Path, found: Sequence[BodyFigures], *, seen: int, pretrained: int | None) -> CorpusFigures:
+    """Writes ``corpus.json`` with the number of seen frames, and returns the summary.
+
+    ``pretrained`` is the number of bodies that the network was trained on; None where it is unknown.
+    """
     whole = summary(found)
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / FILE, msgspec.to_builtins({"all": whole, "bodies": list(found)}))
+    facts = {"seen": seen, "pretrained": pretrained, "all": whole, "bodies": list(found)}
+    write_json(folder / FILE, msgspec.to_builtins(facts))
     return whole
 
 

@@ -56,22 +56,12 @@ def endure(
     pushes: RandomPushes | None = None,
     hands: Hands | None = None,
 ) -> dict[str, Any]:
-    """Figures of a long rollout: energy, distance from rest and growth.
+    """Figures of a long rollout from a state: energy, distance from rest [scene units] and growth.
 
-    Args:
-        dynamics: dynamics of the scene.
-        initial: initial state.
-        rest: rest positions [scene units].
-        diagonal: diagonal of the scene [scene units].
-        frames: number of predicted frames.
-        pushes: forces during the rollout; none when None.
-        hands: poses of the hands that move the pins; None: the pins are at rest.
-
-    Returns:
-        ``energy``: mean motion energy of every 20 frames [diagonals^2, summed over kernels]; ``away``: their mean
-        distance of kernels from rest [diagonals]; ``peak``: time of the highest energy [frames]; ``growth``: highest
-        energy after the pushes (after the first quarter without pushes) over the highest before; ``late``: energy of
-        the last tenth over the highest of all.
+    ``energy`` is the mean motion energy of every 20 frames [diagonals^2, summed over kernels], ``away`` their mean
+    distance of kernels from rest [diagonals], ``peak`` the time of the highest energy [frames], ``growth`` the
+    highest energy after the pushes (after the first quarter without pushes) over the highest before, ``late`` the
+    energy of the last tenth over the highest of all.
 
     Raises:
         DivergenceError: a position is not finite; the message names the frame.

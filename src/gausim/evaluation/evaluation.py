@@ -39,7 +39,7 @@ from gausim.metrics import (
     point_error,
     track_error,
 )
-from gausim.metrics.flip import NO_PACKAGE, flip_is_installed
+from gausim.metrics.image import NO_PACKAGE, flip_is_installed
 from gausim.metrics.lpips import NO_WEIGHTS, SMALLEST, TOO_SMALL, weights_path
 from gausim.render.draw import SceneAppearance, draw
 from gausim.results.curves import (
@@ -102,16 +102,10 @@ def evaluate_object(
     views: Sequence[str] | None = None,
     advance: Callable[[str], None] | None = None,
 ) -> ObjectCurves:
-    """Per-frame figures of every method and reference on every sequence of an object.
+    """Per-frame figures of every method (a prediction by its row) and reference on every sequence of an object.
 
-    Args:
-        data: the object.
-        scene: its rest scene, with all kernels of the trajectories.
-        methods: row name -> prediction.
-        renderer: renderer of predictions and of the reference.
-        sequences: names of the sequences to measure; all when None.
-        views: names of the cameras to measure in; all when None.
-        advance: called with a sequence's name when it is done.
+    The rest scene has all kernels of the trajectories. Sequences and views are all, unless named; ``advance`` is
+    called with a sequence's name when it is done.
 
     Raises:
         DataError: an unknown sequence, or broken data.

@@ -24,13 +24,9 @@ DENSE = 1500
 def largest_eigenvalue(model: GausSim, scene_id: int) -> float:
     """Largest absolute eigenvalue of the step at rest; above 1, small motions grow.
 
-    The step maps displacements (u_t, u_{t-1}) of the finest predicted units and their kernels to (u_{t+1}, u_t). Its
-    Jacobian [[A, B], [I, 0]] over the units that are not pinned comes from automatic differentiation. The energy guard
-    of rollouts is off.
-
-    Args:
-        model: the simulator.
-        scene_id: number of the scene.
+    The step maps displacements (u_t, u_{t-1}) of the finest predicted units and their kernels to (u_{t+1}, u_t).
+    Its Jacobian [[A, B], [I, 0]] over the units that are not pinned comes from automatic differentiation. The
+    energy guard of rollouts is off.
     """
     step = _LinearStep(model, scene_id)
     count = step.count

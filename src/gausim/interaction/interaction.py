@@ -13,18 +13,20 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from gausim.core import (
+    Adjustable,
     ConfigError,
     DataError,
     DivergenceError,
     GaussianScene,
     Handled,
+    Hands,
     SimState,
     Steppable,
     SteppedFrame,
     Trajectory,
     trajectory_of,
 )
-from gausim.interaction.hands import MovedHands
+from gausim.interaction.hands import MovedHands, hand_of
 from gausim.interaction.pushes import Push, exposure, scaled
 from gausim.interaction.selections import Selected, selection_to_json
 from gausim.interaction.session import (
@@ -38,6 +40,7 @@ from gausim.interaction.session import (
     Hand,
     Impulse,
     MadeWith,
+    Material,
     Pin,
     Release,
     Reset,
@@ -85,6 +88,7 @@ class Interaction:
         farthest: float = FARTHEST,
         seed: int = 0,
         keep: int | None = 0,
+        hands: Hands | None = None,
     ) -> None:
         """Begins at ``initial`` without forces.
 
@@ -100,6 +104,7 @@ class Interaction:
             farthest: distance of a kernel from rest at which the simulation stops [diagonals].
             seed: seed of the gusts of wind.
             keep: number of latest frames kept for :meth:`trajectory`; None keeps all.
+            hands: recorded poses of the hands by frame since ``initial``, which each hand follows until it is moved.
 
         Raises:
             ConfigError: a number is not positive and finite.
@@ -109,7 +114,7 @@ class Interaction:
                 raise ConfigError(f"interaction: {name}: expected a number > 0, got {value}.")
         self.scene, self.made_with, self.units = scene, made_with, tuple(units)
         self.gravity, self.most_force, self.seed = gravity, most_force, seed
-        self._dynamics, self._initial, self._farthest = dynamics, initial, farthest
+        self._dynamics, self._initial, self._farthest, self._recorded = dynamics, initial, farthest, hands
         self.masses = masses.to(initial.positions)
         self._rest = scene.means.to(initial.positions)
         self._free = (scene.simulated & ~scene.pinned).to(self._rest.device)
@@ -122,6 +127,8 @@ class Interaction:
         """Begins a new session from the initial state and discards the recorded events."""
         self.tick, self._entries = 0, list[Entry]()
         phases = random.Random(self.seed)
+        if isinstance(self._dynamics, Adjustable):
+            self._dynamics.adjust(1.0, 1.0)
         self._phases = [phases.uniform(0, 2 * math.pi) for _ in _GUSTS]
         self._rest_all()
         self._frames.clear()
@@ -132,9 +139,13 @@ class Interaction:
         self.act(Reset())
 
     def _rest_all(self) -> None:
-        self._stepper = self._dynamics.stepper(self._initial)
         self._limited_at: int | None = None
         self._limited_before, self._hands = 0, cast("MovedHands | None", None)
+        if self._recorded is not None and isinstance(self._dynamics, Handled):
+            self._hands = MovedHands(self.scene, self._recorded)
+            self._stepper = self._dynamics.stepper(self._initial, self._hands.pose)
+        else:
+            self._stepper = self._dynamics.stepper(self._initial)
         self.frame: SteppedFrame = self._stepper.frame
         self.frame_number = 0
         self.broken: str | None = None
@@ -201,6 +212,17 @@ class Interaction:
         """Whether forces were reduced within the last second."""
         return self._limited_at is not None and self.frame_number - self._limited_at < self.fps
 
+    @property
+    def hand(self) -> Int[Tensor, " K"] | None:
+        """The hand that holds each kernel, -1 for none; None where the method moves no hands, or nothing is held."""
+        hand = hand_of(self.scene)
+        return hand if isinstance(self._dynamics, Handled) and bool((hand >= 0).any()) else None
+
+    def place_of_hand(self, number: int) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+        """Displacement of a hand from rest [scene units] and its rotation vector [radian], as of :class:`Hand`."""
+        found = [0.0] * 6 if self._hands is None else self._hands.places(self.frame_number)[number].tolist()
+        return tuple(found[:3]), tuple(found[3:])
+
     def trajectory(self) -> Trajectory:
         """The kept frames, from the initial one or from the oldest that is kept."""
         return trajectory_of(self._frames or [self.frame], self._stepper)
@@ -264,22 +286,44 @@ class Interaction:
                 self.held = self.held & ~event.on.mask(self.scene, self.units).to(self.held.device)
             case Hand():
                 self._move_hand(event)
+            case Material():
+                self._adjust(event)
             case Reset():
                 self._rest_all()
 
     def _move_hand(self, event: Hand) -> None:
         """Moves a hand; the first one to move makes a stepper whose pins can, from the current state on."""
-        if not isinstance(self._dynamics, Handled) or not bool(self.scene.pinned.any()):
+        if self.hand is None:
             raise ConfigError(
                 f"{self.made_with.run or 'this method'}: nothing of '{self.scene.name}' is held by a hand that this "
                 "method can move. Play a run of gausim with pinned kernels."
             )
-        if self._hands is None:
+        if self._hands is None and isinstance(self._dynamics, Handled):
             self._hands, begin = MovedHands(self.scene), self.frame_number
             hands = self._hands
             self._limited_before += self._stepper.limited
             self._stepper = self._dynamics.stepper(self.state, lambda frame: hands.pose(frame + begin))
-        self._hands.move(event, self.frame_number)
+        cast(MovedHands, self._hands).move(event, self.frame_number)
+
+    @property
+    def adjustable(self) -> bool:
+        """Whether the material can be changed."""
+        return isinstance(self._dynamics, Adjustable)
+
+    def _adjust(self, event: Material) -> None:
+        """Changes the material; a new stepper goes on from the current state."""
+        if not isinstance(self._dynamics, Adjustable):
+            raise ConfigError(
+                f"{self.made_with.run or 'this method'}: its material was learned and cannot be set. Take a scene that "
+                "a pretrained network moves (--from BASE)."
+            )
+        self._dynamics.adjust(event.stiffness, event.damping)
+        self._limited_before += self._stepper.limited
+        hands, begin = self._hands, self.frame_number
+        if hands is not None and isinstance(self._dynamics, Handled):
+            self._stepper = self._dynamics.stepper(self.state, lambda frame: hands.pose(frame + begin))
+        else:
+            self._stepper = self._dynamics.stepper(self.state)
 
     def _allowed(self, name: str, amount: float, *, per: float = 1.0) -> float:
         """``amount * per``, a force in weights, or an error if it exceeds the largest force."""

@@ -29,15 +29,10 @@ class Whole(Checked, frozen=True):
 
 
 class Unit(Checked, frozen=True):
-    """The kernels of one unit of the hierarchy.
+    """The kernels of one unit of the hierarchy."""
 
-    Attributes:
-        level: 1 for the finest clusters, 2 for those of clusters, and so on; 0 for a kernel.
-        index: index of the unit within its level.
-    """
-
-    level: Natural
-    index: Natural
+    level: Natural  # 1 for the finest clusters, 2 for those of clusters, and so on; 0 for a kernel
+    index: Natural  # index of the unit within its level
 
     def mask(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]]) -> Bool[Tensor, " K"]:
         """True for the kernels of the unit; ``units`` has the unit of every kernel at levels 1, 2, ..., or -1.
@@ -63,12 +58,9 @@ class Unit(Checked, frozen=True):
 
 
 class Kernels(Checked, frozen=True):
-    """Listed kernels.
+    """Listed kernels."""
 
-    Attributes:
-        numbers: indices of the kernels in the scene, ascending.
-    """
-
+    # indices of the kernels in the scene, ascending
     numbers: Annotated[tuple[Natural, ...], Meta(min_length=1, max_length=MOST_KERNELS)]
 
     def __post_init__(self) -> None:
@@ -91,15 +83,10 @@ class Kernels(Checked, frozen=True):
 
 
 class Ball(Checked, frozen=True):
-    """Simulated kernels whose rest position lies in a ball.
+    """Simulated kernels whose rest position lies in a ball."""
 
-    Attributes:
-        centre: its centre [scene units].
-        radius: its radius [diagonals of the scene].
-    """
-
-    centre: Vector
-    radius: Annotated[float, Meta(gt=0, lt=1e9)]
+    centre: Vector  # its centre [scene units]
+    radius: Annotated[float, Meta(gt=0, lt=1e9)]  # its radius [diagonals of the scene]
 
     def mask(self, scene: GaussianScene, units: Sequence[Int[Tensor, " K"]]) -> Bool[Tensor, " K"]:
         """True for the kernels inside.

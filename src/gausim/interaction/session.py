@@ -20,7 +20,7 @@ from msgspec import Meta
 from torch import Tensor
 from torch.nn import Module
 
-from gausim.core import ConfigError, DataError, GaussianScene, SimState
+from gausim.core import ConfigError, DataError, GaussianScene, HandPath, SimState
 from gausim.interaction.checked import Checked, Natural, Vector, made
 from gausim.interaction.selections import Selected, Whole, selection_from_json, selection_to_json
 from gausim.io.files import write_durably
@@ -29,6 +29,7 @@ FORMAT = "gausim.session/1"
 MOST_BYTES, MOST_EVENTS, MOST_STEPS = 64 << 20, 200_000, 100_000
 _Amount = Annotated[float, Meta(ge=0, lt=1e9)]
 _Positive = Annotated[float, Meta(gt=0, lt=1e9)]
+_Factor = Annotated[float, Meta(ge=1e-3, le=1e3)]
 _Name = Annotated[str, Meta(min_length=1, max_length=200)]
 _Text = Annotated[str, Meta(max_length=200)]
 
@@ -78,16 +79,11 @@ class Gravity(_EventBase, frozen=True):
 
 
 class Wind(_EventBase, frozen=True):
-    """A wind, until the next such event: a force on every kernel in proportion to its cross-section.
-
-    Attributes:
-        weights: force on the whole object, averaged over time [weights of the object]; 0 for none.
-        gusts: relative amplitude of gusts, in 0..1.
-    """
+    """A wind, until the next such event: a force on every kernel in proportion to its cross-section."""
 
     direction: Vector
-    weights: _Amount
-    gusts: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    weights: _Amount  # force on the whole object, averaged over time [weights of the object]; 0 for none
+    gusts: Annotated[float, Meta(ge=0, le=1)] = 0.0  # relative amplitude of gusts, in 0..1
 
 
 class Pin(_EventBase, frozen=True):
@@ -103,61 +99,53 @@ class Unpin(_EventBase, frozen=True):
 
 
 class Hand(_EventBase, frozen=True):
-    """Moves the pins of a hand smoothly to a place relative to rest, and holds them there.
+    """Moves the pins of a hand smoothly to a place relative to rest, and holds them there."""
 
-    Attributes:
-        to: displacement from rest [scene units].
-        frames: duration of the motion.
-        turn: rotation about the middle of the hand's pins, axis times angle [radian].
-        hand: number of the hand; an object without recorded hands has one, which holds all pins.
-    """
-
-    to: Vector
-    frames: Annotated[int, Meta(ge=1, le=MOST_STEPS)] = 1
-    turn: Vector = (0.0, 0.0, 0.0)
+    to: Vector  # displacement from rest [scene units]
+    frames: Annotated[int, Meta(ge=1, le=MOST_STEPS)] = 1  # duration of the motion
+    turn: Vector = (0.0, 0.0, 0.0)  # rotation about the middle of the hand's pins, axis times angle [radian]
+    # number of the hand; an object without recorded hands has one, which holds all pins
     hand: Annotated[int, Meta(ge=0, lt=1000)] = 0
 
 
+class Material(_EventBase, frozen=True):
+    """Changes the material of the whole object, which goes on from where it is.
+
+    Attributes:
+        stiffness: over that at the beginning of the session.
+        damping: over that at the beginning of the session.
+    """
+
+    stiffness: _Factor = 1.0
+    damping: _Factor = 1.0
+
+
 class Reset(_EventBase, frozen=True):
-    """Returns to the initial state without forces, wind, gravity or pins."""
+    """Returns to the initial state without forces, wind, gravity or pins; the material stays."""
 
 
-Event = Force | Release | Impulse | Gravity | Wind | Pin | Unpin | Hand | Reset
+Event = Force | Release | Impulse | Gravity | Wind | Pin | Unpin | Hand | Material | Reset
 KINDS: dict[str, type] = {
-    t.__name__.lower(): t for t in (Force, Release, Impulse, Gravity, Wind, Pin, Unpin, Hand, Reset)
+    t.__name__.lower(): t for t in (Force, Release, Impulse, Gravity, Wind, Pin, Unpin, Hand, Material, Reset)
 }
 
 
 class Entry(Checked, frozen=True):
-    """An event and its time.
+    """An event and its time."""
 
-    Attributes:
-        at: number of steps before it.
-        event: the event.
-    """
-
-    at: Natural
-    event: Event
+    at: Natural  # number of steps before it
+    event: Event  # the event
 
 
 class MadeWith(Checked, frozen=True):
-    """Provenance of a session; a replay with equal hashes is bit-identical.
+    """Provenance of a session; a replay with equal hashes is bit-identical."""
 
-    Attributes:
-        scene: name of the scene.
-        scene_hash: hash of its Gaussians and masks.
-        model_hash: hash of the method's weights and settings.
-        initial_hash: hash of the initial state.
-        initial: name of the initial state: a sequence, or ``rest``.
-        run: name of the run.
-    """
-
-    scene: _Text
-    scene_hash: _Text
-    model_hash: _Text
-    initial_hash: _Text
-    initial: _Text = "rest"
-    run: _Text = ""
+    scene: _Text  # name of the scene
+    scene_hash: _Text  # hash of its Gaussians and masks
+    model_hash: _Text  # hash of the method's weights and settings
+    initial_hash: _Text  # hash of the initial state
+    initial: _Text = "rest"  # name of the initial state: a sequence, or ``rest``
+    run: _Text = ""  # name of the run
 
     @staticmethod
     def of(
@@ -168,43 +156,36 @@ class MadeWith(Checked, frozen=True):
         settings: str = "",
         name: str = "rest",
         run: str = "",
+        path: HandPath | None = None,
     ) -> MadeWith:
         """Hashes the inputs of a simulation: the rest scene, the method and the initial state called ``name``.
 
         A method is identified by its type, by its state dict if it is a torch module, and by ``settings``, a text of
-        its other parameters.
+        its other parameters. A recorded ``path`` of hands counts as part of the initial state.
         """
         masks = (scene.simulated, scene.pinned)
         gaussians = (scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh)
+        moved = () if path is None else (path.rotations, path.centres)
         numbers = dict(sorted(model.state_dict().items())) if isinstance(model, Module) else {}
         return MadeWith(
             scene.name,
             digest("scene", *gaussians, *masks),
             digest(type(model).__name__, settings, *numbers, *(v for v in numbers.values() if isinstance(v, Tensor))),
-            digest("initial", initial.positions, initial.previous),
+            digest("initial", initial.positions, initial.previous, *moved),
             name,
             run,
         )
 
 
 class ForceSession(Checked, frozen=True):
-    """The events on an object and the number of frames.
+    """The events on an object and the number of frames."""
 
-    Attributes:
-        made_with: provenance.
-        fps: frames per second.
-        steps: frames after the initial one.
-        entries: the events, in order of time.
-        gravity: ratio of weight to mass [scene units / s^2].
-        seed: seed of the gusts of wind.
-    """
-
-    made_with: MadeWith
-    fps: _Positive
-    steps: Annotated[int, Meta(ge=0, le=MOST_STEPS)]
-    entries: tuple[Any, ...]
-    gravity: _Positive
-    seed: Natural = 0
+    made_with: MadeWith  # provenance
+    fps: _Positive  # frames per second
+    steps: Annotated[int, Meta(ge=0, le=MOST_STEPS)]  # frames after the initial one
+    entries: tuple[Any, ...]  # the events, in order of time
+    gravity: _Positive  # ratio of weight to mass [scene units / s^2]
+    seed: Natural = 0  # seed of the gusts of wind
 
     def __post_init__(self) -> None:
         Checked.__post_init__(self)

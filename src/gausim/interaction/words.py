@@ -24,6 +24,7 @@ _WORDS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "pin": (("on",), ("at",)),
     "unpin": ((), ("on", "at")),
     "hand": (("to",), ("frames", "turn", "hand", "at")),
+    "material": ((), ("stiffness", "damping", "at")),
 }
 _HELP = {
     "force": "on=PART weights=W direction=D [at=FRAME] [frames=N]: W times the part's weight, from FRAME, for N frames",
@@ -34,6 +35,7 @@ _HELP = {
     "unpin": "[on=PART] [at=FRAME]: let it go",
     "hand": "to=X,Y,Z [frames=N] [turn=X,Y,Z] [hand=H] [at=FRAME]: move the pins to a place relative to rest [scene "
     "units], turned by an axis times an angle [radian], within N frames",
+    "material": "[stiffness=S] [damping=D] [at=FRAME]: multiply those at the beginning, of a scene moved --from a base",
 }
 EPILOG = """\
 parts of an object (on=PART):

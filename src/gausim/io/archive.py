@@ -57,13 +57,10 @@ def files_below(root: Path) -> list[Path]:
 
 
 def pack(target: Path, files: Mapping[str, Path]) -> int:
-    """Writes files under the given names into a tar archive, atomically and reproducibly.
+    """Writes files under the given names into a tar archive, atomically and reproducibly; returns their size [bytes].
 
     Owners, times and permissions are omitted. The archive is not compressed: images and weights hardly shrink, and
     the output of a compressor depends on its version.
-
-    Returns:
-        The total size of the files [bytes], an argument of :func:`unpack`.
     """
     total = 0
     with replacing(target) as temporary, tarfile.open(temporary, "w", format=tarfile.PAX_FORMAT) as tar:

@@ -50,13 +50,9 @@ def read_text(address: str, *, most_bytes: int) -> str:
 
 
 def continue_download(address: str, part: Path, *, size: int, advance: Callable[[int], None]) -> None:
-    """Downloads a file, continuing from its present bytes if the server supports it (HTTP Range).
+    """Downloads ``size`` bytes from a URL or path to ``part``, from its present bytes on where the server can.
 
-    Args:
-        address: a URL of http or https, or a path.
-        part: the file; after an interruption it is kept for the next call.
-        size: expected size [bytes].
-        advance: called with the number of bytes so far.
+    After an interruption the file is kept for the next call. ``advance`` is called with the number of bytes so far.
 
     Raises:
         FetchError: the address is unreachable or has a file of another size.

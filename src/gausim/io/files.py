@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 _LEFTOVER = re.compile(r"\..+\.\d+\.tmp(\.\w+)?")
 
 
@@ -18,13 +20,10 @@ _LEFTOVER = re.compile(r"\..+\.\d+\.tmp(\.\w+)?")
 def replacing(path: Path, *, previous: Path | None = None, typed: bool = False) -> Iterator[Path]:
     """A temporary file that takes the name ``path`` when the block ends without an error.
 
-    After a crash the file has either the old or the new content: the temporary file is in the same directory (made if
-    missing) and is flushed to the disk before it is renamed; then the directory entry is flushed, too.
-
-    Args:
-        path: the file.
-        previous: new name of an existing file ``path``; None replaces it.
-        typed: give the temporary file the same suffix, for writers that depend on it.
+    After a crash the file has either the old or the new content: the temporary file is in the same directory (made
+    if missing) and is flushed to the disk before it is renamed; then the directory entry is flushed, too. An
+    existing file is renamed to ``previous``, if given. ``typed`` gives the temporary file the same suffix, for
+    writers that depend on it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp{path.suffix if typed else ''}")
@@ -60,6 +59,21 @@ def write_json(path: Path, data: Any) -> None:
         ValueError: a number is NaN or infinite, which JSON cannot represent.
     """
     write_durably(path, json.dumps(data, indent=1, allow_nan=False).encode() + b"\n")
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A mapping from a YAML file, with the safe loader: no tag builds an object.
+
+    Raises:
+        ValueError: the file is missing, not YAML or not a mapping.
+    """
+    try:
+        loaded = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+        raise ValueError(f"{path}: cannot be read as YAML ({error}).") from error
+    if not isinstance(loaded, dict):
+        raise ValueError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
+    return loaded
 
 
 def sha256(path: Path) -> str:

@@ -36,17 +36,11 @@ _REMEDY = "Export it again with `gausim export`."
 
 @dataclass
 class Glb:
-    """A document of glTF and its binary part, to be written or as read.
+    """A document of glTF and its binary part, to be written or as read."""
 
-    Attributes:
-        document: the JSON part.
-        binary: the bytes that its buffer views name.
-        source: the file that it was read from, for messages.
-    """
-
-    document: dict[str, Any]
-    binary: bytearray | bytes = field(default_factory=bytearray)
-    source: str = ""
+    document: dict[str, Any]  # the JSON part
+    binary: bytearray | bytes = field(default_factory=bytearray)  # the bytes that its buffer views name
+    source: str = ""  # the file that it was read from, for messages
 
     def add_view(self, array: np.ndarray, **more: int) -> int:
         """Appends an array as a buffer view that begins at a multiple of four bytes; returns its index."""
@@ -172,15 +166,15 @@ def read_glb(path: Path | str) -> Glb:
 def splat_glb(scene: GaussianScene, *, up: str = "z", degree: int | None = None) -> Glb:
     """The document of a scene; spherical harmonics up to ``degree``, by default all."""
     glb = Glb({"asset": {"version": "2.0", "generator": "gausim"}, "extensionsUsed": [EXTENSION]})
-    opacities, sh = torch.sigmoid(scene.opacity_logits), _numpy(scene.sh)
-    base = _numpy(torch.cat(((C0 * scene.sh[:, 0] + 0.5).clamp(0, 1), opacities[:, None]), 1))
+    opacities, sh = torch.sigmoid(scene.opacity_logits), contiguous(scene.sh)
+    base = contiguous(torch.cat(((C0 * scene.sh[:, 0] + 0.5).clamp(0, 1), opacities[:, None]), 1))
     quats = scene.quats / scene.quats.norm(dim=-1, keepdim=True)
     attributes = {
-        "POSITION": _numpy(scene.means),
+        "POSITION": contiguous(scene.means),
         "COLOR_0": (255 * base + 0.5).astype(np.uint8),  # for readers that know points only
-        f"{EXTENSION}:ROTATION": _numpy(quats[:, [1, 2, 3, 0]]),
-        f"{EXTENSION}:SCALE": _numpy(scene.log_scales.exp()),
-        f"{EXTENSION}:OPACITY": _numpy(opacities),
+        f"{EXTENSION}:ROTATION": contiguous(quats[:, [1, 2, 3, 0]]),
+        f"{EXTENSION}:SCALE": contiguous(scene.log_scales.exp()),
+        f"{EXTENSION}:OPACITY": contiguous(opacities),
     }
     attributes |= {name: sh[:, i] for i, name in enumerate(_sh_names(scene.sh_degree if degree is None else degree))}
     kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective",
@@ -221,18 +215,25 @@ def splat_scene(glb: Glb, name: str) -> GaussianScene:
             raise DataError(f"{glb.source}: attribute '{EXTENSION}:{short}': expected numbers {expected}. {_REMEDY}")
     degree = max((d for d in SH_COEFFICIENTS if set(_sh_names(d)) <= set(attributes)), default=0)
     sh = np.stack([glb.attribute(attributes.get(n), n, width=3, count=count) for n in _sh_names(degree)], 1)
-    logits = np.clip(opacities.astype(np.float64), _EDGE, 1 - _EDGE)
     try:
-        return GaussianScene.create(
-            means=torch.from_numpy(means.copy()),
-            log_scales=torch.from_numpy(scales.copy()).log(),
-            quats=torch.from_numpy(np.ascontiguousarray(quats[:, [3, 0, 1, 2]])),
-            opacity_logits=torch.from_numpy(np.log(logits / (1 - logits)).astype(np.float32)),
-            sh=torch.from_numpy(sh),
-            name=name,
-        )
+        return linear_scene(means, scales, quats, opacities, sh, name)
     except SceneError as error:
         raise DataError(f"{glb.source}: {error}") from error
+
+
+def linear_scene(
+    means: np.ndarray, scales: np.ndarray, quats: np.ndarray, opacities: np.ndarray, sh: np.ndarray, name: str
+) -> GaussianScene:
+    """A scene of linear scales, quaternions x y z w and opacities in [0, 1], as glTF and USD hold them."""
+    inside = np.clip(opacities.astype(np.float64), _EDGE, 1 - _EDGE)
+    return GaussianScene.create(
+        means=torch.from_numpy(means.copy()),
+        log_scales=torch.from_numpy(scales.copy()).log(),
+        quats=torch.from_numpy(np.ascontiguousarray(quats[:, [3, 0, 1, 2]])),
+        opacity_logits=torch.from_numpy(np.log(inside / (1 - inside)).astype(np.float32)),
+        sh=torch.from_numpy(sh),
+        name=name,
+    )
 
 
 def save_gltf_frames(folder: Path | str, name: str, frames: Iterable[GaussianScene], *, up: str = "z") -> int:
@@ -264,5 +265,6 @@ def _sh_names(degree: int) -> list[str]:
     return [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{n}" for d in range(degree + 1) for n in range(2 * d + 1)]
 
 
-def _numpy(value: torch.Tensor) -> np.ndarray:
+def contiguous(value: torch.Tensor) -> np.ndarray:
+    """The values as a contiguous array of float32."""
     return np.ascontiguousarray(value.detach().cpu().float().numpy())

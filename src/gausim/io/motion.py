@@ -64,19 +64,12 @@ class _Facts(Struct, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class UnitMotion:
-    """The motion of N units over F frames, and the unit that every kernel follows.
+    """The motion of N units over F frames, and the unit that every kernel follows."""
 
-    Attributes:
-        rest_centres: X_c, mean of the kernels of each unit at rest [scene units].
-        displacements: x_c - X_c of every frame [scene units].
-        deformation_gradients: G_c of every frame.
-        unit_of_kernel: the unit of each kernel.
-    """
-
-    rest_centres: Float[Tensor, "N 3"]
-    displacements: Float[Tensor, "F N 3"]
-    deformation_gradients: Float[Tensor, "F N 3 3"]
-    unit_of_kernel: Int[Tensor, " K"]
+    rest_centres: Float[Tensor, "N 3"]  # X_c, mean of the kernels of each unit at rest [scene units]
+    displacements: Float[Tensor, "F N 3"]  # x_c - X_c of every frame [scene units]
+    deformation_gradients: Float[Tensor, "F N 3 3"]  # G_c of every frame
+    unit_of_kernel: Int[Tensor, " K"]  # the unit of each kernel
 
     @staticmethod
     def of(scene: GaussianScene, trajectory: Trajectory) -> UnitMotion:
@@ -86,7 +79,7 @@ class UnitMotion:
             DataError: the trajectory is of another scene.
             DivergenceError: a frame is not finite.
         """
-        _check_trajectory(scene, trajectory)
+        check_trajectory(scene, trajectory)
         positions, gradients = trajectory.positions.float(), trajectory.deformation_gradients.float()
         made = _averaged(scene.means, positions, gradients, trajectory.unit_of_kernel)
         leaves = torch.zeros(scene.count)
@@ -147,17 +140,11 @@ def motion_glb(scene: GaussianScene, trajectory: Trajectory, *, up: str = "z") -
 
 
 def save_motion(path: Path | str, scene: GaussianScene, trajectory: Trajectory, *, up: str = "z") -> None:
-    """Writes a rest scene and its motion; replaces the file atomically.
+    """Writes a rest scene and its motion; replaces the file atomically. ``up`` (y or z) is for readers of glTF.
 
-    Kept: the rest scene (float32; spherical harmonics above degree 0 with 8 bits), its masks, every unit's centre and
-    deformation gradient with 11 significant bits. Lost: rotations, which on reading are those of the deformation
-    gradients.
-
-    Args:
-        path: the file.
-        scene: the rest scene.
-        trajectory: its motion.
-        up: vertical axis, ``y`` or ``z``, for readers of glTF.
+    Kept: the rest scene (float32; spherical harmonics above degree 0 with 8 bits), its masks, every unit's centre
+    and deformation gradient with 11 significant bits. Lost: rotations, which on reading are those of the
+    deformation gradients.
 
     Raises:
         DataError: the trajectory is of another scene, or goes beyond half floats or the size of a GLB.
@@ -257,7 +244,13 @@ def _averaged(rest: Tensor, positions: Tensor, gradients: Tensor, unit: Tensor) 
     return UnitMotion(centres.float(), (moved / members).float(), gradients, unit)
 
 
-def _check_trajectory(scene: GaussianScene, trajectory: Trajectory) -> None:
+def check_trajectory(scene: GaussianScene, trajectory: Trajectory) -> None:
+    """Checks that a trajectory can be exported with a scene.
+
+    Raises:
+        DataError: it is of another scene.
+        DivergenceError: a frame is not finite.
+    """
     if trajectory.positions.shape[1] != scene.count:
         raise DataError(
             f"{scene.name}: has {scene.count} kernels, the trajectory {trajectory.positions.shape[1]}. Give the scene "

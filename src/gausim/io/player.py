@@ -29,14 +29,9 @@ def save_player(
 ) -> None:
     """Writes a page with time bar, speed, loop and orbit; in it is the file of :func:`gausim.io.motion.save_motion`.
 
-    Args:
-        path: the page; replaced atomically.
-        scene: the rest scene.
-        trajectory: its motion.
-        camera: one camera, whose place and field of view the page begins with; it looks at the point of its axis that
-            is nearest to the scene's middle, with the vertical axis upwards.
-        up: vertical axis, x, y or z, with a minus sign where it points down.
-        background: colour behind the Gaussians; black when absent.
+    The page begins with place and field of view of the one ``camera``, looking at the point of its axis that is
+    nearest to the scene's middle. The vertical axis ``up`` is x, y or z, with a minus sign where it points down. It
+    is replaced atomically.
 
     Raises:
         DataError: the trajectory is of another scene, or goes beyond half floats.

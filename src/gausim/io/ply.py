@@ -60,13 +60,9 @@ def masks_path(path: Path | str) -> Path:
 def load_scene(path: Path | str, *, masks: Path | str | None = None, name: str | None = None) -> GaussianScene:
     """Reads a 3DGS PLY with SH degree 0..3 in any property order, as little endian, big endian or text.
 
-    Normals and unknown properties are skipped; doubles are rounded to float32.
-
-    Args:
-        path: the PLY file.
-        masks: the file of masks; by default ``<stem>.masks.npz`` next to the PLY if it exists, otherwise every kernel
-            is simulated and foreground and none is pinned.
-        name: name of the scene in messages and checkpoints, default the file's stem.
+    Normals and unknown properties are skipped; doubles are rounded to float32. Masks are by default those of
+    ``<stem>.masks.npz`` next to the PLY; without it every kernel is simulated and foreground and none is pinned.
+    The scene's name is by default the file's stem.
 
     Raises:
         SceneError: naming the file and the property that is missing, malformed, NaN, infinite or a zero quaternion.

@@ -39,10 +39,7 @@ def save_ply_sequence(folder: Path | str, name: str, frames: Iterable[GaussianSc
 
 
 def load_ply_sequence(folder: Path | str, *, fps: float | None = None) -> tuple[Iterator[GaussianScene], int, float]:
-    """Reads numbered PLY files one at a time, on request.
-
-    Returns:
-        The scenes in the order of their numbers, their count, and frames per second (``fps`` or NAME.json).
+    """Scenes of numbered PLY files, read on request, their number, and frames per second (``fps`` or NAME.json).
 
     Raises:
         DataError: there are no such files or files of several sequences, a number is missing, or the frame rate is

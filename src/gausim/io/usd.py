@@ -17,12 +17,11 @@ import torch
 from gausim.core import ConfigError, DataError, GaussianScene
 from gausim.core.scene import SH_COEFFICIENTS
 from gausim.io.files import replacing
+from gausim.io.gltf import contiguous, linear_scene
 
 SUFFIXES = (".usd", ".usda", ".usdc")
 PRIM = "/Splats"
 _LARGEST, _MOST_FRAMES = 8 << 30, 100_000
-# Opacities closer to 0 or 1 than this have no finite logit in float32.
-_EDGE = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +54,9 @@ class UsdClip:
 
 
 def save_usd(path: Path | str, frames: Iterable[GaussianScene], fps: float, *, up: str = "z") -> int:
-    """Writes moving Gaussians; replaces the file atomically. Returns the number of frames.
+    """Writes moving Gaussians of equal number, atomically; returns the number of frames. Frame n has time code n.
 
-    Args:
-        path: the file: .usd and .usdc are binary, .usda is text.
-        frames: deformed scenes of equal size; frame n has time code n.
-        fps: frames per second.
-        up: vertical axis, ``y`` or ``z``.
+    Files named .usd and .usdc are binary, .usda is text; the vertical axis ``up`` is y or z.
 
     Raises:
         ConfigError: usd-core is not installed, or the suffix or axis is not supported.
@@ -133,11 +128,11 @@ def _write(pxr: Any, stage: Any, frames: Iterable[GaussianScene], path: Path) ->
         if first is None:
             first = scene
             splats.CreateRadianceSphericalHarmonicsDegreeAttr(scene.sh_degree)
-            splats.CreateOpacitiesAttr(vt.FloatArray.FromNumpy(_numpy(torch.sigmoid(scene.opacity_logits))))
+            splats.CreateOpacitiesAttr(vt.FloatArray.FromNumpy(contiguous(torch.sigmoid(scene.opacity_logits))))
         if scene.count != first.count or scene.sh.shape != first.sh.shape:
             raise DataError(f"{path}: frame {count - 1} has {scene.count} Gaussians, expected {first.count}.")
-        time, means, lengths = count - 1, _numpy(scene.means), _numpy(scene.log_scales.exp())
-        quats = _numpy(scene.quats / scene.quats.norm(dim=-1, keepdim=True))
+        time, means, lengths = count - 1, contiguous(scene.means), contiguous(scene.log_scales.exp())
+        quats = contiguous(scene.quats / scene.quats.norm(dim=-1, keepdim=True))
         positions.Set(vt.Vec3fArray.FromNumpy(means), time)
         # Vt stores the imaginary parts first.
         orientations.Set(vt.QuatfArray.FromNumpy(np.ascontiguousarray(quats[:, [1, 2, 3, 0]])), time)
@@ -147,7 +142,7 @@ def _write(pxr: Any, stage: Any, frames: Iterable[GaussianScene], path: Path) ->
         extent.Set(vt.Vec3fArray.FromNumpy(box), time)
         # Constant colours are written once.
         if last_sh is None or not torch.equal(last_sh, scene.sh):
-            sh.Set(vt.Vec3fArray.FromNumpy(_numpy(scene.sh).reshape(-1, 3)), time)
+            sh.Set(vt.Vec3fArray.FromNumpy(contiguous(scene.sh).reshape(-1, 3)), time)
             last_sh = scene.sh
     if first is None:
         raise DataError(f"{path}: no frames to write; a clip needs at least one.")
@@ -170,15 +165,7 @@ def _scene(clip: UsdClip, time: float, source: str) -> GaussianScene:
         raise DataError(f"{source}: attributes 'scales' and 'opacities': expected values > 0 and in 0..1.")
     if not np.linalg.norm(quats, axis=-1).all():
         raise DataError(f"{source}: attribute 'orientations': expected quaternions that are not zero.")
-    logits = np.clip(opacities.astype(np.float64), _EDGE, 1 - _EDGE)
-    return GaussianScene.create(
-        means=torch.from_numpy(means),
-        log_scales=torch.from_numpy(scales).log(),
-        quats=torch.from_numpy(np.ascontiguousarray(quats[:, [3, 0, 1, 2]])),
-        opacity_logits=torch.from_numpy(np.log(logits / (1 - logits)).astype(np.float32)),
-        sh=torch.from_numpy(held.reshape(count, basis, 3)),
-        name=clip.path.stem,
-    )
+    return linear_scene(means, scales, quats, opacities, held.reshape(count, basis, 3), clip.path.stem)
 
 
 def _array(attribute: Any, time: float, source: str, *, width: int, count: int | None = None) -> np.ndarray:
@@ -197,10 +184,6 @@ def _array(attribute: Any, time: float, source: str, *, width: int, count: int |
     if not np.isfinite(numbers).all():
         raise DataError(f"{source}: attribute '{name}' is NaN or infinite. Export it again.")
     return numbers.astype(np.float32)
-
-
-def _numpy(value: torch.Tensor) -> np.ndarray:
-    return np.ascontiguousarray(value.detach().cpu().float().numpy())
 
 
 def _pxr() -> Any:

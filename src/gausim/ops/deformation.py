@@ -34,10 +34,7 @@ def bounded_deformation(
 ) -> Float[Tensor, "N 3 3"]:
     """Deformation gradients with determinants of at least ``least`` > 0; others are replaced by the identity.
 
-    Args:
-        deformation_gradient: deformation gradients of N units.
-        least: smallest determinant.
-        unit: whether to scale them to determinant 1 (constant volume).
+    ``unit`` scales them to determinant 1 (constant volume).
     """
     det = determinant(deformation_gradient)
     kept = ~(det < least)  # keeps NaN

@@ -21,14 +21,9 @@ TABLE_ELEMENTS = 1 << 24  # distances that neighbour_codes computes at a time: 1
 
 
 def radius_edges(points: Float[Tensor, "N 3"], radius: float, max_neighbours: int) -> Int[Tensor, "2 E"]:
-    """Edges (source, destination): every point receives from its nearest neighbours within ``radius``.
+    """Edges (source, destination): every point receives from its nearest neighbours within ``radius`` [scene units].
 
     Sorted by destination, then source. Self edges are left out; at most ``max_neighbours`` per destination.
-
-    Args:
-        points: positions [scene units].
-        radius: edges are shorter than this [scene units].
-        max_neighbours: cap of incoming edges per point.
 
     Raises:
         ValueError: a position is NaN or infinite.
@@ -46,14 +41,8 @@ def batched_radius_edges(
 ) -> Int[Tensor, "2 E"]:
     """:func:`radius_edges` of every member of a disjoint union, with indices into the union.
 
-    The search runs on the CPU; tensors of another device are copied there and back. :func:`neighbour_codes` avoids
-    this synchronisation.
-
-    Args:
-        points: positions of all members, one member after the other [scene units].
-        offsets: first point of each of the M members, then N.
-        radii: per member, edges are shorter than this [scene units].
-        max_neighbours: cap of incoming edges per point.
+    ``offsets`` are the first point of each of the M members, then N. The search runs on the CPU; tensors of another
+    device are copied there and back. :func:`neighbour_codes` avoids this synchronisation.
 
     Raises:
         ValueError: a position is NaN or infinite.
@@ -111,13 +100,7 @@ def neighbour_codes(
     """The edges of :func:`batched_radius_edges` as N k codes (:func:`edge_codes`), from torch operations alone.
 
     Shapes do not depend on the positions and the host is not synchronised, so a CUDA graph can capture it. All N^2
-    distances are computed, in blocks of rows.
-
-    Args:
-        points: positions of all members [scene units].
-        member_of_point: the member of each point; only points of the same member are neighbours.
-        radii: per member, edges are shorter than this [scene units].
-        k: cap of incoming edges per point.
+    distances are computed, in blocks of rows; ``k`` is the cap of incoming edges per point.
     """
     x, count = points.detach().float(), len(points)
     squares = _squared(radii).index_select(0, member_of_point)
@@ -154,13 +137,9 @@ def no_edge(count: int) -> int:
 
 
 def combine_codes(a: Int[Tensor, " A"], b: Int[Tensor, " B"], count: int, *, rule: str) -> Int[Tensor, " A_and_B"]:
-    """Union or intersection of two sets of edges over ``count`` nodes, as A + B ascending codes, padded.
+    """``union`` or ``intersection`` of two sets of edges over ``count`` nodes, as A + B ascending codes, padded.
 
-    Args:
-        a: codes without repetitions, except of :func:`no_edge`.
-        b: likewise.
-        count: number of nodes.
-        rule: ``union`` or ``intersection``.
+    The codes of a set have no repetitions, except of :func:`no_edge`.
     """
     codes = torch.cat((a, b)).sort().values
     repeated = torch.zeros_like(codes, dtype=torch.bool)

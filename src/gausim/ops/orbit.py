@@ -26,12 +26,8 @@ def orbit_cameras(
 ) -> Cameras:
     """Cameras on a circle about the middle of a scene, at a distance at which the scene fits into the picture.
 
-    Args:
-        means: positions of the kernels [scene units].
-        azimuths: angle of each camera about the vertical [degree].
-        elevation: height of all cameras above the horizon [degree].
-        up: vertical axis, x, y or z, with a minus sign where it points down.
-        size: (width, height) of the pictures [pixels].
+    Azimuths about the vertical ``up`` (x, y or z, with a minus sign where it points down) and the elevation above
+    the horizon are in degrees, ``size`` (width, height) in pixels.
     """
     middle = means.median(0).values.double()
     radius = float(torch.quantile((means.double() - middle).norm(dim=-1), _WITHIN))

@@ -56,17 +56,11 @@ class _Made(Selection):
 
 @dataclass(frozen=True)
 class HalfSpace(Selection):
-    """Kernels whose mean lies strictly below (or above) a value on one axis.
+    """Kernels whose mean lies strictly below (or above) a value on one axis."""
 
-    Attributes:
-        axis: 0, 1 or 2 for x, y or z.
-        below: select coordinates less than this [scene units].
-        above: select coordinates greater than this [scene units].
-    """
-
-    axis: int
-    below: float | None = None
-    above: float | None = None
+    axis: int  # 0, 1 or 2 for x, y or z
+    below: float | None = None  # select coordinates less than this [scene units]
+    above: float | None = None  # select coordinates greater than this [scene units]
 
     def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:
         """True for the kernels on the selected side."""
@@ -110,14 +104,10 @@ class NearPoints(Selection):
 
 @dataclass(frozen=True)
 class Component(Selection):
-    """A connected component of the graph that links kernels whose means are within a radius.
+    """A connected component of the graph that links kernels whose means are within a radius."""
 
-    Attributes:
-        radius: largest distance of linked kernels [scene units].
-        seed: the component of the kernel nearest to this point; the largest one when None.
-    """
-
-    radius: float
+    radius: float  # largest distance of linked kernels [scene units]
+    # the component of the kernel nearest to this point; the largest one when None
     seed: tuple[float, float, float] | None = None
 
     def __call__(self, scene: GaussianScene) -> Bool[Tensor, " K"]:

@@ -100,14 +100,8 @@ def carve(
 ) -> VoxelHull | None:
     """Visual hull with about ``resolution`` voxels along its longest side; None if it is empty.
 
+    ``missing`` is the fraction of the views whose masks may miss a part; 0: one mask that misses it removes it.
     Points outside an image are not carved by it, so that an object may lie partly outside some images.
-
-    Args:
-        masks: foreground.
-        viewmats: world to camera (OpenCV).
-        Ks: intrinsics [pixels].
-        resolution: voxels along the longest side.
-        missing: fraction of the views whose masks may miss a part; 0: one mask that misses it removes it.
     """
     middle, half = search_cube(viewmats, Ks, (masks.shape[2], masks.shape[1]))
     vetoes = int(missing * len(masks))

@@ -45,36 +45,23 @@ Drawable = tuple[Tensor, Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True)
 class ReconstructionOptions:
-    """Options of a reconstruction.
+    """Options of a reconstruction."""
 
-    Attributes:
-        kernels: target number of kernels (pruning may leave fewer).
-        iterations: optimiser steps, one image each.
-        extent: ``object``: the foreground of the masks, within their visual hull; ``scene``: everything in the images.
-        sh_degree: degree of the spherical harmonics, 0..3.
-        hull_resolution: voxels along the longest side of the visual hull.
-        missing_masks: fraction of the views whose masks may lack a part that all others show.
-        minimum_opacity: kernels of less opacity are pruned.
-        anisotropy_limit: r of the penalty mean(max(s_max / s_min, r) - r) (PhysGaussian).
-        random_background: composite over a random colour in every step instead of black.
-        patience: number of successive twentieths of the steps, after the last round, without a better mean loss
-            before an early stop; 0 never stops.
-        seed: seed of all random numbers.
-        rates: Adam's step sizes.
-    """
-
-    kernels: int = 2000
-    iterations: int = 4000
+    kernels: int = 2000  # target number of kernels (pruning may leave fewer)
+    iterations: int = 4000  # optimiser steps, one image each
+    # ``object``: the foreground of the masks, within their visual hull; ``scene``: everything in the images
     extent: Literal["object", "scene"] = "object"
-    sh_degree: int = 1
-    hull_resolution: int = 96
-    missing_masks: float = 0.0
-    minimum_opacity: float = 0.05
-    anisotropy_limit: float = 3.0
-    random_background: bool = True
+    sh_degree: int = 1  # degree of the spherical harmonics, 0..3
+    hull_resolution: int = 96  # voxels along the longest side of the visual hull
+    missing_masks: float = 0.0  # fraction of the views whose masks may lack a part that all others show
+    minimum_opacity: float = 0.05  # kernels of less opacity are pruned
+    anisotropy_limit: float = 3.0  # r of the penalty mean(max(s_max / s_min, r) - r) (PhysGaussian)
+    random_background: bool = True  # composite over a random colour in every step instead of black
+    # number of successive twentieths of the steps, after the last round, without a better mean loss before an
+    # early stop; 0 never stops
     patience: int = 3
-    seed: int = 0
-    rates: LearningRates = field(default_factory=LearningRates)
+    seed: int = 0  # seed of all random numbers
+    rates: LearningRates = field(default_factory=LearningRates)  # Adam's step sizes
 
     def __post_init__(self) -> None:
         """Checks the ranges, or raises :class:`ConfigError`."""
@@ -107,18 +94,11 @@ def reconstruct(
 ) -> GaussianScene:
     """Fits Gaussians to images by L1 + D-SSIM + mask loss (3DGS, with the mask against floaters).
 
-    Kernels of an object start on the surface of its visual hull (or on the points in it), those of an open scene on
-    the points. They are split where the images' error is largest and pruned where they are transparent, never seen or
-    out of bounds, because the dynamics moves every kernel.
-
-    Args:
-        sets: training images; the hull is carved from the first set.
-        renderer: draws the Gaussians.
-        options: sizes, steps and rates.
-        cloud: points at which kernels start; an open scene needs them.
-        name: name of the scene, whose kernels are all simulated and foreground, none pinned.
-        progress: called after every step.
-        begun: :meth:`Reconstruction.state` of an interrupted reconstruction with the same arguments, to continue.
+    Kernels of an object start on the surface of the visual hull of the first set (or on the points of ``cloud`` in
+    it), those of an open scene on the points. They are split where the images' error is largest and pruned where
+    they are transparent, never seen or out of bounds, because the dynamics moves every kernel. All are simulated
+    and foreground, none pinned. ``progress`` is called after every step; ``begun`` is :meth:`Reconstruction.state`
+    of an interrupted reconstruction with the same arguments.
 
     Raises:
         ConfigError: an open scene has no points.

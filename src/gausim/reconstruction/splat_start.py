@@ -30,15 +30,10 @@ OPEN_CEILING = 0.2
 
 @dataclass(frozen=True, eq=False)
 class WithinHull:
-    """Bounds of an object.
+    """Bounds of an object."""
 
-    Attributes:
-        hull: the body within which the centres are.
-        ceiling: largest standard deviation [scene units].
-    """
-
-    hull: VoxelHull
-    ceiling: float
+    hull: VoxelHull  # the body within which the centres are
+    ceiling: float  # largest standard deviation [scene units]
 
     def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
         """True for points within the hull."""
@@ -51,13 +46,9 @@ class WithinHull:
 
 @dataclass(frozen=True, eq=False)
 class BeforeCameras:
-    """Bounds of an open scene: kernels are too small to reach a camera, where they would fill the image.
+    """Bounds of an open scene: kernels are too small to reach a camera, where they would fill the image."""
 
-    Attributes:
-        centers: centres of the cameras [scene units].
-    """
-
-    centers: Float[Tensor, "V 3"]
+    centers: Float[Tensor, "V 3"]  # centres of the cameras [scene units]
 
     def contains(self, points: Float[Tensor, "N 3"]) -> Bool[Tensor, " N"]:
         """True for finite points."""
@@ -70,15 +61,10 @@ class BeforeCameras:
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points at which kernels start.
+    """Points at which kernels start."""
 
-    Attributes:
-        points: positions [scene units].
-        colors: RGB in [0, 1]; None reads the colours of an object from the images.
-    """
-
-    points: Float[Tensor, "P 3"]
-    colors: Float[Tensor, "P 3"] | None = None
+    points: Float[Tensor, "P 3"]  # positions [scene units]
+    colors: Float[Tensor, "P 3"] | None = None  # RGB in [0, 1]; None reads the colours of an object from the images
 
     def __post_init__(self) -> None:
         """Checks the numbers, or raises :class:`DataError`."""
@@ -91,21 +77,13 @@ class PointCloud:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """K initial balls.
+    """K initial balls."""
 
-    Attributes:
-        points: centres [scene units].
-        colors: RGB in [0, 1].
-        scales: standard deviations [scene units].
-        bounds: bounds of positions and sizes.
-        extent: unit of the positions' learning rate [scene units].
-    """
-
-    points: Float[Tensor, "K 3"]
-    colors: Float[Tensor, "K 3"]
-    scales: Float[Tensor, " K"]
-    bounds: WithinHull | BeforeCameras
-    extent: float
+    points: Float[Tensor, "K 3"]  # centres [scene units]
+    colors: Float[Tensor, "K 3"]  # RGB in [0, 1]
+    scales: Float[Tensor, " K"]  # standard deviations [scene units]
+    bounds: WithinHull | BeforeCameras  # bounds of positions and sizes
+    extent: float  # unit of the positions' learning rate [scene units]
 
 
 def start_object(
@@ -113,13 +91,8 @@ def start_object(
 ) -> Start:
     """``count`` balls evenly over the surface of the visual hull of the masks, or over the points that lie in it.
 
-    Args:
-        images: posed images; alpha > 0 is the object.
-        count: number of balls.
-        resolution: voxels along the longest side of the hull.
-        missing: fraction of the views whose masks may lack a part that all others show.
-        cloud: points instead of the surface.
-        name: name of the scene, for errors.
+    The object is where alpha > 0. The hull has ``resolution`` voxels along its longest side; ``missing`` is the
+    fraction of the views whose masks may lack a part that all others show.
 
     Raises:
         DataError: no body projects into all masks, or no point lies in it.

@@ -25,23 +25,14 @@ ADAM_STATE = ("step", "exp_avg", "exp_avg_sq")
 
 @dataclass(frozen=True)
 class LearningRates:
-    """Adam's step sizes per parameter: those of 3DGS, raised for schedules ten times shorter than its 30,000 steps.
+    """Adam's step sizes per parameter: those of 3DGS, raised for schedules ten times shorter than its 30,000 steps."""
 
-    Attributes:
-        means: step of the positions [fraction of the scene's diagonal].
-        log_scales: step of the log-scales.
-        quats: step of the quaternions.
-        opacity: step of the opacity logits.
-        color: step of the constant colour coefficient.
-        color_rest: step of the direction-dependent coefficients (3DGS: a twentieth).
-    """
-
-    means: float = 5e-4
-    log_scales: float = 1e-2
-    quats: float = 3e-3
-    opacity: float = 5e-2
-    color: float = 1e-2
-    color_rest: float = 1e-3
+    means: float = 5e-4  # step of the positions [fraction of the scene's diagonal]
+    log_scales: float = 1e-2  # step of the log-scales
+    quats: float = 3e-3  # step of the quaternions
+    opacity: float = 5e-2  # step of the opacity logits
+    color: float = 1e-2  # step of the constant colour coefficient
+    color_rest: float = 1e-3  # step of the direction-dependent coefficients (3DGS: a twentieth)
 
 
 class Splats:

@@ -15,8 +15,7 @@ from gausim.core import Cameras, DataError, GaussianScene, Renderer
 from gausim.data.images import composite
 from gausim.data.objects import ObjectData
 from gausim.data.records import STILLS_PER_HELDOUT, Stills, read_stills
-from gausim.metrics.psnr import PSNR, ForegroundPSNR
-from gausim.metrics.ssim import SSIM
+from gausim.metrics.image import PSNR, SSIM, ForegroundPSNR
 from gausim.render.draw import draw
 
 # Number of images drawn and compared together, limited because photos have several megapixels.
@@ -25,20 +24,13 @@ MEASURED_AT_ONCE = 4
 
 @dataclass(frozen=True, eq=False)
 class ImageSet:
-    """N posed images of one size.
+    """N posed images of one size."""
 
-    Attributes:
-        name: name of the set in tables.
-        images: straight-alpha RGBA.
-        cameras: one per image.
-        weight: probability of the set when training draws images, up to a factor.
-        span: first and last step in which training draws from the set [fractions of all steps].
-    """
-
-    name: str
-    images: UInt8[Tensor, "N H W 4"]
-    cameras: Cameras
-    weight: float = 1.0
+    name: str  # name of the set in tables
+    images: UInt8[Tensor, "N H W 4"]  # straight-alpha RGBA
+    cameras: Cameras  # one per image
+    weight: float = 1.0  # probability of the set when training draws images, up to a factor
+    # first and last step in which training draws from the set [fractions of all steps]
     span: tuple[float, float] = (0.0, 1.0)
 
     def select(self, index: Sequence[int]) -> ImageSet:
@@ -62,14 +54,10 @@ def gather_stills(
     longest: int | None = None,
     coarse: float = 0.0,
 ) -> Material:
-    """The stills of the ``transforms.json`` at ``path``; some are not used in training but only measured.
+    """The stills of the ``transforms.json`` at ``path``; one in ``every`` is not used in training but only measured.
 
-    Args:
-        path: the file.
-        every: one of this number of stills is left out of training.
-        opaque: every pixel is foreground, whatever its alpha.
-        longest: maximum length of the longer side, to which larger stills are reduced [pixels].
-        coarse: fraction of the steps, from the first, on stills of half that size, which cost a quarter.
+    ``opaque``: every pixel is foreground, whatever its alpha. Larger stills are reduced to ``longest`` [pixels].
+    ``coarse`` is the fraction of the steps, from the first, on stills of half that size, which cost a quarter.
 
     Raises:
         DataError: fewer than two stills, or an image or pose is unusable.
@@ -98,13 +86,9 @@ def gather_object(data: ObjectData, *, video_fraction: float = 0.5) -> Material:
     """The stills of an object and the first frames of its training views, which show the same rest state.
 
     Training compares renderings with the video frames, which are often smaller than the stills, and splats are not
-    scale-free (their pixel filter is 0.3 pixels^2 at every size). So the fraction ``video_fraction`` of the
-    steps is at the size of the video: a quarter of it on the first frames, the others on the stills reduced to that
-    size. Views that are held out are only measured.
-
-    Args:
-        data: the object.
-        video_fraction: fraction of the steps at the video's size, 0 for stills only.
+    scale-free (their pixel filter is 0.3 pixels^2 at every size). So the fraction ``video_fraction`` of the steps
+    (0: stills only) is at the size of the video: a quarter of it on the first frames, the others on the stills
+    reduced to that size. Views that are held out are only measured.
     """
     stills = data.stills()
     train = _part(stills, stills.train, "stills", weight=1 - video_fraction)

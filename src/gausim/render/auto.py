@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 import logging
+from typing import Any
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from gausim.core import Rendered
@@ -38,26 +38,14 @@ class AutoRenderer:
         self.cpu = CpuRenderer(threads=threads, near=near)
         self.gsplat = gsplat.GsplatRenderer(near=near)
 
-    def __call__(
-        self,
-        means: Float[Tensor, "B K 3"],
-        covars: Float[Tensor, "B K 3 3"],
-        colors: Float[Tensor, "B V K 3"],
-        opacities: Float[Tensor, "B K"],
-        viewmats: Float[Tensor, "B V 4 4"],
-        Ks: Float[Tensor, "B V 3 3"],
-        size: tuple[int, int],
-        *,
-        background: Float[Tensor, " 3"] | None = None,
-        depth: bool = False,
-    ) -> Rendered:
-        """Draws B states in V views each (see core.Renderer)."""
-        inputs = (means, covars, colors, opacities, viewmats, Ks)
+    def __call__(self, means: Tensor, *inputs: Any, background: Tensor | None = None, depth: bool = False) -> Rendered:
+        """Draws B states in V views each; the arguments are those of core.Renderer."""
         if chosen(means.device.type) == "gsplat":
-            return self.gsplat(*inputs, size, background=background, depth=depth)
-        means_, covars_, colors_, opacities_, viewmats_, Ks_ = (value.cpu() for value in inputs)
-        behind = None if background is None else background.cpu()
-        images = self.cpu(means_, covars_, colors_, opacities_, viewmats_, Ks_, size, background=behind, depth=depth)
+            return self.gsplat(means, *inputs, background=background, depth=depth)
+        *tensors, size = inputs
+        kernels, covars, colors, opacities, viewmats, Ks = (value.cpu() for value in (means, *tensors))
+        options: dict[str, Any] = {"background": None if background is None else background.cpu(), "depth": depth}
+        images = self.cpu(kernels, covars, colors, opacities, viewmats, Ks, size, **options)
         planes = None if images.depth is None else images.depth.to(means.device)
         return Rendered(images.rgb.to(means.device), images.alpha.to(means.device), planes)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,21 +18,13 @@ from gausim.ops.spherical_harmonics import spherical_harmonics_basis
 
 @dataclass(frozen=True, eq=False)
 class SceneAppearance:
-    """Constants of a scene for drawing, computed once for all frames.
+    """Constants of a scene for drawing, computed once for all frames."""
 
-    Attributes:
-        covars: rest covariances of the n kernels that are drawn [scene units^2].
-        opacities: opacities in [0, 1].
-        sh: colour coefficients.
-        sh_degree: their degree, 0..3.
-        index: indices of the drawn kernels in the scene; None means all.
-    """
-
-    covars: Float[Tensor, "n 3 3"]
-    opacities: Float[Tensor, " n"]
-    sh: Float[Tensor, "n basis 3"]
-    sh_degree: int
-    index: Int[Tensor, " n"] | None
+    covars: Float[Tensor, "n 3 3"]  # rest covariances of the n kernels that are drawn [scene units^2]
+    opacities: Float[Tensor, " n"]  # opacities in [0, 1]
+    sh: Float[Tensor, "n basis 3"]  # colour coefficients
+    sh_degree: int  # their degree, 0..3
+    index: Int[Tensor, " n"] | None  # indices of the drawn kernels in the scene; None means all
 
     @staticmethod
     def of(scene: GaussianScene, mask: Bool[Tensor, " K"] | None = None) -> SceneAppearance:
@@ -74,20 +67,9 @@ def draw(
     """Draws B deformed states of one scene in every camera (METHOD section 2).
 
     Kernel k of unit c has covariance G_c S_k G_c^T and the colour of its spherical harmonics at Q_c^T d, d the unit
-    vector from the camera to the kernel. Differentiable in ``positions``, ``deformation_gradients`` and
-    ``rotations``, and in the tensors of a SceneAppearance.
-
-    Args:
-        renderer: the renderer.
-        scene: the rest scene, or its SceneAppearance, which training computes once.
-        positions: kernel means of each state [scene units].
-        deformation_gradients: accumulated deformation gradients G of the N units.
-        rotations: accumulated rotations Q of the units.
-        unit_of_kernel: the unit of each kernel.
-        cameras: V views.
-        background: colour behind the kernels; black when absent.
-        mask: draw only these kernels of a GaussianScene (a SceneAppearance is masked when it is made).
-        depth: draw the depth, too (core.Rendered).
+    vector from the camera to the kernel. Differentiable in ``positions`` [scene units], ``deformation_gradients`` G
+    and ``rotations`` Q, and in the tensors of a SceneAppearance, which training computes once in the place of the
+    scene. ``mask`` selects kernels of a GaussianScene; the background is black when absent.
 
     Raises:
         ConfigError: a mask is given with a SceneAppearance.
@@ -127,18 +109,9 @@ def deformed_appearance(
     sh: Float[Tensor, "n basis 3"],
     centers: Float[Tensor, "V 3"],
 ) -> tuple[Float[Tensor, "B n 3 3"], Float[Tensor, "B V n 3"]]:
-    """Covariances G S G^T of the kernels and their colours max(0, 0.5 + sum_b sh_b Y_b(Q^T d)) for each camera.
+    """Covariances G S G^T [scene units^2] and colours max(0, 0.5 + sum_b sh_b Y_b(Q^T d)) for each camera.
 
-    Differentiable in all but the camera centres.
-
-    Args:
-        positions: kernel means of B states [scene units].
-        deformation_gradients: accumulated deformation gradients G of the N units.
-        rotations: accumulated rotations Q of the units.
-        unit_of_kernel: the unit of each kernel.
-        covars: rest covariances S [scene units^2].
-        sh: colour coefficients of degree 0..3.
-        centers: centres of V cameras [scene units].
+    Differentiable in all but the camera centres [scene units]; colour coefficients have degree 0..3.
     """
     deformed = transport_covariance(covars, deformation_gradients.index_select(1, unit_of_kernel))
     away = torch.nn.functional.normalize(positions[:, None] - centers[:, None], dim=-1)
@@ -147,37 +120,30 @@ def deformed_appearance(
     return deformed, (torch.einsum("bnvs,nsc->bvnc", basis, sh) + 0.5).clamp_min(0.0)
 
 
+@torch.no_grad()
+def draw_still(renderer: Renderer, scene: GaussianScene, cameras: Cameras, **options: Any) -> Rendered:
+    """Draws a scene as it stands (B = 1), without loss gradients; the options are those of :func:`draw`."""
+    identity, units = torch.eye(3)[None, None], torch.zeros(scene.count, dtype=torch.long)
+    return draw(renderer, scene, scene.means[None], identity, identity, units, cameras, **options)
+
+
 def draw_trajectory(
     renderer: Renderer,
     scene: GaussianScene | SceneAppearance,
     trajectory: Trajectory,
     cameras: Cameras,
     *,
-    background: Float[Tensor, " 3"] | None = None,
     mask: Bool[Tensor, " K"] | None = None,
+    background: Float[Tensor, " 3"] | None = None,
     chunk: int = 16,
 ) -> Iterator[Rendered]:
-    """Draws a trajectory for evaluation, ``chunk`` frames at a time, without loss gradients.
-
-    Yields:
-        The images of the next frames, (frames, V, ...), in order.
-    """
-    if isinstance(scene, GaussianScene):
-        scene, mask = SceneAppearance.of(scene, mask), None
+    """Draws a trajectory for evaluation, ``chunk`` frames (frames, V, ...) at a time, without loss gradients."""
+    look = SceneAppearance.of(scene, mask) if isinstance(scene, GaussianScene) else scene
     for start in range(0, trajectory.frames, chunk):
-        frames = slice(start, start + chunk)
+        now, unit = trajectory.part(slice(start, start + chunk)), trajectory.unit_of_kernel
+        state = now.positions, now.deformation_gradients, now.rotations
         with torch.no_grad():
-            images = draw(
-                renderer,
-                scene,
-                trajectory.positions[frames],
-                trajectory.deformation_gradients[frames],
-                trajectory.rotations[frames],
-                trajectory.unit_of_kernel,
-                cameras,
-                background=background,
-                mask=mask,
-            )
+            images = draw(renderer, look, *state, unit, cameras, background=background)
         yield images
 
 
@@ -187,13 +153,14 @@ def film(
     trajectory: Trajectory,
     cameras: Cameras,
     *,
-    background: Float[Tensor, " 3"] | None = None,
-    mask: Bool[Tensor, " K"] | None = None,
-    chunk: int = 16,
     as_bytes: bool = True,
+    **options: Any,
 ) -> Tensor:
-    """All frames of a trajectory, (F, V, H, W, 3): uint8, or float in linear input colours (not clamped)."""
-    parts = draw_trajectory(renderer, scene, trajectory, cameras, background=background, mask=mask, chunk=chunk)
+    """All frames of a trajectory, (F, V, H, W, 3): uint8, or float in linear input colours (not clamped).
+
+    The options are those of :func:`draw_trajectory`.
+    """
+    parts = draw_trajectory(renderer, scene, trajectory, cameras, **options)
     return torch.cat([to_bytes(part.rgb) if as_bytes else part.rgb for part in parts])
 
 

@@ -52,14 +52,9 @@ class Opening:
 
 
 def make_openings(study: Study, *, pictures: bool = True) -> tuple[list[Opening], int]:
-    """The first screens of the best runs: the best of every object, then the next; one per row before further seeds.
+    """The first screens of the best runs, and the number of omitted ones beyond ``MOST_OPENINGS``.
 
-    Args:
-        study: data of the report.
-        pictures: whether they have videos.
-
-    Returns:
-        At most ``MOST_OPENINGS`` first screens, and the number of omitted ones.
+    The best run of every object is first, then the next of each; one seed per row before further seeds.
     """
     ranked = [_ranked(study, name) for name in study.objects]
     turns = [run for turn in zip_longest(*ranked) for run in turn if run is not None]

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import csv
+import io
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from gausim.io.files import write_durably
 from gausim.report.gather.runs import find_runs
-from gausim.report.gather.study import Study, make_study
-from gausim.report.numbers import csv_numbers
+from gausim.report.gather.study import Group, Study, cell, make_study
 from gausim.report.opening import Opening, make_openings
 from gausim.report.pictures.media import Exhibit, object_figures
-from gausim.report.render import Content, html_page, latex_tables, markdown_report
-from gausim.report.sources import Sources
+from gausim.report.render import Content, Sources, html_page, latex_tables, markdown_report
 from gausim.report.tables.overview import make_sheets
 
+CSV_HEAD = (
+    "row", "kind", "object", "split", "first_frame", "end_frame", "views", "metric", "mean", "std_sequences",
+    "std_seeds", "seeds", "scale", "unit", "status", "runs", "config", "commit", "scene_sha256", "manifest_sha256",
+)  # fmt: skip
 PAGE, MARKDOWN, LATEX, NUMBERS = "report.html", "report.md", "tables.tex", "numbers.csv"
 
 
@@ -36,14 +40,9 @@ def write_report(
     pictures: bool = True,
     say: Callable[[str], None] = lambda text: None,
 ) -> Report:
-    """Writes the report of all runs at or below ``roots`` to ``out``.
+    """Writes the report of all runs at or below ``roots`` to ``out``, which is not searched for runs.
 
-    Args:
-        roots: run directories, sweeps, or folders of them.
-        out: folder of the report; not searched for runs.
-        title: heading.
-        pictures: whether the page has figures and videos.
-        say: called with messages on the progress.
+    ``pictures``: whether the page has figures and videos. ``say`` is called with messages on the progress.
 
     Raises:
         RunError: a root is no directory, or there is no run.
@@ -73,3 +72,52 @@ def write_report(
     for name, text in texts.items():
         write_durably(out / name, text.encode("utf-8", errors="replace"))
     return Report(study, openings, [out / name for name in texts])
+
+
+def csv_numbers(study: Study) -> str:
+    """All figures at full precision and unscaled, one line per figure of every row; columns as in :data:`CSV_HEAD`."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, CSV_HEAD, restval="", lineterminator="\n")
+    writer.writeheader()
+    for group in study.groups:
+        for name in group.objects:
+            rows = {str(row): e["methods"] for _, e in group.entries(name) for row in e["rows"]}
+            for row in [group.method, *(r for r, methods in rows.items() if r not in methods)]:
+                writer.writerows(_lines(study, group, name, row))
+    return stream.getvalue()
+
+
+def _lines(study: Study, group: Group, name: str, row: str) -> Iterator[dict[str, object]]:
+    is_method = row == group.method
+    line: dict[str, object] = {
+        "row": group.label if is_method else f"{row} (with {group.label})",
+        "kind": "method" if is_method else "reference", "object": name, **_sources(group, name),
+    }  # fmt: skip
+    entries = group.entries(name)
+    if not entries:
+        yield line | {"status": cell(group, name, "seen", "train", "l2").status}
+    splits = study.splits(name)
+    places = dict.fromkeys(
+        (split, views, metric) for _, entry in entries for split, by_views in entry["rows"].get(row, {}).items()
+        for views, cells in by_views.items() for metric in cells if split in splits
+    )  # fmt: skip
+    for split, views, metric in places:
+        c, info = cell(group, name, split, views, metric, row=row), study.info(metric) or {}
+        start, end = splits[split]
+        line |= {"split": split, "first_frame": start, "end_frame": end, "views": views, "metric": metric}
+        line |= {"status": c.status, "scale": info.get("scale", ""), "unit": info.get("unit", "")}
+        figures: dict[str, object] = {}
+        if c.value is not None:
+            figures = {"mean": c.value.mean, "std_sequences": c.value.std, "std_seeds": c.value.seed_std}
+            figures["seeds"] = c.value.seeds
+        yield line | figures
+
+
+def _sources(group: Group, name: str) -> dict[str, str]:
+    runs = [r for r, _ in group.entries(name)] or list(group.of(name))
+    hashes = [run.data_hashes.get(name, ("?", "?")) for run in runs]
+    columns = {
+        "runs": [r.name for r in runs], "config": [r.config_hash for r in runs], "commit": [r.commit for r in runs],
+        "scene_sha256": [h[0] for h in hashes], "manifest_sha256": [h[1] for h in hashes],
+    }  # fmt: skip
+    return {key: ";".join(dict.fromkeys(column)) for key, column in columns.items()}

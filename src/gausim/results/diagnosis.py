@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gausim.metrics.level_error import level_error
+from gausim.metrics.motion import level_error
 from gausim.metrics.oscillation import (
     coordinates,
     oscillation,
@@ -44,13 +44,9 @@ class Diagnosis:
         predictions: Mapping[str, Tensor],
         units: Mapping[str, Sequence[Tensor]] | None = None,
     ) -> None:
-        """Adds one sequence.
+        """Adds one sequence: true and predicted positions (F, P, 3), the latter by row, and rest positions (P, 3).
 
-        Args:
-            truth: true positions (F, P, 3).
-            rest: rest positions (P, 3).
-            predictions: predicted positions by row.
-            units: for rows with a hierarchy, the unit of each point, level by level, the finest first.
+        ``units``: for rows with a hierarchy, the unit of each point, level by level, the finest first.
         """
         for name, levels in (units or {}).items():
             pairs = [level_error(predictions[name].to(truth), truth, rest, unit) for unit in levels]

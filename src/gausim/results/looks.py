@@ -24,23 +24,14 @@ DEVELOPMENT, TEST_PART = "development", "test"
 
 
 class Looks(msgspec.Struct):
-    """Content of the file.
+    """Content of the file."""
 
-    Attributes:
-        schema: version of the file.
-        looks: number of looks.
-        trials: declared trials on the development part, at the first look.
-        date: of the first look.
-        commit: of the program at the first look; None if unknown.
-        history: every look.
-    """
-
-    schema: str
-    looks: int
-    trials: int
-    date: str
-    commit: str | None
-    history: list[dict[str, Any]]
+    schema: str  # version of the file
+    looks: int  # number of looks
+    trials: int  # declared trials on the development part, at the first look
+    date: str  # of the first look
+    commit: str | None  # of the program at the first look; None if unknown
+    history: list[dict[str, Any]]  # every look
 
 
 def read_looks(path: Path) -> Looks | None:
@@ -71,14 +62,10 @@ def record_look(
     state: Mapping[str, Any],
     sequences: Mapping[str, Sequence[str]],
 ) -> Looks:
-    """Adds a look to the file and returns all of them.
+    """Adds a look at ``sequences`` (by object) to the file and returns all looks.
 
-    Args:
-        path: the file.
-        trials: declared trials on the development part.
-        provenance: commit of the program (:func:`gausim.runs.provenance.code_provenance`).
-        state: epoch and updates of the checkpoint.
-        sequences: the sequences looked at, by object.
+    ``trials`` are those declared on the development part, ``provenance`` is
+    :func:`gausim.runs.provenance.code_provenance`, ``state`` epoch and updates of the checkpoint.
 
     Raises:
         RunError: the file is malformed.

@@ -70,8 +70,9 @@ from gausim.results.curves import (
     TRUTH,
     ObjectCurves,
 )
-from gausim.results.horizon import horizon
 
+# Frames after the last seen one, of the entry ``horizon``.
+AHEAD = (1, 2, 5, 10, 20, 30, 50, 100)
 SCHEMA = "gausim.evaluation/1"
 MOTION_ENERGY = "motion_energy"
 # End of the shorter of the paper's two test ranges, which every READY sequence has.
@@ -155,7 +156,7 @@ def summarise(curves: ObjectCurves) -> dict[str, Any]:
         "contrast": {"mean_color": color, "norm": math.hypot(*color), "max_l2": facts.max_l2},
         "floor": _floor(curves, groups["train"]),
         "rows": {row: _row(curves, row, splits, groups) for row in curves.rows},
-        "horizon": horizon(curves),
+        "horizon": _horizon(curves, groups),
         **curves.record,
     }
 
@@ -176,8 +177,7 @@ def _row(
     for split, (start, stop) in splits.items():
         cells: dict[str, dict[str, Any]] = {}
         for metric, values in curves.values[row].items():
-            places = {"points": None} if metric in POINT_ARRAYS else {g: v for g, v in groups.items() if v}
-            for group, views in places.items():
+            for group, views in _places(metric, groups).items():
                 window = _window(values, start, stop, views)
                 if metric in (IMAGE_ENERGY, POINT_ENERGY):
                     true = _window(curves.values[TRUTH][metric], start, stop, views)
@@ -188,6 +188,27 @@ def _row(
                     cells.setdefault(group, {})[metric] = _cell(_means(window), _ratio_base(curves, metric, reference))
         result[split] = cells
     return result
+
+
+def _horizon(curves: ObjectCurves, groups: dict[str, list[int]]) -> dict[str, Any]:
+    """Errors by frames ahead: how far after the last seen frame a prediction still holds."""
+    last = curves.facts.first_unseen - 1
+    ahead = [n for n in AHEAD if last + n < max(curves.facts.frames)]
+    rows: dict[str, dict[str, dict[str, list[float | None]]]] = {}
+    for row in curves.rows if ahead else ():
+        found = rows.setdefault(row, {})
+        for metric, values in curves.values[row].items():
+            if metric not in (IMAGE_ENERGY, POINT_ENERGY):
+                frames = np.moveaxis(values[:, [last + n for n in ahead]], 1, 0)  # None where every sequence has ended
+                for group, views in _places(metric, groups).items():
+                    means = _means((frames if views is None else frames[..., views]).reshape(len(ahead), -1))
+                    found.setdefault(group, {})[metric] = [_finite(float(mean)) for mean in means]
+    return {"frames": ahead, "rows": rows}
+
+
+def _places(metric: str, groups: dict[str, list[int]]) -> dict[str, list[int] | None]:
+    """Groups of views in which a metric is, each with its columns."""
+    return {"points": None} if metric in POINT_ARRAYS else {group: views for group, views in groups.items() if views}
 
 
 def _window(values: np.ndarray, start: int, stop: int, views: list[int] | None) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from gausim.metrics.flip import NO_FLIP, NO_PACKAGE
+from gausim.metrics.image import NO_FLIP, NO_PACKAGE
 from gausim.metrics.lpips import NO_LPIPS, NO_WEIGHTS
 from gausim.results.curves import ERROR_3D, STATIC, TRACK_ERROR
 from gausim.results.summary import MOTION_ENERGY

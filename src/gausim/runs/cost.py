@@ -11,11 +11,11 @@ from typing import Any, TypeVar
 
 import torch
 
-from gausim.runs.memory import give_back_freed_memory
+from gausim.runs.memory import give_back_freed_memory, process_memory
 
 T = TypeVar("T")
 CUDA, RESIDENT = "CUDA allocated", "process, resident"
-_STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_RESET = Path("/proc/self/clear_refs")
 
 
 class CostMeter:
@@ -38,11 +38,8 @@ class CostMeter:
         """Runs ``make``, which predicts ``frames`` frames beyond the first, and records its cost."""
         cuda = torch.cuda.is_initialized()
         before = _begin(cuda)
-        start = time.perf_counter()
-        result = make()
-        if cuda:
-            torch.cuda.synchronize()
-        self._seconds.append((time.perf_counter() - start) / max(1, frames))
+        result, seconds = _timed(make)
+        self._seconds.append(seconds / max(1, frames))
         self._frames += frames
         peak = peak_bytes()
         if before is not None and peak is not None:
@@ -53,11 +50,8 @@ class CostMeter:
 
     def draw(self, make: Callable[[], T], images: int) -> T:
         """Runs ``make``, which renders ``images`` images, and records its time."""
-        start = time.perf_counter()
-        result = make()
-        if torch.cuda.is_initialized():
-            torch.cuda.synchronize()
-        self._drawing += time.perf_counter() - start
+        result, seconds = _timed(make)
+        self._drawing += seconds
         self._images += images
         return result
 
@@ -126,9 +120,18 @@ class TrainingCost:
         ]
 
 
+def _timed(make: Callable[[], T]) -> tuple[T, float]:
+    """The result of a function, and its wall time with the work of the GPU [s]."""
+    start = time.perf_counter()
+    result = make()
+    if torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+    return result, time.perf_counter() - start
+
+
 def peak_bytes() -> int | None:
     """Peak memory allocated by CUDA, or resident in the process, since the last reset; None where unknown."""
-    return torch.cuda.max_memory_allocated() if torch.cuda.is_initialized() else _resident("VmHWM")
+    return torch.cuda.max_memory_allocated() if torch.cuda.is_initialized() else process_memory("VmHWM")
 
 
 def _begin(cuda: bool) -> int | None:
@@ -143,13 +146,4 @@ def _begin(cuda: bool) -> int | None:
         _RESET.write_text("5")  # proc(5): resets the peak resident size
     except OSError:
         return None
-    return _resident("VmRSS")
-
-
-def _resident(field: str) -> int | None:
-    try:
-        lines = _STATUS.read_text().splitlines()
-    except OSError:
-        return None
-    found = [line.split()[1] for line in lines if line.startswith(f"{field}:")]
-    return int(found[0]) * 1024 if found else None
+    return process_memory("VmRSS")

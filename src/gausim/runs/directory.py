@@ -18,7 +18,7 @@ import yaml
 from lightning.pytorch.utilities import rank_zero_only
 
 from gausim.core import GausSimError, RunError
-from gausim.io.files import remove_leftovers, write_durably
+from gausim.io.files import read_yaml, remove_leftovers, write_durably
 from gausim.runs.checkpoint import BEFORE_THE_END, PREVIOUS_CHECKPOINT, check_resumable
 from gausim.runs.defaults import with_defaults
 from gausim.runs.files import sole_writer, unwritable
@@ -110,11 +110,9 @@ class RunDirectory:
         if not path.is_file():
             raise RunError(f"{self.path}: no run here ({CONFIG} is missing). Train first (`gausim train name=NAME`).")
         try:
-            loaded = yaml.safe_load(path.read_text())
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            raise RunError(f"{path}: cannot be read as YAML ({error}).") from error
-        if not isinstance(loaded, dict):
-            raise RunError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
+            loaded = read_yaml(path)
+        except ValueError as error:
+            raise RunError(str(error)) from error
         try:
             return dict(with_present_names(loaded))
         except (IndexError, TypeError, ValueError) as error:
@@ -139,11 +137,9 @@ class RunDirectory:
             raise explained from error
 
     def prepare(self, config: Mapping[str, Any], *, overwrite: bool = False) -> Path | None:
-        """Makes the directory and writes the configuration; returns the checkpoint to resume from, if there is one.
+        """Makes the directory and writes the resolved configuration; returns the checkpoint to resume from, if any.
 
-        Args:
-            config: the resolved configuration, plain containers only.
-            overwrite: remove the files of an earlier run.
+        ``overwrite`` removes the files of an earlier run.
 
         Raises:
             RunError: the run is finished (unless it was cut short: then it gets the same epochs and minutes once more),

@@ -22,11 +22,7 @@ DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCE
 
 @contextmanager
 def sole_writer(lock: Path, *, doing: str = "training here") -> Iterator[None]:
-    """Locks a directory for this process until the block or the process ends.
-
-    Args:
-        lock: the lock file in the directory.
-        doing: activity of this process, for the message to others.
+    """Locks a directory by a file in it until the block or the process ends; ``doing`` is told to other processes.
 
     Raises:
         BusyError: another process has locked the directory.

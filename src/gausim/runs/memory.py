@@ -1,9 +1,10 @@
-"""Keeps freed memory in the process, because a rollout frees and allocates the same large blocks at every step."""
+"""Memory of the process: freed blocks that it keeps, as a rollout frees and allocates the same ones, and its size."""
 
 from __future__ import annotations
 
 import ctypes
 import sys
+from pathlib import Path
 from typing import Any
 
 # mallopt parameters of glibc's malloc.h, and the largest threshold accepted on 64 bits.
@@ -23,6 +24,12 @@ def keep_freed_memory() -> bool:
 def give_back_freed_memory() -> bool:
     """Makes glibc return freed blocks to the system once; returns whether it succeeded (no effect on other systems)."""
     return bool(_glibc("malloc_trim")(0))
+
+
+def process_memory(field: str, file: str = "/proc/self/status") -> int | None:
+    """A field of a file in Linux' /proc [bytes]; None on other systems."""
+    lines = Path(file).read_text().splitlines() if Path(file).is_file() else []
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{field}:")), None)
 
 
 def _glibc(name: str) -> Any:

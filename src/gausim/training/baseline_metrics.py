@@ -14,16 +14,11 @@ from gausim.training.supervision.images import Supervision
 
 @dataclass
 class SequenceBaseline:
-    """Baseline metrics of one sequence, for the frames measured so far.
+    """Baseline metrics of one sequence, for the frames measured so far."""
 
-    Attributes:
-        floor: loss of the rest state on frame 0, due to the reconstruction.
-        static: loss of the rest state on frames 1, 2, ...
-        motion: squared change of the truth from frame t to t + 1 (images: summed over pixels).
-    """
-
-    floor: float = 0.0
-    static: list[float] = field(default_factory=list)
+    floor: float = 0.0  # loss of the rest state on frame 0, due to the reconstruction
+    static: list[float] = field(default_factory=list)  # loss of the rest state on frames 1, 2, ..
+    # squared change of the truth from frame t to t + 1 (images: summed over pixels)
     motion: list[float] = field(default_factory=list)
 
 

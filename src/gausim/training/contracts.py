@@ -13,34 +13,23 @@ from gausim.core import GaussianScene, SimState
 
 @runtime_checkable
 class SceneBatch(Protocol):
-    """Several sequences, also of different scenes, as one disjoint graph.
+    """Several sequences, also of different scenes, as one disjoint graph."""
 
-    Attributes:
-        rest: (K over all members, 3) rest positions [scene units].
-        members: the sequences, in the requested order. Each has a ``scene_id``, slices ``kernels`` of the positions and
-            ``units`` of the deformation gradients and rotations, and the unit of each of its kernels, counted within
-            ``units`` (``unit_of_kernel``).
-    """
-
-    rest: Tensor
+    rest: Tensor  # (K over all members, 3) rest positions [scene units]
+    # the sequences, in the requested order. Each has a ``scene_id``, slices ``kernels`` of the positions and
+    # ``units`` of the deformation gradients and rotations, and the unit of each of its kernels, counted within
+    # ``units`` (``unit_of_kernel``)
     members: tuple[Any, ...]
 
 
 @runtime_checkable
 class Step(Protocol):
-    """One predicted frame of a batch.
+    """One predicted frame of a batch."""
 
-    Attributes:
-        positions: (K over all members, 3) kernel means [scene units].
-        deformation_gradients: (N over all members, 3, 3) accumulated deformation gradients of the units.
-        rotations: (N over all members, 3, 3) accumulated rotations of the units.
-        momentum: the momentum loss, summed over members; zero where it is switched off.
-    """
-
-    positions: Tensor
-    deformation_gradients: Tensor
-    rotations: Tensor
-    momentum: Tensor
+    positions: Tensor  # (K over all members, 3) kernel means [scene units]
+    deformation_gradients: Tensor  # (N over all members, 3, 3) accumulated deformation gradients of the units
+    rotations: Tensor  # (N over all members, 3, 3) accumulated rotations of the units
+    momentum: Tensor  # the momentum loss, summed over members; zero where it is switched off
 
 
 @runtime_checkable
@@ -50,12 +39,9 @@ class Simulator(Protocol):
     Training uses these members of :class:`gausim.models.step.scene_model.SceneModel` where a model has them: the units
     of its kernels (``units_of_kernels``), an energy (``knows_energy``, ``energy``), its template's ``mixing`` and the
     parameter groups that all scenes have in common (``shared_groups``).
-
-    Attributes:
-        scenes: the rest scenes; their index is the ``scene_id`` of samples.
     """
 
-    scenes: Sequence[GaussianScene]
+    scenes: Sequence[GaussianScene]  # the rest scenes; their index is the ``scene_id`` of samples
 
     def batch(self, scene_ids: Sequence[int]) -> Any:
         """The disjoint graph of one sequence per entry."""

@@ -19,7 +19,10 @@ FREE_FALL = 4
 
 
 def begin_free_bodies(module: GausSimModule, datamodule: ReadyDataModule) -> None:
-    """Sets the initial states of all sequences of free bodies from the silhouettes of frames 0 to 4."""
+    """Sets the initial states of all sequences of free bodies from the silhouettes of frames 0 to 4.
+
+    A run that is resumed does so too, before its states are restored: its baseline metrics are of these beginnings.
+    """
     scenes, states = module.simulator.scenes, cast(Any, module.initial_states)
     for sequence_id, (scene_id, record) in enumerate(datamodule.index.entries):
         surroundings = scenes[scene_id].surroundings
@@ -35,6 +38,7 @@ def begin_free_bodies(module: GausSimModule, datamodule: ReadyDataModule) -> Non
         # The middle of what is seen is not the centre of the kernels: compare with the body drawn at that place.
         drawn = centroids(_alpha(module, sample, rest + moved)[None], sample.cameras)[0]
         states.begin(sequence_id, moved + place - drawn, velocity)
+        module.images.begun[sequence_id] = states.state(sequence_id).positions.detach()
 
 
 def centroids(alpha: Float[Tensor, "F V H W"], cameras: Cameras) -> Float[Tensor, "F 3"]:

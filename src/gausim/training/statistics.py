@@ -23,27 +23,17 @@ SERIES, SINGLE = ("reach", "images", "momentum", "motion"), ("static", "growth",
 
 @dataclass(frozen=True)
 class Found:
-    """Statistics of a step on the host.
+    """Statistics of a step on the host."""
 
-    Attributes:
-        reach: largest distance of a kernel from rest, per stretch, step and sequence [diagonals].
-        images: image loss per stretch, step and sequence.
-        momentum: momentum loss per stretch and step, summed over sequences.
-        motion: squared change of the predicted images per stretch, summed over sequences.
-        static: the static loss of this rank's scenes, if the batch had this term.
-        growth: energy growth of free motion, this rank's part of the mean, if measured.
-        gradient_fraction: the momentum loss's fraction of the network's loss gradient, if measured; equal on all ranks.
-        gradients: norm of each parameter group's loss gradient; equal on all ranks.
-    """
-
-    reach: list[Table]
-    images: list[Table]
-    momentum: list[list[float]]
-    motion: list[float]
-    static: float | None
-    growth: float | None
+    reach: list[Table]  # largest distance of a kernel from rest, per stretch, step and sequence [diagonals]
+    images: list[Table]  # image loss per stretch, step and sequence
+    momentum: list[list[float]]  # momentum loss per stretch and step, summed over sequences
+    motion: list[float]  # squared change of the predicted images per stretch, summed over sequences
+    static: float | None  # the static loss of this rank's scenes, if the batch had this term
+    growth: float | None  # energy growth of free motion, this rank's part of the mean, if measured
+    # the momentum loss's fraction of the network's loss gradient, if measured; equal on all ranks
     gradient_fraction: float | None
-    gradients: dict[str, float]
+    gradients: dict[str, float]  # norm of each parameter group's loss gradient; equal on all ranks
 
     @staticmethod
     def join(parts: Sequence[Found]) -> Found:
@@ -116,11 +106,7 @@ class Found:
 
 @dataclass
 class Statistics:
-    """Statistics of an optimiser step on the device, by stretch; :class:`Found` explains the attributes.
-
-    Attributes:
-        pulls: the network's gradients of the image losses and of the momentum loss, where their ratio is measured.
-    """
+    """Statistics of an optimiser step on the device, by stretch; :class:`Found` explains the attributes."""
 
     reach: list[Float[Tensor, "T S"]] = field(default_factory=list)
     images: list[Float[Tensor, "T S"]] = field(default_factory=list)
@@ -128,6 +114,7 @@ class Statistics:
     motion: list[Float[Tensor, ""]] = field(default_factory=list)
     static: Float[Tensor, ""] | None = None
     growth: Float[Tensor, ""] | None = None
+    # the network's gradients of the image losses and of the momentum loss, where their ratio is measured
     pulls: tuple[Float[Tensor, " P"], Float[Tensor, " P"]] | None = None
     gradient_fraction: Float[Tensor, ""] | None = None
 

@@ -9,6 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from gausim.core import ConfigError, RunError
+from gausim.models.step.predictor import with_floor_columns
 from gausim.models.step.simulator import GausSim
 from gausim.runs.checkpoint import averaged_weights, fingerprints, read_checkpoint, scene_text
 from gausim.runs.directory import RunDirectory, differing_keys
@@ -33,6 +34,7 @@ def load_shared(simulator: GausSim, run_dir: Path | str, model: Mapping[str, Any
         {name: value for name, value in weights.items() if name.startswith(shared)}
         for weights in (there, simulator.state_dict())
     )
+    found = with_floor_columns(found, own)
     _check(found, own, "network", run_dir, model)
     simulator.load_state_dict(found, strict=False)
 
@@ -57,6 +59,7 @@ def load_simulator(simulator: GausSim, run_dir: Path | str, model: Mapping[str, 
             )
         for old, new in zip(simulator.own(trained.index(scene)), simulator.own(scene_id), strict=True):
             found |= {new + name[len(old) :]: value for name, value in there.items() if _is_below(name, old)}
+    found = with_floor_columns(found, simulator.state_dict())
     _check(found, simulator.state_dict(), "model", run_dir, model)
     simulator.load_state_dict(found)
 

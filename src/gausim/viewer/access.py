@@ -37,20 +37,13 @@ _HOST = re.compile(r"(\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::[0-9]{1,5})?")
 
 @dataclass(frozen=True)
 class Access:
-    """Address and access settings of the viewer.
+    """Address and access settings of the viewer."""
 
-    Attributes:
-        host: address to bind; without ``remote`` a loopback address.
-        port: TCP port; 0 takes a free one.
-        remote: allow addresses that other machines can reach; a token is then required.
-        names: further host names of the page.
-        token: token of the first request (``?token=...``); generated for remote addresses; None: not required.
-    """
-
-    host: str = "127.0.0.1"
-    port: int = 8080
-    remote: bool = False
-    names: tuple[str, ...] = ()
+    host: str = "127.0.0.1"  # address to bind; without ``remote`` a loopback address
+    port: int = 8080  # TCP port; 0 takes a free one
+    remote: bool = False  # allow addresses that other machines can reach; a token is then required
+    names: tuple[str, ...] = ()  # further host names of the page
+    # token of the first request (``?token=...``); generated for remote addresses; None: not required
     token: str | None = None
 
     def checked(self) -> Access:

@@ -69,14 +69,9 @@ class Painter:
         mode: str,
         eye: Float[Tensor, " 3"],
     ) -> tuple[Float[Tensor, "K 3 3"], Float[Tensor, "K 3"], Legend]:
-        """Covariances [scene units^2], colours in [0, 1] and their legend.
+        """Covariances [scene units^2], colours in [0, 1] and their legend, in one of the :attr:`modes`.
 
-        Args:
-            frame: the frame to colour.
-            unit_of_kernel: the unit of each kernel, a row of the frame's deformation gradients.
-            speed: speeds of the kernels [scene units / s].
-            mode: one of :attr:`modes`.
-            eye: position of the camera [scene units].
+        Speeds are in scene units / s, ``eye`` is the position of the camera [scene units].
         """
         positions, unit = frame.positions.cpu(), unit_of_kernel.cpu()
         deformation_gradients, look = frame.deformation_gradients.cpu(), self._look.to(positions)
@@ -126,13 +121,12 @@ def highlighted(rgb: Float[Tensor, "K 3"], selected: Bool[Tensor, " K"], held: B
 
 def hues(units: Int[Tensor, " K"]) -> Float[Tensor, "K 3"]:
     """Distinct colours of neighbouring indices, hues by the golden ratio; grey for -1."""
-    number = units.clamp_min(0).double()
+    from matplotlib.colors import hsv_to_rgb
+
+    number = units.clamp_min(0).double().numpy()
     hue, light = (number * 0.61803398875) % 1, 0.75 + 0.25 * ((number * 0.41421356) % 1)
-    offset = torch.tensor([5.0, 3.0, 1.0], dtype=torch.float64)
-    k = (offset + 6 * hue[:, None]) % 6
-    rgb = light[:, None] * (1 - 0.7 * torch.minimum(k, 4 - k).clamp(0, 1))
-    rgb[units < 0] = 0.5
-    return rgb.float()
+    rgb = torch.from_numpy(hsv_to_rgb(np.stack((hue, np.full_like(hue, 0.7), light), -1))).float()
+    return torch.where(units[:, None] < 0, 0.5, rgb)
 
 
 def _ramp(fraction: Float[Tensor, " K"]) -> Float[Tensor, "K 3"]:

@@ -15,6 +15,7 @@ from gausim.interaction.session import (
     Gravity,
     Hand,
     Impulse,
+    Material,
     Pin,
     Release,
     Unpin,
@@ -24,6 +25,7 @@ from gausim.interaction.session import (
 )
 from gausim.interaction.words import parse_direction
 from gausim.viewer.coloring import VIEW, Legend, gradient_css
+from gausim.viewer.grab import HAND_SECONDS
 from gausim.viewer.live import Live
 from gausim.viewer.pointer import Pointer
 from gausim.viewer.shown import LIVE, Shown
@@ -33,9 +35,8 @@ AXES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _AT_LIMIT = "At the limit of what was learned: the forces act only in part. Pull less for what would really happen."
 # Largest refresh rate of the panel [1 / s].
 _REFRESHES = 4.0
-
-# Time in which a hand follows its slider [s].
-HAND_SECONDS = 0.15
+# Largest displacement of a hand by its sliders [diagonals].
+_HAND_REACH = 0.5
 
 
 class Page:
@@ -89,7 +90,11 @@ class Page:
 
     def _push_tab(self, gui: Any) -> None:
         pointer = self._pointer
-        gui.add_html(_small("Drag a part to pull at it; with Ctrl to flick it. Shift and drag brushes a region."))
+        gui.add_html(
+            _small(
+                "Drag a part to pull at it, a pin to move it; with Ctrl to flick it. Shift and drag brushes a region."
+            )
+        )
         level = gui.add_dropdown("Picks", pointer.level_names, initial_value=pointer.level)
         self._on_change(level, pointer.level_names, pointer.choose_level)
         self._chosen = gui.add_html("")
@@ -104,23 +109,46 @@ class Page:
             self._toward = gui.add_dropdown("Towards", AXES, initial_value="+x")
             self._on_press(gui.add_button("Push once"), lambda: self._on_selection(self._impulse))
         self._strengths = [self._steady(gui, "Wind", "+x", Wind), self._steady(gui, "Gravity", self._down, Gravity)]
-        if bool(self._live.interaction.scene.pinned.any()):
+        if self._live.interaction.hand is not None:
             self._strengths += self._hand(gui)
+
+        self._factors = self._material(gui) if self._live.interaction.adjustable else []
+
+    def _material(self, gui: Any) -> list[Any]:
+        """Sliders of factors on the stiffness and damping that the scene began with."""
+        with gui.add_folder("Material", expand_by_default=False):
+            factors = [
+                gui.add_slider(f"{name} times", 0.1, 10.0, 0.1, 1.0, hint="1: as given on the command line")
+                for name in ("Stiffness", "Damping")
+            ]
+
+        def change(_: object) -> None:
+            event = Material(*(float(factor.value) for factor in factors))
+            self._live.do(lambda: self._live.act(event))
+
+        for factor in factors:
+            self._on_change(factor, (0.1, 10.0), change)
+        return factors
 
     def _hand(self, gui: Any) -> list[Any]:
         """Sliders of where the pins are held, relative to rest."""
         scene, fps = self._live.interaction.scene, self._live.interaction.fps
         with gui.add_folder("Hand", expand_by_default=False):
             hint = "Moves what is pinned, in diagonals of the object"
-            places = [gui.add_slider(f"Hand {axis}", -0.5, 0.5, 0.01, 0.0, hint=hint) for axis in "xyz"]
+            places = [gui.add_slider(f"Hand {axis}", -_HAND_REACH, _HAND_REACH, 0.01, 0.0, hint=hint) for axis in "xyz"]
 
         def move(_: object) -> None:
             x, y, z = (scene.diagonal * float(place.value) for place in places)
             event = Hand((x, y, z), max(1, round(HAND_SECONDS * fps)))
             self._live.do(lambda: self._live.act(event))
 
+        def follow(hand: int, to: tuple[float, float, float]) -> None:
+            for place, value in zip(places, to, strict=True) if hand == 0 else ():
+                place.value = min(max(value / scene.diagonal, -_HAND_REACH), _HAND_REACH)
+
         for place in places:
-            self._on_change(place, (-0.5, 0.5), move)
+            self._on_change(place, (-_HAND_REACH, _HAND_REACH), move)
+        self._pointer.hand_moved = follow
         return places
 
     def _steady(self, gui: Any, name: str, axis: str, kind: type[Wind] | type[Gravity]) -> Any:
@@ -192,7 +220,13 @@ class Page:
 
     def _begin(self) -> None:
         self._live.begin()
+        self._start_over()
+
+    def _start_over(self) -> None:
+        """Shows the beginning of a session on the controls."""
         self._source.value = LIVE
+        for factor in self._factors:
+            factor.value = 1.0
         self._calm()
 
     def _let_go(self) -> None:
@@ -253,8 +287,7 @@ class Page:
 
     def _play_file(self, content: bytes) -> None:
         self._live.replay(parse_session(content, "the file"))
-        self._source.value = LIVE
-        self._calm()
+        self._start_over()
 
     def refresh(self, shown: Shown, legend: Legend, displayed: float, *, now: bool = False) -> None:
         """Updates rates, frame, messages and legend, at most :data:`_REFRESHES` times a second unless ``now``."""

@@ -20,6 +20,7 @@ from viser.transforms import SO3
 
 from gausim.interaction.selections import Kernels, Selected, Unit, Whole
 from gausim.interaction.session import Force, Impulse, Release
+from gausim.viewer.grab import Grab
 from gausim.viewer.live import Live
 from gausim.viewer.shown import Shown
 from gausim.viewer.splats import SIZE, Placing, unit_centres
@@ -40,6 +41,7 @@ class Pointer:
         level: level of the units that a click selects, one of :attr:`level_names`; initially the coarsest.
         gain: force per diagonal of drag [weights].
         notice: called when the selection changes.
+        hand_moved: called with the number of a hand that is dragged and its displacement from rest [scene units].
     """
 
     def __init__(
@@ -49,6 +51,9 @@ class Pointer:
         self._server, self._live, self._placing = server, live, placing
         scene = live.interaction.scene
         self._free = (scene.simulated & ~scene.pinned).cpu()
+        hand = live.interaction.hand
+        self._hand = torch.full((scene.count,), -1) if hand is None else hand.cpu()
+        self._grabs: dict[int, Grab] = {}  # by client
         self._units, self._masses = [u.cpu() for u in units], masses.float().cpu()
         self._shown_handles, self._moved = False, 0.0
         self._pick: Any = None
@@ -58,6 +63,7 @@ class Pointer:
         self.mask: Bool[Tensor, " K"] = torch.zeros_like(self._free)
         self.gain = 8.0
         self.notice: Callable[[], None] = lambda: None
+        self.hand_moved: Callable[[int, tuple[float, float, float]], None] = lambda hand, to: None
         self._label = server.scene.add_label("/weight", "", visible=False)
         self.choose_level(self.level_names[-2 if units else -1])
         # Largest distance of a ray from a kernel's centre: the kernel's size plus a tolerance [page units].
@@ -76,10 +82,11 @@ class Pointer:
         rest = self._live.interaction.scene.means
         with self._lock:
             self._level = level if level < len(self._units) else None
-            # The handle of each kernel, and the handles of units with free kernels.
-            self._index = self._units[level] if level < len(self._units) else torch.where(self._free, 0, -1)
+            # The handle of each kernel, and the handles of units with kernels that are free or in a hand.
+            movable = self._free | (self._hand >= 0)
+            self._index = self._units[level] if level < len(self._units) else torch.where(movable, 0, -1)
             self._count = int(self._index.max()) + 1
-            self._movable = self._index[self._free & (self._index >= 0)].unique()
+            self._movable = self._index[movable & (self._index >= 0)].unique()
             if self._pick is not None:
                 self._pick.remove()
             self._make_handles(self._centres(rest).numpy(), self._handle_radii(rest.float().cpu()).numpy())
@@ -167,6 +174,42 @@ class Pointer:
         numbers = inside.nonzero()[:, 0].tolist()
         self.select(Kernels(tuple(numbers)) if numbers else None)
 
+    def _grab(self, event: Any) -> Grab | None:
+        """The hand whose pin a drag began on; None elsewhere."""
+        if event.phase == "start" and self._page is not None:
+            self._grabs.pop(event.client_id, None)
+            point = torch.tensor([float(v) for v in event.start_position])
+            hand = self._hand_under(event, self._page, point)
+            if hand >= 0:
+                self._grabs[event.client_id] = Grab(
+                    hand, point, self._placing.scale, lambda *place: self.hand_moved(*place)
+                )
+        found = self._grabs.get(event.client_id)
+        if event.phase == "end":
+            self._grabs.pop(event.client_id, None)
+        return found
+
+    def _hand_under(self, event: Any, page: Tensor, point: Tensor) -> int:
+        """The hand of the first kernel under a point, else that of a unit without free kernels; -1 for none."""
+        eye = torch.tensor([float(v) for v in event.client.camera.position])
+        kernel = first_hit(page, self._reach, eye, point - eye, self._free | (self._hand >= 0))
+        if kernel is not None:
+            return int(self._hand[kernel])
+        index = event.instance_index
+        if index is None or not 0 <= index < len(self._movable):
+            return -1
+        unit = self._index == self._movable[index]
+        return -1 if bool((unit & self._free).any()) else int(self._hand[unit].max())
+
+    def _drag_hand(self, grab: Grab, event: Any) -> None:
+        end = event.end_position
+        self._live.do(lambda: self._live.act(grab.event(self._live.interaction, end)))
+        if event.phase == "end":
+            self._label.visible = False
+        else:
+            size = float(grab.drag(end).norm()) / self._live.interaction.scene.diagonal
+            self._point(event, f"hand {grab.hand}: {size:.2f} diagonals")
+
     def _grasp(self, event: Any) -> None:
         """Selects the unit under a drag's start unless the selection overlaps it."""
         index = event.instance_index
@@ -174,7 +217,7 @@ class Pointer:
             return
         chosen = self._part(int(self._movable[index]))
         mask = chosen.mask(self._live.interaction.scene, self._units).cpu() & self._free
-        if not bool((mask & self.mask).any()):
+        if bool(mask.any()) and not bool((mask & self.mask).any()):
             self.select(chosen)
 
     def pull(self, start: Sequence[float], end: Sequence[float]) -> tuple[tuple[float, float, float], float]:
@@ -184,6 +227,9 @@ class Pointer:
         return (x, y, z), min(weights, self._live.interaction.most_force)
 
     async def _dragged(self, event: Any) -> None:
+        if (grab := self._grab(event)) is not None:
+            self._drag_hand(grab, event)
+            return
         name = f"drag-{event.client_id}"
         self._grasp(event)
         direction, weights = self.pull(event.start_position, event.end_position)
@@ -228,8 +274,8 @@ def invisible_handle() -> bytes:
 def first_hit(
     points: Float[Tensor, "K 3"],
     reach: Float[Tensor, " K"],
-    origin: Sequence[float],
-    direction: Sequence[float],
+    origin: Sequence[float] | Tensor,
+    direction: Sequence[float] | Tensor,
     among: Bool[Tensor, " K"],
 ) -> int | None:
     """The first kernel of the mask ``among`` whose centre is within its ``reach`` of a ray, or None."""
@@ -244,13 +290,10 @@ def first_hit(
 def in_rectangle(
     points: Float[Tensor, "K 3"], camera: Any, low: Sequence[float], high: Sequence[float]
 ) -> Bool[Tensor, " K"]:
-    """Points within a rectangle of a viser camera's picture.
+    """Points of the page within a rectangle of a viser camera's picture, from its upper left to its lower right corner.
 
-    Args:
-        points: positions on the page.
-        camera: a viser camera: world pose (wxyz, position), vertical field of view [rad], aspect (width / height).
-        low: upper left corner of the rectangle, in 0..1 of the picture.
-        high: its lower right corner.
+    Corners are in 0..1 of the picture. The camera has a world pose (wxyz, position), the vertical field of view
+    [rad] and the aspect (width / height).
     """
     rotation = torch.from_numpy(SO3(np.asarray(camera.wxyz, float)).as_matrix()).to(points)
     seen = (points - points.new_tensor([float(v) for v in camera.position])) @ rotation

@@ -8,8 +8,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from gausim.core import DataError, DivergenceError, GaussianScene, SteppedFrame, Trajectory
+from gausim.core import DataError, GaussianScene, SteppedFrame, Trajectory
 from gausim.io.files import write_durably
+from gausim.io.motion import check_trajectory
 from gausim.viewer.access import Access
 from gausim.viewer.coloring import BASE, VIEW, Painter
 from gausim.viewer.server import GuardedServer
@@ -29,21 +30,11 @@ def record(
     up: str = "z",
     colors: Literal["base", "view"] = "base",
 ) -> Path:
-    """Writes a trajectory for viser's player, which plays it at its frame rate, in a loop.
+    """Writes a trajectory for viser's player, which plays it at its frame rate, in a loop; returns the path.
 
     Kept: positions (float32), covariances (float16, with the object scaled to :data:`SIZE` units), colours and
-    opacities (8 bit). Lost: view-dependent colours (one colour per kernel and frame), masks, masses, the hierarchy.
-
-    Args:
-        scene: the rest scene.
-        trajectory: the trajectory to play.
-        path: the file; an existing one is replaced.
-        every: interval of the exported frames [frames].
-        up: vertical axis: x, y, z, -x, -y or -z.
-        colors: ``base`` (independent of the view) or ``view`` (as seen from the initial camera).
-
-    Returns:
-        The path.
+    opacities (8 bit). Lost: view-dependent colours (one colour per kernel and frame: ``base``, or the ``view`` of
+    the initial camera), masks, masses, the hierarchy. Takes every ``every``-th frame.
 
     Raises:
         DataError: the trajectory is of another scene or too long, or ``every`` is not positive.
@@ -63,11 +54,6 @@ def record(
 def _frames(scene: GaussianScene, trajectory: Trajectory, every: int) -> range:
     if every < 1:
         raise DataError(f"every: expected at least 1, got {every}.")
-    if trajectory.positions.shape[1] != scene.count:
-        raise DataError(
-            f"{scene.name}: has {scene.count} kernels, the trajectory {trajectory.positions.shape[1]}. Give the scene "
-            "that it was made with."
-        )
     numbers = range(0, trajectory.frames, every)
     size = len(numbers) * scene.count * 32
     if size > _LARGEST:
@@ -75,10 +61,7 @@ def _frames(scene: GaussianScene, trajectory: Trajectory, every: int) -> range:
             f"{scene.name}: {len(numbers)} frames of {scene.count} kernels take {size / 2**30:.1f} GiB, expected "
             f"at most {_LARGEST >> 30}. Take every {-(-size * every // _LARGEST)}th frame, or export PLY files."
         )
-    for values in (trajectory.positions, trajectory.deformation_gradients):
-        bad = ~torch.isfinite(values).reshape(trajectory.frames, -1).all(-1)
-        if bool(bad.any()):
-            raise DivergenceError(f"{scene.name}: frame {int(bad.nonzero()[0])} is not finite; it cannot be shown.")
+    check_trajectory(scene, trajectory)
     return numbers
 
 

@@ -18,26 +18,16 @@ LIVE = "Live simulation"
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A frame with the data for its display.
-
-    Attributes:
-        unit_of_kernel: the unit of each kernel, a row of the frame's deformation gradients.
-        speed: speeds of the kernels [scene units / s].
-        held: mask of the kernels pinned by events; None without any.
-        number: index of the frame on the timeline.
-        last: last index of the timeline.
-        source: :data:`LIVE` or the name of a take.
-        beside: the frame of the second method, or None.
-    """
+    """A frame with the data for its display."""
 
     frame: SteppedFrame
-    unit_of_kernel: Int[Tensor, " K"]
-    speed: Float[Tensor, " K"]
-    held: Bool[Tensor, " K"] | None = None
-    number: int = 0
-    last: int = 0
-    source: str = LIVE
-    beside: Shown | None = None
+    unit_of_kernel: Int[Tensor, " K"]  # the unit of each kernel, a row of the frame's deformation gradients
+    speed: Float[Tensor, " K"]  # speeds of the kernels [scene units / s]
+    held: Bool[Tensor, " K"] | None = None  # mask of the kernels pinned by events; None without any
+    number: int = 0  # index of the frame on the timeline
+    last: int = 0  # last index of the timeline
+    source: str = LIVE  # :data:`LIVE` or the name of a take
+    beside: Shown | None = None  # the frame of the second method, or None
 
     @staticmethod
     def of(now: Interaction, beside: Shown | None = None) -> Shown:
@@ -48,18 +38,12 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """A trajectory that can be played: a method's prediction of a sequence.
+    """A trajectory that can be played: a method's prediction of a sequence."""
 
-    Attributes:
-        name: name on the page.
-        load: computes the trajectory, called at its first use.
-        sequence: the predicted sequence, or None.
-        beside: computes the second method's prediction of the same sequence, or None.
-    """
-
-    name: str
-    load: Callable[[], Trajectory]
-    sequence: str | None = None
+    name: str  # name on the page
+    load: Callable[[], Trajectory]  # computes the trajectory, called at its first use
+    sequence: str | None = None  # the predicted sequence, or None
+    # computes the second method's prediction of the same sequence, or None
     beside: Callable[[], Trajectory] | None = None
 
 

@@ -23,16 +23,11 @@ _LARGEST = 6e4
 
 @dataclass(frozen=True, eq=False)
 class Placing:
-    """Map from the scene to the page: (x - centre) * scale + offset.
+    """Map from the scene to the page: (x - centre) * scale + offset."""
 
-    Attributes:
-        centre: centre of the simulated kernels' bounding box at rest [scene units].
-        scale: page units per scene unit.
-        offset: displacement of a scene shown beside another one [page units].
-    """
-
-    centre: Float[Tensor, " 3"]
-    scale: float
+    centre: Float[Tensor, " 3"]  # centre of the simulated kernels' bounding box at rest [scene units]
+    scale: float  # page units per scene unit
+    # displacement of a scene shown beside another one [page units]
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @staticmethod

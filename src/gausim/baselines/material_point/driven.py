@@ -22,34 +22,21 @@ LEAST_VOLUME = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """P particles of one scene and its K kernels, all in scene units.
+    """P particles of one scene and its K kernels, all in scene units."""
 
-    Attributes:
-        rest: particles at rest.
-        pinned: particles that never move.
-        followed: indices of the n particles that every kernel follows.
-        weights: weights of those particles, with sum 1 for every kernel.
-        means: positions of the kernels at rest.
-        held: kernels that never move: pinned ones and those that are not simulated.
-    """
-
-    rest: Float[Tensor, "P 3"]
-    pinned: Bool[Tensor, " P"]
-    followed: Int[Tensor, "K n"]
-    weights: Float[Tensor, "K n"]
-    means: Float[Tensor, "K 3"]
-    held: Bool[Tensor, " K"]
+    rest: Float[Tensor, "P 3"]  # particles at rest
+    pinned: Bool[Tensor, " P"]  # particles that never move
+    followed: Int[Tensor, "K n"]  # indices of the n particles that every kernel follows
+    weights: Float[Tensor, "K n"]  # weights of those particles, with sum 1 for every kernel
+    means: Float[Tensor, "K 3"]  # positions of the kernels at rest
+    held: Bool[Tensor, " K"]  # kernels that never move: pinned ones and those that are not simulated
 
     def carried(
         self, x: Float[Tensor, "P 3"], deformation_gradients: Float[Tensor, "P 3 3"]
     ) -> tuple[Float[Tensor, "K 3"], Float[Tensor, "K 3 3"], Float[Tensor, "K 3 3"]]:
-        """Positions, deformation gradients and rotations of the kernels.
+        """Positions, deformation gradients and rotations of the kernels, from positions and F of the particles.
 
         Particle p maps X to x_p + F_p (X - X_p); a kernel follows the weighted mean of its particles' maps.
-
-        Args:
-            x: positions of the particles.
-            deformation_gradients: F of the particles.
         """
         middle = self.rest.mean(0)  # maps about a nearby point have less rounding error
         offset = x - middle - (deformation_gradients @ (self.rest - middle)[..., None])[..., 0]

@@ -66,15 +66,10 @@ class TriPlaneField(nn.Module):
 
 @dataclass(frozen=True)
 class SceneMapping:
-    """x_sim = scale x + offset: deformation gradients and rotations are the same in both.
+    """x_sim = scale x + offset: deformation gradients and rotations are the same in both."""
 
-    Attributes:
-        scale: simulation units per scene unit.
-        offset: position of the scene's origin [simulation units].
-    """
-
-    scale: float
-    offset: tuple[float, float, float]
+    scale: float  # simulation units per scene unit
+    offset: tuple[float, float, float]  # position of the scene's origin [simulation units]
 
     def to_simulation(self, points: Float[Tensor, "*N 3"]) -> Float[Tensor, "*N 3"]:
         """Positions in the simulation."""
@@ -106,19 +101,12 @@ class Discretisation:
 
 @dataclass(frozen=True)
 class Domain:
-    """The cubic domain in which scenes are simulated.
+    """The cubic domain in which scenes are simulated."""
 
-    Attributes:
-        side: longest side of the scene in the simulation [simulation units].
-        size: edge of the cubic domain, in whose middle the scene is [simulation units].
-        cells: cells per axis over the whole domain.
-        settings: damping, substeps and filling of the interior.
-    """
-
-    side: float
-    size: float
-    cells: int
-    settings: Discretisation
+    side: float  # longest side of the scene in the simulation [simulation units]
+    size: float  # edge of the cubic domain, in whose middle the scene is [simulation units]
+    cells: int  # cells per axis over the whole domain
+    settings: Discretisation  # damping, substeps and filling of the interior
 
     @property
     def grid(self) -> Grid:
@@ -162,19 +150,13 @@ def extent(scene: GaussianScene) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One scene ready to be simulated on one device.
+    """One scene ready to be simulated on one device."""
 
-    Attributes:
-        driven: particles and kernels [scene units].
-        mapping: mapping to the simulation.
-        places: coordinates of the particles in the fields, in [-1, 1]^3; the longest side of the scene has length 2.
-        solver: solver that moves the particles.
-    """
-
-    driven: Driven
-    mapping: SceneMapping
+    driven: Driven  # particles and kernels [scene units]
+    mapping: SceneMapping  # mapping to the simulation
+    # coordinates of the particles in the fields, in [-1, 1]^3; the longest side of the scene has length 2
     places: Float[Tensor, "P 3"]
-    solver: MPMSolver
+    solver: MPMSolver  # solver that moves the particles
 
 
 class MaterialPoints(Fitted):
@@ -185,6 +167,9 @@ class MaterialPoints(Fitted):
     A velocity is ``velocity_scale`` times the field's output [longest sides / s], and 0 for pinned particles. Before
     fitting all velocities are 0.
     """
+
+    # Particles keep their pins in place, and gravity is not identified.
+    unknown = frozenset({"hands", "trained_gravity"})
 
     def __init__(
         self,
@@ -204,16 +189,10 @@ class MaterialPoints(Fitted):
             velocity_scale: factor on the velocity fields' outputs [longest sides / s].
 
         Raises:
-            ConfigError: Warp is not installed, a number is out of range, or hands move a scene's pins.
+            ConfigError: Warp is not installed, a number is out of range, or a scene has unknown surroundings.
             SceneError: too few kernels.
         """
         super().__init__(**recorded)
-        handled = [scene.name for scene in self.scenes if scene.hand is not None]
-        if handled:
-            raise ConfigError(
-                f"{self.name}: hands move {', '.join(handled)}, but particles keep their pins in place here. Take "
-                "another model, or objects without hands (data.names)."
-            )
         if velocity_resolution < 2 or not velocity_scale > 0:
             raise ConfigError(
                 "model.method: expected velocity_resolution >= 2 and velocity_scale > 0, got "

@@ -35,36 +35,22 @@ class Material:
 
 @dataclass(frozen=True)
 class Slope:
-    """A plane that matter slides on under Coulomb's friction; nodes on it or behind it have no velocity into it.
+    """A plane that matter slides on under Coulomb's friction; nodes on it or behind it have no velocity into it."""
 
-    Attributes:
-        normal: unit vector out of the plane.
-        level: n . x of its points [simulation units].
-        friction: Coulomb's coefficient.
-    """
-
-    normal: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    level: float = 0.0
-    friction: float = 0.0
+    normal: tuple[float, float, float] = (0.0, 0.0, 0.0)  # unit vector out of the plane
+    level: float = 0.0  # n . x of its points [simulation units]
+    friction: float = 0.0  # Coulomb's coefficient
 
 
 @dataclass(frozen=True)
 class Grid:
-    """The background grid over the domain [0, size]^3.
+    """The background grid over the domain [0, size]^3."""
 
-    Attributes:
-        cells: cells per axis; nodes are one more.
-        size: edge L of the domain [simulation units].
-        damping: rate at which nodes lose velocity [1 / s]; 0 is none.
-        gravity: acceleration of all nodes [simulation units / s^2].
-        slope: the floor; None: there is none.
-    """
-
-    cells: int = 50
-    size: float = 2.0
-    damping: float = 0.0
-    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    slope: Slope | None = None
+    cells: int = 50  # cells per axis; nodes are one more
+    size: float = 2.0  # edge L of the domain [simulation units]
+    damping: float = 0.0  # rate at which nodes lose velocity [1 / s]; 0 is none
+    gravity: tuple[float, float, float] = (0.0, 0.0, 0.0)  # acceleration of all nodes [simulation units / s^2]
+    slope: Slope | None = None  # the floor; None: there is none
 
     def __post_init__(self) -> None:
         if self.cells < 4:
@@ -91,17 +77,12 @@ def pressure_wave(poisson_ratio: float) -> float:
 
 @dataclass(frozen=True)
 class TimeStep:
-    """Division of a frame into substeps.
+    """Division of a frame into substeps."""
 
-    Attributes:
-        frame_time: duration of a frame [s].
-        substeps: substeps per frame; None derives the smallest number within the bound.
-        courant: c of the bound dt < c dx / sqrt(E / rho). 0.3 is safe for nu up to 0.45, where pressure waves
-            are 1.9 times as fast as sqrt(E / rho); measured, 0.5 is stable up to 0.4 and 0.7 up to 0.3.
-    """
-
-    frame_time: float = 1 / 30
-    substeps: int | None = None
+    frame_time: float = 1 / 30  # duration of a frame [s]
+    substeps: int | None = None  # substeps per frame; None derives the smallest number within the bound
+    # c of the bound dt < c dx / sqrt(E / rho). 0.3 is safe for nu up to 0.45, where pressure waves are 1.9 times
+    # as fast as sqrt(E / rho); measured, 0.5 is stable up to 0.4 and 0.7 up to 0.3
     courant: float = 0.3
 
     def __post_init__(self) -> None:

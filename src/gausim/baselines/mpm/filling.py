@@ -55,17 +55,10 @@ def fill_interior(
     size: float,
     options: Filling,
 ) -> Float[Tensor, "M 3"]:
-    """Positions of particles that fill dense and enclosed cells [simulation units].
+    """Positions of particles that fill dense and enclosed cells of a domain of edge ``size`` [simulation units].
 
     The density of a cell is the sum of opacity exp(-d^T S^-1 d / 2) at its centre. Cells denser than ``dense`` get
     particles until they have ``per_cell``, as do enclosed cells that contain no kernel.
-
-    Args:
-        means: positions of the kernels [simulation units].
-        covars: their covariances S [simulation units^2].
-        opacities: their opacities in [0, 1].
-        size: edge of the domain [simulation units].
-        options: thresholds.
     """
     grid = Grid(options.cells, size)
     x, s, o = (v.detach().cpu().double().numpy() for v in (means, covars, opacities))

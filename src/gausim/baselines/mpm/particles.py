@@ -17,19 +17,12 @@ HALF = 0.999  # below 1, so that a node half way between pinned and free matter 
 
 @dataclass(frozen=True, eq=False)
 class ParticleState:
-    """The state of N particles between two substeps [simulation units].
+    """The state of N particles between two substeps [simulation units]."""
 
-    Attributes:
-        positions: x.
-        velocities: v.
-        affine: C, the velocity gradient of APIC [1 / s].
-        deformation_gradients: F.
-    """
-
-    positions: Float[Tensor, "N 3"]
-    velocities: Float[Tensor, "N 3"]
-    affine: Float[Tensor, "N 3 3"]
-    deformation_gradients: Float[Tensor, "N 3 3"]
+    positions: Float[Tensor, "N 3"]  # x
+    velocities: Float[Tensor, "N 3"]  # v
+    affine: Float[Tensor, "N 3 3"]  # C, the velocity gradient of APIC [1 / s]
+    deformation_gradients: Float[Tensor, "N 3 3"]  # F
 
     @staticmethod
     def at_rest(positions: Float[Tensor, "N 3"], velocities: Float[Tensor, "N 3"] | None = None) -> ParticleState:
@@ -53,20 +46,15 @@ class ParticleState:
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """Constants of a simulation.
+    """Constants of a simulation."""
 
-    Attributes:
-        mass: m [simulation units].
-        volume: V at rest [simulation units^3].
-        pinned: particles that keep their position. Their F still changes: without it the layer between the last pinned
-            node and the first free one would be soft.
-        pinned_nodes: nodes of velocity 0: the nearest of each pinned particle, and those of whose mass at rest at
-            least half belongs to pinned particles.
-    """
-
-    mass: Float[Tensor, " N"]
-    volume: Float[Tensor, " N"]
+    mass: Float[Tensor, " N"]  # m [simulation units]
+    volume: Float[Tensor, " N"]  # V at rest [simulation units^3]
+    # particles that keep their position. Their F still changes: without it the layer between the last pinned node
+    # and the first free one would be soft
     pinned: Bool[Tensor, " N"]
+    # nodes of velocity 0: the nearest of each pinned particle, and those of whose mass at rest at least half
+    # belongs to pinned particles
     pinned_nodes: Bool[Tensor, "n n n"]
 
     @staticmethod
@@ -122,10 +110,7 @@ def particle_volumes(positions: Float[Tensor, "N 3"], grid: Grid) -> Float[Tenso
 def require_inside(positions: Float[Tensor, "N 3"], grid: Grid, when: str) -> None:
     """Raises :class:`DivergenceError` naming the first particle whose 27 nodes are not all on the grid.
 
-    Args:
-        positions: positions [simulation units].
-        grid: the grid; the allowed region is half a cell less than the domain on each side.
-        when: the time, for the message, e.g. 'frame 12'.
+    The allowed region is half a cell less than the domain on each side; ``when`` is the time, e.g. 'frame 12'.
     """
     low, high = 0.5 * grid.dx, grid.size - 0.5 * grid.dx
     outside = ~((positions >= low) & (positions < high)).all(-1)

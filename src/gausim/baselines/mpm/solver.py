@@ -16,14 +16,9 @@ from gausim.core import DivergenceError
 class MPMSolver:
     """MLS-MPM/APIC on quadratic B-splines, explicit (Hu et al. 2018, Jiang et al. 2015).
 
-    All quantities are in simulation units and float32, on the device of the particles. A frame is differentiable with
-    respect to the state at its start and Young's modulus; :meth:`ParticleState.detach` stops loss gradients there.
-
-    Args:
-        particles: mass, volume and pins.
-        material: the material of all particles.
-        grid: the background grid.
-        step: division of frames into substeps.
+    All quantities are in simulation units and float32, on the device of the particles. A frame is differentiable
+    with respect to the state at its start and Young's modulus; :meth:`ParticleState.detach` stops loss gradients
+    there.
     """
 
     def __init__(self, particles: Particles, material: Material, grid: Grid, step: TimeStep) -> None:
@@ -40,11 +35,7 @@ class MPMSolver:
         return self.step.count(self.grid.dx, young_modulus, density, self.material.poisson_ratio)
 
     def advance(
-        self,
-        state: ParticleState,
-        frame: int,
-        *,
-        young_modulus: Float[Tensor, " N"] | None = None,
+        self, state: ParticleState, frame: int, *, young_modulus: Float[Tensor, " N"] | None = None
     ) -> ParticleState:
         """The state at the end of a frame.
 

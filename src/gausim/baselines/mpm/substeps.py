@@ -50,13 +50,8 @@ class Window:
 class Substeps:
     """Launches the four kernels of a substep forwards and backwards.
 
-    The working memory is a window and one array of stresses: the adjoint of a substep recomputes both from the state at
-    its start.
-
-    Args:
-        particles: mass, volume and pins, on the device to compute on.
-        material: the material of all particles.
-        grid: the grid.
+    The working memory is a window and one array of stresses: the adjoint of a substep recomputes both from the
+    state at its start.
     """
 
     def __init__(self, particles: Particles, material: Material, grid: Grid) -> None:

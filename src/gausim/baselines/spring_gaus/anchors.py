@@ -22,25 +22,16 @@ RIDGE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Anchors:
-    """A anchors of one scene and the kernels that follow them; lengths of anchors are in diagonals of the scene.
+    """A anchors of one scene and the kernels that follow them; lengths of anchors are in diagonals of the scene."""
 
-    Attributes:
-        rest: rest positions [diagonals].
-        pinned: anchors that never move.
-        followed: the n nearest anchors of every kernel.
-        weights: weights of the anchors' displacements; 0 for held kernels, else they sum to 1.
-        slopes: factors g_a of the anchors' displacements in the deformation gradient [1 / diagonals].
-        means: rest positions of the kernels [scene units].
-        diagonal: diagonal of the scene [scene units].
-    """
-
-    rest: Float[Tensor, "A 3"]
-    pinned: Bool[Tensor, " A"]
-    followed: Int[Tensor, "K n"]
-    weights: Float[Tensor, "K n"]
+    rest: Float[Tensor, "A 3"]  # rest positions [diagonals]
+    pinned: Bool[Tensor, " A"]  # anchors that never move
+    followed: Int[Tensor, "K n"]  # the n nearest anchors of every kernel
+    weights: Float[Tensor, "K n"]  # weights of the anchors' displacements; 0 for held kernels, else they sum to 1
+    # factors g_a of the anchors' displacements in the deformation gradient [1 / diagonals]
     slopes: Float[Tensor, "K n 3"]
-    means: Float[Tensor, "K 3"]
-    diagonal: float
+    means: Float[Tensor, "K 3"]  # rest positions of the kernels [scene units]
+    diagonal: float  # diagonal of the scene [scene units]
 
     @staticmethod
     def of(scene: GaussianScene, most: int) -> Anchors:

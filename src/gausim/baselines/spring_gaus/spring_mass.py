@@ -37,12 +37,10 @@ class AnchoredMotion(Fitted):
     anchors; in the original they keep their shape.
     """
 
-    def __init__(
-        self,
-        *,
-        anchors: int,
-        **recorded: Unpack[Recorded],
-    ) -> None:
+    # The body begins at rest in its pins.
+    unknown = frozenset({"free", "hands"})
+
+    def __init__(self, *, anchors: int, **recorded: Unpack[Recorded]) -> None:
         """Places the anchors.
 
         Args:
@@ -106,6 +104,7 @@ class SpringMass(AnchoredMotion):
     """
 
     name = "spring_mass"
+    unknown = frozenset({"free", "gravity", "trained_gravity", "floor", "hands"})
 
     def __init__(
         self,

@@ -31,23 +31,14 @@ FIRM = 16
 
 @dataclass(frozen=True, eq=False)
 class Net:
-    """E springs between A anchors, sorted by their first end.
+    """E springs between A anchors, sorted by their first end."""
 
-    Attributes:
-        first: one end.
-        second: the other end, of a higher number.
-        starts: first spring of every anchor, then E.
-        length: rest length L_0 [diagonals].
-        rank: number of nearer neighbours at an end, 0 for its nearest; the smaller of both ends.
-        reach: neighbours per anchor.
-    """
-
-    first: Int[Tensor, " E"]
-    second: Int[Tensor, " E"]
-    starts: Int[Tensor, " A_and_end"]
-    length: Float[Tensor, " E"]
-    rank: Int[Tensor, " E"]
-    reach: int
+    first: Int[Tensor, " E"]  # one end
+    second: Int[Tensor, " E"]  # the other end, of a higher number
+    starts: Int[Tensor, " A_and_end"]  # first spring of every anchor, then E
+    length: Float[Tensor, " E"]  # rest length L_0 [diagonals]
+    rank: Int[Tensor, " E"]  # number of nearer neighbours at an end, 0 for its nearest; the smaller of both ends
+    reach: int  # neighbours per anchor
 
     @staticmethod
     def of(rest: Float[Tensor, "A 3"], pinned: Tensor, neighbours: int) -> Net:
@@ -113,16 +104,10 @@ def move(
     free: Float[Tensor, "A 1"],
     substeps: int,
 ) -> tuple[Float[Tensor, "A 3"], Float[Tensor, "A 3"]]:
-    """Positions and velocities one frame later, by semi-implicit Euler; differentiable in all but the net.
+    """Positions [diagonals] and velocities [diagonals / frame] one frame later, by semi-implicit Euler.
 
-    Args:
-        net: the springs.
-        x: positions [diagonals].
-        v: velocities [diagonals / frame]; 0 where an anchor is pinned.
-        stiffness: kappa [1 / frames^2].
-        drag: c [1 / frames].
-        free: 1 where an anchor moves, else 0.
-        substeps: within the frame.
+    Stiffness kappa is in 1 / frames^2, drag c in 1 / frames; ``free`` is 1 where an anchor moves, else 0, as its
+    velocity. Differentiable in all but the net.
     """
     if x.device.type != "cpu":
         return move_plain(net, x, v, stiffness, drag, free, substeps)

@@ -28,17 +28,11 @@ OBJECTIVE = "excess_static"
 
 
 class JobResult(float):
-    """The objective of a job as a float for any sweeper (nan if it has none), with the outcome of the job.
+    """The objective of a job as a float for any sweeper (nan if it has none), with the outcome of the job."""
 
-    Attributes:
-        state: one of the constants of this module.
-        directory: the run directory.
-        detail: the error of a failed job.
-    """
-
-    state: str
-    directory: str
-    detail: str
+    state: str  # one of the constants of this module
+    directory: str  # the run directory
+    detail: str  # the error of a failed job
 
     @classmethod
     def of(cls, objective: float | None, state: str, run: RunDirectory, detail: str = "") -> JobResult:
@@ -51,13 +45,8 @@ class JobResult(float):
 def do_job(cfg: DictConfig, run: RunDirectory, train: Callable[[DictConfig, RunDirectory], Any]) -> JobResult:
     """Runs one job of a sweep, unless its run is finished, has failed, or is in use by another process.
 
-    Args:
-        cfg: configuration of the job.
-        run: run directory of the job.
-        train: trains the run to its end, from its last checkpoint where there is one, and evaluates it if asked to.
-
-    Returns:
-        The result. Errors are not raised, so that the other jobs continue.
+    ``train`` trains the run to its end and evaluates it if asked to. Errors are not raised, so that other jobs
+    continue.
     """
     try:
         with run.writing():

@@ -73,10 +73,7 @@ class Search:
         self._results: list[JobResult] = []
 
     def run(self, arguments: Sequence[str]) -> None:
-        """Trains trials until ``n_trials`` are complete, then prints and writes the best.
-
-        Args:
-            arguments: overrides of the command line.
+        """Trains trials, by the command line's overrides, until ``n_trials`` are complete; writes the best.
 
         Raises:
             ConfigError: no parameter is searched, or the stored study has other parameters.
@@ -203,16 +200,11 @@ class Search:
         done = [t for t in trials if t.state == TrialState.COMPLETE]
         choose = min if self._settings.direction == "minimize" else max
         best = choose(done, key=lambda trial: trial.values[0], default=None)
-        known = _row(best) if best else {}
-        facts = {
-            "name": "optuna",
-            "study": self._settings.study_name,
-            "objective": OBJECTIVE,
-            "direction": self._settings.direction,
-            "best_trial": known.get("number"),
-            **{f"best_{key}": known.get(key) for key in ("value", "params", "directory")},
-            "trials": [_row(t) for t in trials],
-        }
+        known, study_name = _row(best) if best else {}, self._settings.study_name
+        facts: dict[str, Any] = {"name": "optuna", "study": study_name, "objective": OBJECTIVE}
+        facts |= {"direction": self._settings.direction, "best_trial": known.get("number")}
+        facts |= {f"best_{key}": known.get(key) for key in ("value", "params", "directory")}
+        facts |= {"trials": [_row(t) for t in trials]}
         write_durably(self._folder / RESULTS, yaml.safe_dump(facts, sort_keys=False).encode())
         return best
 
@@ -277,24 +269,15 @@ def _failed_before(trial: FrozenTrial) -> JobResult:
 
 
 def _row(trial: FrozenTrial) -> dict[str, Any]:
-    return {
-        "number": trial.number,
-        "state": trial.state.name.lower(),
-        "value": trial.value,
-        "params": dict(trial.params),
-        "directory": trial.user_attrs.get("directory"),
-    }
+    facts = {"number": trial.number, "state": trial.state.name.lower(), "value": trial.value}
+    return {**facts, "params": dict(trial.params), "directory": trial.user_attrs.get("directory")}
 
 
 def pruning_judge() -> EpochJudge:
     """Callback that ends the running job, a trial of a search, when its pruner decides so."""
     sweeper = HydraConfig.get().sweeper
-    study = optuna.load_study(
-        storage=sweeper.storage,
-        study_name=sweeper.study_name,
-        sampler=optuna.samplers.RandomSampler(seed=0),  # not used
-        pruner=instantiate(sweeper.pruner),
-    )
+    unused, pruner = optuna.samplers.RandomSampler(seed=0), instantiate(sweeper.pruner)
+    study = optuna.load_study(storage=sweeper.storage, study_name=sweeper.study_name, sampler=unused, pruner=pruner)
     (known,) = (t for t in study.get_trials(deepcopy=False) if t.number == sweeper.trial)
     trial = Trial(study, known._trial_id)
 

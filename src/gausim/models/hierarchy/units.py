@@ -27,8 +27,8 @@ class FixedUnits:
     scale: Float[Tensor, "N 1"]
 
 
-def per_level(batch: SceneBatch, fractions: Sequence[Tensor], finest: Float[Tensor, "N 3"]) -> list[Tensor]:
-    """Positions of every predicted level, coarse to fine: coarser units are the centres of mass of the finer."""
+def per_level(batch: SceneBatch, fractions: Sequence[Tensor], finest: Float[Tensor, "N C"]) -> list[Tensor]:
+    """Values of every predicted level, coarse to fine, such as positions: means of the finer units by mass."""
     found = [finest]
     for position in range(len(batch.levels) - 1, 0, -1):
         level, count = batch.levels[position], batch.levels[position - 1].count

@@ -35,6 +35,8 @@ COMPLIANCE = 1e-3
 SUBSTEPS, ITERATIONS = 8, 30
 # A unit takes part in a frame's contact if its lowest kernel comes nearer to the floor [fractions of the body's size].
 NEAR = 0.05
+# Height below which the network notices the floor [diagonals].
+REACH = 0.2
 # Part of the friction cone's radius above which a point slides.
 SLIDING = 0.999
 
@@ -116,6 +118,19 @@ class Contact:
     floor: Floor
     friction: Float[Tensor, ""]
     restitution: Float[Tensor, ""]
+    diagonal: float  # of the scene [scene units]
+
+    def nearness(
+        self, centres: Float[Tensor, "N 3"], rotation: Float[Tensor, "3 3"] | Float[Tensor, "N 3 3"]
+    ) -> Float[Tensor, "N 4"]:
+        """Nearness p = (1 - h / (0.2 diagonals))^2 of units at height h, 0 beyond; and p times the turned-back normal.
+
+        Args:
+            centres: centres of mass of the units, in the scene [scene units].
+            rotation: of the body or of every unit, from its axes to scene axes.
+        """
+        near = (1 - self.floor.height(centres) / (REACH * self.diagonal)).clamp(0, 1).square()[:, None]
+        return torch.cat((near, near * (centres.new_tensor(self.floor.normal) @ rotation)), 1)
 
     def resolve(
         self, placed: Placed, state: SimState, body: Elasticity, rotation: Tensor, centre: Tensor | None

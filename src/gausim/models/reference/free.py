@@ -102,6 +102,7 @@ class FreeMotion(BodyMotion):
             body.centre + about(now, self.centre) @ self.turned,
             body.centre + about(before, self.last_centre) @ last,
             load,
+            None if body.contact is None else body.contact.nearness(now, self.turned),
         )
 
     def place(self, made: Placed) -> Placed:

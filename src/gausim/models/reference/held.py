@@ -165,8 +165,9 @@ class HeldMotion(BodyMotion):
         last, present, self.after = (body.at(pose) for pose in hands)
         acceleration = self.after[0] - 2 * present[0] + last[0] - body.gravity
         load = -_back(present[1], acceleration) - body.gravity  # at rest the body is in equilibrium with gravity
+        floor = None if body.contact is None else body.contact.nearness(now, present[1])
         self.relative = UnitMotion(
-            body.units + _back(present[1], now - present[0]), body.units + _back(last[1], before - last[0]), load
+            body.units + _back(present[1], now - present[0]), body.units + _back(last[1], before - last[0]), load, floor
         )
 
     def place(self, made: Placed) -> Placed:

@@ -48,6 +48,8 @@ class UnitMotion:
     now: Float[Tensor, "N 3"]
     before: Float[Tensor, "N 3"]
     load: Float[Tensor, "N 3"] | None  # acceleration in the reference's axes [scene units / frame^2]
+    # nearness to the floor, and its normal in the reference's axes times the nearness; None: there is no floor
+    floor: Float[Tensor, "N 4"] | None = None
 
 
 class BodyMotion(ABC):
@@ -184,7 +186,11 @@ class _CarriedBodies(Carried):
     ) -> None:
         self._members, self._motions, self._state = members, motions, state
         load = torch.cat([part.load for part in parts if part.load is not None])
-        self.relative = UnitMotion(torch.cat([p.now for p in parts]), torch.cat([p.before for p in parts]), load)
+        floor = None
+        if any(part.floor is not None for part in parts):
+            floor = torch.cat([p.now.new_zeros(len(p.now), 4) if p.floor is None else p.floor for p in parts])
+        now, before = torch.cat([p.now for p in parts]), torch.cat([p.before for p in parts])
+        self.relative = UnitMotion(now, before, load, floor)
 
     def place(self, made: Placed) -> Placed:
         placed = []

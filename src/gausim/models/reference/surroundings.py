@@ -32,7 +32,8 @@ class SceneSurroundings(nn.Module):
     def __init__(self, scene: GaussianScene, hierarchy: Hierarchy, finest: int, fps: float) -> None:
         """Creates parameters for what the scene leaves to training."""
         super().__init__()
-        self.facts, self.unit = scene.surroundings, GRAVITY_GAIN * hierarchy.diagonal * fps**2
+        self.facts, self.diagonal = scene.surroundings, hierarchy.diagonal
+        self.unit = GRAVITY_GAIN * self.diagonal * fps**2
         floor = self.facts.floor
         given = torch.tensor(self.facts.gravity or (0.0, 0.0, 0.0))
         self.gravity = nn.Parameter(given / self.unit) if self.facts.trains_gravity else None
@@ -67,7 +68,7 @@ class SceneSurroundings(nn.Module):
         if self.restitution is not None:
             restitution = torch.sigmoid(self.restitution)
         assert friction is not None and restitution is not None
-        return Contact(floor, friction, restitution)
+        return Contact(floor, friction, restitution, self.diagonal)
 
 
 def reference_of(

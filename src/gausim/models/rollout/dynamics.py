@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -47,6 +49,24 @@ class SceneDynamics:
     def stepper(self, initial: SimState, hands: Hands | None = None) -> SceneStepper:
         """Stepper from an initial state; its steps are those of :meth:`rollout`."""
         return SceneStepper(self.model, self.scene_id, initial, energy_ceiling=self.energy_ceiling, hands=hands)
+
+
+class MaterialDynamics(SceneDynamics):
+    """Rollouts of a scene whose attributes 0 and 1 are the logarithms of its stiffness and damping."""
+
+    def __init__(self, model: GausSim, scene_id: int = 0, *, energy_ceiling: float | None = None) -> None:
+        """Takes the arguments of :class:`SceneDynamics`."""
+        super().__init__(model, scene_id, energy_ceiling=energy_ceiling)
+        self._given = model.attributes[scene_id].detach().clone()
+        self._ceiling = energy_ceiling
+
+    def adjust(self, stiffness: float, damping: float) -> None:
+        """Multiplies stiffness and damping, as they were at the beginning, by factors > 0; see :class:`Adjustable`."""
+        changed = self._given.clone()
+        changed[:, 0] += math.log(stiffness)
+        changed[:, 1] += math.log(damping)
+        self.model.attributes[self.scene_id].data.copy_(changed)
+        self.energy_ceiling = None if self._ceiling is None else stiffness * self._ceiling  # the same motion
 
 
 class SceneStepper:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gausim.core import ConfigError
+from gausim.core import ConfigError, GaussianScene
 from gausim.models.step.recursion import Solved, Units
 
 # Floor of lengths, which are in diagonals of the scene.
 TINY = 1e-6
+# Nearness to the floor, and the floor's normal times the nearness; the last node features.
+FLOOR_FEATURES = 4
 ANGLES = ("cos_sin", "inner")
 
 
@@ -40,6 +42,7 @@ class FeatureOptions:
         attributes: material attributes per unit.
         gravity: acceleration [scene units / s^2].
         normaliser_floor: smallest standard deviation of a normalised input.
+        floor: nearness of the units to the floor, in models of which a scene has one. False in runs from before it.
 
     Raises:
         ConfigError: an unknown angle, or neither velocities nor rest_inputs.
@@ -52,6 +55,7 @@ class FeatureOptions:
     attributes: int = 4
     gravity: Sequence[float] = (0.0, 0.0, 0.0)
     normaliser_floor: float = 1e-2
+    floor: bool = False
 
     def __post_init__(self) -> None:
         """Checks the choices."""
@@ -63,6 +67,10 @@ class FeatureOptions:
                 "model.simulator.features.velocities=false needs rest_inputs=true, else no input depends on the motion."
             )
 
+    def of(self, scenes: Sequence[GaussianScene]) -> FeatureOptions:
+        """The features of a model of these scenes: without the floor where none of them has one."""
+        return replace(self, floor=self.floor and any(scene.surroundings.floor for scene in scenes))
+
     @property
     def node_normalised(self) -> int:
         """Number of leading node features that are normalised."""
@@ -73,7 +81,7 @@ class FeatureOptions:
     @property
     def node_size(self) -> int:
         """Number of node features."""
-        return self.node_normalised + 1 + self.attributes
+        return self.node_normalised + 1 + self.attributes + (FLOOR_FEATURES if self.floor else 0)
 
     @property
     def edge_normalised(self) -> int:
@@ -119,7 +127,11 @@ def network_inputs(
     else:
         lever = (unit.rest - above.rest.index_select(0, above.index)) / size
         moving = [lever, own.now - own.rest, (coarsely - target) / size]
-    return torch.cat([*moving, unit.log_density[:, None], unit.attributes], -1), edges
+    columns = [*moving, unit.log_density[:, None], unit.attributes]
+    if options.floor:
+        near = unit.floor
+        columns.append(unit.rest.new_zeros(len(unit.rest), FLOOR_FEATURES) if near is None else near)
+    return torch.cat(columns, -1), edges
 
 
 def _velocities(

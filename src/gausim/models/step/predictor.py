@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import cast
 
 import torch
@@ -11,11 +11,27 @@ from torch import Tensor, nn
 
 from gausim.models.hierarchy.batch import LevelBatch
 from gausim.models.hierarchy.edges import exact_edges, fixed_edges
-from gausim.models.step.features import FeatureOptions, network_inputs
+from gausim.models.step.features import FLOOR_FEATURES, FeatureOptions, network_inputs
 from gausim.models.step.head import Head
 from gausim.models.step.recursion import Solved, Units
 from gausim.nn.mlp import zero_output as initialise_zero
 from gausim.nn.normaliser import RunningNormaliser
+
+# Ending of the name of the weights that read the node features.
+READS_NODES = "node_encoder.0.weight"
+
+
+def with_floor_columns(found: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Weights by name for a model with the shapes of ``own``, with or without the columns of the floor's features.
+
+    Both keep the function: new columns are zero, and the features of removed ones are zero without a floor.
+    """
+    fitting = dict(found)
+    for name in found.keys() & own.keys():
+        if name.endswith(READS_NODES) and abs(own[name].shape[1] - found[name].shape[1]) == FLOOR_FEATURES:
+            # A negative number of columns removes the last ones.
+            fitting[name] = nn.functional.pad(found[name], (0, own[name].shape[1] - found[name].shape[1]))
+    return fitting
 
 
 class DeformationPredictor(nn.Module):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -16,6 +17,7 @@ from gausim.models.step.body_frame import Frames
 from gausim.models.step.recursion import Solved
 from gausim.models.template.template import PreparedTemplate
 from gausim.ops.aggregation import weighted_sum
+from gausim.ops.deformation import apply
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,17 +53,24 @@ class Prepared:
     def carried(self, state: SimState, hands: Sequence[HandMotion | None] | None) -> tuple[Carried, UnitMotion]:
         """A state relative to the reference: the way back, and the finest units in body axes, where these are used."""
         carried = self.reference.carry(self.aggregate(state.positions), self.aggregate(state.previous), state, hands)
-        now, before, load = carried.relative.now, carried.relative.before, carried.relative.load
-        if load is not None and self.frames is not None:
-            load = (self.frames.axes[-1] @ load[..., None])[..., 0]
-        return carried, UnitMotion(self._in_body_axes(now), self._in_body_axes(before), load)
+        seen = carried.relative
+        load, floor = seen.load, seen.floor
+        if self.frames is not None:
+            axes = self.frames.axes[-1]
+            load = None if load is None else apply(axes, load)
+            floor = None if floor is None else torch.cat((floor[:, :1], apply(axes, floor[:, 1:])), 1)
+        return carried, UnitMotion(self._in_body_axes(seen.now), self._in_body_axes(seen.before), load, floor)
 
     def _in_body_axes(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         return positions if self.frames is None else self.frames.into(len(self.levels) - 1, positions)
 
-    def per_level(self, finest: Float[Tensor, "N 3"]) -> list[Tensor]:
-        """Positions of every predicted level, coarse to fine: coarser units are the centres of mass of the finer."""
+    def per_level(self, finest: Float[Tensor, "N C"]) -> list[Tensor]:
+        """Values of every predicted level, coarse to fine, such as positions: means of the finer units by mass."""
         return per_level(self.batch, [level.mass_fraction for level in self.levels], finest)
+
+    def floors(self, units: UnitMotion) -> Sequence[Tensor | None]:
+        """Nearness to the floor of every predicted level, coarse to fine; None where there is no floor."""
+        return [None] * len(self.levels) if units.floor is None else self.per_level(units.floor)
 
     def in_scene_axes(
         self, finest: Solved, template: Tensor | None, predicted: list[Tensor]

@@ -22,6 +22,7 @@ class Units:
     mass: Float[Tensor, " N"]  # m_c = sum of m_i
     log_density: Float[Tensor, " N"]  # log of m_c / V_c
     attributes: Float[Tensor, "N A"]  # unweighted mean over the kernels
+    floor: Float[Tensor, "N 4"] | None = None  # nearness to the floor, and its normal times the nearness
 
 
 @dataclass(frozen=True, eq=False)

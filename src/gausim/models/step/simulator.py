@@ -89,8 +89,8 @@ class GausSim(SceneModel):
             conserve_volume=conserve_mass,
         )  # fmt: skip
         self.predictor = DeformationPredictor(
-            networks=1 if hierarchy.share_network else len(self.predicted_levels), features=features, network=network,
-            head=head, edges=hierarchy.edges, conserve_mass=conserve_mass,
+            networks=1 if hierarchy.share_network else len(self.predicted_levels), features=features.of(scenes),
+            network=network, head=head, edges=hierarchy.edges, conserve_mass=conserve_mass,
         )  # fmt: skip
 
     def prepare(self, batch: SceneBatch, *, isolated: bool = False, driven: bool = False) -> Prepared:
@@ -162,12 +162,12 @@ class GausSim(SceneModel):
         states = [prepared.per_level(x) for x in (seen.now, seen.before, template.positions)]
         above, momentum, predicted = prepared.roots, rest.new_zeros(()), []
         unit_of_correction = prepared.template.correction_unit()
-        for position, (level, fixed, x, previous, target) in enumerate(
-            zip(prepared.batch.levels, prepared.levels, *states, strict=True)
+        for position, (level, fixed, x, previous, target, floor) in enumerate(
+            zip(prepared.batch.levels, prepared.levels, *states, prepared.floors(units), strict=True)
         ):
             if position:
                 above = replace(above, index=level.parent)
-            unit = Units(fixed.rest, x, previous, fixed.mass, fixed.log_density, fixed.attributes)
+            unit = Units(fixed.rest, x, previous, fixed.mass, fixed.log_density, fixed.attributes, floor)
             output = self.predictor(level, unit, above, target, position)
             outputs.append(output)
             moved = output if prepared.still is None else output - prepared.still[position]

@@ -133,17 +133,11 @@ class Template(nn.Module, ABC):
 
 
 class ModalScene(ABC):
-    """Template of one scene in modal coordinates z between two updates of the parameters, for S sequences at once.
+    """Template of one scene in modal coordinates z between two updates of the parameters, for S sequences at once."""
 
-    Attributes:
-        inertia: modal inertia [frame units].
-        stiffness: modal stiffness at rest.
-        damping: modal damping.
-    """
-
-    inertia: Float[Tensor, "M M"]
-    stiffness: Float[Tensor, "M M"]
-    damping: Float[Tensor, "M M"]
+    inertia: Float[Tensor, "M M"]  # modal inertia [frame units]
+    stiffness: Float[Tensor, "M M"]  # modal stiffness at rest
+    damping: Float[Tensor, "M M"]  # modal damping
 
     def __init__(
         self, projection: Float[Tensor, "N 3 M"], modes: Float[Tensor, "N 3 M"], gradients: Float[Tensor, "N 3 3 M"]

@@ -11,14 +11,7 @@ from numpy.typing import NDArray
 from gausim.core.errors import DivergenceError
 from gausim.kernels.pool import WorkerPool
 from gausim.render.cpu.binning import TILE_HEIGHT, TILE_WIDTH, bin_band
-from gausim.render.cpu.projection import (
-    EXTENT,
-    RECORD,
-    count_unusable,
-    depth_order,
-    project_adjoint,
-    project_kernels,
-)
+from gausim.render.cpu.projection import EXTENT, RECORD, count_unusable, depth_order, project_adjoint, project_kernels
 from gausim.render.cpu.raster import BLOCKS, PIXELS, SUMS, backward_band, forward_band
 
 Array = NDArray[Any]

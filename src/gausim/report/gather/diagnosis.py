@@ -15,39 +15,24 @@ Number = float | None
 
 
 class Motion(msgspec.Struct):
-    """Motion of one row, with None for undefined figures.
+    """Motion of one row, with None for undefined figures."""
 
-    Attributes:
-        spectrum: power per frequency.
-        frequencies: frequency of each principal motion [Hz].
-        dampings: damping of each principal motion, as a fraction of critical damping.
-        phase_error: phase error per frame [degrees].
-        velocity_cosine: cosine between the first velocity and the true one.
-        level_errors: errors over the static prediction's of the units of each level, the finest first.
-    """
-
-    spectrum: list[float]
-    frequencies: list[Number]
-    dampings: list[Number]
-    phase_error: list[Number] = []
-    velocity_cosine: Number = None
-    level_errors: list[Number] = []
+    spectrum: list[float]  # power per frequency
+    frequencies: list[Number]  # frequency of each principal motion [Hz]
+    dampings: list[Number]  # damping of each principal motion, as a fraction of critical damping
+    phase_error: list[Number] = []  # phase error per frame [degrees]
+    velocity_cosine: Number = None  # cosine between the first velocity and the true one
+    level_errors: list[Number] = []  # errors over the static prediction's of the units of each level, the finest first
 
 
 class Diagnosis(msgspec.Struct):
-    """Diagnosis of one object.
+    """Diagnosis of one object."""
 
-    Attributes:
-        fraction: fraction of the squared displacement in each principal motion (key ``share`` of the file).
-        frequency: frequencies of the spectra [Hz].
-        rows: the truth and the predictions.
-        first_unseen: first unseen frame.
-    """
-
+    # fraction of the squared displacement in each principal motion (key ``share`` of the file)
     fraction: list[float] = msgspec.field(name="share")
-    frequency: list[float]
-    rows: dict[str, Motion]
-    first_unseen: int = 0
+    frequency: list[float]  # frequencies of the spectra [Hz]
+    rows: dict[str, Motion]  # the truth and the predictions
+    first_unseen: int = 0  # first unseen frame
 
     def frequency_error(self, row: str) -> float:
         """Mean over principal motions, weighted by :attr:`fraction`, of the relative error of the frequency."""

@@ -16,6 +16,7 @@ from typing import Any
 import yaml
 
 from gausim.core import RunError
+from gausim.io.files import read_yaml
 from gausim.results.summary import load_summary
 from gausim.runs.names import CONFIG, EPOCHS, EVALUATION, FAILED, FINISHED, LAST_CHECKPOINT
 from gausim.runs.renamed import with_present_names
@@ -130,11 +131,7 @@ def flatten(value: Any, prefix: str = "") -> Iterator[tuple[str, str]]:
 
 
 def find_runs(roots: Sequence[Path], *, skip: Path | None = None) -> list[RunRecord]:
-    """All runs at or below ``roots``, in the order of their paths, each once.
-
-    Args:
-        roots: directories.
-        skip: a directory that is not searched (that of the report).
+    """All runs at or below the directories ``roots``, but not in ``skip``, in the order of their paths, each once.
 
     Raises:
         RunError: a root is no directory, or there is no run at all.
@@ -145,7 +142,8 @@ def find_runs(roots: Sequence[Path], *, skip: Path | None = None) -> list[RunRec
             raise RunError(f"{root}: no such directory. Name run directories, sweeps, or a folder of them.")
         for folder in _run_folders(root, skip.resolve() if skip is not None else None):
             name = root.name if folder == root else str(folder.relative_to(root))
-            found.setdefault(folder.resolve(), _read_run(folder, f"{root.name}/{name}" if len(roots) > 1 else name))
+            record = _read_files(folder, f"{root.name}/{name}" if len(roots) > 1 else name)
+            found.setdefault(folder.resolve(), replace(record, command=_command(folder)))
     if not found:
         raise RunError(
             f"{', '.join(str(r) for r in roots)}: no run in here (no {CONFIG} of `gausim train`). "
@@ -172,37 +170,18 @@ def _run_folders(root: Path, skip: Path | None) -> Iterator[Path]:
 
 def _is_run(folder: Path) -> bool:
     try:
-        return _KEYS_OF_A_RUN <= set(_yaml(folder / CONFIG))
-    except RunError:
+        return _KEYS_OF_A_RUN <= set(read_yaml(folder / CONFIG))
+    except ValueError:
         return any((folder / trace).exists() for trace in _TRACES)
-
-
-def _yaml(path: Path) -> dict[str, Any]:
-    """A mapping from a YAML file, with the safe loader: no tag builds an object.
-
-    Raises:
-        RunError: the file is missing, not YAML or not a mapping.
-    """
-    try:
-        loaded = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise RunError(f"{path}: cannot be read as YAML ({type(error).__name__}).") from error
-    if not isinstance(loaded, dict):
-        raise RunError(f"{path}: expected a mapping, got {type(loaded).__name__}.")
-    return loaded
-
-
-def _read_run(folder: Path, name: str) -> RunRecord:
-    return replace(_read_files(folder, name), command=_command(folder))
 
 
 def _command(folder: Path) -> str:
     """The command of a run from Hydra's records: of a job that of its sweep, unless another has taken its place."""
     sweep = next((parent for parent in folder.resolve().parents if (parent / _SWEEP).is_file()), None)
     try:
-        job = _yaml(folder / _HYDRA / "hydra.yaml")
-        whole = _yaml(sweep / _SWEEP) if sweep is not None and dig(job, "hydra", "mode") == "MULTIRUN" else {}
-    except RunError:
+        job = read_yaml(folder / _HYDRA / "hydra.yaml")
+        whole = read_yaml(sweep / _SWEEP) if sweep is not None and dig(job, "hydra", "mode") == "MULTIRUN" else {}
+    except ValueError:
         return "not recorded"
     own, words = _words(job), _words(whole)
     values = dict(word.lower().partition("=")[::2] for word in own)
@@ -221,9 +200,11 @@ def _read_files(folder: Path, name: str) -> RunRecord:
     is_run = (folder / CONFIG).is_file()
     path = (folder if is_run else folder / _HYDRA) / CONFIG
     try:
-        config = with_present_names(_yaml(path))
-    except RunError as error:
+        config = read_yaml(path)
+    except ValueError as error:
         return RunRecord(folder, name, BROKEN, str(error), choices=choices)
+    try:
+        config = with_present_names(config)
     except (IndexError, TypeError, ValueError) as error:
         return RunRecord(folder, name, BROKEN, f"{path}: its levels cannot be read ({error}).", choices=choices)
     metrics = folder / EVALUATION
@@ -261,7 +242,7 @@ def _progress(folder: Path) -> str:
 
 def _choices(folder: Path) -> dict[str, str]:
     try:
-        node = dig(_yaml(folder / _HYDRA / "hydra.yaml"), "hydra", "runtime", "choices")
-    except RunError:
+        node = dig(read_yaml(folder / _HYDRA / "hydra.yaml"), "hydra", "runtime", "choices")
+    except ValueError:
         return {}
     return {str(k): str(v) for k, v in node.items()} if isinstance(node, dict) else {}

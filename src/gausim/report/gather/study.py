@@ -308,7 +308,7 @@ def _test_part(groups: Sequence[Group]) -> str:
         tested = [(trials, looks) for part, trials, looks in facts if part == "test"]
         if tested:
             trials, looks = (_range([pair[i] for pair in tested]) for i in (0, 1))
-            told.append(f"{group.label}: {trials} trials, {looks} look{'' if looks == '1' else 's'}")
+            told.append(f"{group.label}: {_counted(trials, 'trial')}, {_counted(looks, 'look')}")
         others += [group.label] if len(tested) < len(facts) else []
     if not told:
         return ""
@@ -317,6 +317,10 @@ def _test_part(groups: Sequence[Group]) -> str:
         "Figures of the test part, on which nothing was tuned; declared trials on the development part and looks at "
         f"the test part: {'; '.join(told)}.{more}"
     )
+
+
+def _counted(number: str, noun: str) -> str:
+    return f"{number} {noun}" if number == "1" else f"{number} {noun}s"
 
 
 def _range(values: Sequence[Any]) -> str:

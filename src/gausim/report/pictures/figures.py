@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
+from gausim.io.files import replacing
 from gausim.report.pictures.frames import error_colors, moving_line, space_time_slice
 from gausim.results.curves import ERROR_3D, ObjectCurves
 
@@ -32,11 +34,8 @@ def error_plot(
 ) -> Figure:
     """Errors over time of every row: 3D if the truth is known, then l2 in the training and held-out views.
 
-    Args:
-        rows: label, and the evaluations (seeds) with the name of their row; the mean and, for methods, a band of one
-            standard deviation are over all of them.
-        title: heading.
-        sequence: one sequence; all when None.
+    ``rows`` are labels, and the evaluations (seeds) with the name of their row; the mean and, for methods, a band
+    of one standard deviation are over all of them, and over all sequences unless one is named.
     """
     first = rows[0][1][0][0]
     panels = [("l2", views) for views in ("train", "heldout") if first.view_indices(views)]
@@ -97,14 +96,10 @@ def _lines(curves: ObjectCurves, row: str, panel: tuple[str, str], sequence: str
 def slices_plot(
     columns: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]], first_unseen: int
 ) -> tuple[Figure, list[tuple[str, int]]]:
-    """Space-time slices below each other, through the line with the most motion in a column's first film.
+    """Space-time slices below each other, and the line ("column" | "row", index) of every column.
 
-    Args:
-        columns: heading of each, and its films: label and (F, H, W, 3) uint8, of any length.
-        first_unseen: first unseen frame, marked by a line.
-
-    Returns:
-        The figure, and the line of each column: ("column" | "row", index).
+    It is the line with the most motion in the column's first film. A column is a heading and films, each a label
+    and (F, H, W, 3) uint8 of any length; a line marks ``first_unseen``.
     """
     rows, wide = len(columns[0][1]), len(columns) > 1
     size = (5.2 * len(columns) if wide else 7.0, 1.5 * rows + 0.6 if wide else 2.6 * rows)
@@ -201,7 +196,15 @@ def made_figure(rows: int, columns: int, size: tuple[float, float], title: str =
     return figure, figure.subplots(rows, columns, squeeze=False).ravel()
 
 
+def literal(figure: Figure) -> Figure:
+    """The figure with its texts as they stand: a dollar sign in a name would start a formula."""
+    for text in figure.findobj(Text):
+        assert isinstance(text, Text)
+        text.set_parse_math(False)
+    return figure
+
+
 def save_figure(figure: Figure, path: Path) -> None:
-    """Writes a figure, and creates its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    """Writes a figure atomically, and creates its folder."""
+    with replacing(path, typed=True) as temporary:
+        figure.savefig(temporary)

@@ -43,13 +43,8 @@ def video_frame(
 ) -> np.ndarray:
     """One frame of a comparison: ground truth | prediction | error, labels above, the time line below.
 
-    Args:
-        truth: (H, W, 3) uint8; None beyond the recorded frames, whose panels are empty.
-        prediction: (H, W, 3) uint8.
-        frame: its number.
-        timeline: of the whole video.
-        title: sequence and view.
-        height: number of rows to which smaller images are enlarged.
+    Images are (H, W, 3) uint8, enlarged to ``height`` rows if smaller; ``truth`` is None beyond the recorded
+    frames.
     """
     missing = np.full_like(prediction, _PAPER[0])
     error = missing if truth is None else error_colors(truth, prediction)

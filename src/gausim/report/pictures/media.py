@@ -12,13 +12,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 
 from gausim.core import GausSimError
 from gausim.io.video import SMALL, write_video
 from gausim.report.gather.diagnosis import read_diagnosis
 from gausim.report.gather.study import Group, Study
-from gausim.report.pictures.figures import contact_frames, error_plot, panels_plot, slices_plot
+from gausim.report.pictures.figures import contact_frames, error_plot, literal, panels_plot, slices_plot
 from gausim.report.pictures.frames import Timeline, brighten, label_bar, light_gain, timeline_bar
 from gausim.report.pictures.motion import diagnosis_plot
 from gausim.results.curves import ObjectCurves, load_curves
@@ -221,10 +220,6 @@ def _short(label: str, most: int = 22) -> str:
 
 
 def _drawn(figure: Figure) -> str:
-    # A dollar sign in a name would start a formula.
-    for text in figure.findobj(Text):
-        assert isinstance(text, Text)
-        text.set_parse_math(False)
     stream = io.BytesIO()
-    figure.savefig(stream, format="webp", pil_kwargs={"quality": 85})
+    literal(figure).savefig(stream, format="webp", pil_kwargs={"quality": 85})
     return "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode()

@@ -18,12 +18,7 @@ _GREYS = ("#777777", "#aaaaaa")
 
 
 def diagnosis_plot(named: Sequence[tuple[str, Diagnosis, str]], *, title: str) -> Figure:
-    """Spectra and phase errors of several predictions, with the truth.
-
-    Args:
-        named: label, diagnosis and row in it of each prediction.
-        title: heading.
-    """
+    """Spectra and phase errors of the truth and of predictions: label, diagnosis and row in it of each."""
     figure, (power, phase) = made_figure(1, 2, (10.4, 3.8), title)
     first = named[0][1]
     shown = {row for _, _, row in named}
@@ -63,10 +58,7 @@ def diagnosis_figure(name: str, entry: Mapping[str, Any], path: Path) -> bool:
 def endurance_figure(name: str, rollouts: Mapping[str, Mapping[str, Any]], path: Path) -> None:
     """Motion energy and distance from rest over the frames of every rollout of ``endurance.json``.
 
-    Args:
-        name: name of the object.
-        rollouts: by kind: ``window`` [frames], ``energy`` and ``away`` per window.
-        path: PNG to write.
+    A rollout has ``window`` [frames], and ``energy`` and ``away`` per window.
     """
     figure, (left, right) = made_figure(1, 2, (9.6, 3.4), f"{name}, far beyond the recording")
     for color, (kind, told) in zip(METHOD_COLORS, rollouts.items(), strict=False):

@@ -9,14 +9,20 @@ from typing import Any
 
 from gausim.report.gather.runs import RunRecord, dig
 from gausim.report.gather.study import FULL, Group, Study, cell, deviation, number, pooled
+from gausim.report.records.commands import joined
 from gausim.report.records.print import SEEDS_APART
-from gausim.report.records.record import SCHEMA, Cell, Column, Figure, Made, Record, RecordTable, Row
+from gausim.report.records.record import SCHEMA, Cell, Column, Figure, Made, Record, RecordTable, Row, value_of
 from gausim.results.curves import ERROR_3D, FOLLOW_HANDS, STATIC
 from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import GROUP_TITLES, SPLIT_TITLES, footnotes_of, reference_row
 
 # Columns of an object's first table, of unseen frames: metric, views.
-_FIRST = (("l2", "train"), ("ssim", "train"), ("lpips", "train"), (ERROR_3D, "points"), (MOTION_ENERGY, "points"))
+_FIRST = (
+    ("l2", "train"), ("ssim", "train"), ("lpips", "train"), ("iou", "train"),
+    ("chamfer", "points"), (ERROR_3D, "points"), (MOTION_ENERGY, "points"),
+)  # fmt: skip
+# The same of every object in the summary of several objects.
+_SUMMARY = (("l2", "train"), (ERROR_3D, "points"))
 
 # Costs beside them. Memory: the most that the training process held; what a prediction adds, on a GPU the peak.
 _COSTS = (
@@ -34,24 +40,67 @@ _ABLATED = (
 
 
 def measured_record(study: Study, title: str) -> Record:
-    """The record of a study: per object a comparison on unseen frames with the cost, then every metric."""
+    """The record of a study.
+
+    It has a summary of several objects, then per object a comparison on unseen frames with the cost, the 3D error by
+    frames ahead, and every metric.
+    """
     runs = [run for group in study.groups for run in group.evaluated]
     made = Made(
         recorded=datetime.now(UTC).date().isoformat(),
         commits=_distinct(run.commit for run in runs),
-        commands=_distinct(run.command for run in runs),
+        commands=joined(run.command for run in runs),
         hardware=_distinct(machine(run) for run in runs),
         test=study.test,
         missing=[f"{run.name} ({run.status})" for run in study.runs if run.summary is None],
     )
     tables = [table for name in study.objects for table in _tables(study, name)]
-    return Record(SCHEMA, title, made, tables)
+    return Record(SCHEMA, title, made, [*_summary(study), *tables])
 
 
 def machine(run: RunRecord) -> str:
     """The machine that evaluated a run, from its summary."""
     name = dig(run.summary, "provenance", "machine")
     return name if isinstance(name, str) else "not recorded"
+
+
+def _summary(study: Study) -> Iterator[RecordTable]:
+    """A row per method with a few columns per object, of unseen frames; none for a single object."""
+    names = [name for name in study.objects if "unseen" in study.splits(name)]
+    if len(names) < 2:
+        return
+    keys = [(name, *key) for name in names for key in _SUMMARY if study.info(key[0]) is not None]
+    rows = [
+        Row([g.label], [value_of(_figure(g, n, "unseen", m, v, row=None)) for n, m, v in keys]) for g in study.groups
+    ]
+    columns = [_column(study, n, m) for n, m, _ in keys]
+    for (name, _, _), column in zip(keys, columns, strict=True):
+        column.label = f"{name}: {column.label}"
+    yield RecordTable("summary", columns, rows, title="Unseen frames", caption="Means over seeds and sequences.")
+
+
+def _ahead(study: Study, name: str) -> Iterator[RecordTable]:
+    """3D errors by frames ahead, where the true motion is known beyond the seen frames."""
+    groups = [group for group in study.groups if group.entries(name)]
+    entries = [entry for group in groups for _, entry in group.entries(name)]
+    frames = list(dict.fromkeys(n for entry in entries for n in dig(entry, "horizon", "frames") or ()))
+    rows = []
+    for group, row in [*((g, g.method) for g in groups), *((groups[0], row) for row in _references(groups, name))]:
+        found = [e for _, e in group.entries(name)][: None if row == group.method else 1]
+        own = [_ahead_of(entry, row) for entry in found]
+        cells = [_over_seeds([series.get(n) for series in own], 1.0) for n in frames]
+        label = group.label if row == group.method else row
+        rows.append(Row([label], cells, reference=row != group.method and row not in (STATIC, FOLLOW_HANDS)))
+    if rows := [row for row in rows if any(cell is not None for cell in row.cells)]:
+        columns = [Column(f"+{n}", 2, "low") for n in frames]
+        title = f"{name}, 3D error [% of the diagonal] by frames after the last seen one"
+        yield RecordTable(f"{name}_ahead", columns, rows, title=title, caption="± deviation over seeds.")
+
+
+def _ahead_of(entry: dict[str, Any], row: str) -> dict[int, Any]:
+    """3D errors of a row by frames ahead."""
+    errors = dig(entry, "horizon", "rows", row, "points", ERROR_3D) or []
+    return dict(zip(dig(entry, "horizon", "frames") or (), errors, strict=False))
 
 
 def _tables(study: Study, name: str) -> Iterator[RecordTable]:
@@ -62,6 +111,7 @@ def _tables(study: Study, name: str) -> Iterator[RecordTable]:
     if first is not None:
         first.key, first.title = f"{name}_comparison", f"{name}, {_frames(last, splits)}"
         yield first
+    yield from _ahead(study, name)
     yield from _ablations(study, name)
     for split in splits:
         for views, place in GROUP_TITLES.items():

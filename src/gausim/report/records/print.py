@@ -114,9 +114,10 @@ class _Facts(dict[str, str]):
 
 
 def _block(made: Made) -> str:
-    """Commits and commands for a page."""
-    told = f"Made by ({', '.join(made.commits)}; recorded {made.recorded})"
-    return "\n".join([told, "", *(f"    {line}" for command in made.commands for line in command.splitlines())])
+    """Commits, commands, and looks at the test part for a page."""
+    told = [made.test, ""] if made.test else []
+    told += [f"Made by ({', '.join(made.commits)}; recorded {made.recorded})", ""]
+    return "\n".join([*told, *(f"    {line}" for command in made.commands for line in command.splitlines())])
 
 
 def _listed(made: Made) -> list[str]:

@@ -10,8 +10,7 @@ from typing import Any
 from gausim.report.gather import paper
 from gausim.report.gather.runs import RunRecord, dig
 from gausim.report.gather.study import FULL, NOT_MEASURED, Cell, Group, Study, cell, number
-from gausim.report.tables.diagnosis import diagnosis_sheets
-from gausim.report.tables.further import bounce_sheets, horizon_sheets
+from gausim.report.tables.motion import bounce_sheets, diagnosis_sheets, horizon_sheets
 from gausim.report.tables.sheets import (
     ABLATIONS,
     CONTRAST,

@@ -36,15 +36,10 @@ STILL = 0.05
 
 @dataclass(frozen=True)
 class Forecast:
-    """Errors of the forecast of frames held back.
+    """Errors of the forecast of frames held back."""
 
-    Attributes:
-        error: loss of the prediction over that of the rest state, both less the floor (the loss on frame 0).
-        moving: fraction of the rest state's loss that is above the floor.
-    """
-
-    error: float
-    moving: float
+    error: float  # loss of the prediction over that of the rest state, both less the floor (the loss on frame 0)
+    moving: float  # fraction of the rest state's loss that is above the floor
 
 
 class Convergence(Callback):

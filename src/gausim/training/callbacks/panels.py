@@ -15,7 +15,7 @@ from torch import Tensor
 from gausim.core import ConfigError, DivergenceError
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
-from gausim.metrics.l2 import L2
+from gausim.metrics.image import L2
 from gausim.render.draw import to_bytes
 from gausim.runs.randomness import undisturbed
 from gausim.training.callbacks.cadence import has_come, training_data

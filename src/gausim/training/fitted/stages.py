@@ -128,13 +128,9 @@ class FitPlan:
 
 @dataclass
 class StagedCurriculum(Curriculum):
-    """T of the stages, set by :meth:`enter` before every epoch; ``t_max`` is the number of training frames.
+    """T of the stages, set by :meth:`enter` before every epoch; ``t_max`` is the number of training frames."""
 
-    Attributes:
-        plan: the stages.
-    """
-
-    plan: FitPlan = field(default_factory=FitPlan)
+    plan: FitPlan = field(default_factory=FitPlan)  # the stages
     _state: dict[str, float] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

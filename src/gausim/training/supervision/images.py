@@ -34,19 +34,14 @@ class StaticFigures(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Sources:
-    """Parts of a run from which supervision is built.
-
-    Attributes:
-        truth: true motion of a sequence by its number, None where it is unknown.
-        motions: smooth motions of the model's template, of a scene by its number; None where it has no such basis.
-        loss: image loss.
-    """
+    """Parts of a run from which supervision is built."""
 
     scenes: Sequence[GaussianScene]
-    truth: Callable[[int], GroundTruth | None]
+    truth: Callable[[int], GroundTruth | None]  # true motion of a sequence by its number, None where it is unknown
+    # smooth motions of the model's template, of a scene by its number; None where it has no such basis
     motions: Callable[[int], SmoothMotions | None]
     renderer: Renderer
-    loss: ImageLoss
+    loss: ImageLoss  # image loss
 
 
 @runtime_checkable
@@ -84,7 +79,9 @@ class ImageSupervision:
         self.appearances = Appearances(scenes)
         self._keys: dict[tuple[int, tuple[str, ...]], Hashable] = {}
         self._rest: dict[Hashable, Rendered] = {}
-        # Positions at frame 0 of a sequence whose body does not begin at rest; set by the learner.
+        # Positions at frame 0 of sequences whose bodies do not begin at rest: those with which training began, which
+        # do not depend on when it was resumed, else the present ones; set by the start of training and the learner.
+        self.begun: dict[int, Float[Tensor, "K 3"]] = {}
         self.begins: Callable[[SequenceSample], Float[Tensor, "K 3"] | None] = lambda sample: None
 
     def comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch) -> Comparison:
@@ -122,7 +119,8 @@ class ImageSupervision:
 
         Of a body that begins elsewhere it is an image of where it begins, rendered once per sequence.
         """
-        key, first = self._key(sample), self.begins(sample)
+        key, first = self._key(sample), self.begun.get(sample.sequence_id)
+        first = self.begins(sample) if first is None else first.to(rest)
         if first is not None:
             key, rest = (key, sample.sequence_id), first
         if key not in self._rest:

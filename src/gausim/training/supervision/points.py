@@ -49,7 +49,7 @@ class PointSupervision:
                 over the halves of a stretch, times the rest state's loss. Without it, the least loss of a motion with a
                 wrong phase is no motion.
             relative: divide the loss of a sequence by the mean square of its displacement from rest, so that small and
-                large motions count alike. It uses all frames of the sequence, and is meant for pretraining.
+                large motions count alike. It uses all frames that the source gives, and is meant for pretraining.
         """
         self._scenes, self._read = sources.scenes, sources.truth
         self._energy_weight, self._relative = energy_weight, relative

@@ -33,10 +33,7 @@ def inside(x: wp.vec3, nodes: wp.vec3i) -> bool:
 
 @wp.kernel
 def stress_kernel(
-    deformation_gradients: wp.array[wp.mat33],
-    young: wp.array[float],
-    poisson: float,
-    stress: wp.array[wp.mat33],
+    deformation_gradients: wp.array[wp.mat33], young: wp.array[float], poisson: float, stress: wp.array[wp.mat33]
 ) -> None:
     """Kirchhoff stress per particle."""
     p = wp.tid()

@@ -1,0 +1,223 @@
+"""What `gausim evaluate RUN` does: the development and the test part of the data, tables, figures, long rollouts."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markdown import Markdown
+
+from gausim.cli.bars import named_bar
+from gausim.cli.end import end, error_sentences
+from gausim.compose.build import LoadedRun, is_pretrained, load_corpus_run, load_run
+from gausim.compose.data_paths import data_option
+from gausim.compose.predict import TrainedPrediction, endurance, run_objects, scene_of, sequence_of, state_of
+from gausim.core.errors import ConfigError, DataError
+from gausim.data.objects import ObjectData
+from gausim.evaluation.corpus import FILE, body_figures, sentences, write_figures
+from gausim.evaluation.evaluation import evaluate_object, write_evaluation
+from gausim.report.pictures.figures import error_figure
+from gausim.report.pictures.motion import diagnosis_figure, endurance_figure
+from gausim.results.curves import ObjectCurves
+from gausim.results.looks import DEVELOPMENT, TEST_PART, record_look
+from gausim.runs.directory import RunDirectory
+from gausim.runs.names import TEST
+from gausim.runs.provenance import code_provenance
+
+WRITTEN = ("metrics.json", "metrics.npz", "pictures.npz", "table.md")
+
+
+def evaluate(arguments: argparse.Namespace) -> int:
+    """Measures a run by the options of the command; returns the exit status."""
+    if is_pretrained(arguments.run):
+        return _evaluate_bodies(arguments)
+    run = load_run(arguments.run, data=data_option(arguments.data))
+    facts = {"name": run.config.get("name"), "seed": run.config.get("seed"), "views": arguments.views, **state_of(run)}
+    chosen = choose(run, arguments)
+    if arguments.test:
+        facts |= look(run, arguments, chosen, facts)
+        run = load_run(arguments.run, data=data_option(arguments.data))  # now the test part is open
+    elif chosen.part:
+        facts |= {"part": chosen.part}
+    results = _evaluate(run, arguments, chosen)
+    whole, folder = _folder(run, arguments, chosen.part)
+    summary = write_evaluation(folder, results, facts)
+    drawn: list[str] = []
+    for curves in results:
+        name = curves.facts.name
+        error_figure(curves, folder / f"errors_{name}.png")
+        shown = diagnosis_figure(name, summary["objects"][name], folder / f"motion_{name}.png")
+        drawn += [f"errors_{name}.png", *([f"motion_{name}.png"] if shown else [])]
+    if arguments.endurance is not None:
+        drawn += _endure(run, arguments, folder)
+    if arguments.json:
+        print((folder / "metrics.json").read_text(), end="")
+        return 0
+    if arguments.verbose:
+        # Rich would truncate columns at 80 characters in files.
+        Console(width=None if sys.stdout.isatty() else 200).print(Markdown((folder / "table.md").read_text()))
+        print("\n".join(f"wrote {folder / name}" for name in [*WRITTEN, *drawn]))
+    commands = [["report", arguments.run], ["simulate", arguments.run]] if whole else [["evaluate", arguments.run]]
+    end(error_sentences(summary["objects"]), "tables", folder / "table.md", *commands)
+    return 0
+
+
+def _evaluate_bodies(arguments: argparse.Namespace) -> int:
+    """Measures a run on a corpus: the motion, and where it was fitted the stiffness, of the bodies held out."""
+    parts = arguments.object or arguments.sequences or arguments.views != "all" or arguments.test
+    if parts or arguments.endurance is not None:
+        raise ConfigError(
+            f"{arguments.run}: a run on a corpus is measured as a whole, on true points. Leave out --object, "
+            "--sequences, --views, --test and --endurance."
+        )
+    folder = arguments.out or arguments.run / "evaluation"
+    module, data = load_corpus_run(arguments.run, data=data_option(arguments.data))
+    pretrained = _pretrained(arguments.run, data.trainable)
+    whole = write_figures(folder, body_figures(module, data), seen=data.seen, pretrained=pretrained)
+    if arguments.json:
+        print((folder / FILE).read_text(), end="")
+        return 0
+    end(sentences(whole), "figures", folder / FILE)
+    return 0
+
+
+def _pretrained(run: Path, trainable: int) -> int | None:
+    """Number of bodies that the network of a run on a corpus was trained on; None where its base is gone."""
+    config = RunDirectory(run).config()
+    if config["data"]["part"] != "train":
+        base = config.get("init_from")
+        if base is None or not Path(base).is_dir():
+            return 0 if base is None else None
+        config = RunDirectory(base).config()
+    bodies = config["data"].get("bodies")
+    return trainable if bodies is None else int(bodies)
+
+
+def _evaluate(run: LoadedRun, arguments: argparse.Namespace, chosen: Chosen) -> list[ObjectCurves]:
+    items = run_objects(run, list(chosen.sequences))
+    with named_bar(sum(map(len, chosen.sequences.values())), "evaluate") as advance:
+        return [
+            evaluate_object(
+                item.data,
+                scene_of(run, item),
+                {run.module.method_name: TrainedPrediction(run, item)},
+                run.renderer,
+                sequences=chosen.sequences[item.data.name],
+                views=_views(item.data, arguments.views),
+                advance=advance,
+            )
+            for item in items
+        ]
+
+
+def _endure(run: LoadedRun, arguments: argparse.Namespace, folder: Path) -> list[str]:
+    """Evaluates long rollouts of each object's first sequence; returns the names of the written files."""
+    found = {item.data.name: endurance(run, item, arguments.endurance) for item in run_objects(run, arguments.object)}
+    (folder / "endurance.json").write_text(json.dumps(found, indent=1) + "\n")
+    for name, rollouts in found.items():
+        endurance_figure(name, rollouts, folder / f"endurance_{name}.png")
+        for kind, rollout in rollouts.items():
+            growth, late = rollout["growth"], rollout["late"]
+            print(f"{name}, {kind}: highest energy later over before {growth:.3f}, of the last tenth {late:.2g}")
+    return ["endurance.json", *(f"endurance_{name}.png" for name in found)]
+
+
+def _views(data: ObjectData, group: str) -> list[str]:
+    chosen = {"train": data.train_views, "heldout": data.heldout_views}.get(group, data.views)
+    if not chosen:
+        raise DataError(f"{data.root}: dataset.json names no held-out view. Use --views all or train.")
+    return list(chosen)
+
+
+def _folder(run: LoadedRun, arguments: argparse.Namespace, part: str | None) -> tuple[bool, Path]:
+    """Whether the evaluation covers the whole run (a partial one never overwrites it), and its folder."""
+    whole = home(run.run_dir, part)
+    partial = arguments.object or arguments.sequences or arguments.views != "all"
+    folder = arguments.out or (whole / "partial" if partial else whole)
+    return folder == run.run_dir / "evaluation", folder
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Sequences to evaluate."""
+
+    part: str | None  # ``development`` or ``test``; None where the data declare no test part
+    sequences: Mapping[str, list[str]]  # their names by object
+
+
+def choose(run: LoadedRun, arguments: argparse.Namespace) -> Chosen:
+    """The sequences that are asked for, of one part.
+
+    Raises:
+        ConfigError: no sequence belongs to the part, or ``--test`` or ``--trials`` does not apply.
+        DataError: an object or sequence does not exist, or a sequence belongs to the other part.
+    """
+    items = run_objects(run, arguments.object)
+    declared = any({r.name for r in item.data.sequences} & item.data.test_part for item in items)
+    if not declared and (arguments.test or arguments.trials):
+        raise ConfigError(
+            f"--test, --trials: {run.run_dir} was trained on data without a test part. Leave the options out, or "
+            "declare one (field 'test' of dataset.json, or data.test)."
+        )
+    if arguments.trials and not arguments.test:
+        raise ConfigError("--trials: declares the trials before a look at the test part; give --test with it.")
+    found = {}
+    for item in items:
+        names = arguments.sequences or [record.name for record in item.data.sequences]
+        own = [sequence_of(item, name).name for name in names]
+        fitting = [name for name in own if (name in item.data.test_part) == arguments.test]
+        if arguments.sequences and len(fitting) < len(own):
+            other = [name for name in own if name not in fitting]
+            part, how = ("development", "without") if arguments.test else ("test", "with")
+            raise DataError(f"{item.data.root}: {other} belong to the {part} part, which is evaluated {how} --test.")
+        if fitting:
+            found[item.data.name] = fitting
+    if not found:
+        raise ConfigError(
+            f"{run.run_dir}: every sequence of it belongs to the test part. When all decisions are made, look with "
+            f"`gausim evaluate {run.run_dir} --test --trials N`, N: the trials made on the development part."
+            if not arguments.test
+            else f"{run.run_dir}: no sequence of the chosen objects belongs to the test part. Leave --test out."
+        )
+    return Chosen((TEST_PART if arguments.test else DEVELOPMENT) if declared else None, found)
+
+
+def look(run: LoadedRun, arguments: argparse.Namespace, chosen: Chosen, state: Mapping[str, Any]) -> dict[str, Any]:
+    """Records a look at the test part; returns what the summary says of it.
+
+    Raises:
+        ConfigError: the number of trials is not declared.
+    """
+    trials = arguments.trials or (run.config.get("protocol") or {}).get("trials")
+    if not trials:
+        raise ConfigError(
+            "--test: expected the number of trials that were made of the method on the development part. Declare it "
+            "with --trials N, or train with protocol.trials=N."
+        )
+    path, development = run.run_dir / TEST, run.run_dir / "evaluation" / "development"
+    if not path.is_file():
+        _move(run.run_dir / "evaluation", development)
+    made = record_look(path, trials=trials, provenance=code_provenance(), state=state, sequences=dict(chosen.sequences))
+    again = f", look {made.looks}" if made.looks > 1 else ""
+    print(f"test part: {trials} trials declared{again}; recorded in {path}")
+    return {"part": chosen.part, "trials": trials, "looks": made.looks}
+
+
+def home(run_dir: Path, part: str | None) -> Path:
+    """Folder of a whole evaluation: that of the development part makes room for the test part once it was looked at."""
+    folder = run_dir / "evaluation"
+    return folder / DEVELOPMENT if part == DEVELOPMENT and (run_dir / TEST).is_file() else folder
+
+
+def _move(folder: Path, target: Path) -> None:
+    """Moves the files of an earlier evaluation of the development part."""
+    if (folder / "metrics.json").is_file():
+        target.mkdir(parents=True, exist_ok=True)
+        for path in sorted(p for p in folder.iterdir() if p.is_file()):
+            path.replace(target / path.name)

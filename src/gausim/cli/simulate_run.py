@@ -1,0 +1,289 @@
+"""What `gausim simulate` does: predictions beside the truth, and objects or bare scenes under forces."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from msgspec.structs import replace
+from torch import Tensor
+
+from gausim.cli.arguments import opened_scene, parse_background, pinned_by
+from gausim.cli.bars import named_bar
+from gausim.cli.end import end, error_sentences, push
+from gausim.compose.build import LoadedRun, load_run
+from gausim.compose.config import compose, instantiate
+from gausim.compose.data_paths import data_option
+from gausim.compose.live import REST, open_interaction
+from gausim.compose.predict import RunObject, TrainedPrediction, run_objects, scene_of, sequence_of, state_of
+from gausim.core import Cameras, GaussianScene, Renderer, Trajectory
+from gausim.core.errors import ConfigError, DataError
+from gausim.data.images import composite
+from gausim.data.records import SequenceRecord
+from gausim.evaluation.evaluation import evaluate_object
+from gausim.interaction.arrows import Arrow, arrows_of, draw_arrows
+from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction, differences, replay
+from gausim.interaction.session import ForceSession, load_session, save_session
+from gausim.interaction.words import entries_of, has_forces
+from gausim.io.ply import load_scene
+from gausim.io.trajectory import save_trajectory
+from gausim.io.video import write_gif, write_video
+from gausim.ops.orbit import orbit_cameras
+from gausim.render.draw import film, to_bytes
+from gausim.report.pictures.figures import contact_sheet, error_figure, picture_grid, slice_figure
+from gausim.report.pictures.frames import PANEL_HEIGHT, Timeline, brighten, label_bar, video_frame
+from gausim.results.summary import summarise
+
+# Frames of a scene without --frames; its first motion without forces [diagonals per frame of the farthest kernel].
+FRAMES, SWAY = 120, 0.02
+SIZE = (480, 480)
+
+
+def simulate_run(arguments: argparse.Namespace) -> int:
+    """Simulates objects of a run, under forces if there are any; returns the exit status."""
+    run = load_run(arguments.run, data=data_option(arguments.data))
+    state_of(run)
+    folder = arguments.out or run.run_dir / "simulation"
+    if arguments.session or has_forces(arguments):
+        return simulate_forces(run, arguments, folder)
+    items = run_objects(run, arguments.object)
+    sentences = [_simulate_object(run, item, arguments, folder / item.data.name) for item in items]
+    first = items[0].data.name
+    push_it = push(arguments.run, first if len(run.objects) > 1 else None)
+    end(sentences, "videos", folder if len(items) > 1 else folder / first, ["view", arguments.run], push_it)
+    return 0
+
+
+def _simulate_object(run: LoadedRun, item: RunObject, arguments: argparse.Namespace, folder: Path) -> str:
+    """Writes all results on an object's sequences; returns a sentence on their errors."""
+    names = arguments.sequence or [item.data.sequences[0].name]
+    names = [record.name for record in item.data.sequences] if names == ["all"] else names
+    views = arguments.view or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
+    for name in names:
+        sequence_of(item, name).camera_indices(views)  # raises on an unknown sequence or view before the simulation
+    predict = TrainedPrediction(run, item, frames=arguments.frames or 0)
+    with named_bar(len(names) * (1 + len(views)), f"simulate {item.data.name}") as advance:
+        curves = evaluate_object(
+            item.data, scene_of(run, item), {run.module.method_name: predict}, run.renderer, sequences=names,
+            advance=advance,
+        )  # fmt: skip
+        for name in names:
+            record = item.data.record(sequence_of(item, name).name)
+            trajectory = predict(record, arguments.frames)
+            error_figure(curves, folder / name / "errors.png", sequence=name)
+            write_trajectory(run, item, name, trajectory, folder / name)
+            for view in views:
+                _write_view(run, item, record, trajectory, view, arguments, folder / name)
+                advance(f"{name} {view}")
+    if arguments.verbose:
+        for name in names:
+            print("\n".join(f"wrote {path}" for path in sorted((folder / name).iterdir())))
+    of = names[0] if len(names) == 1 else f"{len(names)} sequences"
+    return error_sentences({f"{item.data.name} {of}": summarise(curves)})[0]
+
+
+def _write_view(
+    run: LoadedRun,
+    item: RunObject,
+    record: SequenceRecord,
+    trajectory: Trajectory,
+    view: str,
+    arguments: argparse.Namespace,
+    folder: Path,
+) -> None:
+    background, scene = parse_background(arguments.background), scene_of(run, item)
+    drawn = film(
+        run.renderer, scene, trajectory, record.cameras_of([view]), background=background, mask=scene.foreground
+    )
+    prediction = brighten(drawn[:, 0].cpu().numpy(), arguments.brighten)
+    truth = brighten(_truth(record, view, min(trajectory.frames, record.count), background), arguments.brighten)
+    unseen, title = item.data.train_frames.stop, f"{item.data.name} {record.name} {view}"
+    fps, timeline = item.data.fps / arguments.slow, Timeline(trajectory.frames, unseen)
+
+    def compared() -> Iterator[np.ndarray]:
+        for number, image in enumerate(prediction):
+            yield video_frame(truth[number] if number < len(truth) else None, image, number, timeline, title)
+
+    write_video(folder / f"{view}.mp4", compared(), fps)
+    if arguments.gif:
+        write_gif(folder / f"{view}.gif", compared(), fps)
+    slice_figure(truth, prediction, folder / f"{view}_slices.png", title=title, first_unseen=unseen)
+    contact_sheet(truth, prediction, folder / f"{view}_sheet.png", title=title, first_unseen=unseen)
+
+
+def _truth(record: SequenceRecord, view: str, frames: int, background: Tensor | None) -> np.ndarray:
+    # In chunks: as floats a whole sequence takes sixteen times its memory in bytes.
+    pieces = [range(start, min(start + 16, frames)) for start in range(0, frames, 16)]
+    parts = [to_bytes(composite(record.frames(piece, [view])[:, 0], background)[0]).numpy() for piece in pieces]
+    return np.concatenate(parts)
+
+
+def simulate_forces(run: LoadedRun, arguments: argparse.Namespace, out: Path) -> int:
+    """Simulates one object under forces; writes trajectory, session, videos and pictures; returns the exit status.
+
+    Raises:
+        ConfigError: options conflict, or an event is invalid.
+        DataError: the session is malformed or of another scene, or an object, sequence or view does not exist.
+        DivergenceError: a simulated position is not finite.
+    """
+    if arguments.session and has_forces(arguments):
+        raise ConfigError("--session has its own forces: leave --force and the like out, or edit the session's file.")
+    if len(arguments.object or []) > 1 or len(arguments.sequence or []) > 1:
+        raise ConfigError("forces act on one object from one initial state: name one --object and one --sequence.")
+    if not arguments.metre > 0:
+        raise ConfigError(f"--metre {arguments.metre}: expected more than 0 scene units.")
+    found = load_session(arguments.session) if arguments.session else None
+    item, interaction = _opened(run, arguments, found)
+    frames = arguments.frames or item.data.sequences[0].count
+    session = _known(interaction, found, arguments) if found else _new_session(interaction, arguments, frames)
+    views = arguments.view or [*item.data.train_views[:1], *item.data.heldout_views[:1]]
+    item.data.sequences[0].camera_indices(views)  # raises on an unknown view before the simulation
+    arrows: list[list[Arrow]] = []
+    trajectory = replay(interaction, session, other_model=True, watch=lambda live: arrows.append(arrows_of(live)))
+    folder = out / item.data.name / (Path(arguments.session).stem if arguments.session else "forces")
+    write_trajectory(run, item, session.made_with.initial, trajectory, folder)
+    save_session(session, folder / "session.json")
+    for view in views:
+        cameras = _sharp(item.data.sequences[0].cameras_of([view]))
+        write_film(run.renderer, interaction.scene, trajectory, arrows, cameras, arguments, folder)
+    if arguments.verbose:
+        print("\n".join(f"wrote {path}" for path in sorted(folder.iterdir())))
+    replayed = ["simulate", arguments.run, "--session", folder / "session.json"]
+    end(told(interaction, trajectory), "videos", folder, ["view", arguments.run], replayed)
+    return 0
+
+
+def simulate_scene(arguments: argparse.Namespace) -> int:
+    """Simulates a scene without a run; writes trajectory, session, video and pictures; returns the exit status.
+
+    Without forces the scene begins with a sway along x.
+
+    Raises:
+        ConfigError: an option is missing or wrong.
+        SceneError: the scene is unusable, or nothing of it is pinned.
+        DivergenceError: a simulated position is not finite.
+    """
+    if arguments.base is None:
+        raise ConfigError("--scene: its motion needs a trained network, --from RUN (a run of model=gausim).")
+    if arguments.session:
+        raise ConfigError("--session replays what was done to a run's object. With --scene give --force and the like.")
+    scene = pinned_by(load_scene(arguments.scene), arguments)
+    interaction = opened_scene(
+        scene, arguments, sway=0.0 if has_forces(arguments) else SWAY, gravity=STANDARD_GRAVITY * arguments.metre,
+        most_force=arguments.most_force,
+    )  # fmt: skip
+    session, arrows = _new_session(interaction, arguments, arguments.frames or FRAMES), list[list[Arrow]]()
+    trajectory = replay(interaction, session, watch=lambda live: arrows.append(arrows_of(live)))
+    folder = arguments.out or Path(f"{arguments.scene.stem}_simulation")
+    save_trajectory(
+        folder / "trajectory.safetensors", trajectory, facts={"object": scene.name, "run": arguments.base.name}
+    )
+    save_session(session, folder / "session.json")
+    cameras = orbit_cameras(
+        scene.means[scene.foreground], azimuths=[arguments.azimuth], up=arguments.up, size=SIZE
+    )  # fmt: skip
+    renderer = instantiate(compose("render/auto").render)
+    write_film(renderer, scene, trajectory, arrows, cameras, arguments, folder)
+    end(told(interaction, trajectory), "videos", folder)
+    return 0
+
+
+def _opened(run: LoadedRun, arguments: argparse.Namespace, found: ForceSession | None) -> tuple[RunObject, Interaction]:
+    """The named object and its interaction; by default the object of the session, or the first."""
+    names = arguments.object
+    if names is None and found and found.made_with.scene in [item.data.name for item in run_objects(run)]:
+        names = [found.made_with.scene]
+    item = run_objects(run, names)[0]
+    start = arguments.sequence[0] if arguments.sequence else (found.made_with.initial if found else REST)
+    return item, open_interaction(
+        run, name=item.data.name, sequence=start, gravity=STANDARD_GRAVITY * arguments.metre,
+        most_force=arguments.most_force,
+    )  # fmt: skip
+
+
+def _new_session(interaction: Interaction, arguments: argparse.Namespace, frames: int) -> ForceSession:
+    steps = frames - 1
+    entries = tuple(entries_of(arguments, interaction.scene))
+    late = [entry.at for entry in entries if entry.at > steps]
+    if late:
+        raise ConfigError(f"at={late[0]}: expected 0 to {steps}, the last frame. Ask for more with --frames.")
+    return ForceSession(interaction.made_with, interaction.fps, steps, entries, interaction.gravity)
+
+
+def _known(interaction: Interaction, found: ForceSession, arguments: argparse.Namespace) -> ForceSession:
+    """The session to replay, cut to the requested number of frames."""
+    for text, allowed in differences(interaction, found):
+        if not allowed:
+            raise DataError(f"{arguments.session}: {text}. Replay it with what it was made with.")
+        print(f"warning: {arguments.session}: {text}; its forces act, its numbers differ.", file=sys.stderr)
+    if not arguments.frames:
+        return found
+    steps = arguments.frames - 1
+    return replace(found, steps=steps, entries=tuple(e for e in found.entries if e.at <= steps))
+
+
+def write_trajectory(run: LoadedRun, item: RunObject, sequence: str, trajectory: Trajectory, folder: Path) -> None:
+    """Writes ``trajectory.safetensors`` of an object that started from a sequence's initial state."""
+    facts = {"object": item.data.name, "sequence": sequence, "run": run.run_dir.name}
+    save_trajectory(folder / "trajectory.safetensors", trajectory, facts=facts)
+
+
+def write_film(
+    renderer: Renderer,
+    scene: GaussianScene,
+    trajectory: Trajectory,
+    arrows: list[list[Arrow]],
+    cameras: Cameras,
+    arguments: argparse.Namespace,
+    folder: Path,
+) -> None:
+    """Writes the video and the contact sheet of a motion and its forces in one view, named after the camera."""
+    (view,), background = cameras.names, parse_background(arguments.background)
+    drawn = film(renderer, scene, trajectory, cameras, background=background, mask=scene.foreground)
+    images = brighten(drawn[:, 0].cpu().numpy(), arguments.brighten)
+    fps, title = trajectory.fps / arguments.slow, f"{scene.name} {view}"
+
+    def pictures() -> Iterator[np.ndarray]:
+        for number, image in enumerate(images):
+            shown = draw_arrows(image, arrows[number], cameras.viewmats[0], cameras.Ks[0])
+            acting = ", ".join(dict.fromkeys(arrow.label for arrow in arrows[number]))
+            text = f"{title}   {number}/{len(images) - 1}   {acting}"
+            yield np.concatenate((shown, label_bar(text, shown.shape[1])))
+
+    write_video(folder / f"{view}.mp4", pictures(), fps)
+    if arguments.gif:
+        write_gif(folder / f"{view}.gif", pictures(), fps)
+    chosen = list(range(0, len(images), max(1, len(images) // 12)))[:12]
+    picture_grid(
+        [images[f] for f in chosen], [f"frame {f}" for f in chosen], folder / f"{view}_sheet.png", title=title,
+        columns=6,
+    )  # fmt: skip
+
+
+def _sharp(cameras: Cameras) -> Cameras:
+    """The same views, enlarged to the size of a video panel if they are smaller."""
+    zoom = max(1.0, PANEL_HEIGHT / cameras.height)
+    Ks = cameras.Ks.clone()
+    Ks[:, :2] *= zoom
+    return Cameras(cameras.viewmats, Ks, round(cameras.width * zoom), round(cameras.height * zoom), cameras.names)
+
+
+def told(interaction: Interaction, trajectory: Trajectory) -> list[str]:
+    """Sentences on the largest displacement and on limits that applied."""
+    scene = interaction.scene
+    away = (trajectory.positions - scene.means.to(trajectory.positions)).norm(dim=-1) / scene.diagonal
+    held = ~scene.simulated | scene.pinned
+    slipped = float(away[:, held].max()) if bool(held.any()) else 0.0
+    sentences = [
+        f"{scene.name}: {trajectory.frames} frames; it is farthest from rest at frame {int(away.amax(1).argmax())}, by "
+        f"{float(away.max()):.3f} of its diagonal; what is pinned moved by {slipped:g}."
+    ]
+    if interaction.limited:
+        sentences.append(
+            f"In {interaction.limited} frames forces acted only in part: they would carry {scene.name} beyond what was "
+            "learned."
+        )
+    return sentences

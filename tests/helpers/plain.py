@@ -1,0 +1,58 @@
+"""What many tests make alike: scenes of round kernels, cameras that look at a place, changed JSON, pickled calls."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gausim.core import Cameras, GaussianScene
+
+
+def plain_scene(
+    means: Tensor, *, log_scale: float = -3.0, opacity: float = 0.0, sh: Tensor | None = None, **fields: Any
+) -> GaussianScene:
+    """Round kernels of one size and opacity; grey unless ``sh`` are given."""
+    count = len(means)
+    made = GaussianScene.create(
+        means=means,
+        log_scales=torch.full((count, 3), log_scale),
+        quats=torch.tensor([1.0, 0, 0, 0]).expand(count, 4).clone(),
+        opacity_logits=torch.full((count,), opacity),
+        sh=torch.zeros(count, 1, 3) if sh is None else sh,
+    )
+    return replace(made, **fields).validated()
+
+
+def cameras_at(eyes: Tensor, at: Sequence[float], *, focal: float, size: int, names: Sequence[str]) -> Cameras:
+    """Square cameras at some places, z up, that look at another."""
+    viewmats = torch.eye(4).repeat(len(eyes), 1, 1)
+    for viewmat, eye in zip(viewmats, eyes, strict=True):
+        forward = torch.nn.functional.normalize(torch.tensor(at) - eye, dim=0)
+        right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
+        rotation = torch.stack((right, torch.linalg.cross(forward, right), forward))
+        viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    k = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
+    return Cameras(viewmats, k.repeat(len(eyes), 1, 1), size, size, tuple(names))
+
+
+def edit_json(path: Path, change: Callable[[dict], object]) -> None:
+    """Changes the JSON object in a file in its place."""
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+class Call:
+    """Is pickled as a call, which a careless reader would run."""
+
+    def __init__(self, function: Any, *arguments: Any) -> None:
+        self.call = function, arguments
+
+    def __reduce__(self) -> tuple:
+        return self.call
