@@ -115,6 +115,17 @@ def test_several_objects_have_a_summary(sweep: Path) -> None:
     assert rows[False, False, False, False][::2] == [11.0, 20.0]
 
 
+def test_runs_that_take_over_from_runs_of_other_seeds_or_objects_are_one_row(tmp_path: Path) -> None:
+    for name, error in (("toy_bunny", 1.0), ("toy_cube", 2.0)):
+        for seed in (0, 1):
+            own = report_runs.config(seed) | {"data": {"root": "/data/toy", "names": [name], "seed": seed}}
+            own |= {"model": {"method": {"_target_": "physgaussian"}}, "init_from": f"out/{name}/seed_{seed}"}
+            run = report_runs.write_run(tmp_path / name / f"seed_{seed}", own, model="physgaussian")
+            report_runs.evaluate(run, report_runs.make_curves(error + seed, name=name))
+    table = measured_record(make_study(find_runs([tmp_path])), "Taken over").table("summary")
+    assert [(row.label, row.cells[::2]) for row in table.rows] == [(["physgaussian"], [15.0, 25.0])]
+
+
 def test_rows_of_different_sequences_are_told_apart(sweep: Path) -> None:
     runs = find_runs([sweep])
     entry = next(run for run in runs if "no_mass" in run.name).objects["toy_bunny"]

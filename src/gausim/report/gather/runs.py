@@ -6,6 +6,7 @@ import csv
 import hashlib
 import json
 import os
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,6 +27,7 @@ _TRACES = (FINISHED, FAILED, EPOCHS, LAST_CHECKPOINT)
 _KEYS_OF_A_RUN = {"model", "data", "seed"}
 # Keys without an effect on the result, and those of seeds.
 _FREE = ("paths", "logger", "callbacks", "sweep", "protocol", "task_name", "evaluate", "seed", "data.seed", "trainer")
+INIT_FROM, _SEED_FOLDER = "init_from", re.compile(r"seed_\d+/?$")
 _DIGITS = 12  # of hashes and commits
 _SWEEP = "multirun.yaml"  # Hydra's record of a sweep
 _HYDRA = ".hydra"  # Hydra's folder, also of a job that did not start a run
@@ -65,7 +67,10 @@ class RunRecord:
     def settings_besides(self, keys: tuple[str, ...]) -> dict[str, str]:
         """The settings without those of the groups ``keys``."""
         flat = flatten(self.config)
-        return {k: v for k, v in flat if not any(k == f or k.startswith(f"{f}.") for f in (*_FREE, *keys))}
+        found = {k: v for k, v in flat if not any(k == f or k.startswith(f"{f}.") for f in (*_FREE, *keys))}
+        if INIT_FROM in found:  # the seed of the run that it started from
+            found[INIT_FROM] = _SEED_FOLDER.sub("seed_*", found[INIT_FROM])
+        return found
 
     @property
     def config_hash(self) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from gausim.report.gather.runs import BROKEN, EVALUATED, FAILURE, NOT_EVALUATED, UNFINISHED, RunRecord, dig
+from gausim.report.gather.runs import BROKEN, EVALUATED, FAILURE, INIT_FROM, NOT_EVALUATED, UNFINISHED, RunRecord, dig
 from gausim.results.summary import MOTION_ENERGY
 from gausim.results.table import footnotes
 
@@ -161,8 +161,12 @@ def _continues(row: About, names: tuple[str, ...], run: RunRecord) -> bool:
 
 
 def _besides_object(run: RunRecord) -> dict[str, str]:
-    """The settings that do not select the object: names of sequences do, their number does not."""
-    found = run.settings_besides(_WHICH_OBJECT)
+    """The settings that do not select the object: names of sequences do, their number does not.
+
+    What a fitted method takes over was found on its object.
+    """
+    taken = (INIT_FROM,) if dig(run.config, "model", "method") else ()
+    found = run.settings_besides((*_WHICH_OBJECT, *taken))
     return {k: v for k, v in found.items() if k != "data.sequences" or not v.startswith("[")}
 
 
