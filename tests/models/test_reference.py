@@ -13,6 +13,7 @@ from gausim.models.initial_state import FreeInitialStates, ModalInitialStates
 from gausim.models.reference.floor import _projected_gradients, _solved
 from gausim.models.reference.reference import hand_motion
 from gausim.models.rollout.dynamics import SceneDynamics
+from gausim.models.step.predictor import with_floor_columns
 from gausim.ops.rotation import rotation_of, rotation_vector
 
 TURN = torch.tensor([0.4, -0.9, 0.3], dtype=torch.float64)
@@ -31,8 +32,8 @@ def _block(count: int = 220, **surroundings) -> GaussianScene:
     return replace(scene, surroundings=Surroundings(**surroundings))
 
 
-def _frozen(scene: GaussianScene):
-    return make_model(scene, **NEURAL).double().eval().requires_grad_(False)
+def _frozen(scene: GaussianScene, **options):
+    return make_model(scene, **NEURAL, **options).double().eval().requires_grad_(False)
 
 
 def _thrown(scene: GaussianScene, speed: float = 1.0) -> SimState:
@@ -85,7 +86,8 @@ def test_a_rigid_spin_about_a_principal_axis_goes_on() -> None:
     assert (last.positions - turned).norm(dim=1).max() < 0.02 * scene.diagonal
 
 
-def test_a_turned_and_moved_scene_gives_turned_and_moved_motion() -> None:
+@pytest.mark.parametrize("sees_floor", [False, True])
+def test_a_turned_and_moved_scene_gives_turned_and_moved_motion(sees_floor: bool) -> None:
     scene, turn, shift = _block(free=True, gravity=(0.0, 0.0, FALL), floor=FLOOR), rotation_of(TURN), TURN.flip(0)
     normal, point = (turn @ torch.tensor(x).double() for x in (FLOOR.normal, FLOOR.point))
     floor = replace(FLOOR, normal=tuple(normal.tolist()), point=tuple((point + shift).tolist()))
@@ -93,12 +95,12 @@ def test_a_turned_and_moved_scene_gives_turned_and_moved_motion() -> None:
     other = replace(
         scene, means=scene.means @ turn.mT + shift, surroundings=Surroundings(free=True, gravity=gravity, floor=floor)
     )
-    model, moved = _frozen(scene), _frozen(other)
+    model, moved = _frozen(scene, floor=sees_floor), _frozen(other, floor=sees_floor)
     moved.load_state_dict(model.state_dict())
     state = _thrown(scene)
     alike = SimState(*(x @ turn.mT + shift for x in (state.positions, state.previous)))
     found, expected = _steps(moved, alike, 15), _steps(model, state, 15)
-    for frame, most in ((6, 1e-5), (15, 1e-4)):  # in the air, and after the impact, which magnifies rounding
+    for frame, most in ((6, 1e-5), (15, 2e-4)):  # in the air, and after the impact, which magnifies rounding
         far = (found[frame].positions - expected[frame].positions @ turn.mT - shift).abs().max()
         assert far < most * scene.diagonal
 
@@ -114,6 +116,49 @@ def test_a_fall_is_a_parabola_until_the_floor_which_nothing_enters() -> None:
     lowest = min(float(FLOOR.height(s.positions).min()) for s in states)
     assert -1e-3 * scene.diagonal < lowest < 0.01 * scene.diagonal
     assert heights[45:].std() < 0.02 * scene.diagonal  # it has come to rest
+
+
+def test_units_see_how_near_the_floor_is_and_where(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, turn = _block(free=True, floor=FLOOR), rotation_of(TURN)
+    model = _frozen(scene, floor=True)
+    batch, seen = model.batch((0,)), []
+    forward = model.predictor.network.forward
+    monkeypatch.setattr(model.predictor.network, "forward", lambda n, *rest: (seen.append(n), forward(n, *rest))[1])
+    prepared = model.prepare(batch)
+    still = len(seen)
+    middle = scene.means.mean(0)
+    turned = (scene.means - middle) @ turn.mT + middle
+    model.step(batch, SimState(turned, turned), prepared=prepared)
+    height = FLOOR.height(prepared.aggregate(turned)) / model.hierarchies[0].diagonal
+    near = prepared.per_level((1 - height[:, None] / 0.2).clamp(0, 1).square())
+    assert float(near[-1].max()) > 0.1 and float(near[-1].min()) == 0
+    normal = torch.from_numpy(model.body_axes[0]) @ turn.mT @ torch.tensor(FLOOR.normal).double()
+    for nodes, p in zip(seen[still:], near, strict=True):
+        # The body's rotation is that of its best fit.
+        torch.testing.assert_close(nodes[:, -4:], torch.cat((p, p * normal), 1), atol=1e-6, rtol=1e-5)
+    assert all(bool((nodes[:, -4:] == 0).all()) for nodes in seen[:still])  # at rest there are no surroundings
+
+
+def test_models_of_scenes_without_a_floor_are_as_before_and_networks_fit_both_ways() -> None:
+    bare, floored = _block(free=True), _block(free=True, floor=FLOOR)
+    before, model = _frozen(bare), _frozen(bare, floor=True)
+    assert all(
+        torch.equal(x, y) for x, y in zip(before.state_dict().values(), model.state_dict().values(), strict=True)
+    )
+    both = make_model([bare, floored], **NEURAL, floor=True).double()
+    wide, narrow = ({n: x for n, x in m.state_dict().items() if n.startswith("predictor")} for m in (both, model))
+    model.load_state_dict(with_floor_columns(wide, narrow), strict=False)
+    state = _thrown(bare)
+    model.load_state_dict({n: x for n, x in both.state_dict().items() if n in model.state_dict()
+                           and not n.startswith("predictor")}, strict=False)  # fmt: skip
+    # Without a floor the columns of the floor read zeros.
+    torch.testing.assert_close(
+        model.step(model.batch((0,)), state).positions, both.step(both.batch((0,)), state).positions
+    )
+    again = with_floor_columns(narrow, wide)
+    name = next(n for n in wide if n.endswith("node_encoder.0.weight"))
+    assert again[name].shape == wide[name].shape and bool((again[name][:, -4:] == 0).all())
+    assert torch.equal(again[name][:, :-4], narrow[name])
 
 
 def test_friction_stops_what_slides_and_without_it_nothing_does() -> None:

@@ -20,7 +20,7 @@ from viser.transforms import SO3
 from gausim.cli.view_subject import playable_run, subject_of
 from gausim.interaction.interaction import Interaction, replay
 from gausim.interaction.selections import Kernels
-from gausim.interaction.session import Force, Impulse, load_session, save_session
+from gausim.interaction.session import Force, Hand, Impulse, load_session, save_session
 from gausim.ops.orbit import orbit_cameras
 from gausim.viewer.access import Access
 from gausim.viewer.app import Subject, Viewer
@@ -124,6 +124,28 @@ def test_page_pulls_where_the_mouse_goes_and_resets(
         page.wait(lambda: not live.playing, 10, "a pause")
         page.press_button("Reset")
         page.wait(lambda: live.interaction.frame_number == 0, 10, "a reset")
+
+
+@pytest.mark.slow
+def test_a_pin_goes_where_the_mouse_goes(make_interaction: Callable[..., Interaction], tmp_path: Path) -> None:
+    with opened(Subject("a column", make_interaction(), sessions=tmp_path), tmp_path) as (viewer, page):
+        live, scene = viewer.live, viewer.live.interaction.scene
+        pins = viewer.placing.to_page(scene.means)[scene.pinned]
+        eye = torch.tensor(next(iter(viewer.server.get_clients().values())).camera.position)
+        pin = pins[(pins - eye).norm(dim=1).argmin()]  # the nearest, which no other kernel hides
+        start = on_screen(viewer, pin)
+        end = (start[0] + 80, start[1])
+        page.drag(start, end, hold=True)
+        page.wait(lambda: any(isinstance(e.event, Hand) for e in live.interaction.session().entries), 60, "a hand")
+        begun = live.interaction.frame_number
+        page.wait(lambda: live.interaction.frame_number > begun + 8, 60, "the hand to arrive")
+        to = torch.tensor(live.interaction.place_of_hand(0)[0])
+        seen = on_screen(viewer, viewer.placing.to_page(viewer.placing.to_scene(pin) + to))
+        assert abs(seen[0] - end[0]) < 15 and abs(seen[1] - end[1]) < 15, (seen, end)
+        page.release(*end)
+        moved = (live.interaction.frame.positions - scene.means)[scene.pinned]
+        torch.testing.assert_close(moved, to.expand_as(moved), atol=1e-4, rtol=0)
+        assert not live.interaction.acting and not live.message
 
 
 @pytest.mark.slow

@@ -212,7 +212,7 @@ def test_a_dragged_pin_takes_its_hand_along(live: tuple[Live, list[Shown]]) -> N
     followed: list[tuple[float, float, float]] = []
     pointer.hand_moved = lambda hand, to: followed.append(to)
 
-    def drag(kernel: int, *way: tuple[str, tuple[float, float, float]]) -> None:
+    def drag(kernel: int, *way: tuple[str, tuple[float, float, float]], handle: int = 0) -> None:
         begun = placing.to_page(interaction.frame.positions[kernel]).double().numpy()
         for phase, moved in way:
             start = placing.to_page(interaction.frame.positions[kernel]).double().numpy()
@@ -221,7 +221,7 @@ def test_a_dragged_pin_takes_its_hand_along(live: tuple[Live, list[Shown]]) -> N
             asyncio.run(
                 pointer._dragged(
                     SimpleNamespace(
-                        client=SimpleNamespace(camera=camera), client_id=0, phase=phase, instance_index=0,
+                        client=SimpleNamespace(camera=camera), client_id=0, phase=phase, instance_index=handle,
                         start_position=start, end_position=end,
                     )
                 )
@@ -237,7 +237,9 @@ def test_a_dragged_pin_takes_its_hand_along(live: tuple[Live, list[Shown]]) -> N
     moved = interaction.frame.positions - scene.means
     torch.testing.assert_close(moved[scene.pinned], torch.tensor([0.1, 0.0, 0.0]).expand(int(scene.pinned.sum()), 3))
     assert followed and followed[-1] == pytest.approx((0.1, 0.0, 0.0), abs=1e-5)
-    drag(low, ("start", (0.0, 0.0, 0.0)), ("update", (0.0, 0.1, 0.0)), ("end", (0.0, 0.1, 0.0)))
+    free = int(scene.means[:, 2].argmax())  # a pin's own handle moves its hand, whatever is in front
+    pins = len(pointer._centres(scene.means)) - 1
+    drag(free, ("start", (0.0, 0.0, 0.0)), ("update", (0.0, 0.1, 0.0)), ("end", (0.0, 0.1, 0.0)), handle=pins)
     assert interaction.session().entries[-1].event.to == pytest.approx((0.1, 0.1, 0.0), abs=1e-5)  # goes on from there
 
 

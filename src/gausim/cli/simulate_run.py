@@ -25,7 +25,7 @@ from gausim.data.images import composite
 from gausim.data.records import SequenceRecord
 from gausim.evaluation.evaluation import evaluate_object
 from gausim.interaction.arrows import Arrow, arrows_of, draw_arrows
-from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction, differences, replay
+from gausim.interaction.interaction import STANDARD_GRAVITY, Interaction, replay
 from gausim.interaction.session import ForceSession, load_session, save_session
 from gausim.interaction.words import entries_of, has_forces
 from gausim.io.ply import load_scene
@@ -215,7 +215,7 @@ def _new_session(interaction: Interaction, arguments: argparse.Namespace, frames
 
 def _known(interaction: Interaction, found: ForceSession, arguments: argparse.Namespace) -> ForceSession:
     """The session to replay, cut to the requested number of frames."""
-    for text, allowed in differences(interaction, found):
+    for text, allowed in found.differences(interaction.made_with, interaction.fps):
         if not allowed:
             raise DataError(f"{arguments.session}: {text}. Replay it with what it was made with.")
         print(f"warning: {arguments.session}: {text}; its forces act, its numbers differ.", file=sys.stderr)

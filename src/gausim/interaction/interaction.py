@@ -215,8 +215,8 @@ class Interaction:
     @property
     def hand(self) -> Int[Tensor, " K"] | None:
         """The hand that holds each kernel, -1 for none; None where the method moves no hands, or nothing is held."""
-        hand = hand_of(self.scene)
-        return hand if isinstance(self._dynamics, Handled) and bool((hand >= 0).any()) else None
+        hand, moves = hand_of(self.scene), isinstance(self._dynamics, Handled)
+        return hand if moves and bool((hand >= 0).any()) else None
 
     def place_of_hand(self, number: int) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
         """Displacement of a hand from rest [scene units] and its rotation vector [radian], as of :class:`Hand`."""
@@ -299,8 +299,8 @@ class Interaction:
                 "method can move. Play a run of gausim with pinned kernels."
             )
         if self._hands is None and isinstance(self._dynamics, Handled):
-            self._hands, begin = MovedHands(self.scene), self.frame_number
-            hands = self._hands
+            self._hands = hands = MovedHands(self.scene)
+            begin = self.frame_number
             self._limited_before += self._stepper.limited
             self._stepper = self._dynamics.stepper(self.state, lambda frame: hands.pose(frame + begin))
         cast(MovedHands, self._hands).move(event, self.frame_number)
@@ -407,7 +407,7 @@ def replay(
         ConfigError: an event cannot be applied.
         DivergenceError: the simulation diverges where the recorded one did not.
     """
-    wrong = differences(interaction, session)
+    wrong = session.differences(interaction.made_with, interaction.fps)
     if wrong and not (other_model and all(allowed for _, allowed in wrong)):
         raise DataError("session: " + "; ".join(text for text, _ in wrong) + ". Replay it with what it was made with.")
     frame = interaction.frame
@@ -425,18 +425,3 @@ def replay(
         if tick < session.steps:
             frames.append(interaction.step())
     return trajectory_of(frames, interaction._stepper)
-
-
-def differences(interaction: Interaction, session: ForceSession) -> list[tuple[str, bool]]:
-    """Differences between a session's header and an interaction: text, and whether a replay can accept it."""
-    made, here = session.made_with, interaction.made_with
-    found = [
-        (made.scene_hash != here.scene_hash, f"it is of another scene, '{made.scene}' and not '{here.scene}'", False),
-        (session.fps != interaction.fps,
-         f"it has {session.fps:g} frames per second and not {interaction.fps:g}", False),
-        (made.model_hash != here.model_hash,
-         f"it was made with another method or training (run '{made.run}')", True),
-        (made.initial_hash != here.initial_hash,
-         f"it begins at another state, '{made.initial}' and not '{here.initial}'", True),
-    ]  # fmt: skip
-    return [(text, allowed) for differs, text, allowed in found if differs]

@@ -200,6 +200,20 @@ class ForceSession(Checked, frozen=True):
                 )
             last = entry.at
 
+    def differences(self, here: MadeWith, fps: float) -> list[tuple[str, bool]]:
+        """Differences of its header from an interaction's: text, and whether a replay can accept it."""
+        made = self.made_with
+        found = [
+            (made.scene_hash != here.scene_hash,
+             f"it is of another scene, '{made.scene}' and not '{here.scene}'", False),
+            (self.fps != fps, f"it has {self.fps:g} frames per second and not {fps:g}", False),
+            (made.model_hash != here.model_hash,
+             f"it was made with another method or training (run '{made.run}')", True),
+            (made.initial_hash != here.initial_hash,
+             f"it begins at another state, '{made.initial}' and not '{here.initial}'", True),
+        ]  # fmt: skip
+        return [(text, allowed) for differs, text, allowed in found if differs]
+
 
 def save_session(session: ForceSession, path: Path | str) -> None:
     """Writes a session, one event a line; replaces the file atomically."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from gausim.core import ConfigError, DivergenceError, GausSimError, Trajectory
-from gausim.interaction.interaction import Interaction, differences
+from gausim.interaction.interaction import Interaction
 from gausim.interaction.session import Event, ForceSession, Release
 from gausim.viewer.companion import Companion
 from gausim.viewer.pipeline import Rate
@@ -201,7 +201,7 @@ class Live(threading.Thread):
         Raises:
             ConfigError: the session is of another scene or frame rate.
         """
-        wrong = differences(self.interaction, session)
+        wrong = session.differences(self.interaction.made_with, self.interaction.fps)
         if any(not allowed for _, allowed in wrong):
             raise ConfigError("session: " + "; ".join(text for text, _ in wrong) + ".")
         self.interaction.gravity, self.interaction.seed = session.gravity, session.seed

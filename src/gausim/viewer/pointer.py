@@ -53,6 +53,7 @@ class Pointer:
         self._free = (scene.simulated & ~scene.pinned).cpu()
         hand = live.interaction.hand
         self._hand = torch.full((scene.count,), -1) if hand is None else hand.cpu()
+        self._pins = pin_groups(self._hand, units[0].cpu() if units else torch.zeros_like(self._hand))
         self._grabs: dict[int, Grab] = {}  # by client
         self._units, self._masses = [u.cpu() for u in units], masses.float().cpu()
         self._shown_handles, self._moved = False, 0.0
@@ -82,19 +83,22 @@ class Pointer:
         rest = self._live.interaction.scene.means
         with self._lock:
             self._level = level if level < len(self._units) else None
-            # The handle of each kernel, and the handles of units with kernels that are free or in a hand.
-            movable = self._free | (self._hand >= 0)
-            self._index = self._units[level] if level < len(self._units) else torch.where(movable, 0, -1)
+            # The handle of each kernel, and the handles of units with free kernels.
+            self._index = self._units[level] if level < len(self._units) else torch.where(self._free, 0, -1)
             self._count = int(self._index.max()) + 1
-            self._movable = self._index[movable & (self._index >= 0)].unique()
+            self._movable = self._index[self._free & (self._index >= 0)].unique()
             if self._pick is not None:
                 self._pick.remove()
             self._make_handles(self._centres(rest).numpy(), self._handle_radii(rest.float().cpu()).numpy())
         self._moved = 0.0
 
     def _centres(self, positions: Tensor) -> Tensor:
-        centres = unit_centres(positions.float().cpu(), self._index, self._masses, self._count)
-        return self._placing.to_page(centres)[self._movable]
+        at = positions.float().cpu()
+        centres = unit_centres(at, self._index, self._masses, self._count)[self._movable]
+        return self._placing.to_page(torch.cat((centres, self._pin_centres(at))))
+
+    def _pin_centres(self, positions: Tensor) -> Tensor:
+        return unit_centres(positions, self._pins, torch.ones(len(positions)), int(self._pins.max()) + 1)
 
     def _handle_radii(self, rest: Tensor) -> Tensor:
         """Radii of the handles, similar to those of their units [page units]."""
@@ -102,7 +106,11 @@ class Pointer:
         inside = self._index >= 0
         away = (rest[inside] - centres[self._index[inside]]).norm(dim=-1)
         widest = torch.zeros(self._count).scatter_reduce(0, self._index[inside], away, "amax")
-        return (0.8 * widest * self._placing.scale).clamp(0.008 * SIZE, 0.2 * SIZE)[self._movable]
+        held = self._pins >= 0
+        spread = (rest[held] - self._pin_centres(rest)[self._pins[held]]).norm(dim=-1)
+        pins = torch.zeros(int(self._pins.max()) + 1).scatter_reduce(0, self._pins[held], spread, "amax")
+        radii = torch.cat((0.8 * widest[self._movable], 1.25 * pins))  # an icosahedron has flat sides
+        return (radii * self._placing.scale).clamp(0.008 * SIZE, 0.2 * SIZE)
 
     def _make_handles(self, centres: np.ndarray, radii: np.ndarray) -> None:
         # `_movable` is already that of the new handles: their events carry indices into it.
@@ -190,16 +198,14 @@ class Pointer:
         return found
 
     def _hand_under(self, event: Any, page: Tensor, point: Tensor) -> int:
-        """The hand of the first kernel under a point, else that of a unit without free kernels; -1 for none."""
+        """The hand of the pins whose handle is dragged, else of the first kernel under a point; -1 for none."""
+        index = event.instance_index
+        if index is not None and index >= len(self._movable):
+            found = self._hand[self._pins == index - len(self._movable)]
+            return int(found[0]) if len(found) else -1
         eye = torch.tensor([float(v) for v in event.client.camera.position])
         kernel = first_hit(page, self._reach, eye, point - eye, self._free | (self._hand >= 0))
-        if kernel is not None:
-            return int(self._hand[kernel])
-        index = event.instance_index
-        if index is None or not 0 <= index < len(self._movable):
-            return -1
-        unit = self._index == self._movable[index]
-        return -1 if bool((unit & self._free).any()) else int(self._hand[unit].max())
+        return -1 if kernel is None else int(self._hand[kernel])
 
     def _drag_hand(self, grab: Grab, event: Any) -> None:
         end = event.end_position
@@ -217,7 +223,7 @@ class Pointer:
             return
         chosen = self._part(int(self._movable[index]))
         mask = chosen.mask(self._live.interaction.scene, self._units).cpu() & self._free
-        if bool(mask.any()) and not bool((mask & self.mask).any()):
+        if not bool((mask & self.mask).any()):
             self.select(chosen)
 
     def pull(self, start: Sequence[float], end: Sequence[float]) -> tuple[tuple[float, float, float], float]:
@@ -269,6 +275,13 @@ def invisible_handle() -> bytes:
     clear = PBRMaterial(alphaMode="BLEND", baseColorFactor=[255, 255, 255, 0], doubleSided=True)
     mesh.visual = TextureVisuals(material=clear)
     return bytes(mesh.export(file_type="glb"))  # type: ignore[arg-type]
+
+
+def pin_groups(hand: Int[Tensor, " K"], units: Int[Tensor, " K"]) -> Int[Tensor, " K"]:
+    """Groups 0, 1, ... of the kernels in hands: those of one unit in one hand; -1 for the others."""
+    held = hand >= 0
+    both = torch.stack((hand, units))[:, held]
+    return torch.full_like(hand, -1).masked_scatter(held, both.unique(dim=1, return_inverse=True)[1])
 
 
 def first_hit(
