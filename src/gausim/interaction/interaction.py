@@ -298,12 +298,19 @@ class Interaction:
                 f"{self.made_with.run or 'this method'}: nothing of '{self.scene.name}' is held by a hand that this "
                 "method can move. Play a run of gausim with pinned kernels."
             )
-        if self._hands is None and isinstance(self._dynamics, Handled):
-            self._hands = hands = MovedHands(self.scene)
-            begin = self.frame_number
-            self._limited_before += self._stepper.limited
+        if self._hands is None:
+            self._hands = MovedHands(self.scene)
+            self._go_on()
+        self._hands.move(event, self.frame_number)
+
+    def _go_on(self) -> None:
+        """Goes on from the current state with a new stepper, and with the hands if anything has moved them."""
+        self._limited_before += self._stepper.limited
+        hands, begin = self._hands, self.frame_number
+        if hands is not None and isinstance(self._dynamics, Handled):
             self._stepper = self._dynamics.stepper(self.state, lambda frame: hands.pose(frame + begin))
-        cast(MovedHands, self._hands).move(event, self.frame_number)
+        else:
+            self._stepper = self._dynamics.stepper(self.state)
 
     @property
     def adjustable(self) -> bool:
@@ -311,19 +318,14 @@ class Interaction:
         return isinstance(self._dynamics, Adjustable)
 
     def _adjust(self, event: Material) -> None:
-        """Changes the material; a new stepper goes on from the current state."""
+        """Changes the material."""
         if not isinstance(self._dynamics, Adjustable):
             raise ConfigError(
                 f"{self.made_with.run or 'this method'}: its material was learned and cannot be set. Take a scene that "
                 "a pretrained network moves (--from BASE)."
             )
         self._dynamics.adjust(event.stiffness, event.damping)
-        self._limited_before += self._stepper.limited
-        hands, begin = self._hands, self.frame_number
-        if hands is not None and isinstance(self._dynamics, Handled):
-            self._stepper = self._dynamics.stepper(self.state, lambda frame: hands.pose(frame + begin))
-        else:
-            self._stepper = self._dynamics.stepper(self.state)
+        self._go_on()
 
     def _allowed(self, name: str, amount: float, *, per: float = 1.0) -> float:
         """``amount * per``, a force in weights, or an error if it exceeds the largest force."""
