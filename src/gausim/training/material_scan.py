@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gausim.data.pretraining import BodyData, CorpusDataModule
+from gausim.models.hierarchy.batch import SceneBatch
 from gausim.models.hierarchy.units import fixed_units
 from gausim.models.step.simulator import GausSim
 from gausim.models.template.material import MaterialTemplate, PreparedMaterial
@@ -29,14 +30,16 @@ def find_materials(model: GausSim, data: CorpusDataModule) -> None:
     A scan of these two numbers finds where to begin. Candidates are compared by rollouts of the template alone.
     """
     for scene_id, item in enumerate(cast("list[BodyData]", data.objects)):
-        attributes, motion = model.attributes[scene_id].data, seen_motion(model, scene_id, item)
+        batch = model.batch((scene_id,))
+        mass, _ = model.masses(batch)
+        attributes, motion = model.attributes[scene_id].data, seen_motion(model, batch, item)
         unchanged, turn = 0, 0
         while unchanged < len(CANDIDATES) and turn < MOST_TURNS:
             number, errors = turn % len(CANDIDATES), []
             before = attributes[0, number].clone()
             for value in CANDIDATES[number]:
                 attributes[:, number] = value
-                errors.append(motion.error(_part(model, scene_id, item.fps)))
+                errors.append(motion.error(_part(model, batch, mass, item.fps)))
             attributes[:, number] = CANDIDATES[number][int(torch.stack(errors).argmin())]
             unchanged, turn = unchanged + 1 if attributes[0, number] == before else 0, turn + 1
 
@@ -59,10 +62,10 @@ class SeenMotion:
         return error.nan_to_num(torch.inf)
 
 
-def seen_motion(model: GausSim, scene_id: int, item: BodyData) -> SeenMotion:
+def seen_motion(model: GausSim, batch: SceneBatch, item: BodyData) -> SeenMotion:
     """Rollouts from every other seen frame of a body; the frame before the first is known."""
-    prepared = model.prepare(model.batch((scene_id,)))
-    projection = cast(MaterialTemplate, model.template).body(scene_id).projection.flatten(0, 1)
+    prepared = model.prepare(batch)
+    projection = cast(MaterialTemplate, model.template).body(batch.scene_ids[0]).projection.flatten(0, 1)
     seen, rest = len(item.train_frames), prepared.levels[-1].rest
     known = item.body.positions[:, : seen + 1].to(projection)
     moved = torch.stack([prepared.finest(x) - rest for x in known.flatten(0, 1)]).flatten(1)
@@ -74,8 +77,8 @@ def seen_motion(model: GausSim, scene_id: int, item: BodyData) -> SeenMotion:
     return SeenMotion(size.repeat_interleave(len(begins)), before, now, torch.stack(after))
 
 
-def _part(model: GausSim, scene_id: int, fps: float) -> PreparedMaterial:
-    template, batch = cast(MaterialTemplate, model.template), model.batch((scene_id,))
-    units = fixed_units(batch, model.masses(batch)[0], model.attributes[scene_id])[1][-1]
+def _part(model: GausSim, batch: SceneBatch, mass: Float[Tensor, " M"], fps: float) -> PreparedMaterial:
+    template, scene_id = cast(MaterialTemplate, model.template), batch.scene_ids[0]
+    units = fixed_units(batch, mass, model.attributes[scene_id])[1][-1]
     matrices = template.matrices(scene_id, units.log_density, units.attributes, 1 / fps)
     return PreparedMaterial(template.body(scene_id), matrices, None)
