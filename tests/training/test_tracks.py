@@ -23,7 +23,8 @@ from gausim.render.draw import draw
 from gausim.training.method import SharedSimulator
 from gausim.training.module import GausSimModule
 from gausim.training.supervision.images import Sources
-from gausim.training.supervision.motion_tracks import MotionTracker, TrackSupervision, tracks_or_images
+from gausim.training.supervision.motion_tracker import MotionTracker
+from gausim.training.supervision.motion_tracks import TrackSupervision
 from gausim.training.supervision.points import PointSupervision
 
 SCENE = toy_object.toy_scene()

@@ -29,6 +29,7 @@ from gausim.runs.defaults import with_defaults
 from gausim.runs.directory import RunDirectory
 from gausim.training.callbacks.convergence import Convergence
 from gausim.training.callbacks.judge import EpochJudge
+from gausim.training.callbacks.warm_start import WarmStart
 from gausim.training.first_frames import begin_free_bodies
 from gausim.training.fitted.fitting import StagedFit
 from gausim.training.material_scan import find_materials
@@ -159,6 +160,9 @@ def _fit(
     plan = module.method.plan if isinstance(module.method, StagedFit) else None
     trainer = _trainer(cfg, run, crew, epochs=None if plan is None else plan.epochs)
     faults: list[str] = []
+    for callback in cast(Any, trainer).callbacks:
+        if isinstance(callback, WarmStart):
+            callback.plan(trainer, module, datamodule)
     for logger in trainer.loggers:
         logger.log_hyperparams(_plain(cfg))
     if crew.is_first:

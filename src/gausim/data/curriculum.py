@@ -16,6 +16,8 @@ class Curriculum:
     epochs_per_increase: int = 1  # epochs between increases
     # current limit of predicted steps, at most ``t_max``; the convergence test lowers it to hold frames back
     longest: int = field(default=0, init=False, repr=False)
+    # whether rollouts are as long as possible from epoch 0 on, because training starts near the motion in the videos
+    grown: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Checks the bounds."""
@@ -25,4 +27,6 @@ class Curriculum:
 
     def steps(self, epoch: int) -> int:
         """Predicted steps T in an epoch (counted from 0)."""
+        if self.grown:
+            return self.longest
         return min(self.longest, self.t_start + epoch // self.epochs_per_increase)

@@ -53,6 +53,10 @@ class InitialStates(nn.Module, ABC):
         """Translation, rotation, velocity and spin of a free body: a part of its parameter."""
 
     @abstractmethod
+    def set_motion(self, sequence_id: int, motion: Float[Tensor, "K 3"]) -> None:
+        """Sets o to the nearest motion to a given one [scene units]."""
+
+    @abstractmethod
     def reach(self, change: float) -> float:
         """Displacement of x_{-1} when the parameter changes by ``change`` [diagonals]."""
 
@@ -113,6 +117,11 @@ class FreeInitialStates(InitialStates):
         """The last four rows."""
         return self.offset[sequence_id][-START // 3 :].view(START)
 
+    @torch.no_grad()
+    def set_motion(self, sequence_id: int, motion: Float[Tensor, "K 3"]) -> None:
+        """Takes the motion of every kernel."""
+        self.offset[sequence_id][: len(motion)] = -motion / self._diagonal[self.scene_of_sequence[sequence_id]]
+
     def reach(self, change: float) -> float:
         """Displacement of x_{-1} when every component of its parameter changes by ``change`` [diagonals]."""
         return change
@@ -160,6 +169,13 @@ class ModalInitialStates(InitialStates):
     def start(self, sequence_id: int) -> Float[Tensor, " 12"]:
         """The last twelve numbers."""
         return self.velocity[sequence_id][-START:]
+
+    @torch.no_grad()
+    def set_motion(self, sequence_id: int, motion: Float[Tensor, "K 3"]) -> None:
+        """Sets the amplitudes by least squares."""
+        basis = self._basis[self.scene_of_sequence[sequence_id]].to(motion).double().flatten(0, 1)
+        found = torch.linalg.solve(basis.mT @ basis, basis.mT @ motion.double().flatten()).float()
+        self.velocity[sequence_id][: len(found)] = found
 
     def reach(self, change: float) -> float:
         """Displacement of x_{-1} when v_0 changes by ``change``, smallest over the scenes [diagonals]."""

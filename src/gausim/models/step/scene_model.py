@@ -23,7 +23,14 @@ from gausim.models.step.body_frame import Frames, body_axes
 from gausim.models.step.predictor import DeformationPredictor
 from gausim.models.step.prepared import Prepared
 from gausim.models.template.smooth import smooth_motions
-from gausim.models.template.template import Motion, PreparedTemplate, Property, Template
+from gausim.models.template.template import (
+    ModalScene,
+    Motion,
+    PreparedScenes,
+    PreparedTemplate,
+    Property,
+    Template,
+)
 from gausim.nn.normaliser import normalisers_of
 
 # Disjoint unions that stay in memory; with many scenes almost every batch is another one.
@@ -127,6 +134,30 @@ class SceneModel(nn.Module, ABC):
         """Masses m = exp(r) V of the simulated kernels, and their log density r."""
         log_density = torch.cat([self.log_density[i] for i in batch.scene_ids])
         return log_density.exp() * batch.volume, log_density
+
+    def modal_scene(self, scene_id: int) -> ModalScene:
+        """The template of one scene in modal coordinates, between two updates of the parameters.
+
+        Raises:
+            ConfigError: the template has no modes.
+        """
+        batch = self.batch((scene_id,))
+        _, units = fixed_units(batch, self.masses(batch)[0], self.attributes[scene_id])
+        template = self.template.prepare(batch, units[-1])
+        if not isinstance(template, PreparedScenes):
+            raise ConfigError(f"model.simulator.template: {type(self.template).__name__} has no modes.")
+        return template.parts[0][0]
+
+    @torch.no_grad()
+    def modal_projection(self, scene_id: int) -> Float[Tensor, "K 3 M"]:
+        """P with z = sum_k u_k P_k, the modal coordinates of displacements u of the kernels of a scene."""
+        batch = self.batch((scene_id,))
+        fraction, _ = fixed_units(batch, self.masses(batch)[0], self.attributes[scene_id])
+        projection = self.modal_scene(scene_id).projection.unflatten(0, (-1, 3))
+        frames = self.frames(batch)
+        if frames is not None:
+            projection = frames.axes[-1].mT @ projection
+        return fraction[:, None, None] * projection.index_select(0, batch.finest)
 
     def pushed(self, prepared: Prepared, state: SimState, force: Float[Tensor, "K 3"]) -> SimState:
         """The state with free kernels displaced by a force: x_t + f dt^2 / (2 m)."""

@@ -1,0 +1,168 @@
+"""Start of a training from the motion in the videos: initial states and material are fitted before the first step.
+
+Rollouts from a state and a material at random do not resemble the videos, and images that do not overlap have no useful
+loss gradient. So the motion of every sequence is tracked without dynamics, in the modes of the template
+(:mod:`gausim.training.supervision.motion_tracker`), and initial states, densities, attributes and the template are
+fitted to it in modal coordinates (:mod:`gausim.training.modal_fit`). Training then starts from there, with the network.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, cast
+
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from rich.progress import track
+from torch import Tensor
+
+from gausim.core import ConfigError
+from gausim.data.datamodule import ReadyDataModule
+from gausim.data.dataset import SequenceSample
+from gausim.models.initial_state import InitialStates
+from gausim.models.step.simulator import GausSim
+from gausim.training import modal_fit
+from gausim.training.callbacks.cadence import training_data
+from gausim.training.modal_fit import KnownMotion
+from gausim.training.module import GausSimModule
+from gausim.training.optimizers import OptimizerSettings, StableDecaySchedule
+from gausim.training.supervision.images import ImageSupervision, Sources
+from gausim.training.supervision.motion_tracker import MotionTracker
+from gausim.training.supervision.motion_tracks import TrackSupervision
+
+# Sequences of a scene, and displacements (F, K, 3) of their kernels in all frames [scene units].
+Tracked = list[tuple[SequenceSample, Tensor]]
+
+
+class WarmStart(Callback):
+    """Tracks the motion of all training sequences and fits initial states and material to it, before the first step.
+
+    It has no effect on models without modes, on bodies that are free or in hands, on supervision other than by images,
+    and on runs that are resumed.
+    """
+
+    def __init__(
+        self,
+        *,
+        updates: int = 300,
+        sequences: int = 12,
+        scene_lr: float = 0.1,
+        template_lr: float = 1e-2,
+        initial_lr: float = 2e-3,
+        later: float = 0.2,
+        epochs: int = 30,
+    ) -> None:
+        """Stores the settings.
+
+        Args:
+            updates: updates of the fit; 0 leaves out the warm start.
+            sequences: most sequences of an object in one update.
+            scene_lr: learning rate of densities and attributes in the fit.
+            template_lr: that of the template.
+            initial_lr: that of the initial states.
+            later: factor on these three rates in the training that follows, which starts near the solution.
+            epochs: most epochs of that training; its rates fall from the first on.
+        """
+        if updates < 0 or min(sequences, epochs) < 1 or later < 0:
+            raise ConfigError(
+                "callbacks.warm_start: expected updates and later >= 0, sequences and epochs >= 1, got "
+                f"updates={updates}, later={later}, sequences={sequences}, epochs={epochs}."
+            )
+        self._updates, self._sequences, self._later, self._epochs = updates, sequences, later, epochs
+        self._chosen: list[int] = []
+        self._settings = OptimizerSettings(
+            scene_lr=scene_lr, template_lr=template_lr, initial_lr=initial_lr, clip_per_group=True
+        )
+
+    def plan(self, trainer: Trainer, module: GausSimModule, data: ReadyDataModule) -> None:
+        """Chooses the sequences; if these are all, rollouts are as long as possible from the first epoch on.
+
+        Then training is short and its rates fall from the beginning.
+        """
+        self._chosen = _tracked(module, data) if self._updates else []
+        if not self._chosen or len(self._chosen) < len(data.index.entries):
+            return
+        data.curriculum.grown = True
+        trainer.fit_loop.max_epochs = min(trainer.max_epochs or self._epochs, self._epochs)
+        schedule = module.settings.schedule
+        if isinstance(schedule, StableDecaySchedule):
+            module.settings = replace(module.settings, schedule=replace(schedule, decay=1.0))
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """The warm start, on the first rank for all."""
+        if trainer.global_step or not self._chosen:
+            return
+        assert isinstance(pl_module, GausSimModule)
+        groups = {name: own for name, own in pl_module.groups().items() if name != "network"}
+        weights = [p for own in groups.values() for p in own]
+
+        def found() -> list[Tensor]:
+            self._fit(pl_module, training_data(trainer), groups, quiet=not trainer.progress_bar_callback)
+            return [p.detach().cpu() for p in weights]
+
+        with torch.no_grad():
+            for weight, value in zip(weights, pl_module.ranks.first(found), strict=True):
+                weight.copy_(value.to(weight))
+        for optimizer in trainer.optimizers:
+            for group in optimizer.param_groups:  # saved with the optimiser, so a resumed run keeps the factor
+                group["base_lr"] *= 1.0 if group["name"] == "network" else self._later
+
+    def _fit(self, module: GausSimModule, data: ReadyDataModule, groups: Any, *, quiet: bool) -> None:
+        model, last = cast(GausSim, module.model), data.curriculum.longest
+        sources = Sources(
+            model.scenes, lambda number: None, model.smooth_motions, module.renderer, module.objective.image
+        )
+        tracker, states = MotionTracker(sources), cast(InitialStates, module.initial_states)
+        found: dict[int, Tracked] = {}
+        for number in track(self._chosen, "Tracking the motion", disable=quiet, transient=True):
+            sample = data.training_sample(number, last).to(module.device)
+            with torch.enable_grad():
+                coordinates = tracker.extend(None, sample)
+            moved = tracker.motions(sample.scene_id).displacements(coordinates)
+            states.set_motion(number, moved[1])
+            found.setdefault(sample.scene_id, []).append((sample, moved))
+        motions = [(i, _Known(module, i, tracked, self._sequences)) for i, tracked in found.items()]
+        with torch.enable_grad():
+            losses = modal_fit.fit(model, motions, self._settings, groups, longest=last, updates=self._updates)
+            for loss in track(losses, "Fitting the material", total=self._updates, disable=quiet, transient=True):
+                final = loss
+        sequences = f"{len(self._chosen)} sequence{'s' if len(self._chosen) != 1 else ''}"
+        print(f"  warm start: {sequences} tracked; without a network {final:.3f} of the motion is left", flush=True)
+
+
+class _Known:
+    """Tracked motion of the sequences of a scene, from their trained initial states."""
+
+    def __init__(self, module: GausSimModule, scene_id: int, tracked: Tracked, most: int) -> None:
+        self._initial, self._draws, self._most = module.method.initial, torch.Generator().manual_seed(0), most
+        self._samples = [sample for sample, _ in tracked]
+        model = cast(GausSim, module.model)
+        self._batch = model.batch((scene_id,))
+        self._projection = model.modal_projection(scene_id).flatten(0, 1)
+        self._z = torch.stack([moved.flatten(1) @ self._projection for _, moved in tracked])
+        self._size = modal_fit.size_of(self._z[:, 1:])
+
+    def __call__(self, steps: int) -> KnownMotion:
+        """T = ``steps`` frames of some of the sequences."""
+        rows = torch.randperm(len(self._samples), generator=self._draws)[: self._most].tolist()
+        states = [self._initial([self._samples[i]], self._batch) for i in rows]
+        now, before = (
+            torch.stack([x - self._batch.rest for x in own]).flatten(1) @ self._projection
+            for own in zip(*((s.positions, s.previous) for s in states), strict=True)
+        )
+        return KnownMotion(self._size[rows], before, now, self._z[rows, 1 : steps + 1].movedim(1, 0))
+
+
+def _tracked(module: GausSimModule, data: ReadyDataModule) -> list[int]:
+    """Numbers of the sequences whose motion is tracked."""
+    model, states = module.model, module.initial_states
+    if not isinstance(model, GausSim) or not isinstance(states, InitialStates):
+        return []
+    if not isinstance(module.supervision, (ImageSupervision, TrackSupervision)):
+        return []
+    free = [scene.surroundings.free for scene in model.scenes]
+    return [
+        number
+        for number, (scene_id, record) in enumerate(data.index.entries)
+        if not free[scene_id] and record.hands is None and model.smooth_motions(scene_id) is not None
+    ]

@@ -1,0 +1,94 @@
+"""Fits of a template to known motion in modal coordinates: a training of seconds, without network and images.
+
+Rollouts z_{t+1} = after(z_t, z_{t-1}) of the template alone are compared with the known coordinates z* of each frame,
+
+    sum_t |z_t - z*_t|^2 / size^2,    size^2 = mean_t |z*_t|^2 of the sequence,
+
+with T growing from 2 to its longest in the first half and rates that fall as a half-cosine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from gausim.models.step.scene_model import SceneModel
+from gausim.models.template.template import ModalScene
+from gausim.training.optimizers import OptimizerSettings
+
+# Predicted frames in the first update, fraction of the updates over which T grows, last factor on the rates.
+SHORTEST, GROWING, LAST_RATE = 2, 0.5, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class KnownMotion:
+    """Beginnings and continuations of B rollouts in modal coordinates."""
+
+    size: Float[Tensor, " B"]  # root mean square of the sequence
+    before: Float[Tensor, "B M"]
+    now: Float[Tensor, "B M"]
+    after: Float[Tensor, "T B M"]
+
+    def distances(self, part: ModalScene) -> Iterator[Float[Tensor, " B"]]:
+        """Squared distances of the rollouts of a template from the motion, in squared sizes, frame by frame."""
+        before, now = self.before, self.now
+        for true in self.after:
+            before, now = now, part.after(now, before)
+            yield (now - true).square().sum(-1) / self.size.square()
+
+    def error(self, part: ModalScene) -> Float[Tensor, ""]:
+        """Mean distance of the rollouts of a template from the motion, in sizes; infinite where it is not finite."""
+        return torch.stack([d.sqrt().mean() for d in self.distances(part)]).sum().nan_to_num(torch.inf)
+
+
+def size_of(z: Float[Tensor, "S F M"]) -> Float[Tensor, " S"]:
+    """Root mean square of the coordinates of sequences, never zero."""
+    return z.square().sum(-1).mean(1).sqrt().clamp_min(torch.finfo(z.dtype).tiny ** 0.5)
+
+
+def fit(
+    model: SceneModel,
+    motions: Sequence[tuple[int, Callable[[int], KnownMotion]]],
+    settings: OptimizerSettings,
+    groups: dict[str, list[nn.Parameter]],
+    *,
+    longest: int,
+    updates: int,
+) -> Iterator[float]:
+    """Fits parameters of a model to known motion; yields the loss of every update.
+
+    Args:
+        model: its template has modes.
+        motions: for some scenes, by their numbers, the known motion for a given T; it may depend on parameters.
+        settings: rates of the groups.
+        groups: the parameters, without the network's.
+        longest: largest T.
+        updates: number of updates.
+    """
+    optimizer = settings.build({name: [p for p in own if p.requires_grad] for name, own in groups.items()})
+    for update in range(updates):
+        done = update / updates
+        steps = min(longest, SHORTEST + int((longest - SHORTEST) * done / GROWING))
+        _set_rates(optimizer, done)
+        optimizer.zero_grad(set_to_none=True)
+        total = 0.0
+        for scene_id, known in motions:
+            motion, part = known(steps), model.modal_scene(scene_id)
+            loss = torch.stack([d.mean() for d in motion.distances(part)]).mean() / len(motions)
+            if bool(torch.isfinite(loss)):
+                loss.backward()
+            total += float(loss.detach())
+        settings.clip(optimizer)
+        optimizer.step()
+        yield total
+
+
+def _set_rates(optimizer: Optimizer, done: float) -> None:
+    for group in optimizer.param_groups:
+        group["lr"] = group["base_lr"] * (LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * done)))

@@ -1,0 +1,92 @@
+"""The start of a training from tracked motion: what is found, and that a resumed run keeps it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from helpers.simulators import SMALLEST
+from helpers.toy_object import write_toy_object
+
+from gausim.cli import train
+from gausim.compose.build import build, load_run
+from gausim.compose.config import compose
+from gausim.core import ConfigError
+from gausim.runs.checkpoint import read_checkpoint
+from gausim.training import modal_fit
+from gausim.training.callbacks.warm_start import WarmStart
+from gausim.training.optimizers import OptimizerSettings
+
+QUICK = [x for x in SMALLEST if "warm_start" not in x] + [
+    "model.simulator.template.modes=6", "render=cpu", "logger=none", "callbacks.motion=null", "evaluate=false",
+    "data.curriculum.t_max=4", "data.repeats=1", "data.batch_size=1", "+trainer.convergence.held_back=1",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_toy_object(tmp_path_factory.mktemp("warm") / "toy", frames=8).root
+
+
+@pytest.mark.parametrize("model", ["gausim", "gausim_elastic"])
+def test_training_starts_near_the_motion_and_a_resumed_run_starts_from_its_checkpoint(
+    toy: Path, tmp_path: Path, model: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    common = [f"data.root={toy}", f"model={model}", *QUICK, "+callbacks.warm_start.updates=60"]
+    assert train.main([*common, "trainer.max_epochs=2", f"hydra.run.dir={tmp_path / 'whole'}"]) == 0
+    printed = capsys.readouterr().out
+    assert "warm start: 2 sequences tracked" in printed
+    first = float(printed.split("epoch 1/2")[1].split(" of static")[0].split()[-1])
+    bare = [*common[:-1], "callbacks.warm_start=null", "trainer.max_epochs=1"]
+    assert train.main([*bare, f"hydra.run.dir={tmp_path / 'bare'}"]) == 0
+    cold = float(capsys.readouterr().out.split("epoch 1/1")[1].split(" of static")[0].split()[-1])
+    assert first < 0.5 * cold
+    cut = f"hydra.run.dir={tmp_path / 'cut'}"
+    module = load_run(tmp_path / "whole").module
+    groups = read_checkpoint(tmp_path / "whole/last.ckpt")["optimizer_states"][0]["param_groups"]
+    rates = {group["name"]: group["base_lr"] for group in groups}
+    assert rates["initial"] == pytest.approx(0.2 * module.settings.initial_lr)
+    assert rates["network"] == pytest.approx(module.settings.network_lr)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gausim.training.module.GausSimModule.on_train_epoch_end", _interrupt)
+        with pytest.raises(RuntimeError, match="cut"):
+            train.main([*common, "trainer.max_epochs=2", "callbacks.checkpoint.every_steps=1", cut])
+    assert train.main([*common, "trainer.max_epochs=2", "callbacks.checkpoint.every_steps=1", cut]) == 0
+    assert "warm start" not in capsys.readouterr().out.split("resuming")[1]
+    whole, again = (read_checkpoint(tmp_path / n / "last.ckpt")["state_dict"] for n in ("whole", "cut"))
+    assert all(torch.equal(value, again[name]) for name, value in whole.items())
+
+
+def _interrupt(module: object) -> None:
+    raise RuntimeError("cut")
+
+
+def test_a_fit_in_modal_coordinates_finds_the_template_that_made_a_motion(toy: Path) -> None:
+    module, _ = build(compose("train", [f"data.root={toy}", "model=gausim", *QUICK]))
+    model, draws = module.model, torch.Generator().manual_seed(3)
+    start = 0.1 * torch.randn(2, 6, generator=draws)
+    attributes = model.attributes[0].detach().clone()
+    with torch.no_grad():
+        model.attributes[0].copy_(0.5 * torch.randn(attributes.shape, generator=draws))
+        part, z = model.modal_scene(0), [start, 1.2 * start]
+        for _ in range(12):
+            z.append(part.after(z[-1], z[-2]))
+        model.attributes[0].copy_(attributes)
+    true = torch.stack(z)
+    size = modal_fit.size_of(true.movedim(0, 1))
+
+    def known(steps: int) -> modal_fit.KnownMotion:
+        return modal_fit.KnownMotion(size, true[0], true[1], true[2 : 2 + steps])
+
+    groups = {"scene": [model.attributes[0]]}
+    settings = OptimizerSettings(scene_lr=0.1)
+    losses = list(modal_fit.fit(model, [(0, known)], settings, groups, longest=12, updates=150))
+    before = float(known(12).error(part))
+    assert before == pytest.approx(0.0, abs=1e-4)
+    assert losses[-1] < 1e-2 and float(known(12).error(model.modal_scene(0))) < 0.1 * 12
+
+
+def test_wrong_settings_are_refused() -> None:
+    with pytest.raises(ConfigError, match="warm_start: expected updates >= 0"):
+        WarmStart(updates=-1)
