@@ -88,5 +88,5 @@ def test_a_fit_in_modal_coordinates_finds_the_template_that_made_a_motion(toy: P
 
 
 def test_wrong_settings_are_refused() -> None:
-    with pytest.raises(ConfigError, match="warm_start: expected updates >= 0"):
+    with pytest.raises(ConfigError, match="warm_start: expected updates and later >= 0"):
         WarmStart(updates=-1)

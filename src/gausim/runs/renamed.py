@@ -28,6 +28,7 @@ MOVED = {
     "gausim.models.elastic": "gausim.models.template.elastic",
     "gausim.models.material": "gausim.models.template.material",
     "gausim.models.simulator": "gausim.models.step.simulator",
+    "gausim.training.supervision.motion_tracks.tracks_or_images": "gausim.training.supervision.motion_tracks.TrackSupervision",
     "gausim.training.trainer.make_trainer": "gausim.training.trainer.TrainerSettings",
 }
 # Removed settings by class, which did not affect training or were off by default.
@@ -36,13 +37,14 @@ GONE = {
     "HierarchySettings": ("edge_bucket",),
     "make_trainer": ("overwrite",),
     "TrainerSettings": ("overwrite",),
+    "TrackSupervision": ("rate",),
 }
 # No schedule now means a constant rate; a run with the cosine schedule can be evaluated, but not resumed.
 SCHEDULES = ("ConstantSchedule", "CosineSchedule")
 # Removed settings of which one value is still supported; a false value stands for all false values.
 UNSUPPORTED: dict[str, dict[str, Any]] = {
     "Objective": {"input_noise": None},
-    **dict.fromkeys(("PointSupervision", "TrackSupervision", "tracks_or_images"), {"velocity_weight": None}),
+    **dict.fromkeys(("PointSupervision", "TrackSupervision"), {"velocity_weight": None}),
     "ModulusField": {"parametrisation": "log"},
     "PhysDreamer": {"gradients": True, "parametrisation": "log"},
     **dict.fromkeys(("SpringMass", "ConstantVelocity"), {"gradients": True}),
