@@ -28,7 +28,9 @@ MOVED = {
     "gausim.models.elastic": "gausim.models.template.elastic",
     "gausim.models.material": "gausim.models.template.material",
     "gausim.models.simulator": "gausim.models.step.simulator",
-    "gausim.training.supervision.motion_tracks.tracks_or_images": "gausim.training.supervision.motion_tracks.TrackSupervision",
+    "gausim.training.supervision.motion_tracks.tracks_or_images": (
+        "gausim.training.supervision.motion_tracks.TrackSupervision"
+    ),
     "gausim.training.trainer.make_trainer": "gausim.training.trainer.TrainerSettings",
 }
 # Removed settings by class, which did not affect training or were off by default.

@@ -37,9 +37,7 @@ def find_materials(model: GausSim, data: CorpusDataModule) -> None:
         _scan(model, scene_id, z)
         groups = {"scene": [model.attributes[scene_id], model.log_density[scene_id]]}
         longest = z.shape[1] - 2
-        for _ in modal_fit.fit(
-            model, [(scene_id, _beginnings(z))], settings, groups, longest=longest, updates=UPDATES
-        ):
+        for _ in modal_fit.fit(model, [(scene_id, _beginnings(z))], settings, groups, longest=longest, updates=UPDATES):
             pass
 
 
