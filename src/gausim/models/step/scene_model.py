@@ -190,7 +190,7 @@ class SceneModel(nn.Module, ABC):
         motions = self.template.basis(scene_id)
         if motions is None:
             return None
-        modes, slopes, sizes = motions
+        modes, slopes, sizes = (x.to(self.scenes[scene_id].means) for x in motions)  # where the scenes are
         axes = self.axes[scene_id].to(modes)
         modes = torch.einsum("ba,nbm->nam", axes, modes)
         slopes = torch.einsum("ca,ncdm,db->nabm", axes, slopes, axes)

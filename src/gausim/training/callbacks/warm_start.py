@@ -118,7 +118,7 @@ class WarmStart(Callback):
             sample = data.training_sample(number, last).to(module.device)
             with torch.enable_grad():
                 coordinates = tracker.extend(None, sample)
-            moved = tracker.motions(sample.scene_id).displacements(coordinates)
+            moved = tracker.motions(sample.scene_id).to(coordinates).displacements(coordinates)
             states.set_motion(number, moved[1])
             found.setdefault(sample.scene_id, []).append((sample, moved))
         motions = [(i, _Known(module, i, tracked, self._sequences)) for i, tracked in found.items()]
@@ -164,5 +164,5 @@ def _tracked(module: GausSimModule, data: ReadyDataModule) -> list[int]:
     return [
         number
         for number, (scene_id, record) in enumerate(data.index.entries)
-        if not free[scene_id] and record.hands is None and model.smooth_motions(scene_id) is not None
+        if not free[scene_id] and record.hands is None and model.template.basis(scene_id) is not None
     ]
