@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeVar
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from rich.console import Console
-from rich.progress import track
 
 from gausim.core import Cameras, GaussianScene
 from gausim.data.objects import ObjectData
 from gausim.data.records import SequenceRecord
 from gausim.doctor.silhouettes import Fit, Silhouettes, draw_silhouettes, fit_silhouette
+from gausim.runs.bar import with_bar
 
 # Sequences whose motion is examined, and whose first frames are compared with the rest scene.
 WATCHED_SEQUENCES, FIRST_FRAMES = 4, 12
@@ -25,8 +22,6 @@ WATCHED_SEQUENCES, FIRST_FRAMES = 4, 12
 WATCHED_FRAMES, FRAMES_AT_A_TIME = 64, 8
 # Length of the longer side of reduced images [pixels].
 LONGEST = 192
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,12 +83,6 @@ class Evidence:
 def same_cameras(a: Cameras, b: Cameras) -> bool:
     """Whether two sets of cameras have the same poses and intrinsics."""
     return bool(torch.equal(a.viewmats, b.viewmats) and torch.equal(a.Ks, b.Ks))
-
-
-def with_bar(items: Sequence[T], step: str) -> Iterable[T]:
-    """The items, with a progress bar if standard error is a terminal."""
-    console = Console(stderr=True)
-    return track(items, step, console=console, transient=True, disable=not console.is_terminal)
 
 
 def gather(data: ObjectData, scene: GaussianScene | None) -> Evidence:

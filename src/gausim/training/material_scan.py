@@ -7,11 +7,11 @@ from typing import cast
 
 import torch
 from jaxtyping import Float
-from rich.progress import track
 from torch import Tensor
 
 from gausim.data.pretraining import BodyData, CorpusDataModule
 from gausim.models.step.simulator import GausSim
+from gausim.runs.bar import with_bar
 from gausim.training import modal_fit
 from gausim.training.modal_fit import KnownMotion
 from gausim.training.optimizers import OptimizerSettings
@@ -32,7 +32,7 @@ def find_materials(model: GausSim, data: CorpusDataModule) -> None:
     A scan of these two numbers, even over the body, finds where to begin.
     """
     settings = OptimizerSettings(scene_lr=RATE, clip_norm=0.0)
-    for scene_id, item in enumerate(track(cast("list[BodyData]", data.objects), "Fitting materials", transient=True)):
+    for scene_id, item in enumerate(with_bar(cast("list[BodyData]", data.objects), "Fitting materials")):
         z = _coordinates(model, scene_id, item)
         _scan(model, scene_id, z)
         groups = {"scene": [model.attributes[scene_id], model.log_density[scene_id]]}

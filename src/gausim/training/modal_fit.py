@@ -9,21 +9,20 @@ with T growing from 2 to its longest in the first half and rates that fall as a 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.optim import Optimizer
 
 from gausim.models.step.scene_model import SceneModel
 from gausim.models.template.template import ModalScene
-from gausim.training.optimizers import OptimizerSettings
+from gausim.training.optimizers import OptimizerSettings, StableDecaySchedule
 
-# Predicted frames in the first update, fraction of the updates over which T grows, last factor on the rates.
-SHORTEST, GROWING, LAST_RATE = 2, 0.5, 0.05
+# Predicted frames in the first update, and fraction of the updates over which T grows.
+SHORTEST, GROWING = 2, 0.5
+FALLING = StableDecaySchedule(warmup=0.0, decay=1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,16 +65,16 @@ def fit(
     Args:
         model: its template has modes.
         motions: for some scenes, by their numbers, the known motion for a given T; it may depend on parameters.
-        settings: rates of the groups.
+        settings: rates of the groups at the beginning.
         groups: the parameters, without the network's.
         longest: largest T.
         updates: number of updates.
     """
+    settings = replace(settings, schedule=FALLING)
     optimizer = settings.build({name: [p for p in own if p.requires_grad] for name, own in groups.items()})
     for update in range(updates):
-        done = update / updates
-        steps = min(longest, SHORTEST + int((longest - SHORTEST) * done / GROWING))
-        _set_rates(optimizer, done)
+        steps = min(longest, SHORTEST + int((longest - SHORTEST) * update / updates / GROWING))
+        settings.set_rates(optimizer, update, updates)
         optimizer.zero_grad(set_to_none=True)
         total = 0.0
         for scene_id, known in motions:
@@ -87,8 +86,3 @@ def fit(
         settings.clip(optimizer)
         optimizer.step()
         yield total
-
-
-def _set_rates(optimizer: Optimizer, done: float) -> None:
-    for group in optimizer.param_groups:
-        group["lr"] = group["base_lr"] * (LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * done)))

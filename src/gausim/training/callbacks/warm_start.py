@@ -13,7 +13,6 @@ from typing import Any, cast
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
-from rich.progress import track
 from torch import Tensor
 
 from gausim.core import ConfigError
@@ -21,13 +20,13 @@ from gausim.data.datamodule import ReadyDataModule
 from gausim.data.dataset import SequenceSample
 from gausim.models.initial_state import InitialStates
 from gausim.models.step.simulator import GausSim
+from gausim.runs.bar import with_bar
 from gausim.training import modal_fit
 from gausim.training.callbacks.cadence import training_data
 from gausim.training.modal_fit import KnownMotion
 from gausim.training.module import GausSimModule
 from gausim.training.optimizers import OptimizerSettings, StableDecaySchedule
 from gausim.training.supervision.images import ImageSupervision, Sources
-from gausim.training.supervision.motion_tracker import MotionTracker
 from gausim.training.supervision.motion_tracks import TrackSupervision
 
 # Sequences of a scene, and displacements (F, K, 3) of their kernels in all frames [scene units].
@@ -37,8 +36,8 @@ Tracked = list[tuple[SequenceSample, Tensor]]
 class WarmStart(Callback):
     """Tracks the motion of all training sequences and fits initial states and material to it, before the first step.
 
-    It has no effect on models without modes, on bodies that are free or in hands, on supervision other than by images,
-    and on runs that are resumed.
+    It has no effect on models without modes, where bodies are free or in hands, on supervision by true points, and on
+    runs that are resumed.
     """
 
     def __init__(
@@ -69,18 +68,19 @@ class WarmStart(Callback):
                 f"updates={updates}, later={later}, sequences={sequences}, epochs={epochs}."
             )
         self._updates, self._sequences, self._later, self._epochs = updates, sequences, later, epochs
-        self._chosen: list[int] = []
+        self._warm = False
         self._settings = OptimizerSettings(
             scene_lr=scene_lr, template_lr=template_lr, initial_lr=initial_lr, clip_per_group=True
         )
 
     def plan(self, trainer: Trainer, module: GausSimModule, data: ReadyDataModule) -> None:
-        """Chooses the sequences; if these are all, rollouts are as long as possible from the first epoch on.
+        """Decides whether there is a warm start.
 
-        Then training is short and its rates fall from the beginning.
+        Then rollouts are as long as possible from the first epoch on, training is short, and its rates fall from the
+        beginning.
         """
-        self._chosen = _tracked(module, data) if self._updates else []
-        if not self._chosen or len(self._chosen) < len(data.index.entries):
+        self._warm = bool(self._updates) and _can_be_tracked(module, data)
+        if not self._warm:
             return
         data.curriculum.grown = True
         trainer.fit_loop.max_epochs = min(trainer.max_epochs or self._epochs, self._epochs)
@@ -90,7 +90,7 @@ class WarmStart(Callback):
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """The warm start, on the first rank for all."""
-        if trainer.global_step or not self._chosen:
+        if trainer.global_step or not self._warm:
             return
         assert isinstance(pl_module, GausSimModule)
         groups = {name: own for name, own in pl_module.groups().items() if name != "network"}
@@ -109,24 +109,23 @@ class WarmStart(Callback):
 
     def _fit(self, module: GausSimModule, data: ReadyDataModule, groups: Any, *, quiet: bool) -> None:
         model, last = cast(GausSim, module.model), data.curriculum.longest
-        sources = Sources(
-            model.scenes, lambda number: None, model.smooth_motions, module.renderer, module.objective.image
-        )
-        tracker, states = MotionTracker(sources), cast(InitialStates, module.initial_states)
+        tracks, states = module.supervision, cast(InitialStates, module.initial_states)
+        if not isinstance(tracks, TrackSupervision):
+            motions_of, image = model.smooth_motions, module.objective.image
+            tracks = TrackSupervision(Sources(model.scenes, lambda number: None, motions_of, module.renderer, image))
         found: dict[int, Tracked] = {}
-        for number in track(self._chosen, "Tracking the motion", disable=quiet, transient=True):
+        count = len(data.index.entries)
+        for number in with_bar(range(count), "Tracking the motion", quiet=quiet):
             sample = data.training_sample(number, last).to(module.device)
-            with torch.enable_grad():
-                coordinates = tracker.extend(None, sample)
-            moved = tracker.motions(sample.scene_id).to(coordinates).displacements(coordinates)
+            moved = tracks.displacements(sample).to(module.device)
             states.set_motion(number, moved[1])
             found.setdefault(sample.scene_id, []).append((sample, moved))
         motions = [(i, _Known(module, i, tracked, self._sequences)) for i, tracked in found.items()]
         with torch.enable_grad():
             losses = modal_fit.fit(model, motions, self._settings, groups, longest=last, updates=self._updates)
-            for loss in track(losses, "Fitting the material", total=self._updates, disable=quiet, transient=True):
+            for loss in with_bar(losses, "Fitting the material", total=self._updates, quiet=quiet):
                 final = loss
-        sequences = f"{len(self._chosen)} sequence{'s' if len(self._chosen) != 1 else ''}"
+        sequences = f"{count} sequence{'s' if count != 1 else ''}"
         print(f"  warm start: {sequences} tracked; without a network {final:.3f} of the motion is left", flush=True)
 
 
@@ -153,16 +152,11 @@ class _Known:
         return KnownMotion(self._size[rows], before, now, self._z[rows, 1 : steps + 1].movedim(1, 0))
 
 
-def _tracked(module: GausSimModule, data: ReadyDataModule) -> list[int]:
-    """Numbers of the sequences whose motion is tracked."""
-    model, states = module.model, module.initial_states
-    if not isinstance(model, GausSim) or not isinstance(states, InitialStates):
-        return []
+def _can_be_tracked(module: GausSimModule, data: ReadyDataModule) -> bool:
+    model = module.model
+    if not isinstance(model, GausSim) or not isinstance(module.initial_states, InitialStates):
+        return False
     if not isinstance(module.supervision, (ImageSupervision, TrackSupervision)):
-        return []
-    free = [scene.surroundings.free for scene in model.scenes]
-    return [
-        number
-        for number, (scene_id, record) in enumerate(data.index.entries)
-        if not free[scene_id] and record.hands is None and model.template.basis(scene_id) is not None
-    ]
+        return False
+    rests = all(not model.scenes[i].surroundings.free and record.hands is None for i, record in data.index.entries)
+    return rests and all(model.template.basis(i) is not None for i in range(len(model.scenes)))

@@ -71,13 +71,31 @@ class Appearances:
         return self._made[scene_id]
 
 
+class ViewKeys:
+    """Keys of sequences that one call of the renderer can draw together: scene, cameras and image size.
+
+    The cameras of a sequence are constant, so they are fetched from the device once.
+    """
+
+    def __init__(self) -> None:
+        self._keys: dict[tuple[int, tuple[str, ...]], Hashable] = {}
+
+    def of(self, sample: SequenceSample) -> Hashable:
+        """The key of a sample's sequence."""
+        cameras, known = sample.cameras, (sample.sequence_id, sample.cameras.names)
+        if known not in self._keys:
+            numbers = [x.detach().cpu().numpy().tobytes() for x in (cameras.viewmats, cameras.Ks)]
+            self._keys[known] = (sample.scene_id, *numbers, cameras.width, cameras.height)
+        return self._keys[known]
+
+
 class ImageSupervision:
     """Supervision by images: renders predictions in a sample's cameras and compares them with its frames."""
 
     def __init__(self, scenes: Sequence[GaussianScene], renderer: Renderer, loss: ImageLoss) -> None:
         self.renderer, self.loss = renderer, loss
         self.appearances = Appearances(scenes)
-        self._keys: dict[tuple[int, tuple[str, ...]], Hashable] = {}
+        self._keys = ViewKeys()
         self._rest: dict[Hashable, Rendered] = {}
         # Positions at frame 0 of sequences whose bodies do not begin at rest: those with which training began, which
         # do not depend on when it was resumed, else the present ones; set by the start of training and the learner.
@@ -95,7 +113,7 @@ class ImageSupervision:
     def _comparison(self, samples: Sequence[SequenceSample], batch: SceneBatch, frames: slice) -> Comparison:
         places: dict[Hashable, list[int]] = {}
         for i, sample in enumerate(samples):
-            places.setdefault(self._key(sample), []).append(i)
+            places.setdefault(self._keys.of(sample), []).append(i)
         groups = [ViewGroup(samples[p[0]].scene_id, tuple(p), samples[p[0]].cameras) for p in places.values()]
         members = zip(samples, batch.members, strict=True)
         appearances = [self.appearances.of(group.scene_id, batch.rest) for group in groups]
@@ -103,23 +121,12 @@ class ImageSupervision:
         true = [sample.frames[frames] for sample in samples]
         return Comparison(self.renderer, self.loss, batch, groups, appearances, true, rest)
 
-    def _key(self, sample: SequenceSample) -> Hashable:
-        """Key of sequences that one call of the renderer can draw together: scene, cameras and image size.
-
-        The cameras of a sequence are constant, so they are fetched from the device once.
-        """
-        cameras, known = sample.cameras, (sample.sequence_id, sample.cameras.names)
-        if known not in self._keys:
-            numbers = [x.detach().cpu().numpy().tobytes() for x in (cameras.viewmats, cameras.Ks)]
-            self._keys[known] = (sample.scene_id, *numbers, cameras.width, cameras.height)
-        return self._keys[known]
-
     def rest_image(self, sample: SequenceSample, rest: Float[Tensor, "K 3"]) -> Rendered:
         """Image of the rest state in a sample's cameras; rendered once per scene and set of cameras.
 
         Of a body that begins elsewhere it is an image of where it begins, rendered once per sequence.
         """
-        key, first = self._key(sample), self.begun.get(sample.sequence_id)
+        key, first = self._keys.of(sample), self.begun.get(sample.sequence_id)
         first = self.begins(sample) if first is None else first.to(rest)
         if first is not None:
             key, rest = (key, sample.sequence_id), first

@@ -28,7 +28,7 @@ from gausim.data.images import composite
 from gausim.ops.deformation import polar_rotation
 from gausim.render.draw import draw
 from gausim.training.supervision.comparison import channels
-from gausim.training.supervision.images import Appearances, Sources
+from gausim.training.supervision.images import Appearances, Sources, ViewKeys
 
 # Random images whose loss gradients give the curvature, and how many are drawn at a time.
 PROBES, TOGETHER = 256, 16
@@ -73,7 +73,7 @@ class MotionTracker:
         self._momentum, self._prior = momentum, prior
         self._motions: dict[int, SmoothMotions] = {}
         self._appearances = Appearances(sources.scenes)
-        self._curvatures: dict[Hashable, Curvature] = {}
+        self._keys, self._curvatures = ViewKeys(), dict[Hashable, Curvature]()
 
     def motions(self, scene_id: int) -> SmoothMotions:
         """The smooth motions of a scene; raises ConfigError where the model has none."""
@@ -148,9 +148,7 @@ class MotionTracker:
 
     def _curvature(self, sample: SequenceSample, factor: int) -> Curvature:
         """Curvature of a scene's images in the sample's cameras, reduced by a factor; computed once."""
-        cameras = sample.cameras
-        numbers = [x.detach().cpu().numpy().tobytes() for x in (cameras.viewmats, cameras.Ks)]
-        key = (sample.scene_id, *numbers, cameras.width, cameras.height, factor)
+        key = self._keys.of(sample), factor
         if key not in self._curvatures:
             draws, like = torch.Generator().manual_seed(0), self.motions(sample.scene_id).kernels
             slopes = []

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from gausim.data.dataset import SequenceSample
@@ -32,15 +33,19 @@ class TrackSupervision(PointSupervision):
         self._sources = sources
         self._coordinates: dict[int, Tensor] = {}
 
-    def motion(self, sample: SequenceSample) -> GroundTruth:
-        """Tracked positions of the simulated kernels."""
+    def displacements(self, sample: SequenceSample) -> Float[Tensor, "F K 3"]:
+        """Tracked displacements of all kernels from rest, frame 0 first [scene units]."""
         known = self._coordinates.get(sample.sequence_id)
         if known is None or len(known) <= sample.steps:
             with torch.enable_grad():
                 self._coordinates[sample.sequence_id] = self.tracker.extend(known, sample)
-        scene, motions = self._sources.scenes[sample.scene_id], self.tracker.motions(sample.scene_id)
+        motions = self.tracker.motions(sample.scene_id)
+        return motions.displacements(self._coordinates[sample.sequence_id].to(motions.kernels))
+
+    def motion(self, sample: SequenceSample) -> GroundTruth:
+        """Tracked positions of the simulated kernels."""
+        scene, moved = self._sources.scenes[sample.scene_id], self.displacements(sample)
         free = scene.simulated & ~scene.pinned
-        moved = motions.displacements(self._coordinates[sample.sequence_id].to(motions.kernels))
         return GroundTruth(scene.means[free], scene.means[free] + moved[:, free])
 
     def state_dict(self) -> dict[int, Tensor]:
