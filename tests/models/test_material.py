@@ -16,7 +16,7 @@ from gausim.core import SimState
 from gausim.evaluation.stability import _LinearStep
 from gausim.models.hierarchy.clusters import build_hierarchy
 from gausim.models.hierarchy.units import FixedUnits
-from gausim.models.template.material import DAMPING_GAIN, MaterialTemplate
+from gausim.models.template.material import DAMPING_GAIN, MaterialTemplate, PreparedMaterial
 from gausim.models.template.solid import solid_body
 from gausim.ops.quaternion import quaternion_to_matrix
 
@@ -117,6 +117,35 @@ def test_links_pull_by_the_gradient_of_their_potential_and_not_at_all_to_first_o
     torch.testing.assert_close(links(z, part.matrices.links), -slope)
     ratio = links(1e-4 * z).norm() / links(1e-3 * z).norm()
     assert float(ratio.detach()) == pytest.approx(0.01, rel=0.1)
+
+
+def test_a_load_acts_on_the_learned_masses(neural) -> None:
+    """Of an acceleration within the modes, Phi a, the force is M a."""
+    part, a = neural().modal_scene(0), torch.randn(3, 9, generator=torch.Generator().manual_seed(4)).double()
+    accelerations = (a @ part.positions.mT).view(3, -1, 3)
+    load = torch.cat((accelerations, accelerations.new_zeros(*accelerations.shape[:2], 9)), -1)
+    torch.testing.assert_close(part.force(load), a @ part.inertia.mT, atol=1e-5, rtol=1e-5)
+
+
+def test_a_strained_reference_pulls_where_the_body_is_stiffer_than_a_homogeneous_one(hierarchy) -> None:
+    """An even strain S of an evenly stiffer body: minus the integral of the stress of S against the modes' strain."""
+    template, level, kernels = _template(hierarchy), hierarchy.levels[1], hierarchy.levels[0]
+    rest, pinned = level.rest.double().numpy(), level.pinned.numpy()
+    mass = (level.volume / level.volume[~level.pinned].mean()).double().numpy()
+    size = 0.2 * hierarchy.diagonal
+    body = solid_body(kernels.rest.double().numpy(), kernels.pinned.numpy(), rest, mass, pinned, modes=9, spacing=size)
+    slope = torch.from_numpy(body.at(body.centres)[1])
+    even = torch.tensor([[0.3, 0.1, 0.0], [0.1, -0.2, 0.05], [0.0, 0.05, 0.1]], dtype=torch.float64)
+    lame, shear = 0.3 / (1.3 * 0.4), 1 / 2.6  # of Young's modulus 1 and Poisson's ratio 0.3
+    stress = 2 * shear * 0.7 * even + lame * 0.2 * even.trace() * torch.eye(3, dtype=torch.float64)
+    expected = -torch.einsum("q,qabm,ab->m", torch.from_numpy(body.weights), slope, stress) / body.values[0]
+    matrices = template.matrices(0, *(0.0 * x for x in _material(hierarchy)), 1 / 24)
+    assert not matrices.uneven.any()
+    part = PreparedMaterial(
+        template.body(0), replace(matrices, uneven=torch.tensor([0.7, 0.2]).double().expand(len(rest), 2)), None
+    )
+    load = torch.cat((torch.zeros(3), even.flatten())).double().expand(1, len(rest), 12)
+    torch.testing.assert_close(part.force(load)[0], expected, atol=1e-5, rtol=1e-4)
 
 
 def test_the_step_is_implicit_in_the_slope_of_the_force(neural) -> None:

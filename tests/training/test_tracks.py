@@ -11,10 +11,11 @@ from helpers import sway, toy_object
 from helpers.simulators import gausim
 from torch import Tensor
 
-from gausim.core import ConfigError
+from gausim.core import ConfigError, HandPath
 from gausim.data.dataset import SequenceSample
 from gausim.losses import ImageLoss
 from gausim.models.initial_state import ModalInitialStates
+from gausim.models.reference.placed import Placed
 from gausim.models.step.simulator import GausSim
 from gausim.models.template.elastic import ElasticTemplate
 from gausim.ops.deformation import polar_rotation
@@ -76,6 +77,38 @@ def test_motion_of_several_modes_is_found_in_the_images(
     error = (made - true).norm(dim=-1).mean(1)[1:] / true.norm(dim=-1).mean(1)[1:]
     assert float(true.norm(dim=-1).max()) > 0.1 * SCENE.diagonal
     assert float(error.max()) < 0.1, error
+
+
+def test_motion_about_moving_hands_is_found_in_the_images(sources: Sources, coordinates: Tensor) -> None:
+    scene = replace(SCENE, hand=torch.where(SCENE.pinned, 0, -1))
+    torch.manual_seed(0)
+    template = partial(ElasticTemplate, modes=MODES, neighbours=6)
+    model = gausim([scene], [24.0], radii=(0.2, 0.5), graph_radii=(2.0, 0.6), hidden=8, layers=1, template=template)
+    corners = torch.tensor([[0.1, 0.0, 0.0], [-0.1, 0.1, 0.0], [0.0, -0.1, 0.0]])
+    way = torch.linspace(0, 0.4, FRAMES)[:, None, None] * torch.tensor([1.0, 0.5, 0.0])
+    path = HandPath.of(corners + way, torch.zeros(3, dtype=torch.long))
+    method = SharedSimulator(model, ModalInitialStates(model, [0]), [0], [path])
+    references = method.references(0, FRAMES - 1)
+    motions = model.smooth_motions(0)
+    assert motions is not None and references is not None
+    deformation = motions.deformations(0.5 * coordinates)
+    made = Placed(SCENE.means + motions.displacements(0.5 * coordinates), deformation, polar_rotation(deformation))
+    rows = [Placed(*(x[f] for x in made[:3])) for f in range(FRAMES)]
+    placed = [rows[0], *(carried.place(row) for (carried, _), row in zip(references, rows[1:], strict=True))]
+    state = [torch.stack(x) for x in zip(*(row[:3] for row in placed), strict=True)]
+    moved = (state[0][-1] - SCENE.means)[SCENE.pinned]
+    torch.testing.assert_close(moved, way[-1].expand_as(moved))
+    drawn = draw(CpuRenderer(), SCENE, *state, motions.unit_of_kernel, toy_object.cameras())
+    straight = drawn.rgb / drawn.alpha.clamp_min(1e-6)[..., None]
+    rgba = (torch.cat((straight, drawn.alpha[..., None]), -1).clamp(0, 1) * 255).round().to(torch.uint8)
+    filmed = replace(sway.sample(0, FRAMES - 1), frames=rgba)
+    tracks = TrackSupervision(replace(sources, motions=model.smooth_motions, references=method.references))
+    found, free = tracks.motion(filmed).positions, ~SCENE.pinned
+    error = (found - state[0][:, free]).norm(dim=-1).mean(1)
+    relative = motions.displacements(0.5 * coordinates).norm(dim=-1).mean(1)
+    assert float((error[1:] / relative[1:]).max()) < 0.2, error / relative
+    # Hands that move evenly, without turning, are no load.
+    assert all(float(units.load.abs().max()) < 1e-5 for _, units in references)
 
 
 def test_tracking_in_two_calls_gives_the_same_bits(sources: Sources, filmed: SequenceSample) -> None:

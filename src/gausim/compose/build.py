@@ -73,7 +73,7 @@ def build(cfg: DictConfig | Mapping[str, Any], *, sealed: bool = True) -> tuple[
         fitted = instantiate(config.model.method, **given, seen=int(config.data.curriculum.t_max))()
         method = StagedFit(fitted, plan, datamodule.curriculum, objective.explosion)
         smooth, learns = (lambda scene_id: None), Objective(explosion=objective.explosion)
-    sources = Sources(scenes, datamodule.index.ground_truth, smooth, renderer, objective.image)
+    sources = Sources(scenes, datamodule.index.ground_truth, smooth, renderer, objective.image, method.references)
     node = config.get("supervision")
     module = GausSimModule(
         method=method,

@@ -14,6 +14,7 @@ from torch.optim import Optimizer
 from gausim.core import ConfigError, HandPath, Hands, SimState, Trajectory
 from gausim.data.dataset import SequenceSample
 from gausim.losses.objective import Objective
+from gausim.models.reference.reference import Carried, UnitMotion, hand_motion
 from gausim.models.rollout.dynamics import SceneDynamics
 from gausim.training.contracts import Simulator
 from gausim.training.optimizers import OptimizerSettings
@@ -110,6 +111,13 @@ class Method(ABC):
         """Poses of the hands of a sequence; None where it has none."""
         return None
 
+    def references(self, sequence_id: int, steps: int) -> list[tuple[Carried, UnitMotion]] | None:
+        """References of a body in hands in the steps to frames 1..T, and their loads; they do not depend on its motion.
+
+        None without hands: the reference is the rest state.
+        """
+        return None
+
     def end_epoch(self, least: float) -> bool:
         """Prepares the next epoch; returns whether training is over. ``least`` is that of :class:`Moment`."""
         return False
@@ -187,6 +195,16 @@ class SharedSimulator(Method):
         """Poses of the hands of a sequence; None where it has none."""
         path = self._hands.get(sequence_id)
         return None if path is None else path.pose
+
+    @torch.no_grad()
+    def references(self, sequence_id: int, steps: int) -> list[tuple[Carried, UnitMotion]] | None:
+        """References of a body in hands in the steps to frames 1..T, and their loads."""
+        hands = self.hands(sequence_id)
+        if hands is None:
+            return None
+        batch = self._simulator.batch([self.scene_of_sequence[sequence_id]])
+        prepared, rest = self._simulator.prepare(batch), SimState(batch.rest, batch.rest)
+        return [prepared.carried(rest, [hand_motion(hands, frame)]) for frame in range(steps)]
 
     def predict(self, sequence_id: int, steps: int) -> Trajectory:
         """Frames 0..``steps`` of a training sequence from its initial state, for all kernels of its scene."""

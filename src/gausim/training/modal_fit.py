@@ -4,6 +4,7 @@ Rollouts z_{t+1} = after(z_t, z_{t-1}) of the template alone are compared with t
 
     sum_t |z_t - z*_t|^2 / size^2,    size^2 = mean_t |z*_t|^2 of the sequence,
 
+relative to the reference of bodies in hands, whose acceleration is a load,
 with T growing from 2 to its longest in the first half and rates that fall as a half-cosine.
 """
 
@@ -33,12 +34,17 @@ class KnownMotion:
     before: Float[Tensor, "B M"]
     now: Float[Tensor, "B M"]
     after: Float[Tensor, "T B M"]
+    load: Float[Tensor, "T B N 12"] | None = (
+        None  # of the units (:class:`gausim.models.reference.reference.UnitMotion`)
+    )
 
     def distances(self, part: ModalScene) -> Iterator[Float[Tensor, " B"]]:
         """Squared distances of the rollouts of a template from the motion, in squared sizes, frame by frame."""
-        before, now = self.before, self.now
-        for true in self.after:
-            before, now = now, part.after(now, before)
+        before, now, pushed = self.before, self.now, torch.zeros_like(self.after)
+        if self.load is not None:
+            pushed = part.response(self.load.flatten(0, 1)).view_as(self.after)
+        for true, push in zip(self.after, pushed, strict=True):
+            before, now = now, part.after(now, before) + push
             yield (now - true).square().sum(-1) / self.size.square()
 
     def error(self, part: ModalScene) -> Float[Tensor, ""]:

@@ -97,7 +97,7 @@ class FreeMotion(BodyMotion):
         self.guess = self.turned @ last.mT @ self.turned  # at a constant rate of rotation
         acceleration = self.guess - 2 * self.turned + last
         offset = body.units - body.centre
-        load = -(offset @ acceleration.mT) @ self.turned
+        load = torch.cat((-(offset @ acceleration.mT) @ self.turned, offset.new_zeros(len(offset), 9)), 1)
         self.relative = UnitMotion(
             body.centre + about(now, self.centre) @ self.turned,
             body.centre + about(before, self.last_centre) @ last,

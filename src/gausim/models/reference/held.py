@@ -153,7 +153,7 @@ class HeldBody(Body):
         return torch.eye(3).to(self.units)
 
     def carry(self, now: Tensor, before: Tensor, state: SimState, hands: HandMotion | None) -> HeldMotion:
-        """The units relative to the static shape, and the load of its acceleration and of gravity in its axes."""
+        """The units relative to the static shape, and the load of its acceleration, gravity and strain in its axes."""
         return HeldMotion(self, now, before, state, hands or HandMotion(None, None, None))
 
 
@@ -164,7 +164,10 @@ class HeldMotion(BodyMotion):
         self.body, self.state, self.hands = body, state, hands
         last, present, self.after = (body.at(pose) for pose in hands)
         acceleration = self.after[0] - 2 * present[0] + last[0] - body.gravity
-        load = -_back(present[1], acceleration) - body.gravity  # at rest the body is in equilibrium with gravity
+        pull = -_back(present[1], acceleration) - body.gravity  # at rest the body is in equilibrium with gravity
+        stretches = [rotation.mT @ gradient for _, rotation, gradient in (last, present, present, self.after)]
+        strain = torch.stack(stretches).mean(0) - torch.eye(3).to(pull)  # weighted as the trapezoidal rule does
+        load = torch.cat((pull, strain.flatten(1)), 1)
         floor = None if body.contact is None else body.contact.nearness(now, present[1])
         self.relative = UnitMotion(
             body.units + _back(present[1], now - present[0]), body.units + _back(last[1], before - last[0]), load, floor

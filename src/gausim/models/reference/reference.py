@@ -6,8 +6,8 @@ the rest state. For one that moves it is carried along (the floating frame of re
 
     y_n = X_n + B_n^T (x_n - a_n)
 
-at t - 1 and t, and a load: the inertial acceleration of the reference, and gravity. Its prediction y, G, Q of the
-kernels at t + 1 goes back to
+at t - 1 and t, and a load: the inertial acceleration of the reference, gravity, and the strain of the reference. Its
+prediction y, G, Q of the kernels at t + 1 goes back to
 
     x_k = a_c + A_c (X_k - X_c) + B_c (y_k - X_k),   A_c + B_c (G_c - I),   B_c Q_c.
 """
@@ -47,7 +47,8 @@ class UnitMotion:
 
     now: Float[Tensor, "N 3"]
     before: Float[Tensor, "N 3"]
-    load: Float[Tensor, "N 3"] | None  # acceleration in the reference's axes [scene units / frame^2]
+    # in the reference's axes: acceleration [scene units / frame^2], and the reference's strain row by row
+    load: Float[Tensor, "N 12"] | None
     # nearness to the floor, and its normal in the reference's axes times the nearness; None: there is no floor
     floor: Float[Tensor, "N 4"] | None = None
 
@@ -168,7 +169,7 @@ class MovingReference(Reference):
         for i, (member, span, body) in enumerate(zip(self._members, self._spans, self._bodies, strict=True)):
             if body is None:
                 motions.append(None)
-                parts.append(UnitMotion(now[span], before[span], torch.zeros_like(now[span])))
+                parts.append(UnitMotion(now[span], before[span], now.new_zeros(len(now[span]), 12)))
                 continue
             own = SimState(state.positions[member.kernels], state.previous[member.kernels])
             motions.append(body.carry(now[span], before[span], own, None if hands is None else hands[i]))

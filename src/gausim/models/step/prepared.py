@@ -57,7 +57,9 @@ class Prepared:
         load, floor = seen.load, seen.floor
         if self.frames is not None:
             axes = self.frames.axes[-1]
-            load = None if load is None else apply(axes, load)
+            if load is not None:
+                strain = axes @ load[:, 3:].unflatten(1, (3, 3)) @ axes.mT
+                load = torch.cat((apply(axes, load[:, :3]), strain.flatten(1)), 1)
             floor = None if floor is None else torch.cat((floor[:, :1], apply(axes, floor[:, 1:])), 1)
         return carried, UnitMotion(self._in_body_axes(seen.now), self._in_body_axes(seen.before), load, floor)
 

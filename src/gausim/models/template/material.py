@@ -34,6 +34,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 import torch
 from jaxtyping import Float
 from scipy.spatial import cKDTree
@@ -54,6 +55,8 @@ LARGEST_LOG = 2.5
 LINK_FRACTION = 0.3
 # The same for the stiffness of the nonlinear links, whose linear part is in K and the rest in f and J.
 SPRING_FRACTION = 0.15
+# Lame's parameters at Young's modulus 1.
+FIRST, SECOND = POISSON / ((1 + POISSON) * (1 - 2 * POISSON)), 1 / (2 * (1 + POISSON))
 # Number of units among which a cell's energy is divided, by inverse squared distance.
 CELL_UNITS = 4
 # Displacement per frame of the lowest mode at coordinate 1 of an initial velocity [diagonals].
@@ -73,6 +76,7 @@ class BodyModes(nn.Module):
     projection: Tensor  # (N, 3, M), z = sum_n projection_n u_n
     values: Tensor  # eigenvalues of the homogeneous body (M,), the first is 1
     stiffness: Tensor  # K_i of shear and B_i of volume (2, N, M, M); their sum is that of the homogeneous body
+    strain: Tensor  # strain of the modes in the cells near each unit, row by row, times volume (N, 9, M)
     inertia: Tensor  # root of M_i, (N, 3, M)
     links: Tensor  # pairs of units (2, E)
     stretch: Tensor  # root of S_ij, (E, M)
@@ -99,16 +103,19 @@ class BodyModes(nn.Module):
         length = np.linalg.norm(offset, axis=1)
         stretch = np.einsum("eam,ea->em", change, offset) / (length**2)[:, None]
         even = math.sqrt(body.values.sum() / lowest / max(float((stretch**2).sum()), 1e-30))
-        between = change * math.sqrt(len(body.values) / max(float((change**2).sum()), 1e-30))
+        stiffness, strain = _cell_stiffness(body, rest, pinned)
+        # Displacements of the links are scaled so that T_ij of all together have the trace of the inertia.
+        self.tie = math.sqrt(len(body.values) / max(float((change**2).sum()), 1e-30))
         arrays = {
             "modes": phi,
             "gradients": slope,
             "projection": phi * mass[:, None, None],
             "values": np.maximum(body.values, 1e-6 * body.values[-1]) / lowest,
-            "stiffness": _cell_stiffness(body, rest, pinned) / lowest,
+            "stiffness": stiffness / lowest,
+            "strain": strain / lowest,
             "inertia": phi * np.sqrt(mass)[:, None, None],
             "stretch": even * stretch,
-            "between": between,
+            "between": self.tie * change,
             "distance": np.log(length / length.mean()),
         }
         for name, array in arrays.items():
@@ -125,15 +132,17 @@ def _links(rest: np.ndarray, pinned: np.ndarray, count: int) -> np.ndarray:
     return np.ascontiguousarray(pairs[distinct & ~pinned[pairs].all(1)].T)
 
 
-def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np.ndarray:
-    """K_i and B_i (2, N, M, M): energy of shear and of volume of the cells near each unit, pinned ones included."""
+def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """K_i and B_i (2, N, M, M): energy of shear and of volume of the cells near each unit, pinned ones included.
+
+    And the strain of the modes in these cells times their volume (N, 9, M).
+    """
     _, slope = body.at(body.centres)
     strain = (slope + slope.transpose(0, 2, 1, 3)) / 2
     trace = np.trace(strain, axis1=1, axis2=2)
-    first, second = POISSON / ((1 + POISSON) * (1 - 2 * POISSON)), 1 / (2 * (1 + POISSON))
     count = slope.shape[-1]
     # Components per cell and mode whose squares sum to twice the energy: nine of shear, one of volume.
-    parts = math.sqrt(2 * second) * strain.reshape(-1, 9, count), math.sqrt(first) * trace[:, None]
+    parts = math.sqrt(2 * SECOND) * strain.reshape(-1, 9, count), math.sqrt(FIRST) * trace[:, None]
     near, units = cKDTree(rest).query(body.centres, k=min(CELL_UNITS, len(rest)))
     near, units = near.reshape(len(body.centres), -1), units.reshape(len(body.centres), -1)
     weights = 1 / (near**2 + 1e-12)
@@ -148,7 +157,9 @@ def _cell_stiffness(body: SolidBody, rest: np.ndarray, pinned: np.ndarray) -> np
     missing = np.diag(body.values) - found.sum((0, 1))  # the springs that hold the pins, and rounding
     free = ~pinned
     found[0, free] += missing / free.sum()
-    return found
+    shares = sp.csr_matrix((weights.ravel(), (units.ravel(), np.arange(units.size) // units.shape[1])))
+    strained = shares @ (body.weights[:, None] * strain.reshape(len(strain), -1))
+    return found, strained.reshape(len(rest), 9, -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,6 +170,9 @@ class Matrices:
     inertia: Float[Tensor, "M M"]  # M (M, M)
     damping: Float[Tensor, "M M"]  # D (M, M)
     links: Float[Tensor, " E"]  # factor on every link's nonlinear spring stiffness (E,)
+    density: Float[Tensor, " N"]  # of every unit over that at the beginning
+    between: Float[Tensor, " E"]  # mass of every link in units of T_ij
+    uneven: Float[Tensor, "N 2"]  # k (e^{s_i} - 1) and k (e^{b_i} - 1), stiffness beyond that of the homogeneous body
 
 
 class MaterialTemplate(Template):
@@ -255,13 +269,14 @@ class MaterialTemplate(Template):
         springs = SPRING_FRACTION * links[:, 2].exp()
         stretch = (LINK_FRACTION * links[:, 0].exp() + springs)[:, None] * body.stretch
         stiffness = torch.einsum("np,pnlm->lm", units[:, :2].exp(), body.stiffness) + body.stretch.mT @ stretch
-        density = _saturated(log_density).exp()[:, None, None]
-        root, heavy = body.inertia.flatten(0, 1), (density * body.inertia).flatten(0, 1)
-        between = LINK_FRACTION * links[:, 1, None, None].exp() * body.between
-        inertia = root.mT @ heavy + body.between.flatten(0, 1).mT @ between.flatten(0, 1)
-        dragged = root.mT @ (units[:, 2, None, None].exp() * density * body.inertia).flatten(0, 1)
+        density, between = _saturated(log_density).exp(), LINK_FRACTION * links[:, 1].exp()
+        heavy = density[:, None, None] * body.inertia
+        root, tied = body.inertia.flatten(0, 1), between[:, None, None] * body.between
+        inertia = root.mT @ heavy.flatten(0, 1) + body.between.flatten(0, 1).mT @ tied.flatten(0, 1)
+        dragged = root.mT @ (units[:, 2, None, None].exp() * heavy).flatten(0, 1)
         damping = drag * frame * dragged + viscosity / frame * k * stiffness
-        return Matrices(k * stiffness, inertia, damping, k * springs)
+        uneven = k * (units[:, :2].exp() - 1)
+        return Matrices(k * stiffness, inertia, damping, k * springs, density, between, uneven)
 
     def material(self, scene_id: int, units: FixedUnits, fps: float) -> dict[str, Property]:
         """Stiffness, damping and density of the units as they enter K, D and M.
@@ -326,7 +341,7 @@ class PreparedMaterial(ModalScene):
         """
         super().__init__(body.projection, body.modes, body.gradients)
         self.matrices, self.springs, self.positions = matrices, body.springs, body.modes.flatten(0, 1)
-        self.values, self.reference = body.values, reference
+        self.body, self.values, self.reference = body, body.values, reference
         self.operator = matrices.inertia + matrices.stiffness / 4 + matrices.damping / 2
         self.inertia, self.stiffness, self.damping = matrices.inertia, matrices.stiffness, matrices.damping
 
@@ -336,6 +351,22 @@ class PreparedMaterial(ModalScene):
         force = nonlinear - z @ self.matrices.stiffness - (z - previous) @ self.matrices.damping
         operator = self.operator + stiffer / 4
         return torch.linalg.solve(operator, force[..., None])[..., 0]
+
+    def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
+        """Phi^T M a of an acceleration a of every unit: sum_i rho_i m_i Phi_i^T a_i, and the same for the links.
+
+        And that of the strain of the reference, which is static for a homogeneous body: of the stiffness beyond it.
+        """
+        acceleration, strain = load.split((3, 9), -1)
+        first, second = (acceleration.index_select(1, end) for end in self.body.links)
+        tied = self.body.tie * self.matrices.between[:, None] * (second - first)
+        own = (self.matrices.density[:, None] * acceleration).flatten(1) @ self.projection
+        shear, volume = self.matrices.uneven.unbind(-1)
+        trace = strain[..., ::4].sum(-1) * (FIRST * volume)
+        stress = 2 * SECOND * shear[:, None] * strain + trace[..., None] * torch.eye(3).to(strain).flatten()
+        return (
+            own + tied.flatten(1) @ self.body.between.flatten(0, 1) - stress.flatten(1) @ self.body.strain.flatten(0, 1)
+        )
 
     def correction_unit(self) -> Float[Tensor, ""] | None:
         """Ratio of the body's stiffness over inertia [1 / frame^2] to the reference's at 24 frames per second.

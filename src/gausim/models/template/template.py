@@ -59,8 +59,8 @@ class PreparedTemplate:
         """Stores where the members' units are."""
         self.spans, self.device = batch.levels[-1].spans, batch.rest.device
 
-    def __call__(self, motion: Motion, load: Float[Tensor, "N 3"] | None = None) -> TemplateState:
-        """The template state at t + 1; ``load`` is an acceleration of every unit [scene units / frame^2]."""
+    def __call__(self, motion: Motion, load: Float[Tensor, "N 12"] | None = None) -> TemplateState:
+        """The template state at t + 1; for ``load`` see :class:`gausim.models.reference.reference.UnitMotion`."""
         return TemplateState(motion.rest, None)
 
     def yielding(self, member: int) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor], Tensor]:
@@ -148,15 +148,22 @@ class ModalScene(ABC):
         self.motions = torch.cat((modes, gradients.flatten(1, 2)), 1).flatten(0, 1)
 
     def __call__(
-        self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"], load: Float[Tensor, "S N 3"] | None = None
+        self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"], load: Float[Tensor, "S N 12"] | None = None
     ) -> Float[Tensor, "S N 12"]:
         """Displacement (3) and displacement gradient (9, row by row) of every unit at t + 1."""
         after = self.after(*self.coordinates(now, before))
         if load is not None:
-            operator = self.inertia + self.stiffness / 4 + self.damping / 2
-            pushed = (load.flatten(1) @ self.projection) @ self.inertia.mT
-            after = after + torch.linalg.solve(operator, pushed.mT).mT
+            after = after + self.response(load)
         return (after @ self.motions.mT).view(*now.shape[:2], 12)
+
+    def response(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
+        """What a load adds to z_{t+1} (:class:`gausim.models.reference.reference.UnitMotion`)."""
+        operator = self.inertia + self.stiffness / 4 + self.damping / 2
+        return torch.linalg.solve(operator, self.force(load).mT).mT
+
+    def force(self, load: Float[Tensor, "S N 12"]) -> Float[Tensor, "S M"]:
+        """Modal force of a load; here Phi^T M a of the part of its accelerations a that is within the modes."""
+        return (load[..., :3].flatten(1) @ self.projection) @ self.inertia.mT
 
     def coordinates(
         self, now: Float[Tensor, "S N 3"], before: Float[Tensor, "S N 3"]
@@ -204,11 +211,11 @@ class PreparedScenes(PreparedTemplate):
         )
         return now.view(len(members), -1, 3), before.view(len(members), -1, 3)
 
-    def __call__(self, motion: Motion, load: Float[Tensor, "N 3"] | None = None) -> TemplateState:
+    def __call__(self, motion: Motion, load: Float[Tensor, "N 12"] | None = None) -> TemplateState:
         """Positions X + u and deformation gradients I + grad u, their determinants bounded."""
         made = []
         for part, rows, members in self.parts:
-            own = None if load is None else load.index_select(0, rows).view(len(members), -1, 3)
+            own = None if load is None else load.index_select(0, rows).view(len(members), -1, 12)
             made.append(part(*self._displacements(motion, rows, members), own).flatten(0, 1))
         moved = made[0] if len(made) == 1 else torch.cat(made).index_select(0, self._places)
         deformation = moved[:, 3:].reshape(-1, 3, 3) + torch.eye(3, dtype=moved.dtype, device=moved.device)

@@ -36,8 +36,8 @@ Tracked = list[tuple[SequenceSample, Tensor]]
 class WarmStart(Callback):
     """Tracks the motion of all training sequences and fits initial states and material to it, before the first step.
 
-    It has no effect on models without modes, where bodies are free or in hands, on supervision by true points, and on
-    runs that are resumed.
+    It has no effect on models without modes, where bodies are free or above a floor, on supervision by true points, and
+    on runs that are resumed.
     """
 
     def __init__(
@@ -111,8 +111,9 @@ class WarmStart(Callback):
         model, last = cast(GausSim, module.model), data.curriculum.longest
         tracks, states = module.supervision, cast(InitialStates, module.initial_states)
         if not isinstance(tracks, TrackSupervision):
-            motions_of, image = model.smooth_motions, module.objective.image
-            tracks = TrackSupervision(Sources(model.scenes, lambda number: None, motions_of, module.renderer, image))
+            motions_of, image, references = model.smooth_motions, module.objective.image, module.method.references
+            sources = Sources(model.scenes, lambda number: None, motions_of, module.renderer, image, references)
+            tracks = TrackSupervision(sources)
         found: dict[int, Tracked] = {}
         count = len(data.index.entries)
         for number in with_bar(range(count), "Tracking the motion", quiet=quiet):
@@ -120,7 +121,7 @@ class WarmStart(Callback):
             moved = tracks.displacements(sample).to(module.device)
             states.set_motion(number, moved[1])
             found.setdefault(sample.scene_id, []).append((sample, moved))
-        motions = [(i, _Known(module, i, tracked, self._sequences)) for i, tracked in found.items()]
+        motions = [(i, _Known(module, states, i, tracked, self._sequences)) for i, tracked in found.items()]
         with torch.enable_grad():
             losses = modal_fit.fit(model, motions, self._settings, groups, longest=last, updates=self._updates)
             for loss in with_bar(losses, "Fitting the material", total=self._updates, quiet=quiet):
@@ -132,24 +133,25 @@ class WarmStart(Callback):
 class _Known:
     """Tracked motion of the sequences of a scene, from their trained initial states."""
 
-    def __init__(self, module: GausSimModule, scene_id: int, tracked: Tracked, most: int) -> None:
-        self._initial, self._draws, self._most = module.method.initial, torch.Generator().manual_seed(0), most
-        self._samples = [sample for sample, _ in tracked]
-        model = cast(GausSim, module.model)
-        self._batch = model.batch((scene_id,))
-        self._projection = model.modal_projection(scene_id).flatten(0, 1)
+    def __init__(
+        self, module: GausSimModule, states: InitialStates, scene_id: int, tracked: Tracked, most: int
+    ) -> None:
+        self._states, self._draws, self._most = states, torch.Generator().manual_seed(0), most
+        self._numbers = [sample.sequence_id for sample, _ in tracked]
+        self._projection = cast(GausSim, module.model).modal_projection(scene_id).flatten(0, 1)
         self._z = torch.stack([moved.flatten(1) @ self._projection for _, moved in tracked])
         self._size = modal_fit.size_of(self._z[:, 1:])
+        found = [module.method.references(number, self._z.shape[1] - 1) for number in self._numbers]
+        loads = [torch.stack([cast(Tensor, units.load) for _, units in own]) for own in found if own is not None]
+        self._load = torch.stack(loads, 1) if loads else None
 
     def __call__(self, steps: int) -> KnownMotion:
         """T = ``steps`` frames of some of the sequences."""
-        rows = torch.randperm(len(self._samples), generator=self._draws)[: self._most].tolist()
-        states = [self._initial([self._samples[i]], self._batch) for i in rows]
-        now, before = (
-            torch.stack([x - self._batch.rest for x in own]).flatten(1) @ self._projection
-            for own in zip(*((s.positions, s.previous) for s in states), strict=True)
-        )
-        return KnownMotion(self._size[rows], before, now, self._z[rows, 1 : steps + 1].movedim(1, 0))
+        rows = torch.randperm(len(self._numbers), generator=self._draws)[: self._most].tolist()
+        motion = torch.stack([self._states.motion(self._numbers[i]) for i in rows])
+        before, after = -motion.flatten(1) @ self._projection, self._z[rows, 1 : steps + 1].movedim(1, 0)
+        load = None if self._load is None else self._load[:steps, rows]
+        return KnownMotion(self._size[rows], before, torch.zeros_like(before), after, load)
 
 
 def _can_be_tracked(module: GausSimModule, data: ReadyDataModule) -> bool:
@@ -158,5 +160,5 @@ def _can_be_tracked(module: GausSimModule, data: ReadyDataModule) -> bool:
         return False
     if not isinstance(module.supervision, (ImageSupervision, TrackSupervision)):
         return False
-    rests = all(not model.scenes[i].surroundings.free and record.hands is None for i, record in data.index.entries)
-    return rests and all(model.template.basis(i) is not None for i in range(len(model.scenes)))
+    alone = all(not scene.surroundings.free and scene.surroundings.floor is None for scene in model.scenes)
+    return alone and all(model.template.basis(i) is not None for i in range(len(model.scenes)))

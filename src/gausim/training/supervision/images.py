@@ -15,6 +15,7 @@ from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
 from gausim.data.records import GroundTruth
 from gausim.losses.image import ImageLoss
+from gausim.models.reference.reference import Carried, UnitMotion
 from gausim.render.draw import SceneAppearance, draw
 from gausim.training.contracts import SceneBatch
 from gausim.training.rollout import States
@@ -42,6 +43,8 @@ class Sources:
     motions: Callable[[int], SmoothMotions | None]
     renderer: Renderer
     loss: ImageLoss  # image loss
+    # references of a sequence, by its number, in the steps to frames 1..T; None where they are the rest state
+    references: Callable[[int, int], Sequence[tuple[Carried, UnitMotion]] | None] = lambda sequence_id, steps: None
 
 
 @runtime_checkable

@@ -6,6 +6,7 @@ coordinates in the model's smooth motions are those whose rendering agrees best 
 
     q_t = argmin_q |draw(X + sum_m q_m phi_m) - frame_t|^2 + prior |q|^2,    q_0 = 0,
 
+(for a body in hands relative to its reference, :mod:`gausim.models.reference.held`,)
 found by Levenberg and Marquardt's method on images of falling blur, from an extrapolation of the two frames before; no
 dynamics are assumed. Its matrix J^T J is that of the rest state: the mean of g g^T over loss gradients g = J^T e for
 random images e. The motions phi are scaled to about equal elastic energy, so coordinates that no camera determines stay
@@ -25,6 +26,8 @@ from torch import Tensor
 from gausim.core import ConfigError, SmoothMotions
 from gausim.data.dataset import SequenceSample
 from gausim.data.images import composite
+from gausim.models.reference.placed import Placed
+from gausim.models.reference.reference import Carried
 from gausim.ops.deformation import polar_rotation
 from gausim.render.draw import draw
 from gausim.training.supervision.comparison import channels
@@ -97,23 +100,32 @@ class MotionTracker:
         if known is None:
             known = motions.kernels.new_zeros(1, motions.count)
         frames = list(known.to(sample.frames.device))
+        references = self._sources.references(sample.sequence_id, sample.steps)
         while len(frames) <= sample.steps:
             guess = frames[-1]
             if len(frames) > 1:
                 guess = guess + self._momentum * (frames[-1] - frames[-2])
-            frames.append(self._find(sample, len(frames), guess))
+            carried = None if references is None else references[len(frames) - 1][0]
+            frames.append(self._find(sample, len(frames), guess, carried))
         return torch.stack(frames)
 
-    def _find(self, sample: SequenceSample, frame: int, guess: Float[Tensor, " M"]) -> Float[Tensor, " M"]:
+    def _find(
+        self, sample: SequenceSample, frame: int, guess: Float[Tensor, " M"], carried: Carried | None
+    ) -> Float[Tensor, " M"]:
         target = channels(*composite(sample.frames[frame : frame + 1]), self._sources.loss)
         place = guess
         for factor in self._pyramid:
             if factor == self._pyramid[-1] or min(target.shape[2:4]) >= LEAST_SIDE * factor:
-                place = self._descend(sample, factor, _shrunk(target, factor), place)
+                place = self._descend(sample, factor, _shrunk(target, factor), place, carried)
         return place
 
     def _descend(
-        self, sample: SequenceSample, factor: int, target: Float[Tensor, "1 V H W C"], place: Float[Tensor, " M"]
+        self,
+        sample: SequenceSample,
+        factor: int,
+        target: Float[Tensor, "1 V H W C"],
+        place: Float[Tensor, " M"],
+        carried: Carried | None,
     ) -> Float[Tensor, " M"]:
         """Steps of Levenberg and Marquardt's method on images reduced by a factor."""
         curvature = self._curvature(sample, factor)
@@ -122,7 +134,7 @@ class MotionTracker:
 
         def compare(place: Tensor) -> tuple[Tensor, Tensor]:
             place = place.detach().requires_grad_()
-            off = _shrunk(self._drawn(sample, place[None]), factor) - target
+            off = _shrunk(self._drawn(sample, place[None], carried), factor) - target
             error = 0.5 * (off.square().sum() + prior * place.square().sum())
             return error.detach(), torch.autograd.grad(error, place)[0]
 
@@ -136,14 +148,18 @@ class MotionTracker:
                 damping *= MORE
         return place
 
-    def _drawn(self, sample: SequenceSample, places: Float[Tensor, "B M"]) -> Float[Tensor, "B V H W C"]:
-        """Images of the scene at some coordinates."""
+    def _drawn(
+        self, sample: SequenceSample, places: Float[Tensor, "B M"], carried: Carried | None = None
+    ) -> Float[Tensor, "B V H W C"]:
+        """Images of the scene at some coordinates; B is 1 where the reference moves."""
         motions, appearance = self.motions(sample.scene_id).to(places), self._appearances.of(sample.scene_id, places)
         rest = self._sources.scenes[sample.scene_id].means.to(places)
         deformation_gradients = motions.deformations(places)
         rotations = polar_rotation(deformation_gradients.detach())
-        state = rest + motions.displacements(places), deformation_gradients, rotations
-        drawn = draw(self._sources.renderer, appearance, *state, motions.unit_of_kernel, sample.cameras)
+        state = Placed(rest + motions.displacements(places), deformation_gradients, rotations)
+        if carried is not None:
+            state = Placed(*(x[None] for x in carried.place(Placed(*(x[0] for x in state[:3])))[:3]))
+        drawn = draw(self._sources.renderer, appearance, *state[:3], motions.unit_of_kernel, sample.cameras)
         return channels(drawn.rgb, drawn.alpha, self._sources.loss)
 
     def _curvature(self, sample: SequenceSample, factor: int) -> Curvature:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gausim.data.dataset import SequenceSample
 from gausim.data.records import GroundTruth
+from gausim.models.reference.placed import Placed
 from gausim.training.supervision.images import Sources
 from gausim.training.supervision.motion_tracker import MotionTracker
 from gausim.training.supervision.points import PointSupervision
@@ -34,7 +35,7 @@ class TrackSupervision(PointSupervision):
         self._coordinates: dict[int, Tensor] = {}
 
     def displacements(self, sample: SequenceSample) -> Float[Tensor, "F K 3"]:
-        """Tracked displacements of all kernels from rest, frame 0 first [scene units]."""
+        """Tracked displacements of all kernels from rest, relative to the reference, frame 0 first [scene units]."""
         known = self._coordinates.get(sample.sequence_id)
         if known is None or len(known) <= sample.steps:
             with torch.enable_grad():
@@ -44,9 +45,13 @@ class TrackSupervision(PointSupervision):
 
     def motion(self, sample: SequenceSample) -> GroundTruth:
         """Tracked positions of the simulated kernels."""
-        scene, moved = self._sources.scenes[sample.scene_id], self.displacements(sample)
-        free = scene.simulated & ~scene.pinned
-        return GroundTruth(scene.means[free], scene.means[free] + moved[:, free])
+        scene = self._sources.scenes[sample.scene_id]
+        positions, free = scene.means + self.displacements(sample), scene.simulated & ~scene.pinned
+        like = self.tracker.motions(sample.scene_id).displacement_gradients[..., 0]
+        still = torch.eye(3).to(positions).expand_as(like)
+        for frame, (carried, _) in enumerate(self._sources.references(sample.sequence_id, len(positions) - 1) or (), 1):
+            positions[frame] = carried.place(Placed(positions[frame], still, still)).positions
+        return GroundTruth(scene.means[free], positions[:, free])
 
     def state_dict(self) -> dict[int, Tensor]:
         """Coordinates by sequence, for a resumed run."""
