@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import platform
 import resource
 import statistics
 import sys
@@ -12,13 +13,16 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 from unittest.mock import patch
 
 import torch
 from torch import Tensor
 
+from gausim import __version__
 from gausim.kernels.operations import plain_forms
+from gausim.runs import provenance
 from gausim.runs.memory import process_memory
 
 
@@ -171,3 +175,15 @@ def torch_threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+def machine(options: Options) -> dict[str, str]:
+    """Processor, device and software of the benchmark."""
+    return {
+        "processor": f"{provenance.machine()}, {torch.backends.cpu.get_cpu_capability()}",
+        "system": f"{platform.system()} {platform.machine()}",
+        "software": f"gausim {__version__}, Python {platform.python_version()}, torch {torch.__version__}, "
+        f"numba {version('numba')}",
+        "threads": str(options.threads),
+        "sizes": "quick (not to be quoted)" if options.quick else "full",
+    }

@@ -1,4 +1,4 @@
-"""Benchmark of rendering: CPU renderer against plain torch and the processor's peak; threads, compilation, memory."""
+"""Benchmark of rendering: CPU renderer against plain torch; its parts, threads, compilation and memory."""
 
 from __future__ import annotations
 
@@ -7,20 +7,16 @@ import os
 import sys
 import tempfile
 from functools import partial
-from typing import Any
-from unittest.mock import patch
 
 import torch
 
 from gausim.benchmark.first_call import in_fresh_process
 from gausim.benchmark.harness import Options, Row, medians, spent_in, torch_threads
-from gausim.benchmark.peaks import fma_peak, peaks
 from gausim.benchmark.splats import Splats, deformed, gradients, splats, without_graph
 from gausim.core import Renderer
 from gausim.render import gsplat
 from gausim.render.cpu import CpuRenderer
-from gausim.render.cpu.batch import Band, Batch
-from gausim.render.cpu.raster import BACKWARD_FLOPS, BLOCKS, FORWARD_FLOPS, LANES
+from gausim.render.cpu.batch import Batch
 from gausim.render.draw import deformed_appearance
 from gausim.render.reference import ReferenceRenderer
 
@@ -31,7 +27,6 @@ PAPER = (23_422, 960, 540)  # kernels, width and height of the paper's scene
 VIEWS = 4
 UNITS, SH_DEGREE = 1_203, 3
 TORCH = "render=reference: plain torch in tiles, float32, one thread, same run"
-FMA = "the processor's fused multiply-add peak, same run; operations of raster.py x pixels evaluated"
 # Calls shorter than this are timed several in a row, as in training, where a call of the renderer follows others.
 SHORT_CALLS = 0.02  # [s]
 PARTS = {
@@ -78,37 +73,12 @@ def _against_torch(name: str, scene: Splats, options: Options) -> list[Row]:
 
 
 def _parts(name: str, scene: Splats, options: Options) -> list[Row]:
-    """Times of the renderer's parts, and the fraction of the peak that the hot loops reach."""
+    """Times of the renderer's parts."""
     renderer, weights = CpuRenderer(threads=1), scene.weights()
     with spent_in({part: [(Batch, method)] for part, method in PARTS.items()}, options.device) as seconds:
         for _ in range(options.rounds):
             scene.both(renderer, weights)
-    times = {part: spent / options.rounds for part, spent in seconds.items()}
-    rows = [Row(name, part, 1e3 * spent, "ms") for part, spent in times.items()]
-    pixels, peak = evaluated(bands_of(scene)), peaks(options).fma
-    work = {"compositing": FORWARD_FLOPS * pixels, "compositing, backward": BACKWARD_FLOPS * pixels}
-    for part, flops in work.items():
-        rows.append(Row(name, f"{part} / peak", flops / times[part] / peak, "1", FMA))
-    both = sum(work.values()) / sum(times[part] for part in work)
-    return [*rows, Row(name, "compositing, both / peak", both / peak, "1", FMA)]
-
-
-def bands_of(scene: Splats) -> list[Band]:
-    """The bands of an image after rendering."""
-    bands, own = [], Batch.composite
-
-    def composite(batch: Batch, band: Band, images: Any) -> None:
-        own(batch, band, images)
-        bands.append(band)
-
-    with patch.object(Batch, "composite", composite):
-        scene.forward(CpuRenderer(threads=1))
-    return bands
-
-
-def evaluated(bands: list[Band]) -> int:
-    """Number of kernel evaluations in the two loops: sixteen pixels for each kernel of a block."""
-    return LANES * sum(int(band.used[:, :BLOCKS].sum()) for band in bands)
+    return [Row(name, part, 1e3 * spent / options.rounds, "ms") for part, spent in seconds.items()]
 
 
 def _threads(cases: tuple[tuple[int, int], ...], options: Options) -> list[Row]:
@@ -116,8 +86,6 @@ def _threads(cases: tuple[tuple[int, int], ...], options: Options) -> list[Row]:
     if len(os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)) < 2:
         print("render: this process has one core; two threads are not measured.", file=sys.stderr)
         return []
-    limit = fma_peak(2) / fma_peak(1)
-    text = f"one thread, same run, forward + backward; two threads' peak of fused multiply-adds is {limit:.2f} x one's"
     rows = []
     for views, (_, size) in itertools.product((1, VIEWS), cases[-2:]):
         count = cases[-1][0]
@@ -127,7 +95,7 @@ def _threads(cases: tuple[tuple[int, int], ...], options: Options) -> list[Row]:
         times = medians(calls, options, rounds=3 * options.rounds, warmup=2, at_least=SHORT_CALLS)
         if views > 1:
             rows.append(Row(name, "forward + backward, one call", 1e3 * times["1"], "ms"))
-        rows.append(Row(name, "one thread / two threads", times["1"] / times["2"], "x", text))
+        rows.append(Row(name, "one thread / two threads", times["1"] / times["2"], "x", "same run, forward + backward"))
     return rows
 
 

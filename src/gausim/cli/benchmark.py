@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from gausim.models.step.simulator import GausSim
 
 CASES = {
-    "render": "the CPU renderer against plain torch and the peak of the processor, threads, views, compilation",
-    "network": "the graph network against the textbook form: time, memory, fraction of the matrix-product peak",
+    "render": "the CPU renderer against plain torch; its parts, threads, views, compilation",
     "step": "one predicted frame at the paper's size, with and without hierarchy; neural steps against elastic ones",
     "train": "whole optimiser steps, part by part, against elastic ones; KEY=VALUE as in `gausim train`",
     "data": "packed frames against decoding PNG; opening and streaming a set of the paper's size",
@@ -33,8 +32,7 @@ def main(argv: list[str]) -> int:
     arguments = _parser().parse_args(argv)
     import torch
 
-    from gausim.benchmark.harness import Options, torch_threads
-    from gausim.benchmark.peaks import machine
+    from gausim.benchmark.harness import Options, machine, torch_threads
 
     options = Options(_device(arguments.device), arguments.threads, arguments.quick, arguments.rounds)
     torch.manual_seed(0)

@@ -45,13 +45,6 @@ ZERO, ONE = np.float32(0), np.float32(1)
 # Without reassociation: offsets from a pixel stay exact far from the image's origin only in the order written.
 ORDER = {"contract", "arcp", "nsz", "afn", "nnan", "ninf"}
 
-# Arithmetic per pixel and kernel, a fused multiply-add counted as two; comparisons, selections, loads and stores not at
-# all. ``gausim benchmark render`` divides them by the machine's peak.
-EXPONENTIAL = 1 + 1 + 1 + 2 + 4 + 10 + 3 + 1  # dx, dy, B dx, A dx dx, u, p, p^8, o p
-FORWARD_FLOPS = EXPONENTIAL + 2 + 6  # w = t alpha and t - w, three colours
-# t / (1 - alpha), w, gap, behind, s; five products with dx and dy, three with v, nine additions
-BACKWARD_FLOPS = EXPONENTIAL + 2 + 1 + 6 + 2 + 1 + 5 + 3 + 9
-
 
 @numba.njit(fastmath=ORDER, **HELPER)
 def distribute(entries, begin, end, lists, stride, counts):
