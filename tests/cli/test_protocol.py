@@ -149,7 +149,7 @@ def test_looks_are_declared_counted_and_said(run: Path, capsys: pytest.CaptureFi
 
     assert report.main([str(run), "--no-pictures", "--out", str(run / "page")]) == 0
     assert report.main([str(run), "--results", str(run / "results")]) == 0
-    for name in ("page/report.html", "page/report.md", "page/tables.tex", "results/results.md", "results/tables.tex"):
+    for name in ("page/report.html", "page/results.md", "page/tables.tex", "results/results.md", "results/tables.tex"):
         text = (run / name).read_text().replace("\\", "")
         tables = text.count("<table") or text.count("| ---") or text.count("begin{tabular}")
         assert tables and "Figures of the test part" in text and "6 trials, 2 looks" in text, name

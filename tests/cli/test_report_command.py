@@ -9,7 +9,7 @@ def test_the_whole_report(tmp_path, capsys):
     sweep = report_runs.write_sweep(tmp_path / "sweep")
     assert cli.main(["report", str(sweep)]) == 0
     shown = capsys.readouterr()
-    files = ["report.html", "report.md", "tables.tex", "numbers.csv"]
+    files = ["report.html", "results.md", "tables.tex", "numbers.csv"]
     assert sorted(p.name for p in (sweep / "report").iterdir()) == sorted(files)
     lines = shown.out.splitlines()
     assert lines[-4] == f"page: {(sweep / 'report' / 'report.html').as_uri()}" and len(lines) == 6

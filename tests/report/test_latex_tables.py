@@ -14,10 +14,10 @@ from gausim.report.write import write_report
 HOSTILE = r"a_b & 100% {x} \input{/etc/passwd} $y^2 #1 ~z"
 # Commands of LaTeX itself and of the packages that the file's first line asks for.
 KNOWN = {
-    "begin", "end", "centering", "caption", "label", "textbf", "textit", "scriptsize", "multicolumn", "linewidth",
-    "width", "ifdim", "else", "fi", "pm", "times", "to", "uparrow", "downarrow", "sigma",  # LaTeX
+    "begin", "end", "centering", "caption", "label", "textbf", "linewidth", "width", "ifdim", "else", "fi", "pm",
+    "times", "to", "uparrow", "downarrow", "sigma", "div",  # LaTeX
     "textbackslash", "textasciitilde", "textasciicircum", "textless", "textgreater", "textbar", "textquotedbl",  # T1
-    "toprule", "midrule", "bottomrule", "cmidrule", "resizebox", "textcolor",  # booktabs, graphicx, xcolor
+    "toprule", "midrule", "bottomrule", "resizebox",  # booktabs, graphicx
 }  # fmt: skip
 
 
@@ -39,18 +39,6 @@ def check(text: str) -> None:
     assert "&" not in re.sub(r"\\begin\{tabular\}.*?\\end\{tabular\}", "", bare, flags=re.S)
 
 
-def rows_of(table: str) -> list[str]:
-    lines = [line for line in table.splitlines() if line and not line.startswith("%")]
-    return [line for line in lines if not line.startswith((r"\toprule", r"\midrule", r"\bottomrule", r"\cmidrule"))]
-
-
-def width(row: str) -> int:
-    """Columns that a row fills."""
-    assert row.endswith(r" \\"), row
-    cells = re.split(r"(?<!\\)&", row)
-    return sum(int(m[1]) if (m := re.match(r"\s*\\multicolumn\{(\d+)\}", c)) else 1 for c in cells)
-
-
 @pytest.fixture
 def latex(tmp_path: Path) -> str:
     root = report_runs.write_sweep(tmp_path / "sweep")
@@ -66,18 +54,16 @@ def test_everything_nests_and_is_escaped(latex: str) -> None:
 
 
 def test_rows_fill_their_columns_between_rules_of_booktabs(latex: str) -> None:
-    tables = re.findall(r"\\begin\{tabular\}\{l(c+)\}\n(.*?)\\end\{tabular\}", latex, re.S)
+    tables = re.findall(r"\\begin\{tabular\}\{(lc+)\}\n(.*?)\\end\{tabular\}", latex, re.S)
     assert len(tables) == latex.count(r"\begin{table*}") == latex.count(r"\caption{") > 6
     for columns, table in tables:
-        rules = re.findall(r"^\\(top|mid|bottom)rule$", table, re.M)
-        assert rules[0] == "top" and rules[-1] == "bottom" and "mid" in rules[1:-1]
-        assert {width(row) for row in rows_of(table)} == {1 + len(columns)}
-        spans = [tuple(map(int, s)) for s in re.findall(r"\\cmidrule\(lr\)\{(\d+)-(\d+)\}", table)]
-        if spans:
-            assert [n for a, b in spans for n in range(a, b + 1)] == list(range(2, 2 + len(columns)))
+        assert re.findall(r"^\\(top|mid|bottom)rule$", table, re.M) == ["top", "mid", "bottom"]
+        rows = [line for line in table.splitlines() if not line.endswith("rule")]
+        assert all(row.endswith(r" \\") and len(re.split(r"(?<!\\)&", row)) == len(columns) for row in rows)
     labels = re.findall(r"\\label\{(.*?)\}", latex)
     assert len(set(labels)) == len(labels) and all(re.fullmatch(r"tab:[A-Za-z0-9-]+", label) for label in labels)
-    assert r"\textbf{11.00 $\pm$ 5.52}" in latex and r"\textcolor{gray}{1.15 $\pm$ 0.12}" in latex
-    assert r"% runs: full/seed\_0, full/seed\_1" in latex and r"\textit{failed}" in latex
-    head = latex.splitlines()[0]
-    assert all(package in head for package in ("booktabs", "graphicx", "xcolor", "T1"))
+    assert (
+        r"\textbf{11.00 $\pm$ 1.41 ($\pm$ 5.52)}" in latex
+        and "% Without figures: no_hierarchy/seed_0 (failed)" in latex
+    )
+    assert all(package in latex.splitlines()[0] for package in ("booktabs", "graphicx", "T1"))

@@ -40,7 +40,7 @@ def test_bounces_of_methods_references_and_the_truth(tmp_path):
 
 def test_errors_by_frames_ahead(tmp_path):
     (sheet,) = horizon_sheets(study(tmp_path))
-    assert sheet.heads == ["+1", "+2", "+5", "+10", "+20", "+30"]
+    assert sheet.columns == (("", ("+1", "+2", "+5", "+10", "+20", "+30")),)
     rows = {line.label: [entry.text for entry in line.entries] for line in sheet.lines}
     # 100 times the l2 of 2e-3, five times that in unseen frames; twice that with the second seed.
     assert rows["gausim"] == ["1.50"] * 6 and rows["ballistic"] == ["4.00"] * 6

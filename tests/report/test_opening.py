@@ -204,4 +204,4 @@ def test_hostile_names_stay_text_on_the_first_screen(tmp_path: Path):
     write_report([tmp_path], tmp_path / "report", title=EVIL)
     page = (tmp_path / "report" / "report.html").read_text()
     assert "<script" not in page and first_screen(page).count("&lt;script&gt;") >= 4 and "<video" in page
-    assert "<script>" not in (tmp_path / "report" / "report.md").read_text().replace("\\<script\\>", "")
+    assert "<script>" not in (tmp_path / "report" / "results.md").read_text().replace("\\<script\\>", "")

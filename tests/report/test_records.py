@@ -149,7 +149,7 @@ def test_results_come_with_commit_command_and_hardware(sweep: Path, capsys: pyte
     assert "tables: file://" in (said := capsys.readouterr().out) and "record: file://" in said
     text = (out / "results.md").read_text()
     command = "gausim train -m experiment=tables/ablations seed=0,1 'data.names=[a]'"
-    assert "* Without figures: no_hierarchy/seed_0 (failed)" in text
+    assert r"* Without figures: no\_hierarchy/seed\_0 (failed)" in text
     assert f"* Command: `{command}`" in text and "* Commits: c0ffeec0ffee" in text and "* Hardware: " in text
     assert "| gausim | **11.00 ± 1.41 (± 5.52)** |" in text
     # Another sweep of the same name has taken the place of the first.

@@ -68,24 +68,21 @@ def _draw_bodies(dirs: list[Path], target: Path) -> int:
 
 def _write_results(arguments: argparse.Namespace) -> int:
     """Writes the record of runs, and tables of it."""
-    from gausim.io.files import write_durably
     from gausim.report.gather.runs import find_runs
     from gausim.report.gather.study import make_study
     from gausim.report.records.measure import measured_record
-    from gausim.report.records.print import results_latex, results_page
     from gausim.report.records.record import save_record
+    from gausim.report.write import write_tables
 
-    record = measured_record(make_study(find_runs(arguments.dirs, skip=arguments.results)), arguments.title)
+    study = make_study(find_runs(arguments.dirs, skip=arguments.results))
+    record = measured_record(study, arguments.title)
     if not record.tables:
         raise RunError(
             f"{' '.join(map(str, arguments.dirs))}: no run here is evaluated, so there is no figure. "
             "Evaluate them with `gausim evaluate RUN`."
         )
     if arguments.results:
-        arguments.results.mkdir(parents=True, exist_ok=True)
-        write_durably(arguments.results / "results.md", results_page(record).encode())
-        write_durably(arguments.results / "tables.tex", results_latex(record).encode())
-        print(f"tables: {(arguments.results / 'results.md').resolve().as_uri()}")
+        print(f"tables: {write_tables(arguments.results, record, study.notes)[0].resolve().as_uri()}")
     if arguments.record:
         arguments.record.parent.mkdir(parents=True, exist_ok=True)
         save_record(arguments.record, record)
@@ -116,7 +113,7 @@ def _parser() -> argparse.ArgumentParser:
     add("dirs", metavar="DIR", type=Path, nargs="*", help="run directories, sweeps, or any folder of them")
     add("--out", metavar="DIR", type=Path, help="folder to write; default report in the first DIR")
     add("--title", default="GausSim report", help="heading (default: %(default)s)")
-    add("--results", metavar="OUT", type=Path, help="instead write results.md and tables.tex to this folder: all "
+    add("--results", metavar="OUT", type=Path, help="write only results.md and tables.tex, to this folder: all "
         "figures with commit, command, hardware and cost")  # fmt: skip
     add("--record", metavar="FILE.json", type=Path, help="instead write these figures as a small record for pages")
     add("--bodies", metavar="FILE.png", type=Path, help="instead draw how far off fits to bodies of a corpus are "

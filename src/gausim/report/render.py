@@ -1,14 +1,12 @@
-"""Reports as HTML (one file without scripts or external resources), Markdown and LaTeX, from templates."""
+"""The page of a report: one HTML file without scripts or external resources."""
 
 from __future__ import annotations
 
 import os
-import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -19,18 +17,6 @@ from gausim.report.opening import Opening, unanswered
 from gausim.report.pictures.frames import FORESEEN, SEEN
 from gausim.report.pictures.media import Exhibit
 from gausim.report.tables.sheets import SECTIONS, Sheet
-
-_LATEX = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
-    "|": r"\textbar{}", '"': r"\textquotedbl{}", "±": r"$\pm$", "×": r"$\times$", "–": "--", "→": r"$\to$",
-    "↑": r"$\uparrow$", "↓": r"$\downarrow$", "⁻": "$^{-}$", "¹": "$^{1}$", "²": "$^{2}$", "³": "$^{3}$",
-    "÷": r"$\div$", "σ": r"$\sigma$", "−": "$-$",
-}  # fmt: skip
-_ANGLES = {
-    "variable_start_string": "<<", "variable_end_string": ">>", "block_start_string": "<%", "block_end_string": "%>",
-    "comment_start_string": "<#", "comment_end_string": "#>",
-}  # fmt: skip
 
 
 class Sources:
@@ -75,10 +61,11 @@ class Content:
 def html_page(content: Content) -> str:
     """The page, with all texts escaped and a security policy that forbids the browser to load anything."""
     sections = [(name, [sheet for sheet in content.sheets if sheet.section == name]) for name in SECTIONS]
-    return _rendered(
-        "page.html",
-        content,
-        {"autoescape": True},
+    environment = Environment(
+        loader=PackageLoader("gausim.report"), undefined=StrictUndefined, trim_blocks=True, autoescape=True
+    )
+    return environment.get_template("page.html").render(
+        vars(content),
         summary=summary_line(content.study),
         remedies=unanswered(content.study),
         sections=[(name, own) for name, own in sections if own and content.openings],
@@ -86,44 +73,6 @@ def html_page(content: Content) -> str:
         seen_color=_rgb(SEEN),
         foreseen_color=_rgb(FORESEEN),
     )
-
-
-def markdown_report(content: Content) -> str:
-    """The whole report without pictures."""
-    # All seeds of a row have the same sentences.
-    told = {opening.title: opening for opening in reversed(content.openings)}
-    options = {"finalize": _escaping(markdown_escape), "lstrip_blocks": True}
-    return _rendered("report.md", content, options, openings=list(reversed(told.values())), notes=content.study.notes)
-
-
-def latex_tables(content: Content) -> str:
-    r"""All tables for ``\input``; needs booktabs, graphicx and xcolor. Comments name the runs of every row."""
-    return _rendered("tables.tex", content, {"finalize": _escaping(latex_escape), **_ANGLES})
-
-
-def _rendered(template: str, content: Content, options: Mapping[str, Any], **more: Any) -> str:
-    loader = PackageLoader("gausim.report")
-    environment = Environment(
-        loader=loader, undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True, **options
-    )
-    return environment.get_template(template).render(vars(content) | more)
-
-
-def _escaping(escape: Callable[[str], str]) -> Callable[[Any], Any]:
-    """Finalizer of a template that escapes every expression not marked as safe."""
-    return lambda value: value if hasattr(value, "__html__") else escape(str(value))
-
-
-def latex_escape(text: str) -> str:
-    """Text escaped for LaTeX, on one line; control characters are removed."""
-    flat = re.sub(r"\s+", " ", text)
-    return "".join(_LATEX.get(c, c) for c in flat if c.isprintable())
-
-
-def markdown_escape(text: str) -> str:
-    """Text escaped for Markdown, also in tables; backquotes stay, for commands."""
-    flat = re.sub(r"\s+", " ", text)
-    return re.sub(r"([\\*_\[\]|<>#~&])", r"\\\1", flat)
 
 
 def summary_line(study: Study) -> str:

@@ -13,14 +13,17 @@ from gausim.report.gather.runs import find_runs
 from gausim.report.gather.study import Group, Study, cell, make_study
 from gausim.report.opening import Opening, make_openings
 from gausim.report.pictures.media import Exhibit, object_figures
-from gausim.report.render import Content, Sources, html_page, latex_tables, markdown_report
+from gausim.report.records.measure import measured_record
+from gausim.report.records.print import results_latex, results_page
+from gausim.report.records.record import Record
+from gausim.report.render import Content, Sources, html_page
 from gausim.report.tables.overview import make_sheets
 
 CSV_HEAD = (
     "row", "kind", "object", "split", "first_frame", "end_frame", "views", "metric", "mean", "std_sequences",
     "std_seeds", "seeds", "scale", "unit", "status", "runs", "config", "commit", "scene_sha256", "manifest_sha256",
 )  # fmt: skip
-PAGE, MARKDOWN, LATEX, NUMBERS = "report.html", "report.md", "tables.tex", "numbers.csv"
+PAGE, MARKDOWN, LATEX, NUMBERS = "report.html", "results.md", "tables.tex", "numbers.csv"
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,16 +65,21 @@ def write_report(
         exhibits.append((name, figures))
         notes += [f"{name}: {problem}" for problem in dict.fromkeys(problems)]
     content = Content(title, study, sheets, sources, openings, left, exhibits, notes)
-    texts = {
-        PAGE: html_page(content),
-        MARKDOWN: markdown_report(content),
-        LATEX: latex_tables(content),
-        NUMBERS: csv_numbers(study),
-    }
+    record = measured_record(study, title)
+    written = _write(out, {PAGE: html_page(content), NUMBERS: csv_numbers(study)})
+    return Report(study, openings, [*written, *write_tables(out, record, notes)])
+
+
+def write_tables(out: Path, record: Record, notes: Sequence[str]) -> list[Path]:
+    """Writes all tables of a record as Markdown, with notes, and LaTeX."""
+    return _write(out, {MARKDOWN: results_page(record, notes), LATEX: results_latex(record)})
+
+
+def _write(out: Path, texts: dict[str, str]) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         write_durably(out / name, text.encode("utf-8", errors="replace"))
-    return Report(study, openings, [out / name for name in texts])
+    return [out / name for name in texts]
 
 
 def csv_numbers(study: Study) -> str:

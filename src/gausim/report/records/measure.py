@@ -8,13 +8,13 @@ from statistics import fmean
 from typing import Any
 
 from gausim.report.gather.runs import RunRecord, dig
-from gausim.report.gather.study import FULL, Group, Study, cell, deviation, number, pooled
+from gausim.report.gather.study import FULL, Group, Study, cell, deviation, number, pooled, says
 from gausim.report.records.commands import joined
 from gausim.report.records.print import SEEDS_APART
 from gausim.report.records.record import SCHEMA, Cell, Column, Figure, Made, Record, RecordTable, Row, value_of
 from gausim.results.curves import ERROR_3D, FOLLOW_HANDS, STATIC
 from gausim.results.summary import MOTION_ENERGY
-from gausim.results.table import GROUP_TITLES, SPLIT_TITLES, footnotes_of, reference_row
+from gausim.results.table import GROUP_TITLES, NO_FORESIGHT, SPLIT_TITLES, footnotes_of, reference_row
 
 # Columns of an object's first table, of unseen frames: metric, views.
 _FIRST = (
@@ -181,7 +181,9 @@ def _table(study: Study, name: str, split: str, keys: Sequence[tuple[str, str]],
         return None
     shown = [Row(row.label, [row.cells[i] for i in kept], row.reference) for row in rows]
     shown = [row for row in shown if any(cell is not None for cell in row.cells)]
-    return RecordTable("", [columns[i] for i in kept], shown, caption=SEEDS_APART + _unlike(groups, name))
+    blind = [f" {group.label}: {NO_FORESIGHT}" for group in groups if NO_FORESIGHT in says(group)]
+    caption = SEEDS_APART + _unlike(groups, name) + "".join(blind)
+    return RecordTable("", [columns[i] for i in kept], shown, caption=caption)
 
 
 def _unlike(groups: Sequence[Group], name: str) -> str:

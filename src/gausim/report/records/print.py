@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from jinja2 import Environment, StrictUndefined, TemplateError
 
 from gausim.core import RunError
 from gausim.report.records.record import Cell, Column, Figure, Made, Record, RecordTable, load_record, value_of
-from gausim.report.render import latex_escape
 
 TEMPLATE = "page.md"
 SEEDS_APART = "± deviation over seeds; in brackets, deviation over sequences (root mean square over seeds)."
+_LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
+    "|": r"\textbar{}", '"': r"\textquotedbl{}", "±": r"$\pm$", "×": r"$\times$", "–": "--", "→": r"$\to$",
+    "↑": r"$\uparrow$", "↓": r"$\downarrow$", "⁻": "$^{-}$", "¹": "$^{1}$", "²": "$^{2}$", "³": "$^{3}$",
+    "÷": r"$\div$", "σ": r"$\sigma$", "−": "$-$",
+}  # fmt: skip
 
 
-def markdown_table(table: RecordTable) -> str:
-    """The table as GitHub Markdown, the best figures bold."""
-    lines = [[*table.stub, *(column.label for column in table.columns)]]
+def markdown_table(table: RecordTable, escape: Callable[[str], str] = str) -> str:
+    """The table as GitHub Markdown, the best figures bold; ``escape`` is applied to every text."""
+    lines = [[escape(text) for text in (*table.stub, *(column.label for column in table.columns))]]
     lines.append(["---"] * len(lines[0]))
     for row, texts, best in _printed(table):
-        lines.append([*row, *(f"**{text}**" if mark else text for text, mark in zip(texts, best, strict=True))])
+        cells = [f"**{escape(text)}**" if mark else escape(text) for text, mark in zip(texts, best, strict=True)]
+        lines.append([*map(escape, row), *cells])
     return "\n".join("| " + " | ".join(line) + " |" for line in lines).replace("|  |", "| |").replace("|  |", "| |")
 
 
@@ -37,7 +44,7 @@ def latex_table(table: RecordTable, record: Record) -> str:
         body.append(" & ".join([*map(latex_escape, row), *cells]) + r" \\")
     caption = latex_escape(" ".join(filter(None, (f"{table.title or record.title}.", table.caption, record.made.test))))
     return "\n".join([
-        *(f"% {line}" for line in origin(record.made)),
+        *(f"% {' '.join(line.split())}" for line in origin(record.made)),
         r"\begin{table*}[ht]", r"\centering", rf"\caption{{{caption}}}", rf"\label{{tab:{_label(table.key)}}}",
         r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%",
         rf"\begin{{tabular}}{{{'l' * len(table.stub)}{'c' * len(table.columns)}}}", r"\toprule",
@@ -57,12 +64,14 @@ def origin(made: Made) -> list[str]:
     ]
 
 
-def results_page(record: Record) -> str:
-    """All tables of one record as a page, with their origin."""
-    parts = [f"# {record.title}", *([record.made.test] if record.made.test else []), "\n".join(_listed(record.made))]
+def results_page(record: Record, notes: Sequence[str] = ()) -> str:
+    """All tables of one record as a page, with their origin and ``notes``; texts are escaped, as runs have any name."""
+    parts = [f"# {markdown_escape(record.title)}", markdown_escape(record.made.test), "\n".join(_listed(record.made))]
+    parts.append("\n".join(f"* {markdown_escape(note)}" for note in notes))
     for table in record.tables:
-        parts += [f"## {table.title or table.key}", *([table.caption] if table.caption else []), markdown_table(table)]
-    return "\n\n".join(parts) + "\n"
+        parts += [f"## {markdown_escape(table.title or table.key)}", markdown_escape(table.caption)]
+        parts.append(markdown_table(table, markdown_escape))
+    return "\n\n".join(filter(None, parts)) + "\n"
 
 
 def results_latex(record: Record) -> str:
@@ -70,6 +79,18 @@ def results_latex(record: Record) -> str:
     return "% \\usepackage{booktabs,graphicx} and T1 font encoding\n\n" + "\n".join(
         latex_table(table, record) for table in record.tables
     )
+
+
+def latex_escape(text: str) -> str:
+    """Text escaped for LaTeX, on one line; control characters are removed."""
+    flat = re.sub(r"\s+", " ", text)
+    return "".join(_LATEX.get(c, c) for c in flat if c.isprintable())
+
+
+def markdown_escape(text: str) -> str:
+    """Text escaped for Markdown, also in tables; backquotes stay, for commands."""
+    flat = re.sub(r"\s+", " ", text)
+    return re.sub(r"([\\*_\[\]|<>#~&])", r"\\\1", flat)
 
 
 def page(folder: Path) -> str:
@@ -121,8 +142,8 @@ def _block(made: Made) -> str:
 
 
 def _listed(made: Made) -> list[str]:
-    return [f"* {line.replace('Command: ', 'Command: `') + ('`' if line.startswith('Command') else '')}"
-            for line in origin(made)]  # fmt: skip
+    heads = (line.partition(": ") for line in origin(made))
+    return [f"* {head}: " + (f"`{text}`" if head == "Command" else markdown_escape(text)) for head, _, text in heads]
 
 
 def _printed(table: RecordTable) -> list[tuple[list[str], list[str], list[bool]]]:

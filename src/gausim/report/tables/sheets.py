@@ -1,9 +1,8 @@
-"""Tables of a report, independent of HTML, Markdown and LaTeX."""
+"""Tables of the page of a report."""
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -61,17 +60,12 @@ class Line:
     kind: str
     entries: tuple[Entry, ...]
 
-    @property
-    def runs(self) -> list[RunRecord]:
-        """All source runs of its entries."""
-        return list(dict.fromkeys(run for entry in self.entries for run in entry.runs))
-
 
 @dataclass(frozen=True)
 class Sheet:
     """One table."""
 
-    key: str  # short name for files and anchors
+    key: str  # short name
     section: str  # one of SECTIONS
     title: str
     caption: str  # explanation
@@ -80,19 +74,9 @@ class Sheet:
     stub: str = ""  # heading of the labels
 
     @property
-    def label(self) -> str:
-        """The key, in letters and digits only."""
-        return re.sub(r"[^A-Za-z0-9]+", "-", self.key)
-
-    @property
     def has_groups(self) -> bool:
         """Whether its columns have group headings."""
         return any(group for group, _ in self.columns)
-
-    @property
-    def heads(self) -> list[str]:
-        """Headings of all columns, each after that of its group."""
-        return [f"{group} {sub}".strip() for group, subs in self.columns for sub in subs]
 
 
 def split_title(study: Study, name: str, split: str) -> str:
