@@ -10,7 +10,7 @@ from gausim.benchmark.harness import Options
 from gausim.cli.benchmark import simulator_of
 
 
-def test_a_frame_is_divided_into_its_parts() -> None:
+def test_the_stages_of_a_frame() -> None:
     rows = interact.run(Options(torch.device("cpu"), quick=True, rounds=1), simulator_of)
     (case,) = {row.case for row in rows}
     found = {row.metric: row.value for row in rows}
@@ -18,5 +18,4 @@ def test_a_frame_is_divided_into_its_parts() -> None:
     assert all(math.isfinite(value) and value >= 0 for value in found.values())
     assert found["simulated"] == pytest.approx(1 / found["step"])
     assert found["made one after the other"] < found["simulated"]
-    for name in (*interact.GROUPS, "colours", "packing"):
-        assert found[name] > 0 and 0 < found[f"{name}, fraction"] < 1
+    assert all(found[name] > 0 for name in ("step", "colours", "packing"))

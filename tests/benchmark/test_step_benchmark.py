@@ -14,24 +14,17 @@ QUICK = Options(torch.device("cpu"), quick=True, rounds=1)
 def test_every_figure_of_the_step_is_reported(memory: int, monkeypatch, capsys) -> None:
     torch.manual_seed(0)
     monkeypatch.setattr(step, "_available_memory", lambda device: memory)
-    monkeypatch.setattr(step, "QUICK", step.Size(120, (24, 4), 2, 100, (20, 4), 2, step.QUICK.network))
+    monkeypatch.setattr(step, "QUICK", step.Size(120, (24, 4), step.QUICK.network))
     rows = step.run(QUICK, simulator_of)
     found = {(row.case, row.metric): row.value for row in rows}
     assert len(found) == len(rows)
-    paper, flat, training = list(dict.fromkeys(row.case for row in rows))
-    assert paper.startswith("step, 120 kernels") and flat.endswith("no hierarchy") and "2 x 100 kernels" in training
-    for metric in ("forward", "forward + backward"):
-        for case in (paper, training):
-            assert found[case, metric] > 0 and found[case, f"{metric}, outside the network"] < 1
-        speed = found[training, f"{metric}, throughput"]
-        assert speed == pytest.approx(2 * 2 * 1e3 / found[training, metric])
-        assert all(found[training, f"{metric}, throughput / {other}"] > 0 for other in ("elastic", "plain"))
+    paper, flat = list(dict.fromkeys(row.case for row in rows))
+    assert paper.startswith("step, 120 kernels") and flat.endswith("no hierarchy")
+    assert all(found[paper, metric] > 0 for metric in ("forward", "forward + backward"))
     assert found[flat, "edges"] > found[paper, "edges"] > 0
     said = capsys.readouterr().err
     for metric in ("forward + backward", "kept for the backward pass"):
         assert ((flat, f"{metric} / with hierarchy") in found) == bool(memory) == ("no backward pass" not in said)
-    parts = [metric for case, metric in found if case == paper and metric.startswith("forward, ")]
-    assert len(parts) == 9 and all(found[paper, metric] > 0 for metric in parts[1:])
 
 
 def test_levels_are_found_that_have_the_units_wanted() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gausim.benchmark.harness import Options, Row, medians, spent_in, torch_threads
-from gausim.benchmark.step import Build, cloud, parts
+from gausim.benchmark.harness import Options, Row, medians, torch_threads
+from gausim.benchmark.step import Build, cloud
 from gausim.core import SimState
 from gausim.interaction.interaction import Interaction
 from gausim.interaction.selections import Ball
@@ -16,16 +16,10 @@ from gausim.viewer.coloring import VIEW, Painter
 from gausim.viewer.splats import Placing, pack
 
 SIZES = {False: (2_000, 20_000), True: (300,)}
-# Parts of a step by purpose.
-GROUPS = {
-    "graph": ("aggregation", "edges", "features", "normalisers"),
-    "network": ("network",),
-    "propagation": ("template", "recursion and kernels"),
-}
 
 
 def run(options: Options, build: Build) -> list[Row]:
-    """Simulated frames per second, and the parts of a frame's time, with untrained weights."""
+    """Simulated frames per second, and the times of a frame's stages, with untrained weights."""
     with torch_threads(options.threads):
         return [row for count in SIZES[options.quick] for row in _frame(count, options, build)]
 
@@ -59,26 +53,10 @@ def _frame(count: int, options: Options, build: Build) -> list[Row]:
         rounds=rounds,
         warmup=3,
     )
-    with torch.no_grad():
-        template = model.prepare(model.batch([0])).template
-    with spent_in(parts(template), options.device) as seconds:
-        for _ in range(rounds):
-            live.step()
-    split = {group: sum(seconds[name] for name in names) / rounds for group, names in GROUPS.items()}
-    return _rows(
-        f"{count} kernels, {sum(level.count for level in model.hierarchies[0].levels[1:])} units", times, split
-    )
-
-
-def _rows(case: str, times: dict[str, float], split: dict[str, float]) -> list[Row]:
-    rest = max(0.0, times["step"] - sum(split.values()))
-    split |= {"forces, energy, checks": rest, "colours": times["colours"], "packing": times["packing"]}
-    whole = times["step"] + times["colours"] + times["packing"]
-    rows = [
+    case = f"{count} kernels, {sum(level.count for level in model.hierarchies[0].levels[1:])} units"
+    whole = sum(times.values())
+    return [
         Row(case, "simulated", 1 / times["step"], "frames/s"),
         Row(case, "made one after the other", 1 / whole, "frames/s"),
-        Row(case, "step", times["step"], "s"),
+        *(Row(case, name, seconds, "s") for name, seconds in times.items()),
     ]
-    for name, seconds in split.items():
-        rows += [Row(case, name, seconds, "s"), Row(case, f"{name}, fraction", seconds / whole, "1", "step to packing")]
-    return rows
