@@ -374,8 +374,8 @@ def still(scene: GaussianScene, frames: int) -> Trajectory:
 
 def test_a_recording_holds_every_frame(make_column: Callable[..., GaussianScene], tmp_path: Path) -> None:
     scene = make_column()
-    path = record(scene, still(scene, 5), tmp_path / "a.viser")
-    data = path.read_bytes()
+    record(scene, still(scene, 5), tmp_path / "a.viser")
+    data = (tmp_path / "a.viser").read_bytes()
     inner = zstandard.ZstdDecompressor().decompress(data[8:], max_output_size=int.from_bytes(data[:8], "little"))
     length = int.from_bytes(inner[:8], "little")
     facts = msgspec.msgpack.decode(inner[8 : 8 + length])
@@ -399,8 +399,6 @@ def test_what_cannot_be_recorded_is_said(make_column: Callable[..., GaussianScen
     scene, path = make_column(), tmp_path / "a.viser"
     with pytest.raises(DataError, match="kernels"):
         record(make_column(80), still(scene, 2), path)
-    with pytest.raises(DataError, match="every"):
-        record(scene, still(scene, 2), path, every=0)
     broken = still(scene, 3)
     broken.positions[1, 4] = float("nan")
     with pytest.raises(DivergenceError, match="frame 1"):

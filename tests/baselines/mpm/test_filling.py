@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from gausim.baselines.mpm import Filling, fill_interior
-from gausim.core import ConfigError
 
 DEVIATION, CELL = 0.035, 0.05
 
@@ -22,10 +21,10 @@ def sphere(radius: float, count: int = 3000) -> Tensor:
     return 1 + radius * torch.stack((flat * angle.cos(), flat * angle.sin(), z), -1)
 
 
-def distances(points: Tensor, **options) -> Tensor:
+def distances(points: Tensor) -> Tensor:
     """Distances from (1, 1, 1) of the particles that fill round kernels at the points."""
     covars = (DEVIATION**2 * torch.eye(3)).expand(len(points), 3, 3)
-    filling = Filling(cells=round(2 / CELL), per_cell=4, **options)
+    filling = Filling(cells=round(2 / CELL), per_cell=4)
     return (fill_interior(points, covars, torch.ones(len(points)), 2.0, filling) - 1).norm(dim=-1)
 
 
@@ -36,12 +35,3 @@ def test_a_hollow_sphere_is_filled_inside_and_only_there() -> None:
     assert float((found < 0.4).sum()) / 4 * CELL**3 == pytest.approx(core, rel=0.05)
     between = distances(torch.cat((sphere(0.6, 6000), sphere(0.3))))
     assert ((between > 0.4) & (between < 0.5)).any() and not (between < 0.15).any()  # the ray meets two walls there
-
-
-def test_an_open_bowl_is_filled_only_if_its_side_is_named() -> None:
-    bowl = sphere(0.5)
-    bowl = bowl[bowl[:, 2] > 0.8]  # nothing below
-    closed, opened = ((distances(bowl, open_side=side) < 0.3).sum() for side in (None, [2, -1]))
-    assert closed < 0.3 * opened
-    with pytest.raises(ConfigError, match="open_side"):
-        Filling(open_side=(0, 1))

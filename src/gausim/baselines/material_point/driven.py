@@ -51,9 +51,7 @@ class Driven:
         return torch.where(self.held[:, None], self.means, positions), found, polar_rotation(found)
 
 
-def clustered(
-    scene: GaussianScene, most: int, interior: Float[Tensor, "M 3"] | None = None, *, followed: int = FOLLOWED
-) -> Driven:
+def clustered(scene: GaussianScene, most: int, interior: Float[Tensor, "M 3"] | None = None) -> Driven:
     """At most ``most`` driving particles by k-means of the simulated kernels and of ``interior`` points [scene units].
 
     Pinned kernels and points form separate clusters, in proportion.
@@ -63,16 +61,16 @@ def clustered(
     """
     points, pinned = (v.cpu().numpy() for v in _with_interior(scene, scene.simulated, interior))
     points = points.astype(np.float64)
-    if len(points) < followed:
+    if len(points) < FOLLOWED:
         raise SceneError(
-            f"{scene.name}: expected at least {followed} simulated kernels (each follows that many particles), got "
+            f"{scene.name}: expected at least {FOLLOWED} simulated kernels (each follows that many particles), got "
             f"{len(points)}. Widen the mask 'simulated'."
         )
-    most = max(followed, min(most, len(points)))
+    most = max(FOLLOWED, min(most, len(points)))
     held = min(int(pinned.sum()), max(1, round(most * float(pinned.mean())))) if pinned.any() else 0
     parts = [k_means(points[chosen], count) for chosen, count in ((~pinned, most - held), (pinned, held)) if count]
     rest = torch.from_numpy(np.concatenate(parts)).to(scene.means.dtype)
-    return follow(scene, rest, torch.arange(len(rest)) >= len(rest) - held, followed)
+    return follow(scene, rest, torch.arange(len(rest)) >= len(rest) - held, FOLLOWED)
 
 
 def opaque(scene: GaussianScene, least: float, interior: Float[Tensor, "M 3"] | None = None) -> Driven:

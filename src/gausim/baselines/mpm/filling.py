@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gausim.baselines.mpm.config import Grid
-from gausim.core import ConfigError
 
 REACH = 3.0  # standard deviations up to which a kernel adds to the density
 
@@ -24,28 +23,12 @@ class Filling:
         dense: density above which a cell is matter and gets particles.
         wall: density above which a cell stops a ray.
         per_cell: particles in a filled cell.
-        ray_axis: axis along which walls are counted; an odd number means inside.
-        open_side: side on which no wall is required, as [axis, +1 or -1], for example [2, -1] for an object that was
-            not seen from below; None requires walls on all sides.
-        seed: seed of the particles' positions within their cells.
     """
 
     cells: int = 50
     dense: float = 5.0
     wall: float = 3.0
     per_cell: int = 8
-    ray_axis: int = 0
-    open_side: tuple[int, int] | list[int] | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.ray_axis not in (0, 1, 2):
-            raise ConfigError(f"filling.ray_axis: expected 0, 1 or 2, got {self.ray_axis}.")
-        if self.open_side is not None and tuple(self.open_side) == (self.ray_axis, 1):
-            raise ConfigError(
-                f"filling.open_side: {self.open_side} has no wall, so walls cannot be counted on that side. "
-                "Change filling.ray_axis."
-            )
 
 
 def fill_interior(
@@ -64,10 +47,10 @@ def fill_interior(
     x, s, o = (v.detach().cpu().double().numpy() for v in (means, covars, opacities))
     density = splat_density(x, s, o, grid)
     count = np.histogramdd(x, bins=grid.cells, range=[(0, size)] * 3)[0].astype(np.int64)
-    filled = (density > options.dense) | ((count == 0) & enclosed(density > options.wall, options))
+    filled = (density > options.dense) | ((count == 0) & enclosed(density > options.wall))
     missing = np.where(filled, np.maximum(options.per_cell - count, 0), 0)
     cells = np.repeat(np.argwhere(missing > 0), missing[missing > 0], axis=0)
-    places = (cells + np.random.default_rng(options.seed).random(cells.shape)) * grid.dx
+    places = (cells + np.random.default_rng(0).random(cells.shape)) * grid.dx
     return torch.from_numpy(places).to(means)
 
 
@@ -91,15 +74,12 @@ def splat_density(
     return density
 
 
-def enclosed(wall: Bool[np.ndarray, "n n n"], options: Filling) -> Bool[np.ndarray, "n n n"]:
-    """Cells with walls in all six directions along the axes and an odd number of them above along ``ray_axis``."""
+def enclosed(wall: Bool[np.ndarray, "n n n"]) -> Bool[np.ndarray, "n n n"]:
+    """Cells with walls in all six directions along the axes and an odd number of them ahead along the first axis."""
     inside = np.ones_like(wall)
     for axis in range(3):
-        for side in (1, -1):
-            if options.open_side is None or tuple(options.open_side) != (axis, side):
-                along = np.flip(wall, axis) if side > 0 else wall
-                beyond_a_wall = np.logical_or.accumulate(along, axis)
-                inside &= np.flip(beyond_a_wall, axis) if side > 0 else beyond_a_wall
-    begins = np.diff(wall.astype(np.int8), axis=options.ray_axis, prepend=0) == 1  # the first cell of every wall
-    above = begins.sum(options.ray_axis, keepdims=True) - begins.cumsum(options.ray_axis)
-    return inside & (above % 2 == 1)
+        inside &= np.logical_or.accumulate(wall, axis)
+        inside &= np.flip(np.logical_or.accumulate(np.flip(wall, axis), axis), axis)
+    begins = np.diff(wall.astype(np.int8), axis=0, prepend=0) == 1  # the first cell of every wall
+    ahead = begins.sum(0, keepdims=True) - begins.cumsum(0)
+    return inside & (ahead % 2 == 1)

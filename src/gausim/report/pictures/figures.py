@@ -133,10 +133,10 @@ def slice_figure(
     return lines[0]
 
 
-def contact_frames(frames: int, first_unseen: int, count: int = 8) -> list[int]:
+def contact_frames(frames: int, first_unseen: int) -> list[int]:
     """Frames of a contact sheet: first, last seen, first unseen, last, and evenly spaced ones between."""
     edges = {0, min(first_unseen - 1, frames - 1), min(first_unseen, frames - 1), frames - 1}
-    even = np.linspace(0, frames - 1, count).round().astype(int).tolist()
+    even = np.linspace(0, frames - 1, 8).round().astype(int).tolist()
     return sorted(edges | {f for f in even if min(abs(f - e) for e in edges) > 2})
 
 
